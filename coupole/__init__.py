@@ -23,9 +23,10 @@ def _is_writable(folder: Path) -> bool:
 
 
 def _keep_kernels_somewhere() -> None:
-    """Numba wants a place for what it compiles: beside the package or in the user's cache. Where neither can be
+    """Numba needs a folder for its compiled code: beside the package or in the user's cache. Where neither can be
     written (another user's installation, no home), it gets this user's folder among the temporary files; one that
-    somebody else has made there is not used, since code is loaded from it. Set before numba is imported."""
+    somebody else has made there is not used, since code is loaded from it. Set before numba is imported.
+    """
     places = (Path(__file__).parent, Path("~/.cache").expanduser())
     if "NUMBA_CACHE_DIR" in os.environ or any(map(_is_writable, places)):
         return

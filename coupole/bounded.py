@@ -1,4 +1,4 @@
-"""Every wait ends: a call that never returns is given up, told, and left behind.
+"""Every wait ends: a call that never returns is reported and given up.
 
 A library may hang in a call, a network disk may be dead: no thread that waits in there can be ended, by a signal
 as little as by another thread. So whoever may hang is a thread that nobody needs (`run_bounded`), and each call of
@@ -88,7 +88,7 @@ class Call:
             self.of,
             expected=f"an end of the call `{self.operation}`",
             happened=f"it has not returned for {lasts_s:.0f} s, and was left behind",
-            remedy="Switch the device off and on, then resume the run; if it comes back, report it with the "
+            remedy="Switch the device off and on, then resume the run; if this happens again, report it with the "
             "versions of the device's library and firmware.",
         )
 

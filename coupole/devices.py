@@ -202,7 +202,7 @@ def table_box(box: LedBox) -> TableLedBox:
         raise DeviceRefused(
             "led box",
             expected="a box that runs tables and triggers the camera, for `trigger: hardware`",
-            happened="this one only switches single LEDs on command",
+            happened="this box only switches single LEDs on command",
             remedy="Set `trigger: software` in the plan: then the host triggers the camera.",
         )
     return cast(TableLedBox, box)

@@ -151,10 +151,10 @@ class ArmUnattended(DeviceError):
         self.silent_s = silent_s
         super().__init__(
             "robot",
-            expected="a look at the arm every 0.1 s while it moves",
+            expected="a check of the arm every 0.1 s while it moves",
             happened=f"nobody looked for {silent_s:.2f} s (the program stood still, or waited for something), so "
             "the arm braked on its path",
-            remedy="See that the cell is clear, then go on.",
+            remedy="Check that the cell is clear, then continue.",
         )
 
 

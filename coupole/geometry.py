@@ -97,7 +97,8 @@ def look_at(
 
 def farthest_first(points: ArrayLike, first: int) -> Iterator[tuple[int, float]]:
     """Give the index of each of points [n, d], after `first` always the one that is farthest from all before it,
-    with that distance (infinite for the first). Of equals comes the one with the lowest index."""
+    with that distance (infinite for the first). Among equals the lowest index is returned.
+    """
     points_array = np.asarray(points, dtype=np.float64)
     index, distance = first, np.inf
     nearest = np.full(len(points_array), np.inf)

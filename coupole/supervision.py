@@ -34,7 +34,7 @@ import time
 ATTENTION_S = 0.1
 """A motion that nobody has looked at for this long ends: the axes brake."""
 LOOK_S = 0.02
-"""Whoever watches an arm that moves waits no longer than this, machine time, before looking again."""
+"""The supervisor of a moving arm checks it again after at most this time, on the machine's clock."""
 ASKS_FROM_S = 1.0
 """A process that did not run for so long was frozen, or its machine slept: a person decides whether to go on."""
 HEARD_WITHIN_S = 0.5

@@ -1,1 +1,3 @@
-"""Drivers of real devices. Of `coupole` they import the contracts only: devices, errors, geometry, kinematics."""
+"""Drivers of real devices. They import only the contracts from `coupole`: devices, errors, geometry,
+kinematics.
+"""

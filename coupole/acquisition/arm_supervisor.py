@@ -60,7 +60,8 @@ class ArmSupervisor:
         tell_lapse: Callable[[str], None] = lambda message: None,
     ) -> None:
         """`stand` waits until a person lets a session that is held go on; without it what held a motion is raised.
-        `tell_lapse` is told of a motion that was braked because nobody had looked at it."""
+        `tell_lapse` is called for a motion that was braked because it was not checked.
+        """
         self._stand, self._tell_lapse = stand, tell_lapse
         self._rig, self._robot, self._clock, self._control = rig, cell.robot, cell.clock, control
         self._halt = cell.halt
@@ -94,8 +95,9 @@ class ArmSupervisor:
         self._checked_state()
 
     def go(self, visit: Visit, meanwhile: Callable[[], None] = lambda: None, speed: float = 1.0) -> SettledPose:
-        """Follow the leg of a visit; returns the measured pose. What `meanwhile`, called every 10 ms, raises is
-        raised at once, while the arm still moves: the caller stops it. `speed`: share of the arm's speeds.
+        """Follow the leg of a visit; returns the measured pose. `meanwhile` is called every 10 ms. If it raises,
+        the error is raised at once, while the arm still moves: the caller stops it. `speed`: share of the arm's
+        speeds.
 
         A motion that was braked because this thread did not look at it, or that is held, goes on from where it
         stands on its checked line: by itself after a short lapse, by a person's word after all else."""
@@ -134,7 +136,8 @@ class ArmSupervisor:
 
     def _stand_after(self, error: Exception) -> None:
         """The motion was braked, or is to be: come to rest, then wait for a person unless the lapse was short.
-        Raises what has another cause."""
+        Other errors are raised.
+        """
         lapse_s = error.silent_s if isinstance(error, ArmUnattended) else 0.0
         if self._control.stop.is_set() or not (self.was_held(error) or lapse_s):
             raise error
@@ -266,6 +269,6 @@ class ArmSupervisor:
 def _may_go_on(lapse_s: float) -> str:
     """Return the message about a lapse after which no person is asked."""
     return (
-        f"robot: nobody looked at its motion for {lapse_s:.2f} s (the program stood still, or waited for "
-        "something), so it braked on its path. It may move on by itself at any moment: keep clear of it."
+        f"robot: its motion was not checked for {lapse_s:.2f} s (the program stood still, or waited for "
+        "something), so it braked on its path. It may move again by itself at any moment: keep clear of it."
     )

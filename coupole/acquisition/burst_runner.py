@@ -104,7 +104,7 @@ class BurstRunner:
             self._upload = self._uploader.submit(box.load, burst.table)
 
     def look_at_upload(self) -> None:
-        """Raise what the upload has raised so far."""
+        """Raise the error of the upload, if it has failed so far."""
         if self._upload is not None and self._upload.done() and self._upload.exception() is not None:
             upload, self._upload = self._upload, None
             upload.result()
@@ -116,7 +116,7 @@ class BurstRunner:
             futures.wait([upload], timeout=_STALL_S)
 
     def _await_upload(self) -> None:
-        """Wait with an eye on the arm until the table is in the box. Raises what the upload raised."""
+        """Wait with an eye on the arm until the table is in the box. Raises the error of the upload."""
         while self._upload is not None:
             self._arm.attend()
             if futures.wait([self._upload], timeout=_POLL_S).done:
@@ -330,7 +330,7 @@ class BurstRunner:
 
 
 def _since_s(begun_ns: int | None, ended_ns: int) -> float:
-    """Seconds; 0 for what has not begun."""
+    """Seconds; 0 for a burst that has not begun."""
     return 0.0 if begun_ns is None else (ended_ns - begun_ns) / 1e9
 
 

@@ -50,7 +50,7 @@ class BurstsOfViews:
         return self._chooser is not None and not has_enough(self._choices_of(number))
 
     def bound(self, number: int) -> tuple[Burst, ...]:
-        """Bursts that are at least what a view gets in all."""
+        """Bursts that cost at least as much as all bursts of a view."""
         return self._job.schedule.bursts[number] if self.may_want_more(number) else self.bursts(number)
 
     def expected_frames(self, number: int) -> int:

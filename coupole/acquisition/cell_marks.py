@@ -1,7 +1,7 @@
 """Marks of cells whose devices a process has open, in the user's runtime folder.
 
-A mark is a lock of an open file (`F_OFD_SETLK` of Linux): it ends with its process, however that ends. Whoever
-asks looks at the lock (`F_OFD_GETLK`) and never takes it, so that a session is marked whoever asks meanwhile.
+A mark is a lock of an open file (`F_OFD_SETLK` of Linux): it ends with its process, however that ends. A process
+that only asks queries the lock (`F_OFD_GETLK`) and never takes it, so a session can always mark its cell.
 
 There is one for each place of the cell's arm (`coupole.plan.controller_places`): rigs that name the same
 controller exclude each other. Sessions that have a simulated world each share no device, and do not.

@@ -26,8 +26,8 @@ def _align(  # type: ignore[no-untyped-def]
 ):
     """Fill `steps_out` [frames] under one hypothesis; returns the number of surplus frames.
 
-    It stops and returns `max_surplus + 1` as soon as there are too many. Of several frames that fall on one step
-    all but one are counted as surplus; which of them does not matter here.
+    It stops and returns `max_surplus + 1` as soon as there are too many. If several frames fall on one step, all
+    but one are counted as surplus; it does not matter here which one is not.
     """
     surplus = pending = 0
     n_frames, n_steps = len(frame_ns), len(step_ns)

@@ -14,8 +14,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def collected_when_asked() -> Iterator[Callable[[], None]]:
-    """Inside, cycles are collected by calls of what this yields, and by nothing else. What outlives such a call is
-    looked at again only after the context."""
+    """Inside, cycles are collected only by calls of the yielded function. Objects that outlive this call are
+    examined again only after the context.
+    """
     was_enabled = gc.isenabled()
     gc.disable()
 

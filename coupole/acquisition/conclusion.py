@@ -23,7 +23,7 @@ _SLOWEST_BYTES_S, _REPORT_S = 10e6, 60.0
 
 
 def open_for_session(run: Run) -> None:
-    """Take out of the manifest what the session may write."""
+    """Remove the files that the session may write from the manifest."""
     manifest.open_for_session(run.folder, complete_views(run))
 
 
@@ -62,8 +62,9 @@ def close_complete(run: Run, console: Console, result: Path | None = None) -> fl
 
 
 def conclude(run: Run, console: Console) -> None:
-    """Write the report and enter in the manifest what is complete. Never raises: the run itself has ended. A disk
-    that hung in the session is not asked again; a folder that is lost leaves nothing to conclude."""
+    """Write the report and enter the complete files in the manifest. Never raises: the run itself has ended. A
+    disk that hung in the session is not asked again; a folder that is lost leaves nothing to conclude.
+    """
     if run.is_lost:
         return
     try:

@@ -1,9 +1,9 @@
 """The light that a session gives the object: entered in its ledger before it is given, corrected afterwards.
 
-Whoever gives light asks here first, burst by burst (`DoseMeter`) or flash by flash (`FlashMeter`): the object's
-budget is asked, after all that its ledger has at that moment, and what is planned is on the disk before the first
-lamp is lit. Lights that the host switches are asked for once more each. A session that ends without a word (kill
--9, power cut) leaves the plan of one burst, which is at least what was given.
+Every caller that gives light asks here first, burst by burst (`DoseMeter`) or flash by flash (`FlashMeter`). The
+object's budget is checked after all entries of its ledger at that moment, and the planned light is on the disk
+before the first lamp is lit. Lights that the host switches are asked for once more each. A session that ends
+without a word (kill -9, power cut) leaves the plan of one burst, which is at least what was given.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class LightOnObject:
 
     @property
     def lux_h_at_most(self) -> float:
-        """The same with all that is planned and of which nobody has said what was given."""
+        """The same, with all planned light whose true amount was never entered."""
         return self.lux_h if self._planned is None else float((self._given_lux_h + self._planned.at_most).max())
 
     @property
@@ -95,7 +95,7 @@ class LightOnObject:
 
     @property
     def total_lux_h(self) -> float:
-        """Dose of the object's life, by its ledger as it is now, without what is being given."""
+        """Dose of the object's life, by its ledger as it is now, without the light that is being given."""
         planned_lux_h = self._history.planned_lux_h(self._planned.plan_id) if self._planned else 0.0
         return self._history.total_lux_h - planned_lux_h + self._unentered_lux_h
 

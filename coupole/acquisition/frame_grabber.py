@@ -70,12 +70,12 @@ class FrameGrabber:
             frame.release()
 
     def __len__(self) -> int:
-        """Frames taken so far. Raises what the camera raised on the taking thread."""
+        """Frames taken so far. Raises the camera's error from the thread that takes frames."""
         self.raise_error()
         return len(self._frame_ids)
 
     def raise_error(self) -> None:
-        """Raise what the camera raised on the taking thread, if it did."""
+        """Raise the camera's error from the thread that takes frames, if there was one."""
         if self._error is not None:
             raise self._error
 

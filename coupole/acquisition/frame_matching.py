@@ -198,7 +198,7 @@ def _verdict(
     if not agrees.all():
         reasons.append("more than one alignment of box and camera is possible")
     if np.any(agreed_steps == DOUBTFUL):
-        reasons.append("some frames do not fit the clocks")
+        reasons.append("the times of some frames do not agree with the clocks")
     if not reasons:
         missing[edge_steps[claims == 0]] = True
     if np.any(claims > 1):
@@ -220,7 +220,7 @@ def compile_now() -> None:
     log["edge_sent"] = True
     log["t_trigger_ns"] = 10_000_000 * np.arange(16)
     match(log, np.arange(16), 10_000_000 * np.arange(16), complete=True)
-    assert agree_on_steps.signatures, "the kernels were not reached"
+    assert agree_on_steps.signatures, "the compiled functions were not reached"
 
 
 def _lost_in_transfer(

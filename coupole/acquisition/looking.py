@@ -44,7 +44,7 @@ from coupole.viewing.live_page import serve
 from coupole.viewing.terminal import LiveFigures, RunObserver, alarm
 
 _FIGURES_EVERY_S = 0.2
-LOOKS_ON = "this process only looks on: the run goes on"
+LOOKS_ON = "this process only observes the run: the run continues"
 """Word of a live view of a run, which has nothing to make safe."""
 
 
@@ -113,7 +113,7 @@ def watch_cell(
     request = Wanted(led=choice.led, exposure_us=choice.exposure_us)
     studio = Studio(choice_from(request, choice, tuple(leds.ids.tolist()), longest_us))
     if job is None or job.plan.object is None:
-        console.print("no object is known, so no light is counted; to have it counted, give a plan")
+        console.print("no object is known, so no light is counted; to count it, give a plan")
     else:
         _ask_the_ledger(job, console)
     faults_of(rig_cell).refuse(rig_cell.document.path)

@@ -106,7 +106,7 @@ class DryRecorder(MemoryRecorder):
 
 
 def _refuse_to_read(shot: ShotId) -> FrameSample:
-    raise KeyError(f"{shot}: nothing of an earlier session is kept")
+    raise KeyError(f"{shot}: no frames of an earlier session are kept")
 
 
 class MeterRecorder(MemoryRecorder):

@@ -1,6 +1,6 @@
 """Devices whose calls are noted (`coupole.bounded`), so that one that never returns is noticed and left behind.
 
-What a call may take is derived from what it asks; drivers have their own time-outs, which are shorter.
+The limit of a call is derived from its work. Drivers have their own time-outs, which are shorter.
 """
 
 from __future__ import annotations

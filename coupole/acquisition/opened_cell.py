@@ -203,7 +203,7 @@ def _get_world(cell: Cell, job: Job | None, sensor: Sensor, *, dry_run: bool, sp
 
 @contextmanager
 def _told_if_slow() -> Iterator[None]:
-    """Whoever waits for a simulated cell hears what for."""
+    """A user who waits for a simulated cell is told the reason."""
     words = "the simulated cell compiles its code, once on a machine: a minute or two, longer on a busy one ..."
     timer = threading.Timer(_SLOW_START_S, alarm, (words,))
     timer.daemon = True

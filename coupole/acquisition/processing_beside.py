@@ -77,7 +77,7 @@ class ProcessingBeside:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the process, if it has not ended: what it did is kept."""
+        """End the process, if it has not ended; its results are kept."""
         if self._end() and self._run is not None:
             self._why = "ended with the run, which is not complete"
             self._console.print(
@@ -95,7 +95,7 @@ class ProcessingBeside:
     def refusals(self) -> list[str]:
         """List why no result could be made; to be asked before anything moves."""
         if not self._has_answered.wait(_TOLD_AFTER_S):
-            self._console.print("reflectance: plan, mesh and records are looked at ...", markup=False)
+            self._console.print("reflectance: checking plan, mesh and records ...", markup=False)
         if not self._has_answered.wait(_READY_WITHIN_S):
             return [f"--reflectance: its process gave no answer within {_READY_WITHIN_S:g} s"]
         if self._reasons is None:
@@ -167,7 +167,7 @@ class ProcessingBeside:
         self._why = why
 
     def _cpu_s(self) -> float:
-        """Time that the process has computed; 0 where that cannot be told."""
+        """Time that the process has computed; 0 if it is not known."""
         with contextlib.suppress(OSError, ValueError, IndexError):
             words = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
             return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
@@ -226,13 +226,13 @@ class ProcessingBeside:
 
     def _tell_of_failure(self) -> None:
         alarm(
-            f"reflectance failed: {self._reason}. The acquisition goes on without it; "
+            f"reflectance failed: {self._reason}. The acquisition continues without it; "
             f"the samples of {self._views_text} are kept"
         )
 
     @property
     def _last_words(self) -> str:
-        """Reason why the process ended, as far as it can be told."""
+        """Reason why the process ended, as far as it is known."""
         code = self._process.returncode
         if code is not None and code < 0:
             return f"its process was killed by signal {-code}" + (" (memory was short?)" if code == -9 else "")
@@ -240,7 +240,7 @@ class ProcessingBeside:
             return "its process ended"
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        return lines[-1] if lines else "its process ended without a word"
+        return lines[-1] if lines else "its process ended without a message"
 
     def _end(self) -> bool:
         """End the process; False if it had ended."""

@@ -278,12 +278,12 @@ class RunRecorder:
         if self._run.is_lost:
             raise StorageError(
                 f"{before}: the run's folder or its journal was removed or replaced while frames were taken. "
-                "Put back what was there, then resume the run; if it is gone, begin a new one."
+                "Put the old files back, then resume the run; if they are lost, begin a new run."
             )
         if self._run.folder != before:
             raise StorageError(
                 f"{before}: the run's folder was moved while frames were taken; it is {self._run.folder} now, "
-                "with all that is proven. Resume it there."
+                f"with all proven frames. Resume it there."
             )
 
     def _follow_folder(self) -> None:

@@ -1,4 +1,4 @@
-"""Actions that make a cell safe, each by itself; what is not sure to be done is told."""
+"""Actions that make a cell safe, each by itself; actions that are not surely done are reported."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from collections.abc import Callable, Sequence
 from coupole.bounded import leave_behind, waited_for
 
 _SAFE_WITHIN_S = 15.0
-"""Longer than any driver's time-outs for switching off and stopping; what hangs longer is given up and told."""
+"""Longer than any driver's time-outs for switching off and stopping; a call that hangs longer is given up and
+reported.
+"""
 
 
 class Safeguard:
@@ -39,7 +41,7 @@ class Safeguard:
 
 
 def unsure(safeguards: Sequence[Safeguard], within_s: float) -> list[str]:
-    """Wait for the actions for a while; list what is not sure to be done then."""
+    """Wait for the actions for a while; list those that are not surely done then."""
     end_s = time.monotonic() + within_s
     for safeguard in safeguards:
         safeguard.wait(max(0.0, end_s - time.monotonic()))

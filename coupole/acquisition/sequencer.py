@@ -266,7 +266,7 @@ class Sequencer:
     # -- small things -------------------------------------------------------------------------------------
 
     def _expected_s(self, number: int) -> float:
-        """Duration of what a view may still get, at most."""
+        """Longest duration of the bursts that a view may still get."""
         is_open = self._bursts.may_want_more(number)
         bursts = self._bursts.bound(number) if is_open else self._bursts.bursts_left(number)
         return sum(map(_expected_s, bursts))
@@ -336,7 +336,7 @@ class Sequencer:
                 if control.unsure:
                     raise DeviceError(
                         "cell",
-                        expected="lights off and the arm at rest while the session stands",
+                        expected="lights off and the arm at rest while the session is paused",
                         happened="; ".join(control.unsure),
                         remedy="Look at the cell, then resume the run.",
                     )

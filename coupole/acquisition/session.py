@@ -240,7 +240,7 @@ def _acquire(
         try:
             with key_actions(keys) as keys_read, observer.showing(job.schedule.frames, len(job.schedule.views)):
                 if keys_read:
-                    console.print("keys: p pauses after the burst, and goes on; q stops")
+                    console.print("keys: p pauses after the burst, and continues; q stops")
                 try:
                     run_bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
                 finally:

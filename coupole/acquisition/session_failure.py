@@ -36,11 +36,11 @@ def note_failure(error: BaseException, cell: OpenedCell, run: Run, recorder: Run
     with contextlib.suppress(OSError, StorageError):
         on_disk(str(path), lambda: path.write_text(trace, encoding="utf-8"), stop=NOW)
     safe = "; ".join(cell.trouble) or "lights are off, the arm is at rest, the camera is disarmed"
-    error.add_note(f"{safe}; the trace is in {path}; go on with `{run.go_on_command}`")
+    error.add_note(f"{safe}; the trace is in {path}; continue with `{run.go_on_command}`")
 
 
 def note_what_hangs(error: BaseException, cell: OpenedCell, run: Run, recorder: RunRecorder) -> None:
-    """A stop has ended the session; if something was left behind meanwhile, that is told too."""
+    """A stop has ended the session; if a call was given up meanwhile, this is reported too."""
     if left_behind():
         alarm(str(error))
         note_failure(error, cell, run, recorder)

@@ -38,7 +38,8 @@ class Shot:
 
 class SingleShots:
     """Pictures of a cell's camera, each under one LED, one panel or no light; the light is counted before it is
-    given. Of several threads the caller lets only one in."""
+    given. The caller must let only one thread in at a time.
+    """
 
     def __init__(
         self,

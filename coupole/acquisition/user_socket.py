@@ -35,8 +35,9 @@ class UserSocket:
     """Serves a socket at a path while a context lasts. Raises OSError if it cannot."""
 
     def __init__(self, path: Path, answer: Callable[[bytes, Gone], Mapping[str, Any]]) -> None:
-        """`answer` makes an answer of a request's line, and begins nothing for who has `Gone`. What lies at the
-        path was left by a process that was killed: the caller knows that none is alive."""
+        """`answer` makes an answer of a request's line, and begins nothing for who has `Gone`. A file at the path
+        was left by a process that was killed: the caller knows that no such process is alive.
+        """
         self.path, self._answer = path, answer
 
     def __enter__(self) -> UserSocket:
@@ -110,7 +111,8 @@ def exchange(
     say: Callable[[str], object] = lambda _: None,
 ) -> dict[str, Any]:
     """The answer to a request; `say` is told, within 2 s, why there is none yet. Raises OSError, and ValueError
-    for what is no answer."""
+    for data that are not an answer.
+    """
     begun_s = time.monotonic()
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(patience_s)
@@ -148,7 +150,8 @@ def _silence(pid: int, patience_s: float) -> str:
     if is_stopped(pid):
         return (
             f"process {pid} is stopped (Ctrl-Z, SIGSTOP). An arm that moved has braked, and the box's watchdog "
-            f"switches lamps off; `kill -CONT {pid}` lets the process run again, and a run then asks a person"
+            f"switches lamps off; `kill -CONT {pid}` lets the process run again; a run then asks a person "
+            f"before it continues"
         )
     return f"nothing within {patience_s:.2g} s from process {pid}"
 

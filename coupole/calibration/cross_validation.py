@@ -1,8 +1,8 @@
 """Quality of a fit's predictions for views that it did not have: each is left out in turn, without fitting anew.
 
 With H the part of the hat matrix that belongs to a view, the residuals that it would have if it had been left out
-are (I - H)^-1 r, and their covariance is (I - H)^-1 (Allen's PRESS, Technometrics 16, 1974, for blocks). What only
-the view itself determines, such as the board's pose in it, does not count.
+are (I - H)^-1 r, and their covariance is (I - H)^-1 (Allen's PRESS, Technometrics 16, 1974, for blocks).
+Quantities that only the view itself determines, such as the board's pose in it, do not count.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ def read_accepted(path: Path, kind: Kind) -> Record:
             f"{failure.what} is {failure.found:.3g} {failure.unit}, at most {failure.limit:.3g}"
             for failure in failures
         )
-        raise InputError(f"{path}: not accepted: {why}. Calibrate anew, or allow more with --limit there")
+        raise InputError(f"{path}: not accepted: {why}. Calibrate again, or allow more there with --limit")
     return record
 
 
@@ -51,13 +51,14 @@ def refuse_read_otherwise(path: Path, record: Record, given_kinds: Collection[st
         beside = _made_with(path, record, kind)
         if (read_with or (read_with is None and beside)) and kind not in given_kinds:
             raise InputError(
-                f"{path}: was made with a {kind} record; without one frames would be read otherwise, and all that "
-                f"is found would be off. Name {beside or 'it'} too"
+                f"{path}: was made with a {kind} record; without such a record the frames would be read "
+                f"differently, and all results would be wrong. Name {beside or 'it'} too"
             )
         if read_with == 0.0 and kind in given_kinds:
             raise InputError(
-                f"{path}: was made without a {kind} record; with one frames would be read otherwise, and all that "
-                "is found would be off. Leave it out, or calibrate the LEDs' powers anew with it"
+                f"{path}: was made without a {kind} record; with such a record the frames would be read "
+                f"differently, and all results would be wrong. Leave it out, or calibrate the LEDs' powers "
+                f"again with it"
             )
 
 
@@ -79,7 +80,7 @@ def refuse_same_images(path: Path, record: Record, inputs: Sequence[tuple[str, s
     image_hashes = {line.sha256 for line in record.inputs if "/" in line.name}
     if common := [name for name, sha256 in inputs if "/" in name and sha256 in image_hashes]:
         raise InputError(
-            f"{path}: was made from the same images ({common[0]}), which would count twice. Leave it out: the "
+            f"{path}: was made from the same images ({common[0]}), so these would count twice. Leave it out: the "
             "lens is estimated from these images anyway"
         )
 

@@ -21,7 +21,7 @@ _SAME = 1e-3
 
 @dataclass(frozen=True)
 class Situation:
-    """The cell that is to take the pictures. What is None is not known and not checked."""
+    """The cell that is to take the pictures. A value of None is not known and not checked."""
 
     now: datetime
     """Time now, with a time zone."""

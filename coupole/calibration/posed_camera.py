@@ -84,5 +84,5 @@ def _refuse_other_lens(hand_eye: Path, prior: CameraPrior, camera: Path, alone: 
         if apart > MOST_APART * together:
             raise InputError(
                 f"{camera} and {hand_eye} are of different lenses or focus: {name} differs by {apart:.4g}, "
-                f"{apart / together:.0f} times its standard uncertainty. Calibrate one of them anew"
+                f"{apart / together:.0f} times its standard uncertainty. Calibrate one of them again"
             )

@@ -134,7 +134,7 @@ class Input(Model):
 
 
 class Validity(Model):
-    """Conditions under which a record holds. What is None was not known and is not checked."""
+    """Conditions under which a record holds. A value of None was not known and is not checked."""
 
     expires: AwareDatetime
     camera: str | None = None
@@ -215,7 +215,7 @@ def write_record(path: Path, record: Record) -> None:
     write_sealed(
         path,
         json.loads(record.model_dump_json()),
-        f"{SEAL}. It carries its own checksum: do not edit it, calibrate anew.",
+        f"{SEAL}. It carries its own checksum: do not edit it, calibrate again.",
     )
 
 
@@ -228,7 +228,7 @@ def write_sealed(path: Path, plain: dict[str, Any], head: str) -> None:
         partial.replace(path)
     except OSError as error:
         raise StorageError(
-            f"{path}: cannot write the record: {error.strerror}. Free or mount its folder."
+            f"{path}: cannot write the record: {error.strerror}. Make its folder readable, or mount it."
         ) from error
     finally:
         partial.unlink(missing_ok=True)

@@ -37,7 +37,7 @@ _CLIPPED = 0.02
 
 @dataclass(frozen=True)
 class About:
-    """The camera that took the images. What is None is not known."""
+    """The camera that took the images. A value of None is not known."""
 
     is_simulated: bool
     camera: str | None = None

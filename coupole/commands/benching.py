@@ -36,10 +36,10 @@ def bench(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell is held.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Hold a cell's devices for a console while no run is at work: state, go-to, moving by hand, pictures.
+    """Hold a cell's devices for a console while no run is acquired: state, motions to a view or by hand, pictures.
 
-    Clients of the same user ask it at a Unix socket, whose path `--json` prints at the beginning. Ends by Ctrl-C,
-    or when a client asks for it; the cell is then safe.
+    Clients of the same user send requests to a Unix socket, whose path `--json` prints at the beginning. Ends by
+    Ctrl-C, or when a client asks for it; the cell is then safe.
     """
     from coupole.acquisition.cell_bench.bench_service import serve_bench
     from coupole.console.command_line.client import borrowed_cell
@@ -72,8 +72,8 @@ def arm(
 ) -> None:
     """Drive the arm to home, park or a plan's view on a collision-free path, which is shown first.
 
-    Without a plan nothing is taken to lie on the support. If a bench holds the cell it is asked; else the devices
-    are opened and closed.
+    Without a plan the support is assumed to be empty. If a bench holds the cell, the command uses it; otherwise it
+    opens and closes the devices.
     """
     from coupole.acquisition.cell_bench.bench_client import ask_bench
     from coupole.acquisition.cell_bench.bench_service import bench_of

@@ -38,7 +38,8 @@ def bracket(
 ) -> None:
     """Merge photographs of different exposure times, taken from a tripod with one aperture and ISO number.
 
-    The camera's response is found from them, and drawn; of raw files it is a straight line, and only tested.
+    The command finds the camera's response from them, and draws it. Raw files have a linear response, which is
+    only tested.
     """
     from coupole.viewing.terminal import make_console
 
@@ -82,7 +83,7 @@ def sphere_brdf(
     out: Annotated[Path, typer.Option("--out", help="The table, MERL's format (.binary).", show_default=False)],
     as_json: JsonOption = False,
 ) -> None:
-    """The BRDF of a finish from merged photographs of a sphere of it, each under one light from afar."""
+    """Compute the BRDF of a finish from merged photographs of a coated sphere, each under one distant light."""
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
@@ -112,7 +113,9 @@ def sphere_brdf(
     if as_json:
         print(json.dumps(document | {"left_out": left_out}))
         return
-    text = f"{out}: {len(samples.f)} samples, half of them missed by up to {off[0]:.1%}, 95 % by {off[1]:.1%}"
+    text = (
+        f"{out}: {len(samples.f)} samples, half of them with an error up to {off[0]:.1%}, 95 % up to {off[1]:.1%}"
+    )
     console.print(text, markup=False)
     for line in _prediction_lines(finish, paths) if len(paths) > 1 else []:
         console.print(line, markup=False)
@@ -121,7 +124,7 @@ def sphere_brdf(
 def _prediction_lines(finish: Finish, paths: list[str]) -> list[str]:
     """One line for each photograph that the others predict."""
     return [
-        "each photograph as the others predict it: incidence, miss at the peak, median miss, nearest sample",
+        "each photograph as the others predict it: incidence, error at the peak, median error, nearest sample",
         *(
             f"  {paths[miss.photograph]}: {miss.incidence_deg:.0f} degrees, {miss.peak_miss:+.1%}, "
             f"{miss.median_miss:.1%}; {miss.nearest_to_peak_deg:.1f} degrees from the peak"

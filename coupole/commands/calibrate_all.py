@@ -23,7 +23,7 @@ def calibrate_all(
     ),
     scan: Annotated[
         Path | None,
-        typer.Option("--scan", help="Mesh of the object with stickers, from `coupole scan`, to calibrate."),
+        typer.Option("--scan", help="Folder of `coupole scan` with the mesh of the object and its stickers."),
     ] = None,
     repeatability_mm: RepeatabilityMm = 0.03,
     repeatability_deg: RepeatabilityDeg = 0.003,

@@ -75,7 +75,7 @@ def leds(
         ),
     ] = False,
 ) -> Work:
-    """Positions and normals of all LEDs, from views of the lit LEDs, each seen six times or more.
+    """Find positions and normals of all LEDs, from views of the lit LEDs, each seen six times or more.
 
     With a dead LED or swapped wires the record is not accepted and no table is written, unless --accept-faults.
     """
@@ -125,7 +125,7 @@ def mesh(
     stickers: ScannedStickers,
     robot: RobotRepeatability,
 ) -> Work:
-    """Pose of a scanned object in the base, by its stickers in six views or more."""
+    """Find the pose of a scanned object in the base, from its stickers in six views or more."""
     from coupole.calibration.calibrated_arm import has_axis_zeros
     from coupole.calibration.posed_camera import read_posed_camera
     from coupole.calibration.report import Outcome

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from coupole.plan.cell import Cell
 
     Work = Callable[[Console, Request], Outcome]
-    """The work of a calibration, its options bound."""
+    """The calibration itself, with its options already set."""
 else:
     Work = Callable
 
@@ -46,7 +46,7 @@ OutOption = Annotated[Path, typer.Option("--out", help="Folder for the record, i
 NameOption = Annotated[
     str | None, typer.Option("--name", help="Name of the record; by default its kind and date.")
 ]
-LensOption = Annotated[str | None, typer.Option("--lens", help="Description of the lens, in words.")]
+LensOption = Annotated[str | None, typer.Option("--lens", help="Description of the lens, as text.")]
 EmissionOption = Annotated[
     str, typer.Option("--emission", help="Emission of LEDs: lambertian, or paper (squared cosine).")
 ]

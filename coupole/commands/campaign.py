@@ -175,7 +175,7 @@ class Campaign:
         return self._out / f"{kind}.yaml"
 
     def _calibrations(self) -> dict[str, Callable[[Path], None]]:
-        """Return for each kind the function that makes its record from a run with the records before it."""
+        """Return, for each kind, the function that makes its record from a run and from the earlier records."""
         record, out = self._record, self._out
         dark, response, flat = record("dark"), record("response"), record("flat-field")
         camera, hand_eye = record("camera"), record("hand-eye")

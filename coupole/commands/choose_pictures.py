@@ -27,16 +27,16 @@ def choose(
             "--until",
             min=1e-6,
             max=1.0,
-            help="Stop when pictures interpolated for the lights not chosen are expected to be off by no more "
-            "than this (rms, as a share of the pictures' bright level).",
+            help="Stop when the expected error of pictures interpolated for the other lights is at most this "
+            "(rms, as a share of the pictures' bright level).",
         ),
     ] = None,
     first: Annotated[int, typer.Option("--first", min=6, help="Lights to begin with, spread over the dome.")] = 6,
-    at_a_time: Annotated[int, typer.Option("--at-a-time", min=1, help="Lights chosen before the next look.")] = 1,
+    at_a_time: Annotated[int, typer.Option("--at-a-time", min=1, help="Number of lights chosen at a time.")] = 1,
     to: Annotated[Path | None, typer.Option("--to", help="Write the choice into this file (JSON).")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Choose, among pictures under known distant lights, the few that tell most; only those are read.
+    """Choose, among pictures under known distant lights, the few that add most information; only those are read.
 
     Lights are counted from 0. `left_out` of the JSON is what `coupole reflectance --leave-out` takes.
     """

@@ -1,4 +1,4 @@
-"""The command line: which commands there are, and what becomes of their errors."""
+"""The command line: its commands, and the handling of their errors."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ AT_A_CELL = {
     "sim",
 }
 AT_A_CELL |= {"serve", "pause", "go-on", "stop"}
-"""Commands that hold a cell, or speak to what does: none of them waits for a reader of its text."""
+"""Commands that hold a cell, or that speak to a process that holds one: none of them waits for a reader of its
+text.
+"""
 
 GROUPS = {
     "Plan and acquire": {
@@ -191,7 +193,7 @@ def _options(
 
 
 def _about_version() -> dict[str, Any]:
-    """Return what a report of a defect should say of an installation."""
+    """Return the facts of an installation for the report of a defect."""
     return {
         "coupole": coupole.__version__,
         "python": platform.python_version(),
@@ -258,7 +260,7 @@ def _code_of_defect(error: Exception) -> int:
 
 def _not_taken(why: str) -> int:
     """Tell that standard output does not have the whole document; the exit code."""
-    error = StorageError(f"standard output: {why}; what was printed there is not complete")
+    error = StorageError(f"standard output: {why}; the text printed there is not complete")
     _say(error)
     return error.exit_code
 

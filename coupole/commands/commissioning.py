@@ -39,13 +39,13 @@ def commission(
     name: Annotated[str, typer.Option("--name", help="Name of the person at the cell.", show_default=False)],
     only: _Only = None,
     board: _Board = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask nobody; for simulated cells only.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask; for simulated cells only.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure a cell's safety figures at reduced speed, step by step, with a person's word before each.
+    """Measure a cell's safety figures at reduced speed, step by step; a person confirms before each step.
 
-    The record lies in the cell's state folder; without one that passed and fits, a real cell runs no plan. Steps
-    that passed are not repeated. Code 3: a step did not pass.
+    The record is in the cell's state folder. Without a record that passed and fits, a real cell runs no plan.
+    Steps that passed are not repeated. Exit code 3: a step did not pass.
     """
     from coupole.acquisition.commissioning.persons import PersonAtTerminal, SimulatedPerson
     from coupole.acquisition.commissioning.session import commission as commission_cell

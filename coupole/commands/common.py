@@ -85,7 +85,9 @@ def served_cell(plan: Path | None, rig: Path | None, resume: Path | None) -> Cel
 
 
 def person_named(name: str, person_role: str) -> str:
-    """A person's name as `--name` gives it, without blanks around it. Raises InputError: none, or no name."""
+    """A person's name as `--name` gives it, without blanks around it. Raises InputError if there is no name, or
+    the text is not a name.
+    """
     if not (person := name.strip()):
         raise InputError(f"--name: expected the name of {person_role}")
     if len(person) > LONGEST_NAME:

@@ -9,14 +9,14 @@ _PLAN_SAYS, _FIRST_BYTES = "views:", 65536
 
 
 def formats(incomplete: str) -> list[tuple[str, str]]:
-    """Formats of `coupole export --to`, with what they are."""
+    """Formats of `coupole export --to`, with their descriptions."""
     from coupole.exchange.formats import FORMATS
 
     return [(name, entry.gives) for name, entry in sorted(FORMATS.items()) if name.startswith(incomplete)]
 
 
 def fits(incomplete: str) -> list[tuple[str, str]]:
-    """Fits of `coupole reflectance relight --fit`, with what they are."""
+    """Fits of `coupole reflectance relight --fit`, with their descriptions."""
     from coupole.reflectance.fits import FITS, RELIT, TEXELS
 
     titles = {name: fit.title for name, fit in FITS.items()} | {TEXELS: "GGX of single pixels"}

@@ -40,13 +40,14 @@ def serve(
     tls_certificate: Annotated[Path | None, typer.Option("--tls-certificate", help="PEM file.")] = None,
     tls_key: Annotated[Path | None, typer.Option("--tls-key", help="PEM file.")] = None,
     test_notifications: Annotated[
-        bool, typer.Option("--test-notifications", help="Send a message by each way that is set up, and end.")
+        bool,
+        typer.Option("--test-notifications", help="Send a message through each channel of notification, and end."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Own a cell's queue and serve its console, until Ctrl-C. Runs that are being acquired go on without it.
 
-    At the first start a token is printed with which the engineer signs in, once, to make accounts.
+    The first start prints a token, with which the engineer signs in once, to make accounts.
     """
     from coupole.console.service import serve as serve_cell
     from coupole.plan.cell import read_cell
@@ -101,8 +102,8 @@ def _test_notifications(rig: Path, *, as_json: bool) -> None:
     settings = read_settings(folder)
     if settings is None:
         raise InputError(
-            f"{folder / NAME}: no such file, so nobody is told of anything; docs/reference/console.md says what "
-            "is in it"
+            f"{folder / NAME}: no such file, so nobody is notified; docs/reference/console.md describes its "
+            f"content"
         )
     troubles_by_way = send_test(settings, cell.rig.name)
     for way, trouble in troubles_by_way.items():
@@ -124,7 +125,7 @@ def queue(
         typer.Option("--resume", help="Resume this run after the plans; repeat for more.", autocompletion=runs),
     ] = None,
     hold: Annotated[
-        str, typer.Option("--hold", help="Wait for a person after them, who is to do this.", show_default=False)
+        str, typer.Option("--hold", help="After these plans, wait for a person to do this.", show_default=False)
     ] = "",
     before: Annotated[
         str, typer.Option("--before", help="Put the new or moved entry before this one.", show_default=False)
@@ -135,14 +136,14 @@ def queue(
     take_out: Annotated[str, typer.Option("--take-out", help="Remove this entry.", show_default=False)] = "",
     go_on: Annotated[bool, typer.Option("--go-on", help="Continue after a hold or a fault.")] = False,
     take_control: Annotated[
-        bool, typer.Option("--take-control", help="Take control first, from whoever has it.")
+        bool, typer.Option("--take-control", help="First take control from the person who has it.")
     ] = False,
     give_control: Annotated[bool, typer.Option("--give-control", help="Give up control last.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Enter plans in the queue of a cell whose console is served on this machine; without plans show it.
 
-    Preflight is made of each as it is entered, counted with what runs and waits before it.
+    Each plan is checked by preflight when it is entered, together with the plans that run and wait before it.
     """
     from coupole.console.command_line.client import PREFLIGHT_S, call
     from coupole.plan.cell import read_cell
@@ -169,7 +170,7 @@ def queue(
 
 
 def _queue_requests(plans: list[Path], resumed_runs: list[Path], hold: str) -> list[dict[str, str]]:
-    """List what is to be entered, in order."""
+    """List the entries to be made, in order."""
     requests = [{"plan": str(path.resolve())} for path in plans] + [
         {"resume": str(path.resolve())} for path in resumed_runs
     ]

@@ -41,7 +41,7 @@ def demo(
 ) -> None:
     """Measure a relief on the simulated cell, find its reflectance, and make a page to relight it.
 
-    No device is needed. An interrupted demo goes on when it is called again.
+    No device is needed. An interrupted demo continues when it is called again.
     """
     from coupole.viewing.terminal import make_console
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 SLOWER_MS = 12
 """RSI's other cycle (#IPO)."""
-NOT_TIMED = "the arm's driver does not answer its controller in cycles: there was nothing to measure"
+NOT_TIMED = "the arm's driver does not answer its controller in cycles, so there is nothing to measure"
 
 
 def doctor(
@@ -35,12 +35,12 @@ def doctor(
     ] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Look what this machine lacks for a rig, and measure whether it answers the arm's controller in time.
+    """List what this machine lacks for a rig, and measure whether it answers the arm's controller in time.
 
-    Libraries, rights, ports, folders: each with its remedy. No device is opened. Where the arm's driver answers
-    its controller in every cycle, the process that answers runs as in a session, with a controller that this
-    command plays; have the machine do meanwhile what it does in a run. Exit code 3: something is missing, or the
-    machine cannot hold the rig's cycle.
+    The list has libraries, rights, ports and folders, each with its remedy. No device is opened. If the arm's
+    driver answers its controller in every cycle, the answering process runs as in a session, against a controller
+    that this command simulates. Meanwhile let the machine do the work of a run. Exit code 3: something is missing,
+    or the machine cannot hold the rig's cycle.
     """
     from coupole.commands.extras import lacking_extras
     from coupole.plan.cell import read_cell

@@ -44,7 +44,7 @@ def dose(
 ) -> None:
     """All light that an object has received, run by run, and its budget; light given elsewhere is entered by hand.
 
-    The budget holds under every rig and plan from the next burst on; a plan's own can only be stricter.
+    The budget holds under every rig and plan from the next burst on. The budget of a plan can only be stricter.
     """
     from coupole.plan.cell import read_cell, users_ledger_folder
     from coupole.storage.ledger import Ledger, ledger_of, similar_ids
@@ -52,9 +52,11 @@ def dose(
     from coupole.viewing.terminal import make_console
 
     if (add is not None) != bool(note.strip()):
-        raise InputError("--add and --note belong together: how many lux hours, and what that light was")
+        raise InputError("--add and --note belong together: the lux hours, and a note about the light")
     if (budget is not None) != bool(name.strip()) or (reason.strip() and budget is None):
-        raise InputError("--budget and --name belong together (and --reason to them): how many lux hours, and who")
+        raise InputError(
+            "--budget and --name belong together (and --reason to them): the lux hours, and the person who decides"
+        )
     cell = read_cell(rig) if rig else None
     ledger = ledger_of(cell, object_id) if cell else Ledger(users_ledger_folder(), object_id)
     if add is not None and not _entered_by_console(

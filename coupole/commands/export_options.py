@@ -12,10 +12,10 @@ from coupole.commands.common import RecordsOption
 from coupole.commands.completion import formats, materials
 from coupole.exchange.formats import FORMATS, MAPS, Source, formats_of
 
-_COLOUR, _PARTS, _ABOUT = "Colour of frames (dng, tiff)", "What is exported", "What the crate says (rocrate)"
+_COLOUR, _PARTS, _ABOUT = "Colour of frames (dng, tiff)", "What is exported", "Metadata of the crate (rocrate)"
 _OF_MATERIALS = [name for name, export_format in FORMATS.items() if "triangle" in export_format.options]
 _WITH_MAPS = [name for name, export_format in FORMATS.items() if MAPS[0] in export_format.options]
-_SHOWN = "How views are shown (relight, iiif)"
+_SHOWN = "Display of views (relight, iiif)"
 
 ToOption = Annotated[
     str,
@@ -54,7 +54,7 @@ TriangleOption = Annotated[
     list[int] | None,
     typer.Option(
         "--triangle",
-        help=f"Of results, for {', '.join(_OF_MATERIALS)}: its number; again for more.",
+        help=f"For results, for {', '.join(_OF_MATERIALS)}: number of a triangle; repeat for more.",
         min=0,
         rich_help_panel=_PARTS,
     ),
@@ -150,14 +150,14 @@ LinearOption = Annotated[
 LicenceOption = Annotated[
     str | None,
     typer.Option(
-        "--licence", help="URL of the licence, or words; by default the plan's licence.", rich_help_panel=_ABOUT
+        "--licence", help="URL of the licence, or its text; by default the plan's licence.", rich_help_panel=_ABOUT
     ),
 ]
 AuthorOption = Annotated[
     list[str] | None,
     typer.Option(
         "--author",
-        help="'NAME <https://orcid.org/...> at HOUSE'; repeat for more.",
+        help="'NAME <https://orcid.org/...> at INSTITUTION'; repeat for more.",
         rich_help_panel=_ABOUT,
     ),
 ]

@@ -34,7 +34,7 @@ class Asked:
     """Options that were given, by name."""
 
     def refuse(self, names: tuple[str, ...], why: str) -> None:
-        """Raise InputError if one of these options was given; `why` is what they are for."""
+        """Raise InputError if one of these options was given; `why` is their purpose."""
         if option_names := [f"--{name}" for name in names if name in self.options]:
             raise InputError(f"{', '.join(option_names)}: {'is' if len(option_names) == 1 else 'are'} {why}")
 
@@ -102,7 +102,7 @@ def export(
         raise
     console.print(f"{summary.files} files, {bytes_text(summary.bytes)}, in {folder}")
     for view, miss_dn in summary.misses_dn.items():
-        console.print(f"{view}: its own pictures are missed by {miss_dn:.1f} of 255, rms")
+        console.print(f"{view}: the error against its own pictures is {miss_dn:.1f} of 255, rms")
     if as_json:
         document = {"out": str(folder.resolve()), "files": summary.files, "bytes": summary.bytes}
         print(json.dumps({**document, **({"misses_dn": summary.misses_dn} if summary.misses_dn else {})}))

@@ -54,7 +54,7 @@ ClassesOption = Annotated[
 ]
 UnitOption = Annotated[
     Literal["auto", "percent", "fraction"],
-    typer.Option("--unit", help="Unit of the spectra's reflectance, if their files do not tell it."),
+    typer.Option("--unit", help="Unit of the spectra's reflectance, if their files do not state it."),
 ]
 PageOption = Annotated[
     Path | None, typer.Option("--report", help="Folder for a page with the curves and the evidence in each band.")
@@ -92,8 +92,8 @@ def identify(
 ) -> None:
     """Which class of pigments each spectrum shows, or that the library has none for it.
 
-    A verdict is match, mixture, ambiguous or unknown. The class and its probability stand beside the verdict,
-    whatever it is; how often the library misleads about its own spectra is printed below.
+    A verdict is match, mixture, ambiguous or unknown. The class and its probability are printed beside every
+    verdict. Below, the error rates of the library about its own spectra are printed.
     """
     from coupole.scripting.analyses import references_of
     from coupole.viewing.terminal import make_console

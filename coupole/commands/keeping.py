@@ -24,9 +24,9 @@ def status(
     following: Annotated[bool, typer.Option("--follow", help="Show the progress until the run ends.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Progress of a run, also while it is running, and the command line that takes what is left.
+    """Show the progress of a run, also while it is running, and the command line that continues it.
 
-    Without a run: of the one that is being acquired.
+    Without RUN, show the run that is being acquired.
     """
     from coupole.storage.run import Run
     from coupole.storage.run_status import status as status_of
@@ -68,8 +68,9 @@ def verify(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Read a run back: every frame, its completeness and checksums, whether its light, exposure and pose are those
-    of the run's plan, and every file that the manifest lists."""
+    """Read a run back: every frame, its completeness and checksums, whether its light, exposure and pose agree
+    with the run's plan, and every file that the manifest lists.
+    """
     from rich.progress import Progress
 
     from coupole.storage import manifest
@@ -193,10 +194,10 @@ def scan(
     targets: Annotated[Path | None, typer.Option("--targets", help="Table of the scanner's targets.")] = None,
     unit: Annotated[str, typer.Option("--unit", help="The mesh's unit: mm, cm, m, um or in.")] = "mm",
     targets_unit: Annotated[
-        str | None, typer.Option("--targets-unit", help="Unit of the table, if it is another.")
+        str | None, typer.Option("--targets-unit", help="Unit of the table, if it differs from the mesh's.")
     ] = None,
     accept_defects: Annotated[
-        bool, typer.Option("--accept-defects", help="Accept a mesh that is not a clean surface.")
+        bool, typer.Option("--accept-defects", help="Accept a mesh with defects of its surface.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:

@@ -56,7 +56,7 @@ class FilmSpectra:
         if len(films) < 2:
             raise InputError(
                 "expected --over-black and --over-white, or one of them and --opaque: "
-                "one spectrum cannot tell K from S"
+                "one spectrum cannot separate K from S"
             )
         return films
 
@@ -109,9 +109,10 @@ def layer(
     out: Annotated[Path | None, typer.Option("--out", help="Folder for paint file and report.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """K and S of a paint, with 95 % intervals, from films over grounds, an opaque and a thin one, or a series.
+    """Compute K and S of a paint, with 95 % intervals, from films over grounds, from an opaque and a thin film, or
+    from a series.
 
-    What a film needs: two spectra of it over different grounds; or one over a ground, and one of an opaque film.
+    Give two spectra of a film over different grounds, or one over a ground and one of an opaque film.
     """
     from coupole.viewing.terminal import make_console
 
@@ -286,10 +287,11 @@ def _say(document: dict[str, Any], console: Console) -> None:
     console.print(f"{document['model']['deserved']}: {document['model']['because']}", markup=False)
     if document["model"]["difference"] > 0.0:
         console.print(
-            f"directional light shows up to {document['model']['difference']:.3f} else than diffuse light"
+            f"spectra under directional light differ by up to {document['model']['difference']:.3f} from those "
+            f"under diffuse light"
         )
     if (misfit := document["misfit"]) is not None:
-        console.print(f"the films miss one K and S by {misfit:.1f} times what noise explains")
+        console.print(f"the films differ from a single K and S by {misfit:.1f} times what noise explains")
     if grains := document.get("grains"):
         console.print(
             f"its grains are {grains['ratio']:.2f} +- {2 * grains['u_ratio']:.2f} times as large as those of "

@@ -78,10 +78,10 @@ def makie(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Take a photograph of makie apart: alpha is the share of metal, colours are the lacquers' part.
+    """Separate a photograph of makie: alpha is the share of metal, colours are the part of the lacquers.
 
-    Take it in diffuse light, so that all of the metal shines alike. X counts columns from the left, Y rows from
-    the top, both from 0.
+    Photograph in diffuse light, so that all of the metal is equally bright. X counts columns from the left, Y rows
+    from the top, both from 0.
     """
     from coupole.viewing.terminal import make_console
 

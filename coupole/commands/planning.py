@@ -173,10 +173,10 @@ def plan_new(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random views of `leds`.")] = 1,
 ) -> None:
-    """Write a plan to start from. The views of `leds` are chosen for the rig's dome: a minute or two.
+    """Write a plan to start from. Choosing the views of `leds` for the rig's dome takes a minute or two.
 
-    For a calibration in a simulated cell also NAME-rig.yaml, the rig with the board, card or tile on its support,
-    and NAME-board.yaml or NAME-tile.yaml, its description for `coupole calibrate`.
+    For a calibration in a simulated cell it also writes NAME-rig.yaml, the rig with the board, card or tile on its
+    support, and NAME-board.yaml or NAME-tile.yaml, its description for `coupole calibrate`.
     """
     from coupole.plan.base_model import NAME_PATTERN
     from coupole.plan.templates import LEDS, TEMPLATES

@@ -53,7 +53,9 @@ def recipe(
     out: Annotated[Path | None, typer.Option("--out", help="Write this page (HTML).")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Paints of a palette whose opaque mixture is a colour: shares, match under lights, cost of one less."""
+    """Find paints of a palette whose opaque mixture has a colour: shares, match under several lights, error with
+    one paint less.
+    """
     from coupole.appearance.matter.glossy_face import face
     from coupole.viewing.terminal import make_console
 
@@ -181,7 +183,7 @@ def _say(search: Found, matches: Sequence[Sequence[Match]], console: Console) ->
     console.print(f"{search.verdict()}.", markup=False)
     for rival in search.rivals[:_FEWER]:
         shares = ", ".join(f"{100 * share:.0f} % {name}" for name, share in rival.items())
-        console.print(f"not told from it at a noise of {search.noise:g}: {shares}", markup=False)
+        console.print(f"not distinguishable from it at a noise of {search.noise:g}: {shares}", markup=False)
     for number in range(search.chosen_index - 1, max(-1, search.chosen_index - _FEWER), -1):
         fewer = search.recipes[number]
         words = ", ".join(f"{100 * share:.0f} % {name}" for name, share in fewer.shares.items())

@@ -51,7 +51,8 @@ reflectance_app = typer.Typer(
     "and pictures under new lights.\n\n"
     "`coupole reflectance RUN --out OUT` and `coupole reflectance --pictures FOLDER --lights FILE --out OUT` make "
     "results; "
-    "`coupole reflectance from --help` lists its options. A step's name as first word is the step.",
+    "`coupole reflectance from --help` lists its options. If the first word is the name of a step, this step is "
+    "run.",
     no_args_is_help=True,
 )
 
@@ -74,7 +75,7 @@ def from_runs_or_pictures(
 ) -> None:
     """Fit normals and materials to proven frames of runs, or to pictures under known distant lights; check them.
 
-    A job that was stopped goes on where it was when it is given again.
+    A job that was stopped continues when you give the same command again.
     """
     from coupole.viewing.terminal import make_console, step_bars
 
@@ -130,7 +131,7 @@ def _refuse_mixed(runs: list[Path], samples: SamplesOfRuns, without: PicturesWit
     if (samples.refined_folder or samples.poses) and (is_uncalibrated or without.pictures is not None):
         raise InputError("--refined, --poses: are for calibrated runs")
     if without.pictures is None and any((without.lights, without.srgb, without.intensities, without.mask)):
-        raise InputError("--lights, --srgb, --intensities, --mask: go with --pictures alone, not with runs")
+        raise InputError("--lights, --srgb, --intensities, --mask: need --pictures, not runs")
 
 
 def _refuse_texels(texels: str | None, runs: list[Path], without: PicturesWithoutRecords) -> None:
@@ -185,7 +186,7 @@ def extract(
     scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """The first step alone: samples of reflectance of each triangle under each LED, from proven frames."""
+    """Compute only the first step: samples of reflectance of each triangle under each LED, from proven frames."""
 
     def step(say: Said) -> dict[str, Any]:
         from coupole.reflectance.run_job import extract_runs
@@ -219,7 +220,7 @@ def fit(
 
 @reflectance_app.command()
 def check(result: ResultArgument, memory: MemoryOption = "2GB", as_json: JsonOption = False) -> None:
-    """The third step alone: what the fits miss under the LEDs that were left out, and the report."""
+    """Run only the third step: the errors of the fits under the LEDs that were left out, and the report."""
 
     def step(say: Said) -> dict[str, Any]:
         from coupole.reflectance.result_pages import run_reflectance_page
@@ -233,7 +234,7 @@ def check(result: ResultArgument, memory: MemoryOption = "2GB", as_json: JsonOpt
 
 @reflectance_app.command()
 def ablate(result: ResultArgument, as_json: JsonOption = False) -> None:
-    """What the fits would miss with fewer LEDs, without grazing light, with fewer coefficients: one page."""
+    """Compute the errors of the fits with fewer LEDs, without grazing light, with fewer coefficients: one page."""
 
     def step(say: Said) -> dict[str, Any]:
         from coupole.reflectance.result_pages import ablation_page
@@ -253,7 +254,7 @@ def cluster(
         typer.Option(
             "--clusters",
             min=1,
-            help="Largest number of clusters; by default one for each 400 triangles, 16 to 1000.",
+            help="Number of clusters; by default one for each 400 triangles, 16 to 1000.",
         ),
     ] = None,
     degrees: Annotated[
@@ -264,13 +265,17 @@ def cluster(
     ] = 10,
     without_view: Annotated[
         str | None,
-        typer.Option("--without-view", help="Leave the samples of this view out, and judge the fit by them."),
+        typer.Option(
+            "--without-view", help="Leave the samples of this view out, and measure the error with them."
+        ),
     ] = None,
     memory: MemoryOption = "2GB",
     as_json: JsonOption = False,
 ) -> None:
-    """A few materials for all triangles, from the samples of all that look alike; triangles with too few samples
-    for a material borrow one. Beside each material, harmonics of pairs of directions, which suppose no model."""
+    """Find a few materials for all triangles, each from the samples of triangles that look alike. Triangles with
+    too few samples borrow a material. Each material also has harmonics of pairs of directions, which assume no
+    model.
+    """
 
     def step(say: Said) -> dict[str, Any]:
         from coupole.reflectance.result_pages import cluster_page

@@ -31,7 +31,7 @@ SupportOption = Annotated[
 ]
 KeepOption = Annotated[
     bool,
-    typer.Option("--keep-inter-reflection", help="Do not remove the light that comes by way of other surfaces."),
+    typer.Option("--keep-inter-reflection", help="Do not subtract the light that arrives from other surfaces."),
 ]
 MemoryOption = Annotated[
     str, typer.Option("--memory", help="Memory for the samples that are fitted together, such as 500MB or 4GB.")

@@ -70,7 +70,7 @@ def register(
     ] = "5,10,50,250",
     as_json: JsonOption = False,
 ) -> None:
-    """Find the poses of scans from what they overlap, prove them by loops, and merge the scans."""
+    """Find the poses of scans from their overlaps, test them by loops, and merge the scans."""
     from coupole.scan.registration.summary import about, remarks
     from coupole.scan.scan import new_scan_folder
     from coupole.scripting import analyses

@@ -47,11 +47,11 @@ DirectionOption = Annotated[
     Several,
     _option(
         "--direction",
-        "To the light. Of pictures: x right, y up, z to the camera; of runs: in the support frame, z up.",
+        "To the light. For pictures: x right, y up, z to the camera; for runs: in the support frame, z up.",
     ),
 ]
 LedOption = Annotated[
-    list[int] | None, _option("--led", "An LED of the run, in shares of the camera's range.", min=0)
+    list[int] | None, _option("--led", "An LED of the run; values are shares of the camera's range.", min=0)
 ]
 LightAtOption = Annotated[Several, _option("--light-at", "X,Y,Z of a point light, mm; white is 1 at 1 m.")]
 AreaOption = Annotated[
@@ -65,8 +65,8 @@ EnvironmentOption = Annotated[
     list[Path] | None,
     _option(
         "--environment",
-        "Light from everywhere: .exr or .hdr, latitude and longitude. Its top is up: z of runs, y of pictures; "
-        "its middle is x of runs, z of pictures.",
+        "Light from everywhere: .exr or .hdr, latitude and longitude. Its top is z for runs, y for pictures; "
+        "its middle is x for runs, z for pictures.",
     ),
 ]
 LightsOption = Annotated[Path | None, _option("--lights", "A file (YAML) of lights with strengths.")]
@@ -80,7 +80,7 @@ SizeOption = Annotated[str | None, _option("--size", "Size of its picture, WIDTH
 FieldOption = Annotated[
     float | None,
     _option(
-        "--field-of-view", "Width of its field, degrees; by default as the object needs.", min=0.01, max=170.0
+        "--field-of-view", "Width of its field, degrees; by default as narrow as possible.", min=0.01, max=170.0
     ),
 ]
 FitOption = Annotated[

@@ -55,7 +55,8 @@ class EyeColours:
     def read_colour(self) -> CameraColour | None:
         """Read it from a record, or from tables of spectra; None if no picture for the eye is wanted.
 
-        Raises InputError for what does not go together, and as `camera_colour` and `colour_of_record`."""
+        Raises InputError for options that do not go together, and as `camera_colour` and `colour_of_record`.
+        """
         from coupole.exchange.camera_colour import camera_colour, colour_of_record
 
         tables = {"--sensor-spectra": self.sensor_spectra, "--led-spectrum": self.led_spectrum}

@@ -51,7 +51,7 @@ def restore(
     out: Annotated[Path, typer.Option("--out", help="Folder for pictures and report.", show_default=False)],
     hypothesis: Annotated[
         list[str] | None,
-        typer.Option("--hypothesis", help="Only this hypothesis; repeat for more.", show_default=False),
+        typer.Option("--hypothesis", help="Render only this hypothesis; repeat for more.", show_default=False),
     ] = None,
     unit: UnitOption = "mm",
     samples: Annotated[
@@ -67,7 +67,7 @@ def restore(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Render hypotheses of how an object looked: pictures that say so, side by side, differences, and a report.
+    """Render hypotheses of how an object looked: labelled pictures, side by side, their differences, and a report.
 
     Pictures that are there already with the same settings are not rendered again.
     """
@@ -130,7 +130,9 @@ def pick(
     unit: UnitOption = "mm",
     as_json: JsonOption = False,
 ) -> None:
-    """Write a page, in one file without a network, on which parts are painted; it saves what `--parts` reads."""
+    """Write a page, one file that needs no network, on which you paint parts. It saves the file that `--parts`
+    reads.
+    """
     from coupole.exchange.pick.pick_page import write_pick_page
     from coupole.heritage.restoration.painted_mesh import read_painted
     from coupole.viewing.terminal import make_console

@@ -45,7 +45,7 @@ def go_on(run: RunningRun = None, as_json: JsonOption = False) -> None:
     state = _state_after(run, "go-on")
     if why := state.get("unheard"):
         raise DeviceError(
-            "run", expected="it to go on", happened=why, remedy="Say `coupole go-on` again when it is paused."
+            "run", expected="it to go on", happened=why, remedy="Give `coupole go-on` again when it is paused."
         )
     _say(state, as_json=as_json)
 
@@ -138,7 +138,7 @@ def running_run(run: Path | None) -> State:
     if not states:
         silent = [why for state in answers for why in state.get("trouble", ())]
         raise InputError(
-            "; ".join(["no run is being acquired by this user on this machine that answers", *silent])
+            "; ".join(["no run that answers is being acquired by this user on this machine", *silent])
         )
     if len(states) > 1:
         folders = "\n".join(f"  {state['run']}" for state in states)

@@ -36,12 +36,12 @@ ReflectanceOption = Annotated[
     typer.Option(
         "--reflectance",
         help="Take samples of each view as soon as it is complete, beside the acquisition, and end with the "
-        "result that `coupole reflectance RUN` makes. A resumed run goes on with it by itself.",
+        "result that `coupole reflectance RUN` makes. A resumed run continues it by itself.",
     ),
 ]
 ResultOption = Annotated[
     Path | None,
-    typer.Option("--result", help="Folder of that result; by default the run's, with -reflectance behind."),
+    typer.Option("--result", help="Folder of that result; by default the run's name followed by -reflectance."),
 ]
 
 
@@ -70,8 +70,9 @@ def acquire(
 
     Ctrl-C stops safely (lights off, arm still) and the run can be resumed: `acquire --resume RUN`, with the run's
     own copies of plan and rig, or with the plan again, whose comments alone may have changed. On a terminal the
-    key p pauses between bursts and goes on, q stops; from elsewhere `coupole pause`, `go-on` and `stop` do. Where
-    a console owns the cell (`coupole serve`) it acquires in its name, if nothing runs or waits there.
+    key p pauses between bursts and continues, q stops. From elsewhere use `coupole pause`, `go-on` and `stop`. If
+    a console owns the cell (`coupole serve`), the command acquires in the console's name, if nothing runs or waits
+    there.
     """
     from coupole.acquisition.session import acquire_plan, rehearse
     from coupole.preflight.job import read_job
@@ -188,7 +189,8 @@ def meter(
     ] = 1e-3,
     snr: Annotated[float, typer.Option("--snr", min=1, help="Signal-to-noise ratio to reach.")] = 30.0,
     share: Annotated[
-        float, typer.Option("--share", min=0.01, max=1, help="Share of the object's pixels that must reach it.")
+        float,
+        typer.Option("--share", min=0.01, max=1, help="Share of the object's pixels that must reach this ratio."),
     ] = 0.9,
     write: Annotated[
         Path | None, typer.Option("--write", help="Write the plan with this exposure, in the plan's folder.")
@@ -196,7 +198,9 @@ def meter(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell moves.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Advise on a plan's exposure, by a few pictures of each view under a few lights, which are not stored."""
+    """Advise on a plan's exposure, from a few pictures of each view under a few lights. The pictures are not
+    stored.
+    """
     from coupole.acquisition.looking import meter as meter_plan
     from coupole.console.command_line.client import borrowed_cell
     from coupole.preflight.exposure_advice import Request, write_plan
@@ -237,7 +241,7 @@ def live(
 ) -> None:
     """Live view of the camera, or of a run in progress: figures here, pictures on a page for this machine.
 
-    For a run only its folder is read, so it is not slowed. For a rig or a plan (whose object's light is then
+    For a run only its folder is read, so the run is not slowed. For a rig or a plan (whose object's light is then
     entered in the ledger) the camera is opened; the arm is not moved.
     """
     from coupole.acquisition.looking import watch_cell, watch_run
@@ -274,8 +278,8 @@ def confirm(
     note: Annotated[str, typer.Option("--note", help="Cause of the fault.")] = "",
     as_json: JsonOption = False,
 ) -> None:
-    """A named person's word that, after a fault of the arm, its cause is found, the cell is clear and the arm may
-    move again.
+    """Confirm, by name, that after a fault of the arm its cause is found, the cell is clear and the arm may move
+    again.
     """
     from coupole.plan.cell import read_cell
     from coupole.storage.arm_faults import faults_of
@@ -290,7 +294,7 @@ def confirm(
         faults.confirm(name, note)
         console.print(f"confirmed by {name}: the arm may move again", markup=False)
     else:
-        console.print("no fault of the arm stands; nothing to confirm")
+        console.print("there is no fault of the arm; nothing to confirm")
     if as_json:
         print(json.dumps({"confirmed": [fault.model_dump() for fault in standing], "name": name}))
 

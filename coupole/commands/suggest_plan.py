@@ -126,10 +126,10 @@ def plan_suggest(
     wishes: Wishes,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a plan for an object from its mesh, with the uncertainty to be expected, before anything is measured.
+    """Write a plan for an object from its mesh, with the expected uncertainty, before anything is measured.
 
-    Views, LEDs and exposures are chosen for a supposed material within time and light. NAME.yaml is the plan,
-    NAME.html shows on the object how well normals and materials will be known.
+    Views, LEDs and exposures are chosen for an assumed material, within limits of time and light. NAME.yaml is the
+    plan, NAME.html shows on the object how well normals and materials will be known.
     """
     from coupole.viewing.terminal import make_console, step_bars
 

@@ -63,8 +63,7 @@ def budget(
         list[Path] | None,
         typer.Argument(
             help="Records, or folders of them: camera, hand-eye, leds, mesh, flat-field, response, "
-            "led-power, drift. Where there is no record, figures of seed 003 or assumed ones are "
-            "used.",
+            "led-power, drift. Without a record, figures of seed 003 or assumed figures are used.",
             metavar="RECORD_OR_FOLDER",
         ),
     ] = None,
@@ -74,7 +73,7 @@ def budget(
     ] = None,
     beside: Annotated[
         list[Path] | None,
-        typer.Option("--beside", help="Records of another cell, for a column of their own in the table."),
+        typer.Option("--beside", help="Records of another cell, for a separate column in the table."),
     ] = None,
     *,
     spot: SpotOfObject,
@@ -83,7 +82,7 @@ def budget(
     out: Annotated[Path | None, typer.Option("--out", help="Write this PNG, and HTML and JSON beside it.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Uncertainty of a reflectance, what dominates it, and our accuracies beside the paper's.
+    """Compute the uncertainty of a reflectance, its dominant sources, and our accuracies beside the paper's.
 
     The intervals are by Monte Carlo (JCGM 101); the linear formula checks them.
     """
@@ -185,7 +184,7 @@ def _write_report(out: Path, result: _Result) -> None:
 
 
 def _with_plan(given_records: tuple[InForce, ...], plan: Path | None) -> tuple[InForce, ...]:
-    """The records given, and for kinds that are not given those in force for a plan."""
+    """The given records; for kinds that are not given, the records in force for a plan."""
     from coupole.calibration.budget.records import of_use
     from coupole.preflight.job import read_job
 

@@ -60,7 +60,9 @@ def serve(
     address; StorageError.
     """
     if not is_here(host) and tls is None:
-        raise InputError(f"--host {host}: others can reach this address: give --tls-certificate and --tls-key")
+        raise InputError(
+            f"--host {host}: other machines can reach this address: give --tls-certificate and --tls-key"
+        )
     folder = console_folder(cell)
     make_folder(folder)
     folder.chmod(0o700)  # hashes of passwords, and who did what

@@ -1,9 +1,9 @@
 """Colour of frames for the eye, to CIE XYZ: by a chart's record, or by the sensor's sensitivities and the LEDs'
 spectrum.
 
-The transform by spectra is the linear one that misses least, in the mean over smooth reflectances, what the same
-surface has under daylight (D65) for the 1931 observer; the perfect white is exact. Reflectances are taken as a
-random process of wavelength with a Gaussian covariance (Wiener estimation: Pratt and Mancill, Spectral
+The transform by spectra is the linear one with the smallest mean error, over smooth reflectances, from the colour
+of the same surface under daylight (D65) for the 1931 observer; the perfect white is exact. Reflectances are taken
+as a random process of wavelength with a Gaussian covariance (Wiener estimation: Pratt and Mancill, Spectral
 estimation techniques for the spectral calibration of a color image scanner, Applied Optics 15, 1976).
 """
 
@@ -78,7 +78,7 @@ def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None
     white_balance = signals / white[:, None]
     if np.linalg.cond(white_balance @ covariance @ white_balance.T) > _LARGEST_CONDITION:
         raise InputError(
-            f"{sensor}: its channels are too much alike under the light of {leds} to tell colours apart; expected "
+            f"{sensor}: its channels are too similar under the light of {leds} to tell colours apart; expected "
             "sensitivities of red, green and blue that differ in shape"
         )
     matrix = _least_missing(white_balance, towards, covariance)

@@ -39,7 +39,7 @@ def linear_colours(picture: NDArray[np.float32], colour: CameraColour) -> NDArra
 
 def write_for_the_eye(path: Path, linear: NDArray[np.float64], white: float, about: dict[str, Any]) -> None:
     """Write linear sRGB, of which `white` is shown as white, whole or not at all: PNG of 8 bits or TIFF of 16,
-    with the profile of sRGB and `about`. What is brighter, or out of gamut, is cut.
+    with the profile of sRGB and `about`. Values that are brighter, or out of gamut, are cut.
 
     Raises InputError for another kind of file, StorageError if it cannot be written.
     """

@@ -82,7 +82,7 @@ def write_crate(
         raise InputError(f"{root}: has files already. Choose another --out, or give --overwrite")
     if not in_place and (root / DATA).exists() and not (root / METADATA).exists():
         raise InputError(
-            f"{root / DATA}: is no crate's, {METADATA} is missing. Remove it, or choose another --out"
+            f"{root / DATA}: does not belong to a crate: {METADATA} is missing. Remove it, or choose another --out"
         )
     inside = "" if in_place else f"{DATA}/"
     paths = sorted(_files(source, without=None if in_place else root))
@@ -119,7 +119,7 @@ def _source_facts(source: Path) -> dict[str, Any]:
         }
     run = Run(source)
     if run.in_use:
-        raise InputError(f"{source}: another process is acquiring into this run; wait for it")
+        raise InputError(f"{source}: another process is acquiring into this run; wait until it ends")
     return {
         "kind": "run",
         "ended": run.about["created"],

@@ -1,8 +1,8 @@
 """The files that a job depends on, each read once.
 
 Plan, rig, LED table, mesh, records and the files beside them are read into memory by the first reader, and hashed.
-Whoever asks again gets the same bytes: what is checked, what is run and what a run keeps in `inputs/` cannot
-differ, whatever happens to a file on the disk meanwhile. `changes` says what did.
+A second caller gets the same bytes. Therefore the bytes that are checked, run and kept in `inputs/` cannot differ,
+whatever happens to a file on the disk meanwhile. `changes` says what did.
 """
 
 from __future__ import annotations

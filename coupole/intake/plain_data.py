@@ -110,7 +110,9 @@ def yaml_of(text: str, name: str, *, line: int = 1) -> Any:
 
 
 def _values(node: Any, known_counts: dict[int, int]) -> int:
-    """Values in a node, each alias as many as it stands for; one that holds itself is too many."""
+    """Number of values in a node. An alias counts as many values as it stands for; an alias that contains itself
+    is too many.
+    """
     if id(node) in known_counts:
         return known_counts[id(node)]
     known_counts[id(node)] = MAX_VALUES + 1

@@ -61,7 +61,7 @@ def surface_points(corners_mm: Floats, step_mm: float = MESH_STEP_MM) -> Floats:
     `step_mm` from one of them.
 
     Each triangle is divided into similar ones whose edges are at most e; then none of their points is farther than
-    e / sqrt(3) from a corner. Of the corners in a cubic cell of edge c one is kept, at most c sqrt(3) from the
+    e / sqrt(3) from a corner. One of the corners in a cubic cell of edge c is kept, at most c sqrt(3) from the
     others.
     """
     edge_mm = 0.6 * step_mm

@@ -168,9 +168,9 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
-        """Begin a flight. What the command refuses is the error of `complete`."""
+        """Begin a flight. If the command refuses the view, `complete` raises the error."""
         if self._acquisition is not None:
-            raise InputError("the cell is in flight; complete it first")
+            raise InputError("the cell is in a flight; complete it first")
         plan = await self.next_plan()
         self._forget()
         # In the thread of the event loop, which lives as long as its process: the run is bound to it.
@@ -181,7 +181,7 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
         """Wait until the flight is over. Raises what `coupole.acquire` raises."""
         acquisition = self._acquisition
         if acquisition is None:
-            raise InputError("the cell is not in flight; kick it off first")
+            raise InputError("the cell is not in a flight; kick it off first")
         try:
             proven = 0
             while (event := await asyncio.to_thread(next, acquisition, None)) is not None:

@@ -185,7 +185,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page that links may lead to, as `#name`. What is empty is left out."""
+    """A part of a page that links may lead to, as `#name`. Empty parts are left out."""
 
     name: str
     heading: Inline

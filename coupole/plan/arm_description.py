@@ -79,7 +79,7 @@ class LinkDescription(Model):
 
 
 class KeptApart(Model):
-    """Two bodies of the arm that could touch. Those that are not listed touch by design, or cannot."""
+    """Two bodies of the arm that could touch. Pairs that are not listed touch by design, or cannot touch."""
 
     body: BodyName
     """One of the two."""

@@ -89,7 +89,8 @@ def first_lights(ids: NDArray[np.int64], leds: LedTable, most: int) -> NDArray[n
 
 def sentinels_among(lit: Sequence[Sequence[Led] | Panel], leds: LedTable) -> tuple[int, ...]:
     """Ids of the LEDs that a view's sentinels are, spread over the middle half of those `lit` by their height: low
-    ones graze, and the highest are alike. None where too few are lit to place them between."""
+    ones graze, and the highest are alike. None if too few LEDs are lit to place them between.
+    """
     ids = np.array([led.id for lights in lit if not isinstance(lights, Panel) for led in lights], np.int64)
     if len(ids) < FEWEST_WATCHED:
         return ()

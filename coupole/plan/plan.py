@@ -144,7 +144,7 @@ class Plan(Model):
     def _something_to_shoot(self) -> Plan:
         lights = [view.lights or self.lights for view in self.views]
         if any(isinstance(selection, NoLights) for selection in lights) and self.darks_per_view == 0:
-            raise ValueError("lights, or at least one dark frame per view: a view would shoot nothing")
+            raise ValueError("lights, or at least one dark frame per view: otherwise a view takes no frame")
         return self
 
     @property
@@ -162,7 +162,7 @@ class Plan(Model):
         if self.takes_sentinels and (self.chooses_lights or isinstance(self.exposure, AutoExposure)):
             raise ValueError(
                 "`watch: {frames: darks}` where lights or exposures are chosen in the run: "
-                "sentinels stand in bursts that the plan says"
+                "sentinels need bursts that the plan determines"
             )
         return self
 
@@ -192,7 +192,11 @@ class Plan(Model):
             return self
         lights = [view.lights or self.lights for view in self.views]
         if any(isinstance(selection, NoLights | Panels) for selection in lights):
-            raise ValueError("LEDs in each view with `exposure: {kind: auto}`; panels and darks have no choice")
+            raise ValueError(
+                "LEDs in each view with `exposure: {kind: auto}`; exposures of panels and darks cannot be chosen"
+            )
         if self.repeats > 1:
-            raise ValueError("`repeats: 1` with `exposure: {kind: auto}`: its `snr` says how often light is taken")
+            raise ValueError(
+                "`repeats: 1` with `exposure: {kind: auto}`: its `snr` determines the number of exposures"
+            )
         return self

@@ -84,7 +84,7 @@ class Lens(Model):
     @model_validator(mode="after")
     def _makes_an_image(self) -> Lens:
         if self.focus_distance_mm <= self.focal_length_mm:
-            raise ValueError("a focus distance longer than the focal length, or there is no image")
+            raise ValueError("a focus distance longer than the focal length, because otherwise there is no image")
         return self
 
 

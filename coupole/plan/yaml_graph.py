@@ -1,10 +1,10 @@
 """The graph of nodes of a YAML text.
 
 ruamel.yaml reads YAML 1.2, in Python. libyaml (by PyYAML) makes the same nodes in a quarter of the time, but reads
-YAML 1.1. So plain texts are composed by libyaml: printable ASCII without anchors, aliases, tags,
-directives, escapes, block scalars, complex keys, several documents and empty values. Of these both make the same
-nodes at the same places, once scalars are resolved by ruamel's rules; a property test holds that. All other texts,
-and all that libyaml refuses, are ruamel's: its graph, or its error with its place, counts.
+YAML 1.1. So plain texts are composed by libyaml: printable ASCII without anchors, aliases, tags, directives,
+escapes, block scalars, complex keys, several documents and empty values. For these both make the same nodes at the
+same places, once scalars are resolved by ruamel's rules; a property test checks this. All other texts, and all
+that libyaml refuses, are ruamel's: its graph, or its error with its place, counts.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Chooses LEDs in the run, by what those before them have shown of the view (`lights: {kind: adaptive}`).
 
-The first burst is spread over the dome. After each burst `next_lights` says by how much pictures for the LEDs not
-yet lit would miss, and which LEDs tell most beside those lit. Pixels are divided by the illuminance that the LED
-table gives at the view's target. Neither mesh nor records are needed: what is judged are the frames themselves.
+The first burst is spread over the dome. After each burst `next_lights` gives the expected error of pictures for
+the LEDs not yet lit, and the LEDs that would add most information. Pixels are divided by the illuminance that the
+LED table gives at the view's target. Neither mesh nor records are needed: only the frames are used.
 """
 
 from __future__ import annotations
@@ -54,7 +54,9 @@ class AdaptiveLightsChooser:
             first_ids = self._affordable(view, lights, spread_ids[: lights.until.lights].tolist(), 0, 0)
             reason = f"{len(first_ids)} LEDs spread over the dome"
             return self._choice(
-                view, first_ids, reason if first_ids else "`seconds` or `lux_h` of `until` allow not one LED"
+                view,
+                first_ids,
+                reason if first_ids else "`seconds` or `lux_h` of `until` do not allow a single LED",
             )
         return self._next(view, lights, choices, samples)
 
@@ -71,7 +73,7 @@ class AdaptiveLightsChooser:
         if len(lit_ids) == len(view.leds):
             return Choice(bursts=(), reason="all LEDs of the view are lit")
         if len(seen_ids) < FEWEST_TAKEN:
-            return Choice(bursts=(), reason=f"{len(seen_ids)} frames are proven: too few to choose by")
+            return Choice(bursts=(), reason=f"{len(seen_ids)} frames are proven: too few for a choice")
         values = self._values(view, seen_ids, samples)
         unlit_rows = np.flatnonzero(~np.isin(view.leds, lit_ids))
         count = min(lights.burst_lights, lights.until.lights - len(lit_ids))
@@ -82,7 +84,7 @@ class AdaptiveLightsChooser:
         if reason := _enough(lights, figures, len(affordable_ids)):
             return Choice(bursts=(), reason=reason, figures=figures)
         errors = f"{100.0 * figures['relit_rms']:.2f} %, {100.0 * figures['relit_rms_after']:.2f} % after them"
-        reason = f"{len(affordable_ids)} LEDs that tell most: expected error {errors}"
+        reason = f"{len(affordable_ids)} LEDs that add most information: expected error {errors}"
         return self._choice(view, affordable_ids, reason, figures)
 
     def _affordable(

@@ -67,7 +67,7 @@ class AutoExposureChooser:
         lux_of_led = dict(zip(view.leds.tolist(), self._lux(view).tolist(), strict=True))
         evidence = Evidence(self._exposure, lux_of_led, choices[0].bursts[0].leds, samples)
         if not evidence.first_leds:
-            return Choice(bursts=(), reason="no frame of the first pass is proven: nothing to choose by")
+            return Choice(bursts=(), reason="no frame of the first pass is proven: there is no basis for a choice")
         if len(choices) == 1 and (probes := self._probes(view, evidence)):
             reason = _in_words("the first pass clips or is dark", probes)
             return Choice(bursts=tuple(probes), reason=reason, figures={_PROBE: True})

@@ -49,12 +49,14 @@ def preflight_of(
     called with each step in words.
     """
     if measure:
-        say("the disk's speed is measured")
+        say("measuring the disk's speed")
     storage = storage_of(folder, job.cell.rig, allocated_bytes, measure=measure)
-    say("paths, heat, light and time are reckoned")
+    say("computing paths, heat, light and time")
     job, report = check_job(job, storage, paths=paths, proven=proven)
     if measure and not storage.write_bytes_s and not storage.trouble:
-        report.warnings.append(f"storage {folder}: too little room to measure the disk's speed; none is assumed")
+        report.warnings.append(
+            f"storage {folder}: too little room to measure the disk's speed; it is not considered"
+        )
     report.warnings += trusted_by_name(job.cell.rig)
     report.refusals += commissioning_refusals(job.cell)
     return job, report
@@ -168,7 +170,7 @@ def ledger_warnings(job: Job, history: History, more_lux_h: float) -> list[str]:
         )
     if allowed_lux_h(job, history) is None and not in_world(job.cell.rig, dry_run=False):
         warnings.append(
-            f"object {name}: nobody has said how much light it may receive: `coupole dose {name} --budget LUX_H "
+            f"object {name}: nobody has set how much light it may receive: `coupole dose {name} --budget LUX_H "
             "--name NAME` does"
         )
     if ids := similar_ids(job.cell.ledger_folder, name):

@@ -41,7 +41,7 @@ _DEVICES: Mapping[Step, tuple[str, ...]] = {
 """The devices that a step is about."""
 _MOST_TOLD = 8
 _FILE = "commissioning.yaml"
-_HEAD = "# The commissioning of a cell. It carries its own checksum: do not edit it, say `coupole commission`."
+_HEAD = "# The commissioning of a cell. It carries its own checksum: do not edit it, use `coupole commission`."
 
 
 class Answer(Model):
@@ -117,8 +117,8 @@ def empty_record(cell: Cell) -> CommissioningRecord:
 def read_commissioning(cell: Cell) -> CommissioningRecord | None:
     """The record of the cell, by the controller of its arm and in the rig's state folder; None if there is none.
 
-    Of each step the newest result that fits the rig is taken, else the newest. Raises InputError for a record that
-    was edited or cannot be read.
+    For each step the newest result that fits the rig is taken, otherwise the newest result. Raises InputError for
+    a record that was edited or cannot be read.
     """
     paths = [place / _FILE for place in places_of_arm(cell)]
     records = {path: _read_record(path) for path in paths if path.exists()}
@@ -185,7 +185,7 @@ def why_outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identi
     lacking = []
     if result.covers is None:
         if places := _places(key for key in now if key not in before):
-            lacking = [f"it was done by an earlier version, which did not cover {places}"]
+            lacking = [f"an earlier version did it, which did not cover {places}"]
         before, now = ({key: fingerprints[key] for key in before if key in now} for fingerprints in (before, now))
     changes = _changes(before, now)
     if identities is not None:

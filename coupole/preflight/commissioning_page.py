@@ -70,10 +70,10 @@ def _quality(record: CommissioningRecord, results: dict[Step, StepResult | None]
 def _next_step(record: CommissioningRecord, open_steps: Sequence[Step]) -> Inline:
     if not open_steps:
         return (
-            "Nothing: do a step again when rig or device that it is about have changed; the program asks for it."
+            "Nothing: repeat a step when its part of the rig or its device has changed; the program asks for it."
         )
     links: list[Inline] = [Link(f"#{anchor(step)}", step) for step in open_steps]
-    line: list[Inline] = ["Remove the cause, then say ", Code("coupole commission"), " again; open: "]
+    line: list[Inline] = ["Remove the cause, then give ", Code("coupole commission"), " again; open: "]
     for number, link in enumerate(links):
         line += [", " if number else "", link]
     return [*line, "."]

@@ -208,7 +208,7 @@ def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -
     noise = noise_of(views.values())
     advices = tuple(advise_view(view, metered_view, request, noise) for view, metered_view in views.items())
     remarks = [
-        f"view {a.view}: nothing but noise is seen; is the object lit?" for a in advices if not a.object_share
+        f"view {a.view}: the pictures show only noise; is the object lit?" for a in advices if not a.object_share
     ]
     remarks += [
         f"view {a.view}: saturated at all metered exposures; meter again with this exposure"

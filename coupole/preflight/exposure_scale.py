@@ -24,7 +24,7 @@ from coupole.plan.light_selection import leds_of_plan
 if TYPE_CHECKING:
     from coupole.preflight.job import Job
 
-HOW_TO_KNOW = "`white_response` in the rig makes it known (docs/how-to/expose-and-focus.md)"
+HOW_TO_KNOW = "set `white_response` in the rig (docs/how-to/expose-and-focus.md)"
 UNDER_EXPOSED = 0.05
 """Share of full scale that white must reach."""
 
@@ -103,7 +103,9 @@ def white_share(job: Job, scale: ExposureScale, exposure_us: int) -> float:
 
 
 def _power(path: Path, record: Record, files: InputFiles, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-    """[ids] power in the channel that has most of it, DN s^-1 m^2 sr; 0 for LEDs that are dead or not in it."""
+    """[ids] power in the channel with the highest power, DN s^-1 m^2 sr; 0 for LEDs that are dead or not in the
+    record.
+    """
     table = path.parent / record.files[0].name
     try:
         lines = [line for line in files.read_bytes(table).decode("utf-8").splitlines() if not line.startswith("#")]

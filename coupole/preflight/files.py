@@ -20,7 +20,7 @@ class Files:
     rig: Path | None = None
     """None: the plan's."""
     resume: Path | None = None
-    """The run of which only what is left is checked."""
+    """The run whose remaining part is checked."""
     output: Path | None = None
     """Parent folder of the run; None: the rig's."""
 
@@ -42,13 +42,13 @@ def check_files(
     from coupole.preflight.job import read_job, without_hidden
     from coupole.storage.run import Run
 
-    say("plan, mesh and records are read")
+    say("reading plan, mesh and records")
     job = read_job(files.plan, files.rig)
     run = Run(files.resume) if files.resume else None
     if run is not None:
         run.refuse_changes(job.inputs)
     if run is not None or paths:
-        say("paths and hidden lights are reckoned")
+        say("computing paths and hidden lights")
         job = without_hidden(job, run.hidden_leds if run else None)
     folder = run.folder if run else files.output or job.cell.storage_folder
     allocated_bytes, proven = (run.allocated_bytes(), run.proven()) if run else (0, {})

@@ -244,8 +244,8 @@ def _judged_views(
             problem = f"view {framing.view}: object {name} is out of its field"
         elif not framing.in_focus:
             problem = (
-                f"view {framing.view}: nothing of object {name} is in focus: what it sees is "
-                f"{framing.nearest_mm:.0f} to {framing.farthest_mm:.0f} mm away, sharp is {sharp}"
+                f"view {framing.view}: nothing of object {name} is in focus: the visible part is "
+                f"{framing.nearest_mm:.0f} to {framing.farthest_mm:.0f} mm away, the sharp range is {sharp}"
             )
         if problem:
             (refusals if is_aimed else warnings).append(problem)

@@ -265,6 +265,6 @@ def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts
         )
     if frame_bytes % PAGE_BYTES:
         report.warnings.append(
-            f"a frame of {rig.sensor.width_px} x {rig.sensor.height_px} is no multiple of {PAGE_BYTES} bytes: "
+            f"a frame of {rig.sensor.width_px} x {rig.sensor.height_px} is not a multiple of {PAGE_BYTES} bytes: "
             "it is written through the page cache, which is slower"
         )

@@ -1,8 +1,8 @@
 """Samples of views that were taken beside an acquisition, before anybody knew what else the run would hold.
 
-A result is begun with the frames of all its views (`result_folder.begin`). What was taken before that is noted
-view by view: the frames that it depends on, and the LEDs kept for the check. When the run is complete, what agrees
-is used, and the rest is taken again.
+A result is begun with the frames of all its views (`result_folder.begin`). Samples that were taken before are
+noted view by view: the frames that it depends on, and the LEDs kept for the check. When the run is complete, what
+agrees is used, and the rest is taken again.
 """
 
 from __future__ import annotations
@@ -81,9 +81,10 @@ def is_taken(out: Path, file_name: str, basis: ViewBasis) -> bool:
 
 
 def adopt(out: Path, settings: Mapping[str, Any], bases: Mapping[str, ViewBasis]) -> None:
-    """Keep of what was taken beside an acquisition what holds for the complete run; `bases` are those of its
+    """Keep those samples taken during an acquisition that are valid for the complete run; `bases` are those of its
     views, by the names of their files. Raises InputError if the samples are of other input, or a process is at
-    work on them."""
+    work on them.
+    """
     if not (out / FOLDER).is_dir():
         return
     refuse_held(out)
@@ -104,7 +105,7 @@ def adopt(out: Path, settings: Mapping[str, Any], bases: Mapping[str, ViewBasis]
 
 
 def clear_beside(out: Path) -> None:
-    """Remove what only the making of a result wants, when that is whole."""
+    """Remove the files that are needed only while a result is made, when the result is complete."""
     shutil.rmtree(out / FOLDER, ignore_errors=True)
 
 

@@ -57,8 +57,9 @@ class Workshop(Protocol):
         ...
 
     def refuse_blind(self, folder: Path, witness: str) -> None:
-        """Raises InputError if a worker does not see a folder as it is here, by the content of one of its files,
-        or has another version of Coupole."""
+        """Raises InputError if a worker sees another content of one file of a folder than this machine, or has
+        another version of Coupole.
+        """
         ...
 
 
@@ -122,8 +123,8 @@ class Cluster:
             ) from error
         except (CancelledError, CommClosedError) as error:
             raise InputError(
-                f"--scheduler: the scheduler {self._address} is gone; start it, and give this command again: what "
-                "is done is kept"
+                f"--scheduler: the scheduler {self._address} is gone; start it, and give this command again: "
+                f"finished work is kept"
             ) from error
 
     def everywhere(self, function: Callable[[], Any]) -> None:
@@ -136,7 +137,9 @@ class Cluster:
         here = _seen_from_here(folder / witness)
         for worker, there in self._client.run(_seen_from_here, folder / witness).items():
             if there[1] != here[1]:
-                raise InputError(f"--scheduler: the worker {worker} has Coupole {there[1]}, here is {here[1]}")
+                raise InputError(
+                    f"--scheduler: the worker {worker} has Coupole {there[1]}, this machine has {here[1]}"
+                )
             if there != here:
                 raise InputError(
                     f"--scheduler: the worker {worker} does not see {folder} as it is here: put runs, records and "
@@ -174,7 +177,7 @@ def workshop(scheduler: str | None) -> Iterator[Workshop]:
         client: Any = Client(scheduler, timeout=_ANSWERS_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
         raise InputError(
-            f"--scheduler: no scheduler answers at {scheduler}; `dask scheduler` starts one and tells its address"
+            f"--scheduler: no scheduler answers at {scheduler}; `dask scheduler` starts one and prints its address"
         ) from error
     with client:
         if not client.nthreads():

@@ -2,9 +2,9 @@
 their contradiction.
 
 A cable's full shadow is too dark to give samples. At its edge a triangle is lit in part, and its sample is too low
-by any amount. Such a sample is darker than the triangle's material in all channels, where that is mostly diffuse
-(the form of a lobe cannot be blamed), and darker than its noise allows; and the LEDs beside it agree with the
-material, so that neither the triangle nor the model is wrong.
+by any amount. A contradicted sample is darker than the triangle's material in all channels, by more than its noise
+allows. The material there is mostly diffuse, so the form of a lobe is not the cause. The neighbouring LEDs agree
+with the material, so neither the triangle nor the model is wrong.
 """
 
 from __future__ import annotations

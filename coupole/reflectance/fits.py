@@ -103,7 +103,7 @@ SLICES = _fits_by_name(
     ViewFit("sh", "spherical harmonics", "#0072b2", HARMONICS),
     ViewFit("rbf", "radial functions", "#d55e00", RADIAL),
     ViewFit(
-        "ggx_rbf", "GGX, normals fitted, with radial functions of what is left", "#009e73", RESIDUAL, GGX_NORMAL
+        "ggx_rbf", "GGX, normals fitted, with radial functions of the residual", "#009e73", RESIDUAL, GGX_NORMAL
     ),
 )
 FITS: dict[str, MaterialFit | ViewFit] = {**MATERIALS, **SLICES}

@@ -1,5 +1,4 @@
-"""Light that comes from one part of the object to another, estimated from its mesh and samples, and taken off
-them.
+"""Light from one part of the object to another, estimated from its mesh and samples, and subtracted from them.
 
 A sample of reflectance counts all light of its triangle as the LED's own. In a fold a part of it came by way of
 other triangles. The object is cut into patches; their radiosity under each LED follows from the light that
@@ -322,7 +321,7 @@ def _subtract_view(
         shutil.copyfile(view.path, part)
         shares, sample_count = [], 0
         with h5py.File(part, "r+") as file:
-            description = "share of f that was inter-reflection, and was taken off"
+            description = "share of f that was inter-reflection, and was subtracted"
             share_dataset = file.create_dataset(
                 INTER_REFLECTION, file["f"].shape, np.float16, chunks=file["f"].chunks, fillvalue=np.nan
             )

@@ -1,12 +1,12 @@
 """Correction of what interpolation between lights gets wrong, learnt from the lights themselves.
 
-Shadows and highlights move as the light moves; a weighted sum of pictures fades one into the next instead. How the
-truth differs from the sum is seen wherever a light is left out: a small network is trained on those differences,
-with what the kernels say, what the nearest pictures show at the pixel and round it. Each light is left out
-together with its nearest neighbour: a new light is farther from the measured ones than they are from each other.
+Shadows and highlights move as the light moves; a weighted sum of pictures fades one into the next instead. If a
+light is left out, the difference between truth and sum is known. A small network is trained on these differences,
+from the kernels' values and from the nearest pictures at the pixel and around it. Each light is left out together
+with its nearest neighbour: a new light is farther from the measured ones than they are from each other.
 
-The network sees values as shares of the pixel's mean, so its answer does not depend on exposure or albedo. What it
-adds never leaves the range of the kernels' values and the nearest pictures'.
+The network sees values as shares of the pixel's mean, so its answer does not depend on exposure or albedo. The
+corrected value never leaves the range of the kernels' and the nearest pictures' values.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Many small regularised least-squares problems, one after the other in compiled code, by SciPy's BLAS and LAPACK.
 
-Their own threads are to be turned off by the caller (`one_thread`): whole problems are what is done side by side.
+The caller must turn off their own threads (`one_thread`), because whole problems are solved in parallel.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ _INT, _DOUBLE, _CHAR = map(types.CPointer, (types.intc, types.float64, types.uin
 
 
 def _routine(module: str, name: str, *kinds: Any) -> Any:
-    """A Fortran routine that compiled code may call. It is known by name, so that what calls it can be cached."""
+    """A Fortran routine that compiled code may call. It is known by name, so functions that call it can be
+    cached.
+    """
     symbol = f"coupole_{name}"
     llvmlite.binding.add_symbol(symbol, get_cython_function_address(f"scipy.linalg.cython_{module}", name))
     return types.ExternalFunction(symbol, types.void(*kinds))
@@ -88,7 +90,7 @@ def factorise(product, penalty, factor):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def solve(factor, right):  # type: ignore[no-untyped-def]
-    """Solve in place for `right` [m, n], by what `factorise` left."""
+    """Solve in place for `right` [m, n], with the factors from `factorise`."""
     upper = np.array([85], np.uint8)
     sizes = np.array([len(factor), len(right), 0], np.intc)
     _dpotrs(

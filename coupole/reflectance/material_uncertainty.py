@@ -3,9 +3,10 @@
 The fit solves equations of scores: sums over samples of weight times derivative times residual, and the priors.
 Its covariance is H^-1 M H^-1 with H the derivatives of the scores and M their variance (Huber 1967). M comes from
 the residuals, summed by groups of neighbouring LEDs before they are squared, since a material that does not fit,
-an LED's power and a shadow's edge are off together there (Liang and Zeger 1986); so it has noise, each LED's own
-power, and what the model misses. To it come the scanner's noise, which turns normals that are held, and what is
-unknown where only the usual roughness and ks hold them. What all LEDs share is a factor of kd and ks, kept apart.
+an LED's power and a shadow's edge are off together there (Liang and Zeger 1986); so it contains noise, each LED's
+own power, and the error of the model. To it come the scanner's noise, which turns normals that are held, and what
+is unknown where only the usual roughness and ks hold them. The uncertainty that all LEDs share is a factor of kd
+and ks, kept apart.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Common tilt of all fitted normals of a material, which is taken off them.
 
 A material that is not of the fit's form makes its normals lean, towards the cameras or away from them: the error
-that the fit would have in its form shows as a tilt. From single triangles it cannot be told, and their residuals
-do not show it. But errors of the scanner's vertices are independent of it, and of each other some millimetres
-away, so over many triangles the mean of what lies between fitted and scanned normals is the fit's error, which
-changes slowly with the direction in which the surface faces: a polynomial of second degree of that direction, for
-triangles that look alike. What is left after it is noise, as the covariance of the fit states it.
+that the fit would have in its form shows as a tilt. It cannot be estimated from single triangles, and their
+residuals do not show it. But errors of the scanner's vertices are independent of it, and of each other some
+millimetres away, so over many triangles the mean of what lies between fitted and scanned normals is the fit's
+error, which changes slowly with the direction in which the surface faces: a polynomial of second degree of that
+direction, for triangles that look alike. The remainder is noise, which the covariance of the fit states.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ _CHUNK = 1 << 16
 def unbiased_normals(
     materials: TriangleMaterials, mesh_normals: Floats, centres_mm: Floats, areas_mm2: Floats, noise_um: float
 ) -> Floats:
-    """[n, 3] fitted normals without what they have in common against those of the mesh [n, 3]; as they are for too
-    few triangles. `noise_um` is that of the mesh's vertices."""
+    """[n, 3] fitted normals without their common deviation from the mesh's normals [n, 3]; unchanged for too few
+    triangles. `noise_um` is that of the mesh's vertices.
+    """
     normals = materials.normals.copy()
     fitted_triangles = np.flatnonzero(np.isfinite(materials.alpha))
     if len(fitted_triangles) < FEWEST:

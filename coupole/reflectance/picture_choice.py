@@ -76,7 +76,9 @@ def _refuse(pictures: PictureSet, how_many: HowMany) -> None:
             f"got {how_many.first}"
         )
     if how_many.most > len(pictures):
-        raise InputError(f"--count: expected at most the {len(pictures)} lights there are, got {how_many.most}")
+        raise InputError(
+            f"--count: expected at most the {len(pictures)} lights of the pictures, got {how_many.most}"
+        )
 
 
 def _with_new(

@@ -139,7 +139,7 @@ def read_picture(path: Path) -> NDArray[Any]:
 
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if picture is None:
-        refuse(path, "is no picture that can be read; expected PNG, TIFF or JPEG")
+        refuse(path, "is not a readable picture; expected PNG, TIFF or JPEG")
     if picture.dtype not in (np.uint8, np.uint16):
         refuse(path, f"has values of type {picture.dtype}; expected 8 or 16 bit")
     if picture.ndim == 2:

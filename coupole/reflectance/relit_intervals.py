@@ -97,8 +97,8 @@ def refuse_uncalibrated(result: PictureResult) -> None:
     """Raise InputError if a result has no intervals."""
     if not (result.folder / INTERVALS).exists():
         raise InputError(
-            f"{result.folder}: has no intervals: they need {FEWEST_LIGHTS} lights, and a result of this version; "
-            "give the command that made it again"
+            f"{result.folder}: has no intervals: they need {FEWEST_LIGHTS} lights, and a result of this "
+            f"version; repeat the command that made the result"
         )
 
 

@@ -54,7 +54,7 @@ def read_settings(out: Path) -> dict[str, Any]:
     except (OSError, InputError, ValueError) as error:
         raise InputError(f"{path}: expected the settings of a result of runs; {reason(error)}") from error
     if not {"subtracted", "refined"} <= set(settings):
-        raise InputError(f"{path}: was begun by an earlier version; make the result anew, with another --out")
+        raise InputError(f"{path}: was begun by an earlier version; make the result again, with another --out")
     return settings
 
 

@@ -197,7 +197,8 @@ def _interval_percent(uncertainty: dict[str, Any] | None) -> dict[str, float] | 
 
 def _typical(result: RunResult, name: str) -> dict[str, float | None]:
     """Medians of standard uncertainties of a material; of kd and ks with what all samples of a triangle, and all
-    triangles, share. None for those that are not known."""
+    triangles, share. None if it is not known.
+    """
     variances = np.einsum("nii->ni", result.material_covariances(name)).copy()
     variances[:, 2:4] += (result.u_triangles(slice(None)) ** 2 + result.u_shared**2)[:, None]
     deviations = np.sqrt(variances)

@@ -127,9 +127,10 @@ def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None
 
 
 def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> None:
-    """The samples of a complete view of a run that is still acquired, with the run's own mesh and records. What is
-    there already, and agrees with the view's frames, stays; so does a result that was begun with all frames of its
-    runs. Raises as `reflectance_of`."""
+    """The samples of a complete view of a run that is still acquired, with the run's own mesh and records. Files
+    that are there already, and agree with the view's frames, stay. A result that was begun with all frames of its
+    runs stays as well. Raises as `reflectance_of`.
+    """
     if (out / SETTINGS).exists():
         return
     request, token = RunRequest((run,)), uuid4().hex

@@ -36,7 +36,9 @@ SAMPLES = "samples"
 AS_MEASURED = "as_measured.h5"
 """File of the reflectance before inter-reflection was taken off, from the folder."""
 U_OF_INTER_REFLECTION = 0.2
-"""Relative standard uncertainty of what is taken off. Of a simulated relief of white stone it was 0.15 to 0.19."""
+"""Relative standard uncertainty of what is taken off. For a simulated relief of white stone it was 0.15 to
+0.19.
+"""
 MOST_ROWS = 1 << 16
 LOWER = np.tril_indices(UNKNOWNS)
 VARIANCES = [row * (row + 3) // 2 for row in range(UNKNOWNS)]
@@ -161,7 +163,7 @@ class RunResult:
         if settings["subtracted"] and any(view.inter_reflection is None for view in self.views):
             raise InputError(
                 f"{self.folder}: inter-reflection is still in its samples; `coupole reflectance extract`, as it "
-                "was begun, takes it off"
+                "was begun, subtracts it"
             )
         paths = [self.materials_path(name) for name in MATERIALS]
         paths += [self.slices_path(name, view) for name in SLICES for view in self.views]
@@ -299,7 +301,7 @@ class RunResult:
         path = self.slices_path(name, view)
         with h5py.File(path, "r") as file:
             if file["coefficients"].shape[-1] != SLICES[name].coefficients:
-                raise InputError(f"{path}: an earlier version made it; make the result anew")
+                raise InputError(f"{path}: an earlier version made it; make the result again")
             return np.asarray(file["coefficients"][rows], np.float32)
 
 
@@ -350,7 +352,7 @@ def read_about(folder: Path) -> dict[str, Any]:
         raise InputError([problem]) from error
     if not isinstance(about, dict) or about.get("schema") != SCHEMA:
         raise InputError([Problem(str(path), 0, 0, "schema", f"expected {SCHEMA}")])
-    remedy = f"`coupole reflectance check {folder}` writes it anew"
+    remedy = f"`coupole reflectance check {folder}` writes it again"
     wrong = [name for name, kind in _TOLD.items() if not isinstance(about.get(name), kind)]
     if "software" not in wrong and "coupole" not in about["software"]:
         wrong.append("software: coupole")

@@ -75,4 +75,4 @@ def begin_slices(file: h5py.File, fit: ViewFit, view: ViewSamples, channels: int
 def refuse_without_uncertainty(path: Path, file: h5py.File) -> None:
     """Raise InputError for a file of materials that an earlier version made."""
     if "covariance" not in file:
-        raise InputError(f"{path}: has no uncertainty, an earlier version made it; make the result anew")
+        raise InputError(f"{path}: has no uncertainty, an earlier version made it; make the result again")

@@ -153,7 +153,7 @@ def triangles_beside(result: RunResult, view: ViewSamples, rows: Integers) -> Be
     plane across the line of sight. Raises InputError for a file that an earlier version made."""
     with h5py.File(view.path, "r") as file:
         if "lateral_u_mm" not in file.attrs:
-            raise InputError(f"{view.path}: an earlier version made it; make the result anew")
+            raise InputError(f"{view.path}: an earlier version made it; make the result again")
         lateral_u_mm = float(file.attrs["lateral_u_mm"])
     areas_mm2 = result.areas_mm2[view.triangles]
     centres_mm, camera_mm, tree = _centres(view.path)

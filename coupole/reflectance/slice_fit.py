@@ -3,8 +3,8 @@
 A sample's error counts as it shows in a picture, multiplied with the cosine of incidence; what a slice gives is
 never below 0. A slice holds for the view that it was fitted to (seed 003, 6.3).
 
-A fit to what a model leaves is stacked with one to the samples themselves (Breiman, Stacked regressions, Machine
-Learning 24, 1996): the share of the model is the one with which samples that are left out are missed least.
+A fit to the residual of a model is stacked with a fit to the samples themselves (Breiman, Stacked regressions,
+Machine Learning 24, 1996): the share of the model is the one with the smallest error for left-out samples.
 """
 
 from __future__ import annotations
@@ -216,8 +216,9 @@ def _take_samples(values, sample_numbers, first, targets):  # type: ignore[no-un
 
 @numba.njit(cache=True, nogil=True)
 def _stack(off, plain, coefficients):  # type: ignore[no-untyped-def]
-    """Make of `coefficients` [channels, COUNT + 1], a model and what it leaves, and of `plain` [channels, COUNT]
-    the mean that misses least what both miss, `off` [2, channels, samples]."""
+    """Combine `coefficients` [channels, COUNT + 1] (a model and its residual) and `plain` [channels, COUNT] into
+    the mean with the smallest error, from the errors of both, `off` [2, channels, samples].
+    """
     covariance, apart = 0.0, 0.0
     for channel in range(off.shape[1]):
         for number in range(off.shape[2]):

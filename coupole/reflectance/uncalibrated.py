@@ -1,7 +1,7 @@
 """Pictures of one view of a run without calibrations, for what is done with pictures under known lights.
 
-Of nominal places alone, by rig and LED table: directions to the LEDs are those of the point that the camera is
-focused on, their light is what the table says of it there. Values are relative, and each pixel stands for itself.
+Only nominal places of rig and LED table are used: the directions to the LEDs, and their light by the table, are
+those at the point in focus. Values are relative, and each pixel stands for itself.
 """
 
 from __future__ import annotations

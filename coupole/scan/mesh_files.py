@@ -32,7 +32,7 @@ def read_mesh(path: Path, data: bytes | None = None) -> Mesh:
     mesh = readers[path.suffix.lower()](MeshFile(path, data))
     if len(mesh.triangles) == 0:
         raise InputError(
-            f"{path}: expected triangles; the file holds {len(mesh.vertices)} vertices and none of them"
+            f"{path}: expected triangles; the file holds {len(mesh.vertices)} vertices and no triangles"
         )
     if len(mesh.vertices) >= MOST_VERTICES:
         raise InputError(f"{path}: expected fewer than {MOST_VERTICES} vertices, found {len(mesh.vertices)}")

@@ -92,7 +92,7 @@ def calibrate_camera(
 
     plain_board = plain_chessboard(board, square_mm) if isinstance(board, tuple) else None
     if plain_board is None and square_mm is not None:
-        raise InputError("square_mm: belongs to a plain board of columns and rows")
+        raise InputError("square_mm: only for a plain board of columns and rows")
     path = Path(board) if board is not None and not isinstance(board, tuple) else None
     sources, _, sightings = sight_board(
         _paths(images, "runs, or one folder of pictures"),

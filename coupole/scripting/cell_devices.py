@@ -34,8 +34,8 @@ def open_cell(rig: str | os.PathLike[str] = "sim", *, support_is_empty: bool = F
     cell = read_cell(Path(rig))
     if not (support_is_empty or in_world(cell.rig, dry_run=False)):
         raise InputError(
-            f"{cell.document.path}: is a real cell, and here no path is checked and no ledger counts the light: "
-            "take the object away and give support_is_empty=True, or acquire a plan"
+            f"{cell.document.path}: is a real cell, where this function checks no path and counts no light: "
+            f"remove the object and give support_is_empty=True, or acquire a plan"
         )
     faults_of(cell).refuse(cell.document.path)
     refuse_uncommissioned(cell)

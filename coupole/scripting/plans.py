@@ -132,6 +132,6 @@ def _text(model: BaseModel) -> str:
 
 def _write(model: Plan | Rig, path: Path, *, overwrite: bool) -> Path:
     if path.exists() and not overwrite:
-        raise InputError(f"{path}: exists already; choose another name, or say overwrite=True")
+        raise InputError(f"{path}: exists already; choose another name, or give overwrite=True")
     write_synced(path, model.text)
     return path

@@ -70,5 +70,5 @@ class Frame:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """The pixels as numpy wants them; always a new array."""
         if copy is False:
-            raise ValueError("a frame is read from the disk: it cannot be had without a copy")
+            raise ValueError("a frame is read from the disk, so an array without a copy is not possible")
         return np.asarray(self.pixels, dtype)

@@ -39,7 +39,8 @@ def open_result(
     result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int, *, uncertain: bool
 ) -> Relit:
     """The result in a folder, of runs or of pictures. `samples` are rays to an area or an environment. Raises
-    InputError: no result, or one that has no such view, fit, camera or uncertainty."""
+    InputError: no result, or a result without this view, fit, camera or uncertainty.
+    """
     from coupole.reflectance import fits, relit_uncertainty, run_relighting, run_result
 
     if (result / run_result.OBJECT).exists():
@@ -60,7 +61,7 @@ def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera
     from coupole.reflectance import relit_uncertainty, run_intervals, run_relighting, run_result
 
     if camera is not None and view is not None:
-        raise InputError("--view: a camera anywhere (--from) is no view of the run; give one of the two")
+        raise InputError("--view: a free camera (--from) is not a view of the run; give one of the two")
     is_simulated = bool(run_result.read_about(result)["simulated"])
     folder = run_result.RunResult(result)
     if camera is None:

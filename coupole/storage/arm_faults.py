@@ -3,7 +3,7 @@
 A fault belongs to the arm, not to the run in which it happened, nor to the rig: until a named person confirms that
 the cause is found and the cell is clear, no session of any run may move that arm. So it is noted by the address
 and the serial number of the arm's controller and in the rig's state folder (`coupole.plan.controller_places`), and
-stands as long as it stands in one of them. A confirmation names the faults that it is about: it counts for these
+holds as long as it is in one of them. A confirmation names the faults that it is about: it counts for these
 wherever else they are noted.
 """
 
@@ -94,10 +94,10 @@ class ArmFaults:
         if standing := self.standing():
             raise DeviceFault(
                 "robot",
-                expected="the word of a person who has been to the cell",
-                happened=f"since {standing[-1].t} the arm is in a fault: {standing[-1].message.rstrip('.')}",
-                remedy=f"Find the cause, see that the cell is clear, then say `coupole confirm {rig} --name NAME` "
-                "(`--yes` does not).",
+                expected="a confirmation by a person who has been to the cell",
+                happened=f"since {standing[-1].t} the arm has a fault: {standing[-1].message.rstrip('.')}",
+                remedy=f"Find the cause, check that the cell is clear, then give `coupole confirm {rig} --name "
+                f"NAME` (`--yes` is not enough).",
             )
 
     def note(self, message: str, run: str = "") -> None:

@@ -72,7 +72,7 @@ class AsPlanned:
         for number, view in enumerate(self.schedule.views if self.schedule.is_open else ()):
             open_view, view_choices = self.schedule.open_view(number), choices.get(view.name, ())
             if has_enough(view_choices) and not any(choice.bursts for choice in view_choices):
-                yield f"the journal says that {view.name} has enough, though no frame was chosen for it"
+                yield f"the journal says that {view.name} is complete, although no frame was chosen for it"
             for chosen_burst in (burst for choice in view_choices for burst in choice.bursts):
                 try:
                     open_view.burst_of(chosen_burst)
@@ -123,7 +123,7 @@ class AsPlanned:
         off_deg = rotation_angle_deg(support_from_camera, planned_pose.support_from_camera)
         if off_mm <= math.radians(allowed_deg) * _REACH_MM and off_deg <= 3 * allowed_deg:
             return ""
-        return f"the camera was {off_mm:.1f} mm and {off_deg:.2f} deg from where the run's plan has it"
+        return f"the camera was {off_mm:.1f} mm and {off_deg:.2f} deg from its pose in the run's plan"
 
 
 def as_planned(run: Run) -> AsPlanned:

@@ -101,7 +101,7 @@ class Layout:
 
 @contextmanager
 def open_view(path: Path) -> Iterator[h5py.File]:
-    """A view's file, to be read. What h5py or the caller then finds wrong in it raises StorageError."""
+    """A view's file, to be read. If h5py or the caller then finds a fault in it, StorageError is raised."""
     try:
         with h5py.File(path, "r") as file:
             yield file
@@ -117,7 +117,7 @@ def read_layout(path: Path) -> Layout:
         is_packed = data.dtype == np.uint8
         slots, height_px, columns = data.shape
         if data.dtype not in (np.uint8, np.uint16) or frames.dtype != FRAME_DTYPE or poses.dtype != POSE_DTYPE:
-            raise ValueError("pixels or tables have another type")
+            raise ValueError("pixels or tables have an unexpected type")
         if frames.shape != (slots,) or len(poses) > MAX_POSES:
             raise ValueError(f"{slots} frames, a table of {frames.shape}, {len(poses)} poses")
         return Layout(

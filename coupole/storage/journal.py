@@ -153,8 +153,8 @@ def _events(path: Path, lines: Iterable[bytes]) -> Iterator[Event]:
             problem = error.errors()[0]
             raise StorageError(
                 f"{path}: line {number} is not an event of a journal that this version knows "
-                f"({'.'.join(map(str, problem['loc']))}: {problem['msg']}). Was it changed, or is it of a later "
-                "version?"
+                f"({'.'.join(map(str, problem['loc']))}: {problem['msg']}). Was it changed, or written by a "
+                f"later version?"
             ) from error
         if isinstance(event, JournalBegun) and event.version > JOURNAL_VERSION:
             raise StorageError(

@@ -172,7 +172,7 @@ class Asked:
         total_lux_h, allowed_lux_h = history.total_lux_h + more_lux_h, history.allowed_lux_h(self.budget_lux_h)
         if allowed_lux_h is None or total_lux_h + self.lux_h <= allowed_lux_h * (1.0 + _ROUNDING):
             return
-        remedy = f"If it may receive more, say `coupole dose {object_id} --budget LUX_H --name NAME`"
+        remedy = f"If it may receive more, give `coupole dose {object_id} --budget LUX_H --name NAME`"
         if history.budget_lux_h is None or allowed_lux_h < history.budget_lux_h:
             remedy = "Raise `dose_budget_lux_h` in the plan if the object may receive it"
         raise DoseBudgetReached(
@@ -242,7 +242,7 @@ class Reading:
         if self._only_grows and self._read_bytes:
             raise StorageError(
                 f"{path}: the dose ledger {loss} while light was given, so nobody knows what the object may "
-                "still receive. Put it back, then go on."
+                "still receive. Put it back, then continue."
             )
 
     def _with_rest(self, path: Path, file: BinaryIO) -> Reading:
@@ -261,7 +261,7 @@ class Reading:
         if self._only_grows and b"\0" in rest:
             raise StorageError(
                 f"{path}: expected text in UTF-8, found bytes 0 (UTF-16, or a damaged file), so nobody "
-                "knows what the object may still receive. Restore the dose ledger, then go on."
+                "knows what the object may still receive. Restore the dose ledger, then continue."
             )
         if rest:
             for text in rest.split(b"\n"):

@@ -2,7 +2,7 @@
 
 At every moment, also after a crash, all that it lists is on the disk and unchanged: files that a session writes
 (journal, views, report) are taken out of the list before the session begins, and entered when they are complete.
-What is not listed yet, `verify --manifest` enters.
+`verify --manifest` enters files that are not listed yet.
 """
 
 from __future__ import annotations

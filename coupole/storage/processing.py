@@ -133,7 +133,7 @@ def processing_of(run: Path, result: Path, *, frames_left: bool, in_use: bool) -
         if in_use and not counts[1]:
             return Processing(place, "waiting")
         return Processing(
-            place, "ended", *counts, why="its process ended before the result was whole", remedy=remedy
+            place, "ended", *counts, why="its process ended before the result was complete", remedy=remedy
         )
     share = f" {progress.done_count} of {progress.of}" if progress.of else ""
     pid = holder_of(result / _LOCK)
@@ -184,8 +184,8 @@ def refuse_held(result: Path) -> None:
 def _at_work(result: Path) -> str:
     pid = holder_of(result / _LOCK)
     return (
-        f"{result}: {f'process {pid}' if pid else 'another process'} makes this result beside its acquisition; "
-        "`coupole status RUN` tells how far it is. Wait until it has ended, or name another folder with --out"
+        f"{result}: {f'process {pid}' if pid else 'another process'} makes this result during the acquisition; "
+        f"`coupole status RUN` shows its progress. Wait until it has ended, or name another folder with --out"
     )
 
 

@@ -260,12 +260,12 @@ class Run:
             if altered_files := manifest.problems(self.folder, only=own_files):
                 raise InputError(
                     f"{self.folder}: cannot be resumed, because the run's own files were changed after it began: "
-                    f"{'; '.join(altered_files.values())}. What the plan and the rig were is known from them "
-                    "alone: put back what was there (from a copy of the run), or start a new run."
+                    f"{'; '.join(altered_files.values())}. Only these files say what the plan and the rig were: "
+                    f"put the old files back (from a copy of the run), or start a new run."
                 )
             raise InputError(
                 f"{self.folder}: cannot be resumed, because this changed since the run began: "
-                f"{'; '.join(changes)}. Put the old value or file back, go on with the run's own copies by "
+                f"{'; '.join(changes)}. Put the old value or file back, continue with the run's own copies by "
                 f"`{self.go_on_command}`, or start a new run."
             )
 

@@ -122,7 +122,7 @@ class Status:
     def left_in_words(self) -> str:
         """Say in words what is left to take; where bursts are chosen in the run, nobody knows how much more."""
         frames = "1 frame" if self.frames_left == 1 else f"{self.frames_left} frames"
-        return f"{frames} and what is yet to be chosen" if self.open_views else frames
+        return f"{frames} and frames that are not chosen yet" if self.open_views else frames
 
     def figures(self) -> dict[str, Any]:
         """Content of `--json`."""
@@ -133,7 +133,9 @@ class Status:
 
 
 def status(run: Run, *, in_use: bool | None = None) -> Status:
-    """Progress of a run, also of one that is running. Whoever holds its lock says whether it is `in_use`."""
+    """Progress of a run, also of one that is running. The caller that knows about its lock states whether it is
+    `in_use`.
+    """
     status = Status(proof=run.proof)
     shots = list(run.expected_shots())
     status.shots = sum(shot.is_shot for shot in shots)

@@ -19,8 +19,9 @@ def is_stopped(pid: int) -> bool:
 
 
 def holder_of(file: Path) -> int | None:
-    """The process that has locked a file alone (flock), found without a lock of one's own; None if there is none,
-    or that cannot be told."""
+    """The process that holds the exclusive lock of a file (flock), found without taking a lock; None if there is
+    none, or if it cannot be determined.
+    """
     try:
         inode = file.stat().st_ino
         lines = _LOCKS.read_text(encoding="ascii").splitlines()

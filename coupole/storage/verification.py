@@ -42,7 +42,7 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
     result = Verification()
     proven = run.proven()
     result.missing = [str(shot) for shot in run.expected_shots() if shot not in proven]
-    result.missing += [f"{view}: what else it needs is not chosen yet" for view in run.open_views()]
+    result.missing += [f"{view}: its other frames are not chosen yet" for view in run.open_views()]
     result.bad += _unchosen(run)
     by_file: dict[str, list[FrameProven]] = {}
     for frame in proven.values():

@@ -50,7 +50,7 @@ class ViewWriter:
         if self._layout.is_archived:
             raise StorageError(
                 f"{path}: is archived, so nothing can be written into it. Only complete views are archived: "
-                "see with `coupole verify` whether the journal lost lines."
+                "check with `coupole verify` whether the journal lost lines."
             )
         self._table = read_frames(path)
         self._lock = threading.Lock()
@@ -111,7 +111,7 @@ class ViewWriter:
         except IndexError:
             raise StorageError(
                 f"{self.path}: no slot is free: more frames came than the view's bursts can have made. "
-                "Look for a trigger line that bounces."
+                "Check whether the trigger line bounces."
             ) from None
         record = np.zeros((), FRAME_DTYPE)
         record["state"], record["frame_id"], record["camera_ns"] = STORED, frame_id, camera_ns

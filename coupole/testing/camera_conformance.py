@@ -84,8 +84,8 @@ class CameraConformance:
     """The contract `coupole.devices.Camera`.
 
     A subclass gives the fixture `world`, a `CameraWorld`: the camera that the driver talks to, with small frames.
-    Refusals tell people what to do: that of a camera which was not configured names `configure`, that of one which
-    another program has says that it is `in use`.
+    Refusals tell people what to do. If a camera was not configured, the refusal names `configure`. If another
+    program has the camera, it says `in use`.
     """
 
     frame_format: ClassVar[FrameFormat] = FrameFormat(HEIGHT_PX, WIDTH_PX, 12, "GBRG", 64, WHITE_DN)

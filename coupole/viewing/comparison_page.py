@@ -104,10 +104,10 @@ def remarks(comparison: Comparison) -> Iterator[str]:
     if comparison.noise_factor > 1.5 or comparison.colour_factor > 1.5:
         yield (
             f"differences scatter {max(comparison.noise_factor, comparison.colour_factor):.1f} times more than "
-            "points about their own surface: uncertainties were enlarged by that"
+            f"points about their own surface: uncertainties were multiplied by this factor"
         )
     if comparison.before.outward is None:
-        yield "without triangles it is not known which side is out: signs of distances mean nothing"
+        yield "without triangles it is not known which side is outside: signs of distances have no meaning"
 
 
 def _scale(distance_mm: Points, u_mm: Points) -> float:

@@ -1,7 +1,7 @@
 """Live view: the newest frame of a cell or of a run in progress, to focus, to aim and to watch.
 
 A *source* gives frames, and `Studio` holds the newest one for viewers. Viewers poll it at any time, and nothing
-waits for them. Of a run only its folder is read, so that viewers cannot slow it.
+waits for them. For a run only its folder is read, so viewers cannot slow it.
 """
 
 from __future__ import annotations
@@ -185,7 +185,9 @@ class RunSource:
 
 
 class Wanted(BaseModel):
-    """A viewer's choice as it comes: numbers are whole numbers, nothing is converted. What is left out stays."""
+    """A viewer's choice as it comes: numbers are whole numbers, nothing is converted. Fields that are left out do
+    not change.
+    """
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 

@@ -158,7 +158,7 @@ class LiveServer(ThreadingHTTPServer):
                     _hang_up(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A connection that breaks is none of our errors; anything else is, and is told."""
+        """A broken connection is not an error of this server. Any other exception is, and is printed."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
 

@@ -19,7 +19,9 @@ _ON_THE_DISK_MM = 0.05
 
 
 def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> None:
-    """Print the summary of a preflight. For a resumed run figures are what is left, beside the whole."""
+    """Print the summary of a preflight. For a resumed run the figures are those of the rest, beside those of the
+    whole run.
+    """
     whole = report.whole
     table = Table(title=f"{name} on {rig}", title_justify="left", box=None, show_header=False)
     counts = f"{len(report.views)}, {report.shots}, {report.frames}"

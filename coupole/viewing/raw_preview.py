@@ -125,8 +125,9 @@ def _sharpness(plane: NDArray[np.float32], other_plane: NDArray[np.float32]) -> 
 
 
 def white_point(raw: NDArray[np.uint16], coding: Coding) -> tuple[float, float, float] | None:
-    """Gains of R, G, B that make the mean of a region neutral, green unchanged. None if the region is saturated or
-    too dark to tell, or has no colours."""
+    """Gains of R, G, B that make the mean of a region neutral, green unchanged. None if the region is saturated,
+    too dark, or has no colours.
+    """
     planes = channels(raw, coding.pattern)
     span = coding.white_dn - coding.black_dn
     mean = {name: (float(plane.mean()) - coding.black_dn) / span for name, plane in planes.items()}

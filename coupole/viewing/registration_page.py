@@ -64,9 +64,9 @@ def _quality(registration: Registration) -> str:
 
 def _next_step(registration: Registration, merged_mesh: Merged | None, name: str) -> Inline:
     if registration.unplaced_numbers:
-        return "Scan again where scans were not placed, so that they overlap others; or give targets."
+        return "For scans that were not placed, scan again with more overlap, or give targets."
     if merged_mesh is None:
-        return "Say it again without --no-mesh to merge the scans."
+        return "Give the command again without --no-mesh to merge the scans."
     return ["Look at the mesh from all sides, then plan its views: ", Code(f"{name}/mesh.ply"), "."]
 
 
@@ -183,7 +183,7 @@ def _scans(registration: Registration) -> Section:
     head = ("scan", "points", "spacing, mm", "seen from", "u of its points, mm")
     control = ", or of the control points" if registration.site_from_first is not None else ""
     note = (
-        "u: standard uncertainty (68 %) of where a scan's pose puts its points, in the frame of the first scan"
+        "u: standard uncertainty (68 %) of the points of a scan from its pose, in the frame of the first scan"
         f"{control}."
     )
     return Section("scans", "Scans", tables=[Table("Scans", head, rows)], notes=[note])
@@ -198,10 +198,10 @@ def _loops(registration: Registration) -> Section:
         return Section("loops", "Loops", words=["No pairs form a ring."])
     count = len(registration.loops)
     words = (
-        f"{count} ring{'s' if count > 1 else ''} of pairs, each pair adjusted by itself. The worst misses by "
-        f"{worst_loop_mm(registration):.3g} mm. All uncertainties hold a factor of "
-        f"{registration.loop_factor:.2f} by "
-        "the loops."
+        f"{count} ring{'s' if count > 1 else ''} of pairs, each pair adjusted by itself. The worst closing "
+        f"error is "
+        f"{worst_loop_mm(registration):.3g} mm. All uncertainties include a factor of "
+        f"{registration.loop_factor:.2f} from the loops."
     )
     table = Table("The worst loops", ("scans in a ring", "mm", "degrees"), rows)
     return Section("loops", "Loops", words=[words], tables=[table])

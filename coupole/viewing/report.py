@@ -31,8 +31,9 @@ from coupole.viewing.run_sample import SampledView, sampled_views
 
 
 def write(run: Run, path: Path | None = None, *, in_use: bool | None = None) -> Path:
-    """Write the run's report into its folder, or to another file; also of an incomplete run. Whoever holds the
-    run's lock says whether it is `in_use`. Raises StorageError."""
+    """Write the run's report into its folder, or to another file; also of an incomplete run. The caller that knows
+    about the run's lock states whether it is `in_use`. Raises StorageError.
+    """
     path = path or run.report_path
     write_page(path, _page(run, status(run, in_use=in_use)))
     return path
@@ -182,7 +183,7 @@ def _measured_views(run: Run, events: Sequence[Event], views: Sequence[SampledVi
         "What was measured",
         tables=[Table("Views, in the plan's order", head, rows)],
         notes=[
-            "Proven: box and camera show of which light and exposure the frame is. Hidden: LEDs that light "
-            "nothing which the view sees, because arm, camera or object stand between."
+            "Proven: box and camera show which light and exposure the frame belongs to. Hidden: LEDs that light "
+            "nothing that the view sees, because arm, camera or object hide it."
         ],
     )

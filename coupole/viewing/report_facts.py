@@ -47,7 +47,7 @@ def light(events: Sequence[Event], views: Iterable[SampledView], run_status: Sta
     """The dose by view, at the point of the object that received most."""
     total = run_dose.lux_h_of_points(events)
     if not total:
-        words = "The journal has no light: it was not recorded, or none was given."
+        words = "The journal has no entry of light: it was not recorded, or no light was given."
         return Section("light", "Light on the object", notes=[words])
     point = total.index(max(total))
     rows = []
@@ -59,7 +59,7 @@ def light(events: Sequence[Event], views: Iterable[SampledView], run_status: Sta
     return Section(
         "light",
         "Light on the object",
-        tables=[Table("Light on the point that received most", ("view", "lux h"), rows)],
+        tables=[Table("Light on the point that received the most light", ("view", "lux h"), rows)],
         notes=["A burst in which a session was killed counts as it was planned."] if was_killed else [],
     )
 

@@ -80,7 +80,7 @@ def exposures(views: Sequence[SampledView], scaling: str) -> Section:
     return Section(
         "exposure",
         "Exposure",
-        words=[f"The light is simulated: {scaling}. A real cell's may differ."] if scaling else [],
+        words=[f"The light is simulated: {scaling}. The exposure in a real cell may differ."] if scaling else [],
         tables=[Table("Exposure of each view, by pictures spread over its lights", head, rows)],
         notes=[
             "Brightest: the highest 99.9 % quantile of a picture, as a share of full scale above black. "
@@ -139,8 +139,8 @@ def coverages(coverage: Coverage) -> Section:
         },
         tables=[Table("What each view has of the object", _FRAMED, list(_framings(coverage)))],
         notes=[
-            "By the mesh, the measured poses and the rig's lens. Of the arm, which may stand in a view's way, "
-            "nothing is counted; nor which lights reach a point."
+            "By the mesh, the measured poses and the rig's lens. It does not consider whether the arm hides a "
+            "point, nor which lights reach it."
         ],
     )
 

@@ -211,7 +211,7 @@ def show_status(console: Console, status: Status) -> None:
     )
     if status.stopped_pid:
         console.print(
-            f"  its process {status.stopped_pid} is stopped (Ctrl-Z, SIGSTOP): nothing goes on; `kill -CONT "
+            f"  its process {status.stopped_pid} is stopped (Ctrl-Z, SIGSTOP): nothing continues; `kill -CONT "
             f"{status.stopped_pid}` lets it run again, and the run then asks a person (`coupole go-on`)",
             markup=False,
         )
@@ -227,15 +227,15 @@ def show_status(console: Console, status: Status) -> None:
         console.print("  reflectance:", Text(status.processing.words), soft_wrap=True)
         if status.processing.remedy:
             console.print(
-                f"  goes on from what is there: {status.processing.remedy}", markup=False, soft_wrap=True
+                f"  continue from the present state by: {status.processing.remedy}", markup=False, soft_wrap=True
             )
     for fault in status.faults:
         console.print("  [red]fault:[/]", Text(fault))
     if status.go_on:
-        console.print(f"  left to take: {status.left_in_words}; go on with")
+        console.print(f"  left to take: {status.left_in_words}; continue with")
         if status.before_that:
             console.print(f"  {status.before_that}", markup=False, soft_wrap=True)
-            console.print("  (the arm is in a fault: find the cause, see that the cell is clear), and then")
+            console.print("  (the arm has a fault: find the cause, check that the cell is clear), and then")
         console.print(f"  {status.go_on}", markup=False, soft_wrap=True)
 
 

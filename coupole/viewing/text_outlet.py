@@ -149,7 +149,8 @@ def install() -> None:
 
 def full_stdout() -> str:
     """Return why standard output does not take what was written to it; empty if it does, or if its reader has
-    gone. What it did not take is dropped."""
+    gone. Text that it did not take is dropped.
+    """
     try:
         sys.stdout.flush()
     except BrokenPipeError:

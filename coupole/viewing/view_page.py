@@ -42,7 +42,7 @@ show();
 """
 """`{plot_id}` is Plotly's."""
 _BUTTONS = [["toImage"], ["orbitRotation", "tableRotation", "pan3d", "zoom3d"], ["resetCameraDefault3d"]]
-"""None of those that would send the drawing to a server."""
+"""Buttons that would send the drawing to a server are left out."""
 
 
 def write_page(scene: Scene, path: Path) -> None:

@@ -255,7 +255,7 @@ def _column(pen: Any, scene: Scene, x: int, top: int) -> None:
     colour = colours.css(colours.RED if scene.refusals else colours.INK)
     pen.text((x, top + 16), "refused" if scene.refusals else "legs", colour, _font(15), anchor="ls")
     if len(rows) > _ROWS:
-        rows = [*rows[: _ROWS - 1], f"and {len(rows) - _ROWS + 1} more lines; the page has them all"]
+        rows = [*rows[: _ROWS - 1], f"and {len(rows) - _ROWS + 1} more lines; the page has all of them"]
     for row, line in enumerate(rows):
         pen.text((x, top + 40 + 19 * row), line, colour, _font(14), anchor="ls")
 
@@ -265,7 +265,7 @@ def _legend(pen: Any, bottom_left: tuple[int, int]) -> None:
     x, y = bottom_left
     for k in range(120):
         pen.line((x + k, y - 10, x + k, y), colours.css(colours.of_share(k / 119)))
-    note = "LEDs: share of what the camera sees that they reach, 0 to 100 %, mean of the views"
+    note = "LEDs: share of the visible surface that they reach, 0 to 100 %, mean of the views"
     pen.text((x + 130, y - 5), note, colours.css(colours.INK), _font(13), anchor="lm")
     for row, (colour, words) in enumerate(
         (

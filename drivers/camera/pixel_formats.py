@@ -1,6 +1,6 @@
 """Pixel formats of GenICam cameras (PFNC), and the unpacking of packed pixels to 16-bit numbers.
 
-Formats of 10 to 16 bits in two bytes are used as received. Those of one byte, and packed ones, are widened to
+Formats of 10 to 16 bits in two bytes are used as received. Formats of one byte, and packed formats, are widened to
 16-bit frames.
 """
 

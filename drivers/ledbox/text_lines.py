@@ -1,9 +1,9 @@
 """An LED box controlled by lines of text only, such as a dome built with a microcontroller.
 
-Each command is a line made from a template in the rig; the box answers each with one line. Such
-a box has no table, log, clock or watchdog. Therefore this driver limits the light: a thread ends each flash in
-time, whatever the caller does, and all LEDs are switched off at opening, at closing and after any failure. It has
-no device clear either: `lights_off` waits for the rest of a line, but for no answer.
+Each command is a line made from a template in the rig; the box answers each with one line. A box of this kind has
+no table, log, clock or watchdog. Therefore this driver limits the light: a thread ends each flash in time,
+whatever the caller does, and all LEDs are switched off at opening, at closing and after any failure. It has no
+device clear either: `lights_off` waits for the rest of a line, but for no answer.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ class TextLineBox:
         }
 
     def presence(self) -> bool | None:
-        """Such a box has no input for an enabling switch."""
+        """A box of this kind has no input for an enabling switch."""
         return None
 
     def flash(self, led: int, on_us: int) -> None:

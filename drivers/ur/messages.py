@@ -62,7 +62,7 @@ class Ask:
     speed: float = 1.0
     """Share of the configured speed."""
     looks: bool = False
-    """Whoever watches the motion asks: the motion goes on."""
+    """The supervisor of the motion asks for it: the motion continues."""
 
 
 @dataclass(frozen=True)

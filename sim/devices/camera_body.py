@@ -126,7 +126,7 @@ class Surroundings:
     disturbance: Callable[[int], Disturbance] = lambda _: CALM
     """Disturbance of an exposure that begins at a world time, ns."""
     on_exposed: Callable[[int, int, int, int, int], None] = lambda *_: None
-    """Told of each exposure that has ended: number, frame id, timestamp ns, world times ns of start and end."""
+    """Called for each exposure that has ended: number, frame id, timestamp ns, world times ns of start and end."""
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,7 @@ class GigeServer:
     # -- control ------------------------------------------------------------------------------------------
 
     def _answer(self, port: socket.socket) -> None:
-        """One datagram of a client. What is no command is ignored."""
+        """One datagram of a client. Data that are not a command are ignored."""
         data, client = port.recvfrom(2048)
         if len(data) < _HEADER.size or data[0] != _KEY:
             return
@@ -238,7 +238,7 @@ class GigeServer:
         self._registers.set_integer(reg.SESSION, self._sessions if on else 0)
 
     def _fit_image(self) -> None:
-        """An image that has become larger than the sensor gives is made whole; a smaller one stays as it is."""
+        """An image that is larger than the sensor gives is completed; a smaller one stays as it is."""
         registers = self._registers
         for size, offset, most, step in (
             (reg.WIDTH, reg.OFFSET_X, registers.widest(), 4),

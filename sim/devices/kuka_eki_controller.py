@@ -286,8 +286,9 @@ class KukaEkiController:
         self._timer = self._reactor.after(self._settings.status_ms / 1e3, self._cycle)
 
     def _send(self, status: bytes) -> None:
-        """A client that has not read for `write_limit_s` holds the world no longer: until it reads it misses
-        statuses; each that it gets is whole."""
+        """A client that has not read for `write_limit_s` does not hold up the world any more. Until it reads it
+        misses statuses; each status that it gets is complete.
+        """
         assert self._client is not None
         self._unsent = self._unsent or status
         while self._unsent:

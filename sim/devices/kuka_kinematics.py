@@ -68,8 +68,8 @@ class PoseErrors:
     """Difference between the true flange pose and the controller's; reproducible by seed.
 
     Standard deviations per coordinate. An arm's absolute errors are drawn once: the flange's position in base
-    coordinates, and the zero of each axis, which gives an error that varies over the cell. Those of
-    repeatability are drawn for each stop: position, and a rotation vector in the flange's coordinates.
+    coordinates, and the zero of each axis, which gives an error that varies over the cell. Errors of repeatability
+    are drawn for each stop: position, and a rotation vector in the flange's coordinates.
     """
 
     seed: int

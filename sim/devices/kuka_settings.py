@@ -75,8 +75,9 @@ class Settings(_Model):
     corrects: Literal["axes", "pose"] = "axes"
     mode: Literal["absolute", "relative"] = "absolute"
     hold_on: bool | None = None
-    """HOLDON of the corrections: in a cycle without answer the last one is kept, else zero is applied. None: the
-    right one for the mode, on for absolute and off for relative."""
+    """HOLDON of the corrections: in a cycle without answer the last one is kept, else zero is applied. None
+    selects the right one for the mode: on for absolute, off for relative.
+    """
     limits: Limits = Limits()
 
     lock_step: bool = True

@@ -68,7 +68,8 @@ class TextBox:
 
     def mute(self, seconds: float | None = None) -> None:
         """The box neither receives nor answers, for ever or for `seconds`; lit LEDs stay lit until they are due.
-        What comes meanwhile is lost."""
+        Data that arrive meanwhile are lost.
+        """
         if seconds is None:
             self._link.mute()
             return

@@ -1,8 +1,8 @@
 """Interreflection: light that meets two or more surfaces, from patch to patch (radiosity by final gathering).
 
 The scene's triangles are grouped into patches of like normal. From points on both sides of each patch, rays in a
-cosine distribution tell once which sides of patches it sees. Then, for each light, the irradiance of all patches
-is gathered bounce by bounce: a side receives the mean over its rays of what the others reflect.
+cosine distribution determine once which sides of patches it sees. Then, for each light, the irradiance of all
+patches is gathered bounce by bounce: a side receives the mean over its rays of what the others reflect.
 
 All surfaces reflect this light as if they were diffuse, with their diffuse reflectance and that along the normal:
 right for matt surfaces, an approximation for glossy ones, and wrong in direction for mirrors. Concave places finer

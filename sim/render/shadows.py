@@ -18,7 +18,7 @@ _Bits = NDArray[np.uint8]
 class Shadows:
     """Table of bits [LED, side of a triangle], filled as views and LEDs require.
 
-    Sides get their places in it when a view first shows them. What exceeds `memory_bytes` is not kept: first the
+    Sides get their places in it when a view first shows them. Bits beyond `memory_bytes` are not kept: first the
     sides of earlier views, then LEDs that come late.
     """
 

@@ -1,7 +1,7 @@
 """The folder of a running world: clock, sockets; in memory where the machine has such a place.
 
-A world that is killed cannot remove its folder, so the next one removes those of worlds that are gone: each holds
-a lock on its own for as long as it lives.
+A world that is killed cannot remove its folder, so the next world removes the folders of worlds that are gone.
+Each world holds a lock on its own folder as long as it lives.
 """
 
 from __future__ import annotations

@@ -116,8 +116,8 @@ def test_nobody_is_sent_to_the_cell_while_the_arm_may_move_on_by_itself(
     supervisor.go(VISIT)
     assert arm.done == ["move", "stop", "move"]
     (text,) = told
-    assert ("See that the cell is clear, then go on" in text) == asks == bool(stood)
-    assert ("It may move on by itself at any moment: keep clear of it" in text) != asks
+    assert ("Check that the cell is clear, then continue" in text) == asks == bool(stood)
+    assert ("It may move again by itself at any moment: keep clear of it" in text) != asks
 
 
 @pytest.mark.parametrize(("late_s", "done"), [(0.0, ["move"]), (2.0, ["move", "halt"])])

@@ -155,7 +155,7 @@ def test_a_stop_that_takes_longer_than_promised_is_found(wrong: Bench) -> None:
 def test_swapped_leds_are_named_and_no_others(wrong: Bench) -> None:
     lamp_step.lamps(wrong)
     assert missed(wrong) == [
-        *(f"LED {led}: from its place in the table" for led in SWAPPED),
+        *(f"LED {led}: angle from its place in the table" for led in SWAPPED),
         "largest deviation from the LED table",
     ]
 
@@ -217,7 +217,7 @@ def test_a_watchdog_that_is_off_is_found_and_the_light_goes_out_all_the_same(
     box: Any = wrong.opened.ledbox
     box._scpi.ask(":SYST:WATC 0", 0)
     light_timing.watchdog(wrong)
-    assert "last light after the host fell silent" in missed(wrong)
+    assert "last light after the host's last command" in missed(wrong)
     assert "watchdogs that the box does not report" in missed(wrong)
     assert _world(wrong_cell).ask("state")["shining"] == []
 

@@ -72,11 +72,11 @@ def test_a_cell_without_a_switch_passes_and_its_record_says_so(tmp_path: Path) -
     bench = bench_with(Box(None), Onlooker())
     presence_step.presence(bench)
     assert missed(bench) == []
-    assert "nothing tells whether anybody is at the cell" in bench.findings.remarks[0]
+    assert "nothing shows whether anybody is at the cell" in bench.findings.remarks[0]
 
 
 def test_a_cell_whose_rig_has_a_switch_needs_one() -> None:
-    with pytest.raises(StepFailedError, match="tells of no input"):
+    with pytest.raises(StepFailedError, match="reports no input"):
         presence_step.presence(bench_with(Box(None), Onlooker(), must_exist=True))
 
 

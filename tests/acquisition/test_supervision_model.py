@@ -25,29 +25,29 @@ from supervision_model import (
 )
 
 PROMISES: dict[str, Callable[[State], bool]] = {
-    "An arm that moves was looked at by the supervising thread within 0.1 s and a cycle, or it brakes": (
+    "The supervising thread has checked a moving arm within 0.1 s and a cycle, or the arm brakes": (
         lambda now: now.arm != MOVES or now.unwatched <= ATTENTION + 1 or now.unanswered > 0
     ),
     "An arm that is not answered brakes within the controller's limit": (
         lambda now: now.arm != MOVES or now.unanswered <= DELAY_LIMIT
     ),
-    "Nothing moves the arm once its controller has ended RSI, whoever wakes up": lambda now: (
+    "Once the controller has ended RSI, nothing moves the arm, whichever process continues": lambda now: (
         not (now.lost and now.arm == MOVES)
     ),
     "Lamps are dark when the session has not spoken to the box for the watchdog's time": (
         lambda now: not now.lamps or now.unspoken <= WATCHDOG
     ),
-    "After a freeze that asks, and after Ctrl-Z, nothing moves or shines before a person's word": (
+    "After a freeze that needs a confirmation, or Ctrl-Z, nothing moves or is lit before a person confirms": (
         lambda now: not (now.owed and now.since >= AT_ONCE and (now.lamps or now.arm == MOVES))
     ),
-    "A person's word ends no hold that is still being made safe, or at which the session does not stand yet": (
+    "A confirmation ends no pause while the cell is still being made safe, or before the session has paused": (
         lambda now: now.pause or not (now.held or now.halting)
     ),
-    "After a stop nothing moves or shines": (
+    "After a stop nothing moves and no LED is lit": (
         lambda now: not (now.stop and now.since >= AT_ONCE and (now.lamps or now.arm == MOVES))
     ),
-    "A motion that is looked at in time is never ended by the watch": lambda now: not now.false_lapse,
-    "Ctrl-Z stops the process when all is safe; only what was allowed before the hold may have come after it": (
+    "A motion that is checked in time is never ended by the watch": lambda now: not now.false_lapse,
+    "Ctrl-Z stops the process when all is safe; only an action that was allowed before the pause may follow": (
         lambda now: now.signals != SUSPENDED or not (now.lamps or now.arm == MOVES) or now.slipped or now.unsure
     ),
 }

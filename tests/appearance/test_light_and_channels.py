@@ -126,5 +126,5 @@ def test_a_narrow_band_of_light_reads_the_spectrum_at_its_wavelength() -> None:
 
 
 def test_a_light_that_a_channel_does_not_see_is_refused() -> None:
-    with pytest.raises(InputError, match="sees nothing"):
+    with pytest.raises(InputError, match="sees none of it"):
         channels.channel_weights(np.zeros(BANDS), light.camera())

@@ -94,7 +94,7 @@ def test_an_uneven_panel_does_not_pass_for_the_lens() -> None:
 
 def test_views_that_are_not_shifted_are_refused() -> None:
     views = random_field(1).views(np.random.default_rng(2), ((0, 0, 0),) * 4)
-    with pytest.raises(InputError, match="cannot tell the panel's unevenness"):
+    with pytest.raises(InputError, match="cannot separate the panel's unevenness"):
         fitted(views)
 
 

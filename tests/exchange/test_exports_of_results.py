@@ -269,7 +269,7 @@ def test_an_adaptive_bsdf_that_cannot_be_is_refused(
     ended = cells.here(*asked)
     assert ended.code == 2
     assert re.search(
-        r"--adaptive 0.001: triangle\d+: a table of 0 MB misses its fit by", " ".join(ended.err.split())
+        r"--adaptive 0.001: triangle\d+: a table of 0 MB differs from its fit by", " ".join(ended.err.split())
     )
 
 

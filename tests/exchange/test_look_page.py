@@ -213,7 +213,7 @@ def test_samples_of_an_earlier_version_are_refused(tmp_path: Path) -> None:
         del file.attrs["lateral_u_mm"]
     ended = cells.here("show", tmp_path / "old", "--samples", "--out", tmp_path / "look.html")
     assert ended.code == 2
-    assert "make the result anew" in " ".join(ended.err.split())
+    assert "make the result again" in " ".join(ended.err.split())
 
 
 def test_a_page_of_another_name_is_refused(result: Path, tmp_path: Path) -> None:
@@ -258,4 +258,4 @@ def test_a_result_without_uncertainty_is_refused(tmp_path: Path) -> None:
         del file["covariance"]
     ended = cells.here("show", tmp_path / "old", "--out", tmp_path / "look.html")
     assert ended.code == 2
-    assert "make the result anew" in " ".join(ended.err.split())
+    assert "make the result again" in " ".join(ended.err.split())

@@ -361,7 +361,7 @@ def wrong_after_resuming(cell: CellFolder, run: Path | None, ended: Ended) -> li
     again = ("--resume", run) if run is not None else ()
     with cell.world():
         resumed = cell.acquire(*again)
-        if resumed.code == 4 and "word of a person" in resumed.err:
+        if resumed.code == 4 and "confirmation by a person" in resumed.err:
             cell.confirm()
             resumed = cell.acquire(*again)
     if resumed.code != 0:

@@ -48,7 +48,7 @@ def told(cell: CellFolder, ended: Ended, *words: str) -> None:
 def can_be_resumed(cell: CellFolder) -> None:
     with cell.world():
         resumed = cell.acquire("--resume", cell.run_folder)
-        if resumed.code == 4 and "word of a person" in resumed.err:
+        if resumed.code == 4 and "confirmation by a person" in resumed.err:
             cell.confirm()
             resumed = cell.acquire("--resume", cell.run_folder)
     assert resumed.code == 0, resumed

@@ -117,7 +117,7 @@ def test_after_a_fault_of_the_arm_nothing_moves_without_a_persons_word_and_yes_d
         for again in (("--resume", run), ("--output", joining.folder / "elsewhere")):
             ended = joining.acquire(*again, "--yes", typed="y\n")
             assert ended.code == 4, ended
-            assert "robot: expected the word of a person" in ended.document["error"]
+            assert "robot: expected a confirmation by a person" in ended.document["error"]
             assert "emergency stop" in ended.err
         live = cells.here("live", joining.plan, "--yes")
         assert live.code == 4, live
@@ -165,7 +165,7 @@ def test_an_arm_that_is_not_confirmed_to_be_at_rest_counts_as_a_fault_of_the_cel
     (fault,) = ArmFaults(joining.folder / "storage" / "state").standing()
     assert "arm stopped" in fault.message
     with joining.world():
-        assert "word of a person" in joining.acquire("--resume", joining.run_folder).err
+        assert "confirmation by a person" in joining.acquire("--resume", joining.run_folder).err
 
 
 def test_an_arm_pushed_in_a_burst_that_springs_back_has_just_that_burst_taken_again(joining: CellFolder) -> None:

@@ -97,7 +97,7 @@ def test_a_film_that_hides_its_ground_tells_no_scattering() -> None:
 
 def test_films_that_are_alike_are_refused() -> None:
     one = Film(np.full(3, 0.3), np.full(3, 0.9), "white")
-    with pytest.raises(InputError, match="cannot tell K from S"):
+    with pytest.raises(InputError, match="cannot separate K from S"):
         layer_fit.fit([one, one], FACE, NOISE)
 
 

@@ -86,7 +86,7 @@ def test_every_picture_says_that_it_is_a_hypothesis_and_names_its_sources(restor
             told = opened.info
             strip = np.asarray(opened.convert("L"))[PX:]
         assert "ypothesis" in told["Description"]
-        assert "no photograph" in told["Disclaimer"]
+        assert "not a photograph" in told["Disclaimer"]
         assert (LETTER in told["Sources"]) == ("light" in path.as_posix() or "side" in path.name)
         assert strip.max() > 120, "words below the picture"
     attributes = restored.exr("light")[0]

@@ -218,7 +218,7 @@ def test_all_mistakes_of_a_plan_are_reported_in_the_order_of_the_file(tmp_path: 
 def test_a_plan_that_shoots_nothing_is_refused(tmp_path: Path) -> None:
     text = changed(changed(PLAN, "{kind: all}", "{kind: none}"), "darks_per_view: 2", "darks_per_view: 0")
     (problem,) = problems_of(tmp_path, text, Plan)
-    assert "would shoot nothing" in problem.message
+    assert "takes no frame" in problem.message
 
 
 @given(

@@ -111,7 +111,7 @@ def test_pixels_that_show_nothing_do_not_lengthen_the_exposure() -> None:
 
 def test_a_view_of_nothing_is_said_to_be_one() -> None:
     advice = advise({"top": metered([np.zeros(PIXELS)] * 4)}, Request(), longest_us=200_000)
-    assert "view top: nothing but noise is seen" in advice.remarks[0]
+    assert "view top: the pictures show only noise" in advice.remarks[0]
 
 
 def test_pictures_that_are_all_saturated_ask_for_another_metering() -> None:

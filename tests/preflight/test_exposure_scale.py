@@ -57,7 +57,7 @@ def test_without_a_figure_for_this_lens_nothing_is_known(told: dict[str, float] 
 
 def test_check_says_that_it_does_not_know_and_how_to_make_it_known(cell: CellFolder) -> None:
     ended = cells.here("check", cell.plan, "--no-paths")
-    assert "not known; `white_response` in the rig makes it known" in " ".join(ended.err.split())
+    assert "not known; set `white_response` in the rig" in " ".join(ended.err.split())
 
 
 @pytest.mark.parametrize(

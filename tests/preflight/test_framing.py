@@ -174,7 +174,10 @@ def test_a_mesh_that_may_have_another_unit_is_warned_of(cell: CellFolder) -> Non
         ({"abc_deg": [0, 0, 180]}, "object thing: it reaches 60.0 mm into the disk"),
         ({"translation_mm": [900, 0, 0]}, "object thing: it is beside the disk"),
         ({"translation_mm": [300, 0, 0]}, "view top: object thing is out of its field"),
-        ({"translation_mm": [0, 0, 200]}, "view top: nothing of object thing is in focus: what it sees is 75 "),
+        (
+            {"translation_mm": [0, 0, 200]},
+            "view top: nothing of object thing is in focus: the visible part is 75 ",
+        ),
     ],
     ids=["in-the-disk", "upside-down", "beside-the-disk", "out-of-the-field", "out-of-focus"],
 )

@@ -83,4 +83,4 @@ def test_the_test_of_a_disk_leaves_nothing_and_never_writes_into_the_reserve(tmp
 def test_a_frame_that_is_no_multiple_of_a_page_is_warned_of() -> None:
     assert RIG is not None
     rig = rig_of(sensor={**RIG.sensor.model_dump(), "width_px": 500})
-    assert "500 x 384 is no multiple of 4096 bytes" in checked(plan_of(), rig).warnings[0]
+    assert "500 x 384 is not a multiple of 4096 bytes" in checked(plan_of(), rig).warnings[0]

@@ -159,7 +159,7 @@ def test_what_colmaps_own_bundle_adjustment_finds_is_taken(tmp_path: Path) -> No
             pycolmap.Rotation3d(np.array([*random.normal(0, 2e-3, 3), 1.0])), random.normal(size=3)
         )
         image.frame.set_cam_from_world(1, push * image.cam_from_world())
-    with pytest.raises(InputError, match="from where the records have it"):
+    with pytest.raises(InputError, match="from its place in the records"):
         read_poses(written(model, tmp_path / "pushed"), measured)
     options = pycolmap.BundleAdjustmentOptions(
         refine_focal_length=False, refine_principal_point=False, refine_extra_params=False, print_summary=False
@@ -184,7 +184,7 @@ def test_poses_that_the_records_do_not_allow_are_refused(tmp_path: Path) -> None
     shifted = np.stack([view.base_from_camera for view in measured.views])
     shifted[2, :3, 3] += [0.0, 0.0, 4.0]
     with pytest.raises(
-        InputError, match=r"the camera of right is .* from where the records have it, after a similarity to the 4"
+        InputError, match=r"the camera of right is .* from its place in the records, after a similarity to the 4"
     ):
         read_poses(written(model_of(measured, shifted), tmp_path / "shifted"), measured)
     turned = np.stack([view.base_from_camera for view in measured.views])

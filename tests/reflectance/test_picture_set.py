@@ -97,7 +97,7 @@ def test_the_mask_says_what_is_fitted_and_intensities_may_be_one_number(folder: 
         ("lights.lp", "1\n9.png 0 0 1\n", "at least 6 are needed"),
         ("intensities.txt", "1\n1\n", "expected 6 lines of positive intensities, got 2"),
         ("intensities.txt", "1\n" * 5 + "-1\n", "positive intensities"),
-        ("mask.png", "no picture", "is no picture that can be read"),
+        ("mask.png", "no picture", "is not a readable picture"),
     ],
 )
 def test_what_is_wrong_is_refused_with_its_place(

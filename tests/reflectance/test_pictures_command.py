@@ -164,7 +164,7 @@ def test_options_of_pictures_are_refused_with_runs(tmp_path: Path) -> None:
     for options in (["--srgb"], ["--lights", "a.lp"], ["--intensities", "a.txt"], ["--mask", "a.png"]):
         ended = cells.here("reflectance", tmp_path / "run", *options, "--out", tmp_path / "out", "--json")
         assert ended.code == 2
-        assert "go with --pictures alone" in ended.document["error"]
+        assert "need --pictures, not runs" in ended.document["error"]
 
 
 def test_an_environment_with_one_sun_is_that_direction(made: Made, tmp_path: Path) -> None:

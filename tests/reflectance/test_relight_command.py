@@ -107,7 +107,7 @@ def test_white_of_a_video_is_its_brightest_thousandth_without_a_number(folder: P
         (["--direction", "0,0,1", "--view", "side"], "--view: expected one of top"),
         (["--direction", "0,0,1", "--fit", "best"], "--fit: expected one of ggx"),
         (["--direction", "0,0,1", "--fit", "sh"], "has no fit sh"),
-        (["--direction", "0,0,1", "--from", "0,0,300", "--view", "top"], "--view: a camera anywhere"),
+        (["--direction", "0,0,1", "--from", "0,0,300", "--view", "top"], "--view: a free camera"),
         (["--direction", "0,0,1", "--from", "0,0,300", "--fit", "rbf"], "rbf holds for the view"),
         (
             ["--direction", "0,0,1", "--from", "0,0,300", "--look-at", "0,0,400", "--field-of-view", "9"],

@@ -217,7 +217,7 @@ def test_leds_that_arm_and_object_hide_are_not_chosen_though_they_are_only_marke
 def test_a_limit_that_allows_no_led_is_refused(tmp_path: Path, until: dict[str, float]) -> None:
     refused = _cell(tmp_path, until={"lights": 60, **until}).acquire()
     assert refused.code == 3
-    assert "allow not one LED" in refused.out + refused.err
+    assert "do not allow a single LED" in refused.out + refused.err
 
 
 def test_fewer_leds_than_errors_can_be_told_from_are_all_lit(tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ def test_a_path_is_shown_before_it_is_driven(asked: Bench, cell: CellFolder, wor
     assert np.allclose(joints_deg(world), path["waypoints_deg"][-1], atol=0.01)
     assert world.ask("state")["t_s"] - begun_s > 0.9 * (path["duration_s"] - 0.3)
     refused = asked.ask("drive", path=path["path"])
-    assert "plan it anew" in refused["error"], "the arm is elsewhere now"
+    assert "plan it again" in refused["error"], "the arm is elsewhere now"
     assert np.allclose(joints_deg(world), path["waypoints_deg"][-1], atol=0.01)
     asked.drive("park")
     assert np.allclose(joints_deg(world), PARK_DEG, atol=0.01)
@@ -131,7 +131,7 @@ def test_a_drive_is_stopped_on_its_way(asked: Bench, world: World) -> None:
     assert asked.ended_work()["state"] == "stopped"
     assert abs(stopped_deg[0] - HOME_DEG[0]) > 3.0
     assert np.allclose(joints_deg(world), stopped_deg, atol=0.05)
-    assert "plan it anew" in asked.ask("drive", path=path["path"])["error"]
+    assert "plan it again" in asked.ask("drive", path=path["path"])["error"]
     asked.drive("home")
 
 
@@ -354,7 +354,7 @@ def test_a_stopped_bench_is_named_by_who_asks_it_moves_nothing_later_and_says_wh
     finally:
         stopped.send_signal(signal.SIGCONT)
     assert given_up.code == 130
-    assert "given up without an answer: nothing moves or shines by it later" in given_up.err
+    assert "given up without an answer: it will not move the arm or light an LED later" in given_up.err
     ended = cells.finish(stopped)
     assert ended.code == 130
     assert "the program did not run for" in ended.err

@@ -39,7 +39,7 @@ def test_a_full_standard_output_is_told_in_one_sentence(
     ended = dose(tmp_path, "vase", "--json", streams=">/dev/full")
     assert ended.code == 6
     told = ended.err.strip().splitlines()
-    assert told[-1] == "standard output: No space left on device; what was printed there is not complete"
+    assert told[-1] == "standard output: No space left on device; the text printed there is not complete"
     assert "Traceback" not in ended.err
 
 

@@ -130,9 +130,9 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("file", "at", "value", "said"),
     [
         ("plan", "exposure.exposure_us", 16000, "exposed for 8000 us, where the run's plan has 16000 us"),
-        ("plan", "views.0.distance_mm", 355, "mm and 0.00 deg from where the run's plan has it"),
+        ("plan", "views.0.distance_mm", 355, "mm and 0.00 deg from its pose in the run's plan"),
         ("plan", "lights.ids.1", 701, "the run's plan has no such shot"),
-        ("rig", "flange_from_camera.abc_deg.0", 5.0, "deg from where the run's plan has it"),
+        ("rig", "flange_from_camera.abc_deg.0", 5.0, "deg from its pose in the run's plan"),
     ],
 )
 def test_frames_that_are_not_what_the_kept_plan_says_are_named(

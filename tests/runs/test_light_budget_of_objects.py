@@ -146,7 +146,7 @@ def test_the_budget_is_shown_before_and_after_a_run(real: CellFolder) -> None:
 
 def test_an_object_without_a_budget_is_remarked_upon_on_a_real_cell(real: CellFolder) -> None:
     warnings = cells.here("check", real.plan, "--no-paths", "--json").document["warnings"]
-    assert any("nobody has said how much light it may receive" in one for one in warnings)
+    assert any("nobody has set how much light it may receive" in one for one in warnings)
 
 
 def test_two_cells_at_once_give_one_object_no_more_than_its_budget(tmp_path: Path) -> None:

@@ -239,7 +239,7 @@ def test_a_live_view_that_was_suspended_by_ctrl_z_does_not_light_again_and_says_
         assert ended.code == 130
         assert "which then ends" in ended.err
         assert "suspended by Ctrl-Z" in ended.err
-        assert "cannot stand and go on, so it was ended" in ended.err
+        assert "cannot pause, so it was ended" in ended.err
         assert not world.ask("state")["shining"]
 
 

@@ -99,7 +99,7 @@ def test_a_box_that_falls_silent_counts_as_released(at_cell: tuple[Bench, World]
         cells.wait_until(lambda: abs(a1_deg(world) - start_deg) > 1.0, "a motion")
         world.ask("fault", fault={"kind": "mute_box", "seconds": 0.8})
         work = asked.ended_work()
-    assert work["ended"] == "the enabling switch was not heard of for 300 ms"
+    assert work["ended"] == "the enabling switch was not reported for 300 ms"
 
 
 def test_a_cell_without_one_says_so_and_is_moved_all_the_same(tmp_path: Path) -> None:

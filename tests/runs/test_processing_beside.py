@@ -154,7 +154,7 @@ def test_a_run_ends_as_it_would_when_the_processing_is_killed_and_what_is_there_
     said = frames_alone_count(ended)
     assert not said["is_whole"]
     assert "killed by signal 9" in said["why"]
-    assert "The acquisition goes on without it" in ended.err
+    assert "The acquisition continues without it" in ended.err
     told = status(cell.run_folder)
     assert told["state"] == "ended"
     assert told["remedy"] == f"coupole reflectance {cell.run_folder} --out {result_of(cell)}"

@@ -273,6 +273,6 @@ def test_what_does_not_fit_is_refused_with_the_remedy(made: Made, tmp_path: Path
     assert "is not empty" in refused("refine", *made.words, "--out", made.out)
     assert "is a file: name a folder" in refused("refine", *made.words, "--out", made.out / "refined.json")
     true_mesh = [made.cell.folder / "waves.ply" if word == made.drawn.mesh else word for word in made.words]
-    assert "another mesh" in refused("extract", *true_mesh, "--refined", made.out, *out)
+    assert "a mesh other than" in refused("extract", *true_mesh, "--refined", made.out, *out)
     assert "`coupole reflectance refine RUN" in refused("extract", *made.words, "--refined", tmp_path, *out)
     assert not (tmp_path / "none").exists()

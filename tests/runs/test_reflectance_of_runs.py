@@ -227,7 +227,7 @@ def test_runs_of_one_object_are_fitted_together(made: Made, tmp_path: Path) -> N
         "reflectance", runs[0], moved.document["run"], "--calibrations", RECORDS, "--out", tmp_path / "b"
     )
     assert ended.code == 2
-    assert "shows another object, or in another place" in ended.err
+    assert "shows another object, or the object in another place" in ended.err
 
 
 def test_a_mesh_whose_normals_are_off_is_mended(made: Made, tmp_path: Path) -> None:

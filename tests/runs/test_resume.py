@@ -379,5 +379,5 @@ def test_a_run_whose_own_files_were_changed_names_them_and_no_command_that_does_
     assert refused.code == 2
     said = " ".join(refused.err.split())
     assert f"{path.relative_to(run)}: is not what manifest.sha256 lists" in said
-    assert "put back what was there" in said
+    assert "put the old files back" in said
     assert "own copies by" not in said

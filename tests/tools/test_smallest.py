@@ -97,6 +97,7 @@ TESTED_ELSEWHERE = {
     "bench_console.py": "tests/tools/test_smallest.py",
     "check_sizes.py": "tests/tools/test_check_sizes.py",
     "check_words.py": "tests/tools/test_check_words.py",
+    "draw_sentences.py": "tests/tools/test_draw_sentences.py",
     "list_public_names.py": "tests/scripting/test_public_names.py",
     "make_architecture.py": "tests/docs/test_architecture.py",
     "make_dome.py": "tests/tools/test_make_assets.py",

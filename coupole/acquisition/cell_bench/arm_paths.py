@@ -64,7 +64,7 @@ class ArmPaths:
         return ShownPath(number, name, start_deg, visit, self.motion)
 
     def figures(self, path: ShownPath) -> dict[str, Any]:
-        """Return what a console shows of a path, as JSON's values only."""
+        """Return a path as a console shows it, with values of JSON only."""
         corners = [path.start_deg, *path.visit.leg.waypoints]
         along = shown_postures(corners)
         return {
@@ -124,7 +124,9 @@ class ArmPaths:
             self._jobs = {key: read_job(plan, self._cell.document.path)}
         job = self._jobs[key]
         if self._job is not None and not np.array_equal(job.shape.corners_mm, self._job.shape.corners_mm):
-            raise InputError(f"{plan}: its object is not, or does not lie, as that with which the bench was begun")
+            raise InputError(
+                f"{plan}: its object, or the place of its object, differs from that with which the bench was begun"
+            )
         return job
 
 

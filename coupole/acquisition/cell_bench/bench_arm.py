@@ -55,7 +55,7 @@ class BenchArm:
         self._paths.motion.bodies.is_clear(home_deg, home_deg + 0.1)  # compiled before anybody waits for it
 
     def state(self) -> dict[str, Any]:
-        """Posture, motion and what the controller tells of its safety."""
+        """Posture, motion and the controller's report of its safety."""
         arm = self._opened.robot.measured()
         joints_deg = np.array(arm.joints_deg)
         return {
@@ -98,7 +98,7 @@ class BenchArm:
         off_deg = float(np.abs(here_deg - path.start_deg).max())
         if off_deg > _SAME_PLACE_DEG:
             raise InputError(
-                f"path {number} begins {off_deg:.2f} deg from where the arm stands: plan it anew and look at it"
+                f"path {number} begins {off_deg:.2f} deg from where the arm stands: plan it again and look at it"
             )
         about = {"path": path.id, "to": path.to}
         work = Work(self._control, "drive", about, lambda control: self._follow(path, control))
@@ -132,7 +132,7 @@ class BenchArm:
     def _renew(self, request: JogAsked) -> dict[str, Any]:
         hold = self._hold
         if hold is None or hold.number != request.hold:
-            raise InputError(f"hold: {request.hold} has ended; let the button go and press it anew")
+            raise InputError(f"hold: {request.hold} has ended; release the button and press it again")
         if (request.axis, request.direction) == (hold.asked.axis, hold.asked.direction):
             hold.renew()
         else:
@@ -207,7 +207,7 @@ class _Hold:
         self._renewed_s = time.monotonic()
 
     def let_go(self) -> None:
-        self._ended = "the button was let go"
+        self._ended = "the button was released"
 
     def check(self) -> None:
         """Raise HoldLostError unless it is still held."""

@@ -15,8 +15,8 @@ from coupole.plan.cell import Cell
 _LONG_PATIENCE_S = 120.0
 """A path among many bodies, or a long exposure, takes a while."""
 _AT_ONCE = {"state", "stop", "jog", "drive"}
-"""Commands whose answer does not wait for what they begin or end."""
-_GIVEN_UP = "given up without an answer: nothing moves or shines by it later"
+"""Commands whose answer does not wait for the work that they begin or end."""
+_GIVEN_UP = "given up without an answer: it will not move the arm or light an LED later"
 _STOP_GIVEN_UP = "given up without an answer: the bench obeys the stop as soon as it runs again"
 
 

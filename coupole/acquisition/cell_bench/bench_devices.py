@@ -1,4 +1,4 @@
-"""The devices of a bench: who they are, how they are linked, what they last said."""
+"""The devices of a bench: their identities, links and last reports."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class BenchFrames:
         it was asked. Raises InputError, DoseBudgetReached, DeviceError."""
         self._refuse_what_there_is_not(request)
         if request.stops not in (None, stops):
-            raise InputError("frame: the bench was stopped since; look at its state, and ask anew")
+            raise InputError("frame: the bench was stopped meanwhile; look at its state, then ask again")
         with self._devices.in_use:
             before_lux_h = self._shots.given_lux_h
             shot = self._expose_lights(request, stops)
@@ -94,8 +94,9 @@ class BenchFrames:
         return {"number": number, "region": [*at_px, width_px, height_px], "picture": str(picture)}
 
     def dose(self) -> dict[str, Any]:
-        """Return the dose of this bench, and of the object if it is known. A ledger that cannot be read is the
-        `warning`: the rest is told all the same."""
+        """Return the dose of this bench, and of the object if it is known. A ledger that cannot be read gives the
+        `warning`; the other figures are returned all the same.
+        """
         meter, total_lux_h, left_lux_h, warning = self._meter, None, math.inf, ""
         if meter:
             try:
@@ -110,7 +111,7 @@ class BenchFrames:
         }
 
     def begin_counting(self) -> None:
-        """Begin to count from what the object's ledger says now. Raises StorageError."""
+        """Begin to count from the present state of the object's ledger. Raises StorageError."""
         job = self._job
         self._meter = FlashMeter(job, self._opened, "bench", 1.0) if job and job.plan.object else None
         self._shots = SingleShots(self._cell, self._opened, self._lux, self._meter)
@@ -120,7 +121,7 @@ class BenchFrames:
         self._shots.disarm()
 
     def end(self) -> None:
-        """Once the cell is safe: enter what was given, remove the pictures."""
+        """Once the cell is safe, enter the light that was given and remove the pictures."""
         self._settle()
         shutil.rmtree(self._folder, ignore_errors=True)
 

@@ -102,7 +102,7 @@ class FrameAsked(_Request):
     gains: _Gains = [1.0, 1.0, 1.0]
     """White point: factors of R, G, B in the JPEG."""
     stops: Annotated[int, Field(ge=0)] | None = None
-    """Number of stops as a state told it: nothing is lit if a stop came since."""
+    """Number of stops from a state: no LED is lit if a stop came since then."""
 
 
 class LoupeAsked(_Request):

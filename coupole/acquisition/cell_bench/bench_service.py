@@ -70,7 +70,7 @@ class BenchService:
         self.works = Works()
         self.closing = threading.Event()
         self.trouble: list[str] = []
-        """Sentences on what was not sure when the bench was closed."""
+        """Sentences on devices that were not surely safe when the bench was closed."""
         self._devices = BenchDevices(cell, opened_cell)
         self._arm = BenchArm(cell, opened_cell, job, self.works, control)
         self._frames = BenchFrames(cell, opened_cell, job, self._devices, self.works)
@@ -102,7 +102,7 @@ class BenchService:
             if self._ending or self.closing.is_set() or (begins and self._control.stop.is_set()):
                 raise InputError("the bench is closing")
             if begins and is_gone():
-                raise InputError("whoever asked has gone: not begun")
+                raise InputError("the caller has disconnected: not begun")
             return {"version": VERSION, **self._obey(request, stops)}
         except CoupoleError as error:
             if isinstance(error, DeviceError):
@@ -177,8 +177,9 @@ class BenchService:
         return work.figures()
 
     def _stop(self) -> list[str]:
-        """Stop everything; return what is not sure then. Pictures that are under way have ended, with their light,
-        when this returns."""
+        """Stop everything; return the devices that are not surely safe then. Pictures that are under way have
+        ended, with their light, when this returns.
+        """
         self.works.stop()
         trouble = unsure(self._opened.halt(), _STOPPED_WITHIN_S)
         if self.works.last is not None:
@@ -209,7 +210,7 @@ class BenchService:
         }
 
     def end(self) -> None:
-        """Stop what is under way, make the cell safe, enter the light that was given."""
+        """Stop the present work, make the cell safe, enter the light that was given."""
         self._ending = True
         self.closing.set()
         self._stop()
@@ -273,7 +274,7 @@ def serve_bench(
                     "cell",
                     expected="a metering that ends as it should",
                     happened=service.works.last.figures()["why"] if service.works.last else "it failed",
-                    remedy="The cell was made safe; begin the bench anew.",
+                    remedy="The cell was made safe; begin the bench again.",
                 )
             if service.idle_s > leave_after_s:
                 console.print(f"nobody has asked for {leave_after_s:g} s: closed")

@@ -13,7 +13,7 @@ from coupole.errors import CoupoleError, InputError, Interrupted
 
 
 class Work:
-    """One piece of work, and what has become of it."""
+    """One piece of work, and its outcome."""
 
     def __init__(
         self, session: Control, kind: str, about: dict[str, Any], act: Callable[[Control], dict[str, Any]]
@@ -79,7 +79,7 @@ class Works:
             work.begin()
 
     def stop(self) -> None:
-        """Returns at once; what was asked before and has not begun never begins."""
+        """Returns at once. Work that was requested before and has not begun never begins."""
         with self._lock:
             self.stops += 1
             if self.last is not None:

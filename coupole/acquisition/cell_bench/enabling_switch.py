@@ -38,8 +38,8 @@ class EnablingSwitch:
         if not self.exists:
             if self._must_exist:
                 raise InputError(
-                    "the rig has an enabling switch (`console: enabling_switch:`), but the LED box tells of no "
-                    "input for one: see its wiring and firmware"
+                    "the rig has an enabling switch (`console: enabling_switch:`), but the LED box reports no "
+                    "input for one: check its wiring and firmware"
                 )
             return
         if not self._box.presence():
@@ -77,7 +77,7 @@ class _Watch:
             self._resumed_s = now_s
         self._checked_s = now_s
         if not self._released and now_s - max(self._heard_s, self._resumed_s) > _NEWS_S:
-            self._released = f"the enabling switch was not heard of for {1e3 * _NEWS_S:g} ms"
+            self._released = f"the enabling switch was not reported for {1e3 * _NEWS_S:g} ms"
         if self._released:
             raise ReleasedError(self._released)
 

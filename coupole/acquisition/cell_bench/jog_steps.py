@@ -156,5 +156,5 @@ def _outwards(bodies: CellBodies, here_deg: Joints, there_deg: Joints) -> Joints
     along_deg = here_deg + np.linspace(0.0, 1.0, _SAMPLES)[:, None] * (there_deg - here_deg)
     closer = [np.diff(margins).min() < -_ROUNDING_MM for margins in bodies.margins(along_deg, 0.0).values()]
     if any(closer):
-        raise InputError(f"{bodies.contacts(here_deg)[0]}; from here the arm goes only away from it")
+        raise InputError(f"{bodies.contacts(here_deg)[0]}; from here the arm moves only away from it")
     return there_deg

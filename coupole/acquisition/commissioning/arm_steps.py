@@ -36,7 +36,7 @@ def cycle(bench: Bench) -> None:
     expects."""
     findings, robot, clock = bench.findings, bench.opened.robot, bench.opened.clock
     findings.remedy = (
-        "Set the driver's cycle to that of the controller's program, or mend the network between them."
+        "Set the driver's cycle to that of the controller's program, or repair the network between them."
     )
     bench.ask_before("Step cycle: the arm stands still while the controller's reports are counted.")
     driver, settings = device_for(bench.cell.rig, "robot", dry_run=False)
@@ -61,8 +61,8 @@ def cycle(bench: Bench) -> None:
 
 
 def axes(bench: Bench) -> None:
-    """Turn each axis by a few degrees: the measured change, and what the person sees, must be what the rig's arm
-    says.
+    """Turn each axis by a few degrees: the measured change, and the motion that the person sees, must agree with
+    the rig's arm.
 
     The angles that a controller reports are its own, so only the person can tell an axis that turns the wrong way.
     """
@@ -86,7 +86,7 @@ def axes(bench: Bench) -> None:
         is_as_described = bench.ask_whether(
             f"A{axis + 1} was turned by {turned_deg[axis]:+.2f} deg. "
             f"{_motion_text(bench, before_deg, turned_deg)} "
-            "Did you see just that?"
+            "Did you see exactly this?"
         )
         if not (right and is_as_described):
             findings.remedy = (
@@ -107,9 +107,9 @@ def stopping(bench: Bench) -> None:
     """
     findings = bench.findings
     findings.remedy = (
-        "Find what delays the stop (load of this machine, network, the controller's filters or override), or have "
-        "the "
-        "driver promise more: a lower acceleration_deg_s2 in the rig's `motion:`, as the controller really brakes."
+        "Find what delays the stop (load of this machine, network, the controller's filters or override), or "
+        "let the driver promise a larger angle: set acceleration_deg_s2 in the rig's `motion:` as low as the "
+        "controller really brakes."
     )
     bench.ask_before(
         "Step stopping: the arm makes three motions of all axes by at most 15 degrees, is stopped in the middle "
@@ -135,7 +135,7 @@ def stopping(bench: Bench) -> None:
     findings.remarks.append(
         f"at the greatest speeds of this session the arm turned on for as long as {1e3 * max(delays_s):.0f} ms of "
         "its "
-        "full speed; stops from the speeds of plans are not measured, since they exceed 250 mm/s"
+        "full speed; stops from the speeds of plans are not measured, because these exceed 250 mm/s"
     )
 
 
@@ -157,7 +157,7 @@ def _stopped_once(bench: Bench, shares: NDArray[np.float64]) -> tuple[NDArray[np
                 samples.append((state.t_ns, np.array(state.joints_deg)))
             if state.fault or deadline.has_expired:
                 robot.stop()
-                raise StepFailedError(f"the arm did not go where it was sent: {state.fault or 'too slow'}")
+                raise StepFailedError(f"the arm did not reach its target: {state.fault or 'too slow'}")
             bench.pause(_POLL_S)
         commanded_deg = bench.joints_deg()
         robot.stop()

@@ -23,8 +23,8 @@ def emergency_stop(bench: Bench) -> None:
     """Move an axis to and fro until the person presses the emergency stop."""
     findings, robot = bench.findings, bench.opened.robot
     findings.remedy = (
-        "Check the controller's safety circuit and its programs: after an emergency stop nothing may move the arm "
-        "until its program is started anew. Do not run any plan."
+        "Check the controller's safety circuit and its programs: after an emergency stop nothing may move the "
+        "arm until its program is started again. Do not run any plan."
     )
     bench.ask_before(
         "Step emergency-stop: the arm turns slowly to and fro. Press the emergency stop while it moves, and do "
@@ -47,7 +47,7 @@ def emergency_stop(bench: Bench) -> None:
     further_deg = float(np.abs(_last_known_deg(bench, rested_deg) - rested_deg).max())
     findings.at_most("turn of the axes at rest", further_deg, _STILL_DEG, "deg")
     bench.ask_whether("Did the arm stop at once, and has it stood still since?")
-    bench.person.tell("Release the emergency stop, acknowledge it, reset the robot program, start it anew.")
+    bench.person.tell("Release the emergency stop, acknowledge it, reset the robot program, start it again.")
 
 
 def _moved_until_pressed(bench: Bench) -> np.ndarray:
@@ -78,7 +78,7 @@ def _moved_until_pressed(bench: Bench) -> np.ndarray:
     robot.stop()
     raise StepFailedError(
         f"no fault of the arm was seen within {_PRESSED_WITHIN_S:g} s: if the emergency stop was pressed, the "
-        "controller does not tell it; else repeat the step"
+        f"controller does not report it; otherwise repeat the step"
     )
 
 

@@ -54,7 +54,7 @@ def geometry(bench: Bench) -> None:
     )
     bench.ask_before(
         "Step geometry: nothing moves yet. You are asked for lengths that you have measured by ruler and tape, "
-        "the arm standing as it stands now and its drives off. The board lies flat on the support, in the "
+        "with the arm as it stands now and its drives off. The board lies flat on the support, in the "
         "camera's view."
     )
     place_mm = np.array([bench.measured_mm(*question) for question in _BOARD])
@@ -77,11 +77,11 @@ def _measure_bodies(bench: Bench) -> None:
     findings, rig = bench.findings, bench.cell.rig
     over_mm = bench.measured_mm(
         "tool_over_support_mm",
-        "plumb distance from the disk's surface up to the lowest point of all that the flange carries (camera, "
-        "lens, cables)",
+        "vertical distance from the disk's surface up to the lowest point of everything that the flange carries "
+        "(camera, lens, cables)",
     )
     said_mm = _lowest_mm(rig, forward(arm_of(rig), bench.joints_deg()))
-    findings.at_most("room above the disk that only the rig has", said_mm - over_mm, MOST_TOO_NEAR_MM, "mm")
+    findings.at_most("room above the disk, rig beyond ruler", said_mm - over_mm, MOST_TOO_NEAR_MM, "mm")
     reach_mm, width_mm = _extent_mm(rig)
     for name, question, rig_mm in (
         (
@@ -99,12 +99,12 @@ def _measure_bodies(bench: Bench) -> None:
         findings.at_most(f"{name}: beyond the bodies of `tool`", sticks_out_mm, MOST_BEYOND_MM, "mm")
     diameter_mm = bench.measured_mm("support_diameter_mm", "diameter of the disk")
     findings.at_most(
-        "diameter of the disk, beyond the rig's", diameter_mm - rig.support.diameter_mm, MOST_ROUGH_MM, "mm"
+        "diameter of the disk, beyond that in the rig", diameter_mm - rig.support.diameter_mm, MOST_ROUGH_MM, "mm"
     )
     centre_mm = rig.support.base_from_support.matrix()[:3, 3]
     radius_mm = float(np.linalg.norm(bench.cell.leds.positions_mm - centre_mm, axis=1).min())
     nearest_mm = bench.measured_mm("dome_radius_mm", "from the disk's centre to the LED that is nearest to it")
-    findings.at_most("room inside the dome that only the rig has", radius_mm - nearest_mm, MOST_ROUGH_MM, "mm")
+    findings.at_most("room inside the dome, rig beyond ruler", radius_mm - nearest_mm, MOST_ROUGH_MM, "mm")
 
 
 def _ask_for_volumes(bench: Bench) -> None:
@@ -112,7 +112,8 @@ def _ask_for_volumes(bench: Bench) -> None:
     volumes = bench.cell.rig.keep_out
     for volume in volumes:
         bench.ask_whether(
-            f"{_volume_text(volume)}. Does it enclose, by your ruler, what it is there for, where the arm reaches?"
+            f"{_volume_text(volume)}. Measure with your ruler: does it enclose its thing completely, wherever "
+            f"the arm reaches?"
         )
     names = ", ".join(volume.name for volume in volumes) or "none"
     bench.ask_whether(

@@ -41,12 +41,11 @@ class Pictures:
 
 
 def lamps(bench: Bench) -> None:
-    """Light each LED of the table once and compare what the camera sees with the table."""
+    """Light each LED of the table once and compare the picture with the table."""
     findings, table = bench.findings, bench.cell.leds
     findings.remedy = (
-        "See that LED's wire, driver and board, and its line in the LED table; after swapping wires or lines "
-        "repeat "
-        "the step."
+        "Check that LED's wire, driver and board, and its line in the LED table; after swapping wires or lines "
+        "repeat the step."
     )
     bench.ask_before(
         f"Step lamps: {len(table.ids)} LEDs are lit one by one. Take every object that light can harm out of the "
@@ -71,12 +70,12 @@ def lamps(bench: Bench) -> None:
     )
     if spread_found < _LEAST_SPREAD:
         raise StepFailedError(
-            f"what the camera sees is too flat to tell directions of light ({spread_found:.3f}; "
+            f"the visible surface is too flat to show directions of light ({spread_found:.3f}; "
             f"{_LEAST_SPREAD} are needed): put a matte ball on the support, then repeat"
         )
     for led, angle_deg in zip(pictures.ids[lit], off_deg, strict=True):
         if angle_deg > MOST_DEVIATION_DEG:
-            findings.at_most(f"LED {led}: from its place in the table", angle_deg, MOST_DEVIATION_DEG, "deg")
+            findings.at_most(f"LED {led}: angle from its place in the table", angle_deg, MOST_DEVIATION_DEG, "deg")
     findings.at_most("largest deviation from the LED table", float(off_deg.max()), MOST_DEVIATION_DEG, "deg")
     _ask_for_dark_ones(bench, dark_and_on)
 
@@ -143,7 +142,7 @@ def _dark_leds(pictures: Pictures) -> list[int]:
 def _ask_for_dark_ones(bench: Bench, leds: list[int]) -> None:
     """LEDs that draw current and light nothing that the camera sees (the arm hides them): a person looks."""
     findings, table = bench.findings, bench.cell.leds
-    if not findings.at_most("LEDs that the camera does not see the light of", len(leds), _MOST_ASKED, ""):
+    if not findings.at_most("LEDs whose light the camera does not see", len(leds), _MOST_ASKED, ""):
         findings.remarks.append(
             f"they are LEDs {', '.join(map(str, leds))}; is the arm in their way? Jog it aside"
         )

@@ -1,4 +1,4 @@
-"""Directions of light from pictures of a matte body, each LED judged by what all the others show.
+"""Directions of light from pictures of a matte body; each LED is judged by the pictures of all others.
 
 Of a matte object with a constant shape, a pixel's value under a far light is `l . b`: l the direction of the light
 times its illuminance, b the pixel's normal times its reflectance (Woodham, "Photometric method for determining
@@ -23,7 +23,7 @@ FEWEST_LEDS = 8
 _LIT_SHARE = 0.1
 _RIDGE = 1e-6
 _FEWEST_LIGHTS = 4
-"""A pixel that fewer lights reach tells no normal."""
+"""A pixel that fewer lights reach gives no normal."""
 _LEAST_REST = 1e-4
 """Least share of a direction that may be left when a light is taken out. If less is left, the pixel is solved
 anew: the update would lose more than four digits."""

@@ -133,8 +133,8 @@ def watchdog(bench: Bench) -> None:
             "the rig switches the box's watchdog off: set `watchdog_s` of the led box, 2 for example"
         )
     bench.ask_before(
-        "Step watchdog: LEDs are lit in turn, then this machine falls silent. The box must make itself dark "
-        "after "
+        "Step watchdog: LEDs are lit in turn, then this machine sends no more commands. The box must switch off "
+        "by itself after "
         f"{seconds:g} s."
     )
     ids = bench.cell.leds.ids
@@ -142,7 +142,7 @@ def watchdog(bench: Bench) -> None:
     exposure_us, led = good_exposure_us(bench, metered_ids)
     lit_s, dark_s = _last_light_s(bench, led, exposure_us, seconds)
     findings.remarks.append(f"silent at 0 s; light was last seen at {lit_s:.2f} s, dark first at {dark_s:.2f} s")
-    findings.at_most("last light after the host fell silent", lit_s, seconds + _DARK_LATE_S, "s")
+    findings.at_most("last light after the host's last command", lit_s, seconds + _DARK_LATE_S, "s")
     findings.at_most("light until the end of the test", int(not np.isfinite(dark_s)), 0, "")
     report = ""
     try:

@@ -10,22 +10,24 @@ _WITHIN_S, _POLL_S = 30.0, 0.05
 
 
 def presence(bench: Bench) -> None:
-    """Ask the person to hold and to release it. A cell without one passes, and its record says so, unless its rig
-    has one."""
+    """Ask the person to hold and to release it. A cell without an enabling switch passes, and its record says so,
+    unless its rig has one.
+    """
     findings, box = bench.findings, bench.opened.ledbox
     findings.remedy = (
-        "See the enabling switch and its cable to the LED box. Until it works, move the arm from no console."
+        "Check the enabling switch and its cable to the LED box. Until it works, do not move the arm from any "
+        "console."
     )
     input_state = box.presence()
     if input_state is None:
         if bench.cell.rig.console.enabling_switch:
             raise StepFailedError(
-                "the rig has `console: enabling_switch: true`, but the LED box tells of no input for one: see its "
-                "wiring and firmware"
+                "the rig has `console: enabling_switch: true`, but the LED box reports no input for one: check "
+                "its wiring and firmware"
             )
         findings.remarks.append(
-            "the LED box has no input for an enabling switch: nothing tells whether anybody is at the cell when a "
-            "console moves the arm by hand"
+            "the LED box has no input for an enabling switch: when a console moves the arm by hand, nothing "
+            "shows whether anybody is at the cell"
         )
         return
     bench.ask_before("Step presence: nothing moves. Do not hold the enabling switch at the cell yet.")

@@ -32,7 +32,7 @@ def greatest_speeds_deg_s(rig: Rig) -> NDArray[np.float64]:
     """[6] of the axes, in the motions of the rig's driver. Raises InputError if the arm is not described."""
     arm = planning_arm(rig)
     if arm is None:
-        raise InputError("expected a described arm (`arm:` in the rig): its reach decides what is slow")
+        raise InputError("expected a described arm (`arm:` in the rig): its reach determines the slow speed")
     return np.array(arm.velocity_deg_s)
 
 

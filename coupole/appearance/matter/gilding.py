@@ -54,7 +54,7 @@ def gilt(
 ) -> Gilt:
     """A leaf of `index` and thickness on a bole [bands]; under the leaf there is no air.
 
-    Of a bole measured in air: `glossy_face.face(binder_index).inside(measured)`.
+    For a bole measured in air: `glossy_face.face(binder_index).inside(measured)`.
     """
     return Gilt(
         leaf=layered.sheet([Film(index, thickness_nm)], binder_index),

@@ -2,8 +2,8 @@
 between them.
 
 A binder's glossy face reflects part of the light before it enters, and most of the diffuse light that wants to
-leave. Of a paint that reflects 0.50 in air, gloss excluded, the layer inside reflects 0.74 under an index of 1.5.
-The two must not be mixed: the types have no arithmetic, and `Face` is the only way from one to the other.
+leave. If a paint reflects 0.50 in air, gloss excluded, the layer inside reflects 0.74 under an index of 1.5. The
+two must not be mixed: the types have no arithmetic, and `Face` is the only way from one to the other.
 """
 
 from __future__ import annotations
@@ -63,8 +63,9 @@ class Face:
         return MeasuredReflectance(np.asarray(self.passing * r / (1.0 - self.inner * r) + self.gloss))
 
     def inside(self, measured_reflectance: MeasuredReflectance) -> InternalReflectance:
-        """Return the reflectance of the layer under this face. Raises InputError where no layer can be the reason
-        of what is seen."""
+        """Return the reflectance of the layer under this face. Raises InputError if no layer can have the
+        reflectance that was seen.
+        """
         r = np.asarray(measured_reflectance.values, dtype=float) - self.gloss
         internal = np.asarray(r / (self.passing + self.inner * r))
         internal = np.where((internal > 1.0) & (internal < 1.0 + _ROUNDING), 1.0, internal)
@@ -73,8 +74,8 @@ class Face:
             low, high = (np.broadcast_to(v, internal.shape)[wrong][0] for v in (self.gloss, self.brightest))
             raise InputError(
                 f"a paint under this face is seen with a reflectance of {low:.3g} to {high:.3g}; found "
-                f"{np.asarray(measured_reflectance.values)[wrong][0]:.3g}, R inside the binder beyond 0 to 1: see "
-                "whether gloss is included, and whether the sample has a glossy face"
+                f"{np.asarray(measured_reflectance.values)[wrong][0]:.3g}, R inside the binder beyond 0 to 1: "
+                f"check whether gloss is included, and whether the sample has a glossy face"
             )
         return InternalReflectance(internal)
 
@@ -103,4 +104,4 @@ def face(index: ArrayLike, geometry: Geometry = "gloss excluded") -> Face:
 
 
 BARE = Face(np.ones(()), np.zeros(()), np.zeros(()))
-"""No face: dry powder, matt distemper. What is seen is what holds inside."""
+"""No face: dry powder, matt distemper. The reflectance seen and the reflectance inside are the same."""

@@ -49,7 +49,8 @@ def cosine_weighted(
 
 
 def nodes_for_linear_reading(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Nodes [1, theta_i, channels, phi, theta_m] whose linear interpolation misses least, of values there.
+    """Nodes [1, theta_i, channels, phi, theta_m] whose linear interpolation has the smallest error, from values
+    there.
 
     Between values h apart it misses f by f'' h^2 t (1 - t) / 2, in the mean by f'' h^2 / 12, on each axis: that
     much is taken from the nodes, of h before and after them, but not where f ends at the horizon.

@@ -22,7 +22,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 def cos_inside(cos_outside: ArrayLike, outside: ArrayLike, inside: ArrayLike) -> Complex:
     """Cosine of the refracted ray (Snell); complex in absorbing media and under total reflection.
 
-    Of the two roots it is the wave that decays in the second medium (or, if neither decays, travels forward).
+    The root is the wave that decays in the second medium (or, if neither decays, that travels forward).
     """
     n1, n2 = np.asarray(outside, dtype=complex), np.asarray(inside, dtype=complex)
     sin2 = 1.0 - np.asarray(cos_outside, dtype=complex) ** 2

@@ -71,7 +71,7 @@ def acrylic() -> Complex:
 
 
 def at_d_line(index: Complex) -> float:
-    """n at 587.6 nm, for what knows one index only."""
+    """n at 587.6 nm, for models that know only one index."""
     return float(np.interp(587.6, WAVELENGTHS_NM, index.real))
 
 

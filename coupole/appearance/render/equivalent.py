@@ -37,8 +37,8 @@ def equivalent_index(reflectance: Callable[[Array], Array]) -> Complex:
     off = float(np.abs(reflectances[:, best, np.arange(BANDS)] - target).max())
     if off > MOST_OFF:
         raise InputError(
-            f"films: expected a stack that reflects like some bulk within {MOST_OFF} at all angles; the nearest "
-            f"is off by {off:.2f}. Take thinner films, or fewer"
+            f"films: expected a stack that reflects like a bulk material within {MOST_OFF} at all angles; the "
+            f"nearest material differs by {off:.2f}. Take thinner films, or fewer"
         )
     index: Complex = n[best, np.arange(BANDS)] + 1j * k[best, np.arange(BANDS)]
     return index

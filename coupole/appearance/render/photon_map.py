@@ -1,8 +1,9 @@
 """Sunlight that comes over gold onto matt surfaces, anywhere: photons are kept there and gathered by the eye.
 
-Photon mapping (Jensen 1996) for what path tracing finds only by chance. Photons start at the sun, are reflected by
-gold as in `caustic`, and by matt surfaces with Lambert's distribution; they are kept at each matt surface that
-they meet after gold. This light and that of paths without gold, which a path tracer finds well, are the whole.
+Photon mapping (Jensen 1996) for light that path tracing finds only by chance. Photons start at the sun, are
+reflected by gold as in `caustic`, and by matt surfaces with Lambert's distribution; they are kept at each matt
+surface that they meet after gold. This light and that of paths without gold, which a path tracer finds well, are
+the whole.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
 _HALF_MOST = 65504.0
-SYNTHETIC = "simulated: computed by spectral path tracing, no photograph"
+SYNTHETIC = "simulated: computed by spectral path tracing, not a photograph"
 
 
 def eye_of(scene: PlainScene, folder: Path) -> colour.Eye:
@@ -47,7 +47,7 @@ def write(
     xyz = eye.tristimulus(spectral_picture.radiance)
     shown_white = scene.display.white_cd_m2 or float(np.quantile(xyz[..., 1], 1.0 - scene.display.clipped))
     if shown_white <= 0.0:
-        raise InputError(f"{scene.name}: expected some light in the picture, found none; see to lights and camera")
+        raise InputError(f"{scene.name}: expected some light in the picture, found none; check lights and camera")
     about = f"{scene.name}: {SYNTHETIC}; {written_by}"
     display_xyz = denoised_xyz(xyz) if scene.display.denoised else xyz
     comment = f"{about}; {DENOISED}" if scene.display.denoised else about

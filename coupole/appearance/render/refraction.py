@@ -68,6 +68,7 @@ def real_index(refraction: Refraction, folder: Path) -> Array:
     index = complex_index(refraction, folder)
     if np.any(index.imag > 1e-3):
         raise InputError(
-            f"index: expected something transparent, found k up to {index.imag.max():g}; give a binder's"
+            f"index: expected a transparent material, found k up to {index.imag.max():g}; give the index of a "
+            f"binder"
         )
     return within("index of a binder", index.real, 1.0 + 1e-9, 3.0)

@@ -59,9 +59,9 @@ class Renderer:
     _mi: Any
     _parts: Description
     _radiance_unit: NDArray[np.float64]
-    """[81] W/(m^2 sr nm), of what Mitsuba computes."""
+    """[81] W/(m^2 sr nm), for Mitsuba's result."""
     _files: Path
-    """A folder for what Mitsuba reads."""
+    """A folder for the files that Mitsuba reads."""
 
     def render(self, camera: Camera, progress: Progress = lambda done, total: None) -> Spectral:
         """The camera's picture; the same scene and seed give the same bits in the same variant."""

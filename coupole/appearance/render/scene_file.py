@@ -188,7 +188,7 @@ class Scene(Model):
         if self.film is not None and "daylight" not in kinds:
             raise ValueError("`film` needs a light of kind `daylight`, whose time it moves")
         if self.film is not None and self.turntable is not None:
-            raise ValueError("`film` and `turntable` exclude each other: a film moves one thing")
+            raise ValueError("`film` and `turntable` exclude each other: one moves the sun, the other the objects")
         return self
 
     def at(self, when: datetime) -> Scene:

@@ -127,7 +127,7 @@ def makie_grains(thing: Makie, folder: Path) -> sprinkled.Grains:
     if thing.wrapped == "uv":
         if not isinstance(thing.body, MeshBody):
             raise InputError(
-                f"makie: a body of kind {thing.body.kind} has no texture coordinates; wrap it otherwise"
+                f"makie: a body of kind {thing.body.kind} has no texture coordinates; choose another `wrapped`"
             )
         corners, uv = mesh_and_uv(folder / thing.body.path, thing.body.unit)
     else:

@@ -19,7 +19,10 @@ def channel_weights(power: ArrayLike, sensitivities: ArrayLike) -> Array:
     weights = np.asarray(power, dtype=float) * np.asarray(sensitivities, dtype=float)
     total = weights.sum(axis=-1, keepdims=True)
     if not np.all(total > 0.0):
-        raise InputError("channels: expected a light that every channel sees; one sees nothing of it; see to both")
+        raise InputError(
+            "channels: expected a light that every channel sees, but one channel sees none of it; "
+            "check the light and the channels"
+        )
     return np.asarray(weights / total)
 
 

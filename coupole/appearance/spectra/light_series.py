@@ -68,5 +68,5 @@ def _time(text: str, path: Path) -> datetime:
     except ValueError:
         raise InputError(f"{path}:1: expected columns named by {_FORM}, found {text!r}") from None
     if time.tzinfo is None:
-        raise InputError(f"{path}:1: expected {_FORM}, found {text}; write {text}+02:00 if that was it")
+        raise InputError(f"{path}:1: expected {_FORM}, found {text}; for example {text}+02:00")
     return time

@@ -121,7 +121,7 @@ def _table(text: str, file: str) -> _Table:
         header = header if rows else line
     if len(rows) < _LEAST_ROWS:
         raise InputError(
-            [Problem(file, 0, 0, "", f"expected {_LEAST_ROWS} or more lines `nm, value`; see the export")]
+            [Problem(file, 0, 0, "", f"expected {_LEAST_ROWS} or more lines `nm, value`; check the export")]
         )
     return _Table(rows, header, tuple(remarks), separator)
 
@@ -215,7 +215,7 @@ def _check_values(values: Array, rows: list[_Row], unit: Unit, file: str) -> Non
                 file,
                 row.line,
                 f"expected {'a number' if unit == 'power' else f'a reflectance of {low:g} to {high:g}'}, found "
-                f"{value:g}; see whether it is percent, a fraction or a power",
+                f"{value:g}; check whether it is percent, a fraction or a power",
             )
 
 

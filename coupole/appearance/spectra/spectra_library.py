@@ -41,7 +41,7 @@ class LibrarySpectrum:
     wavelengths_nm: Array
     """[n], rising."""
     reflectance: Array
-    """[n], fraction. Of K and S: that of an opaque layer; NaN where K is negative or S not positive."""
+    """[n], fraction. For K and S it is that of an opaque layer; NaN where K is negative or S not positive."""
     absorption: Array | None = None
     """K [n] in the file's unit, the same as of S; None if reflectance was measured."""
     scattering: Array | None = None

@@ -72,7 +72,7 @@ def _next_step(budget: Budget, doubts: Sequence[str]) -> Inline:
 def verdict(validation: Validation) -> str:
     """Say in words whether the linear formula is sufficient."""
     if not validation.sure:
-        return "may do or not: more trials would tell"
+        return "may be good enough or not: more trials would show it"
     return "will do" if validation.is_within_tolerance else "will not do"
 
 

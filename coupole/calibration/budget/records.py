@@ -33,8 +33,10 @@ class Said:
 
 
 def read_records(paths: Sequence[Path]) -> tuple[InForce, ...]:
-    """The records at `paths`; of a folder, those of the kinds that a budget uses. Raises InputError: no such file,
-    no such record in a folder, a record of a kind that a budget does not use, two of one kind."""
+    """The records at `paths`. From a folder, the records of the kinds that a budget uses are taken. Raises
+    InputError: no such file, no such record in a folder, a record of a kind that a budget does not use, two of one
+    kind.
+    """
     records: list[InForce] = []
     for path in paths:
         if path.is_dir():

@@ -1,6 +1,6 @@
 """Signals of a chart's patches: means over the pixels of each in a picture, then one value from many lights.
 
-Of a matt chart each light k gives the patch p the signal s = g_k E_kp b_p: E is the light's irradiance there,
+On a matt chart each light k gives the patch p the signal s = g_k E_kp b_p: E is the light's irradiance there,
 known or from a white sheet in the chart's place, g the light's own strength. Medians over patches and lights give
 g and b; a patch that departs from them under a light is in shadow there, or glossy, and is left out.
 """
@@ -66,7 +66,7 @@ class Signals:
     mean: Floats
     """[patches, 3] of uniform light."""
     u: Floats
-    """[patches, 3] standard uncertainty, by noise and by what lights disagree."""
+    """[patches, 3] standard uncertainty, from noise and from the disagreement of the lights."""
     pixel_sd: Floats
     """[patches, 3] relative standard deviation of single pixels, in the median of the lights."""
     remarks: tuple[str, ...]
@@ -106,7 +106,7 @@ def pixels_inside(polygon: Floats, shape: tuple[int, ...]) -> tuple[NDArray[np.i
 def read_patches(picture: ChartPicture, names: Sequence[str]) -> Reading:
     """Means of all patches. Raises InputError: patches outside the picture, or too small in it."""
     if picture.pattern == MONO:
-        raise InputError(f"{picture.name}: the camera has one channel; it has no colours")
+        raise InputError(f"{picture.name}: the camera has one channel, so it has no colours")
     count = len(names)
     mean, u, sd = (np.empty((count, 3)) for _ in range(3))
     full = np.zeros(count, np.bool_)
@@ -166,7 +166,7 @@ def combined_signals(
         good &= ~odd
         strength, patch = _split(mean, good)
     else:
-        remarks.append("fewer than three lights: shadows and gloss on the chart cannot be told")
+        remarks.append("fewer than three lights: shadows and gloss on the chart cannot be detected")
     return _averaged_signals(mean / strength[:, None], u / strength[:, None], sd, good, tuple(remarks))
 
 

@@ -77,7 +77,8 @@ class ChartReader:
         frames = [frame for frame in self._frames.lit if self._suits(frame)]
         if not frames:
             raise InputError(
-                "colour: no light suits: all graze the chart, or are reflected into the camera; expected LEDs at "
+                "colour: no light can be used: all graze the chart, or are reflected into the camera; expected "
+                "LEDs at "
                 "about 45 degrees to the chart, seen from above"
             )
         return frames
@@ -173,7 +174,7 @@ def key_of(frame: LightFrame) -> tuple[str, str]:
 
 
 def mean_picture(pictures: Sequence[ChartPicture]) -> ChartPicture:
-    """The mean of pictures of one view; what is saturated in one is so in the mean."""
+    """The mean of pictures of one view; pixels that are saturated in one picture are saturated in the mean."""
     first = pictures[0]
     signal = np.mean([picture.signal for picture in pictures], axis=0)
     full = np.any([picture.full for picture in pictures], axis=0)

@@ -112,7 +112,7 @@ def _least_squares(terms: Floats, xyz: Floats) -> Floats:
     design = (terms[:, :-1] - terms[:, -1:]) * weight[:, None]
     if np.linalg.cond(design) > _LARGEST_CONDITION:
         raise InputError(
-            "colour: the channels are too much alike on this chart to tell its colours apart; expected a colour "
+            "colour: the channels are too similar on this chart to distinguish its colours; expected a colour "
             "camera and patches of many hues"
         )
     target = (xyz - terms[:, -1:] * D50_WHITE) * weight[:, None]
@@ -172,7 +172,9 @@ def leave_out(patch_signals: Balanced, form: Form, tell: Callable[[], None] = la
 
 
 def better(matrix: LeftOut, roots: LeftOut) -> Form:
-    """The form that misses patches left out less; the matrix, unless the other is clearly better."""
+    """The form with the smaller error for left-out patches; the matrix, unless the other form is clearly
+    better.
+    """
     return "root-polynomial" if roots.mean < _WORTH * matrix.mean and roots.worst < matrix.worst else "matrix"
 
 

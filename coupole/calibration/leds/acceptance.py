@@ -8,8 +8,8 @@ LEDS = (
     Allowed("missing", "LEDs not found", 0.02),
     Allowed("centre_mm", "median centre", 0.7, "mm"),
     Allowed("normal_deg", "median normal", 0.21, "deg"),
-    Allowed("robot_ratio", "robot's noise, found over stated", 3.0),
+    Allowed("robot_ratio", "robot's noise, estimated over stated value", 3.0),
     Allowed("rejected", "spots left out", 0.05),
-    Allowed("record_step", "camera and hand-eye from their record, in its u", 4.0),
+    Allowed("record_step", "distance of camera and hand-eye from their record, in standard uncertainties", 4.0),
 )
 """`centre_mm`, `normal_deg`: standard uncertainties (seed 003: 700 um, 0.21 deg)."""

@@ -69,7 +69,7 @@ def boards_of(table: LedTable) -> Boards:
         if (table.normals[rows] @ normal).min() < _PARALLEL:
             raise InputError(
                 f"dome's table: board {number} has LEDs whose normals differ by more than 2 degrees; a flat board "
-                "has one normal. Correct the table, or give LEDs that are alone boards of their own"
+                "has one normal. Correct the table, or give single LEDs separate boards"
             )
         middle_mm = table.positions_mm[rows].mean(axis=0)
         along = table.positions_mm[rows[-1]] - table.positions_mm[rows[0]]

@@ -195,8 +195,8 @@ def _unseen(sightings: LedSightings, found_mm: Floats, ids: NDArray[np.int64]) -
             yield LedFault(
                 "astray",
                 (led,),
-                f"LED {led}: the spots of {views[row]} views agree on no point near the dome: reflections, or "
-                "the camera's poses are wrong",
+                f"LED {led}: the spots of {views[row]} views meet in no point near the dome: they are "
+                f"reflections, or the camera's poses are wrong",
             )
 
 
@@ -267,7 +267,7 @@ def _wiring(here: Indices, ids: NDArray[np.int64], boards: Boards) -> Iterator[L
         else:
             chain = " -> ".join(map(str, (*leds, int(ids[here[ring[-1]]]))))
             yield LedFault(
-                "miswired", leds, f"mis-wired {where}: each of LEDs {chain} lights where the next should"
+                "miswired", leds, f"mis-wired {where}: each of LEDs {chain} is at the place of the next one"
             )
 
 

@@ -249,13 +249,13 @@ def _h5(
         axes = geometry.state.base_from_board[boards.board_of[where], :3, :2]
         write_dataset("board_axes", axes, "", "[leds, 3, 2] x and y of its board in the base")
         shared_text = (
-            "[leds] of the centre's variance that comes from poses, lens and hand-eye, as its neighbours' does"
+            "[leds] share of the centre's variance from poses, lens and hand-eye, common to its neighbours"
         )
         write_dataset("shared_part", geometry.shared_part[where], "", shared_text)
-        write_dataset("offset_mm", geometry.state.offsets_mm[where], "mm", "[leds, 3] off its place on the board")
-        write_dataset("views", views[where], "", "[leds] that it was found in")
+        write_dataset("offset_mm", geometry.state.offsets_mm[where], "mm", "[leds, 3] from its place on the board")
+        write_dataset("views", views[where], "", "[leds] number of views in which the LED was found")
         write_dataset("residual_rms", np.sqrt(square / np.maximum(views, 1))[where], "px", "[leds]")
-        write_dataset("found", matching.place_of >= 0, "", "[leds] False: placed by its board alone")
+        write_dataset("found", matching.place_of >= 0, "", "[leds] False: only its board determines its place")
     return buffer.getvalue()
 
 

@@ -12,8 +12,8 @@ IMAGES = (
 )
 """`bare_field`: share of the field's 8 x 6 cells. `rejected`: share of the corners left out as gross errors."""
 DOUBTS = (
-    Allowed("pattern", "lens: form that the model lacks, over its uncertainty", 1.0),
-    Allowed("predicted", "views left out: error over uncertainty", 1.5),
+    Allowed("pattern", "lens: error of the model's form, over its uncertainty", 1.0),
+    Allowed("predicted", "views left out: prediction error over uncertainty", 1.5),
 )
 """`pattern`: root mean square over the field of what a richer lens would change, over the standard uncertainty of
 a direction's image. `predicted`: of all views, each left out in turn."""

@@ -137,7 +137,7 @@ def _remark(channel: str, shift: Floats, shift_covariance: Floats) -> str:
     worst = int(np.argmax(length))
     u = float(np.sqrt(np.trace(shift_covariance[worst])))
     return (
-        f"{channel} is seen up to {length[worst]:.3f} px (u {u:.3f} px) beside green, root mean square over the "
+        f"{channel} is seen up to {length[worst]:.3f} px (u {u:.3f} px) from green, root mean square over the "
         f"field {np.sqrt(np.mean(length**2)):.3f} px"
     )
 

@@ -74,12 +74,13 @@ class Diagnosis:
         lines = []
         if self.contradicts:
             lines.append(
-                f"robot and camera contradict each other: seen from the poses, the board's place scatters by "
+                f"robot and camera contradict each other: by the poses, the board's place scatters by "
                 f"{self.scatter_mm:.3g} mm and {self.scatter_deg:.3g} deg, where noise explains "
                 f"{self.noise_scatter.position_mm:.2g} mm and {self.noise_scatter.orientation_deg:.2g} deg"
             )
             lines += [
-                f"likely cause: {h.sentence}: then {h.scatter_mm:.3g} mm and {h.scatter_deg:.3g} deg are left"
+                f"likely cause: {h.sentence}. With this correction {h.scatter_mm:.3g} mm and "
+                f"{h.scatter_deg:.3g} deg remain"
                 for h in self.likely[:1]
             ]
             if not self.likely:

@@ -58,7 +58,7 @@ class Hypothesis:
     scatter_mm: float
     scatter_deg: float
     sure: bool = False
-    """True for what noise cannot explain, even if the scatter falls little."""
+    """True for deviations that noise cannot explain, even if the scatter falls little."""
 
 
 def scatter_of(base_from_flange: Floats, camera_from_board: Floats) -> tuple[float, float]:

@@ -47,5 +47,8 @@ def find_board(
         progress(number + 1, len(sources.images))
     if not sightings or size_px is None:
         why = f"; {left_out[0]}" if left_out else ""
-        raise InputError(f"the board is in none of {len(sources.images)} images{why}. Is it the one described?")
+        raise InputError(
+            f"the board was found in none of {len(sources.images)} images{why}. Is it the board of "
+            f"the description?"
+        )
     return Found(tuple(sightings), np.array(numbers, dtype=np.intp), size_px, tuple(left_out))

@@ -155,7 +155,8 @@ def _readings(
     """
     if not frames_of_views:
         raise InputError(
-            "drift: no view shows the whole reference tile where its description has it; correct the description, "
+            "drift: no view shows the whole reference tile where its description puts it; correct the "
+            "description, "
             "or add a view of the tile to the plan"
         )
     readings: list[Reading] = []

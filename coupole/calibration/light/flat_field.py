@@ -203,7 +203,8 @@ def _fit(blocks: _Blocks, views: int, focal_px: float, size_px: tuple[int, int])
         normal = (design / scale).T @ ((design / scale) * weight[:, None])
         if np.linalg.cond(normal) > _INDEFINITE:
             raise InputError(
-                "flat field: these views cannot tell the panel's unevenness from the lens's fall-off; add views "
+                "flat field: these views cannot separate the panel's unevenness from the lens's fall-off; add "
+                "views "
                 "shifted both ways by a third of the field, and turned by 90 degrees or more about the view"
             )
         step = np.linalg.solve(normal, (design / scale).T @ (weight * residuals)) / scale

@@ -203,7 +203,7 @@ def _refuse_other_scene(
     worst = int(np.nanargmax(rms - _SCENE_SIGMA * noise))
     if rms[worst] > _CHANGED + _SCENE_SIGMA * noise[worst]:
         raise InputError(
-            f"response: the scene is another one in {pairs[worst].name}; nothing may move between exposures"
+            f"response: the scene has changed in {pairs[worst].name}; nothing may move between exposures"
         )
 
 

@@ -340,7 +340,7 @@ def linearise(record_path: Path | None, channel: str, frames: LightFrames) -> Ca
     record = read_earlier(record_path, "response", frames.about, frames.size_px)
     if f"c2.{channel}" not in {parameter.name for parameter in record.parameters}:
         raise InputError(
-            f"{record_path}: has no response of the channel {channel}; make a record with this camera"
+            f"{record_path}: has no response for the channel {channel}; make a record with this camera"
         )
     c2, c3 = record.value(f"c2.{channel}"), record.value(f"c3.{channel}")
     range_dn = record.value("range_dn")

@@ -124,7 +124,7 @@ def rows_of(
     """Observations of view `number`, and the LEDs that are lit in it although their frames cannot be used.
 
     `figures` are shared by all LEDs: two tilts and the height for each place of the tile, of which the view's is
-    number `place`, ln reflectance, Minnaert's k. What cannot be used is added to `remarks`.
+    number `place`, ln reflectance, Minnaert's k. Views that cannot be used are added to `remarks`.
     """
     centres, normals = positions.of(view.leds)
     h, cos_in = transfer(view, centres, normals, tile, emission=emission, side_mm=side_mm)

@@ -252,8 +252,9 @@ class _Problem:
         return blocks
 
     def _pose_blocks(self, state: _State) -> list[Block]:
-        """Each view's pose is the reported one, moved by what views share, within the arm's noise. What views
-        share is zero within its record's covariance."""
+        """Each view's pose is the reported one, moved by what views share, within the arm's noise. The errors that
+        views share are zero within the covariance of their record.
+        """
         pose_sigma = np.array([self.stated_noise.robot_mm] * 3 + [np.radians(self.stated_noise.robot_deg)] * 3)
         shared_columns = self.first_shared + np.arange(len(self.prior_whiten))
         off_by = between(state.base_from_camera, self.reported_poses) + self.by_shared @ state.shared_step

@@ -118,7 +118,9 @@ class Bench:
             self._task, self.plan, self.closed_because = task, plan, ""
 
     def close(self, why: str = "") -> list[str]:
-        """End the bench, with the cell safe; return what is not sure then. Raises InputError: there is none."""
+        """End the bench, with the cell safe; return the devices that are not surely safe then. Raises InputError:
+        there is none.
+        """
         if self.phase not in ("open", "opening"):
             raise InputError(f"the devices are {self.phase}")
         return self._close(why)
@@ -130,8 +132,10 @@ class Bench:
             threading.Thread(target=self._close, args=(self._closing,), daemon=True).start()
 
     def stop(self) -> list[str]:
-        """Stop what the bench does; return what is not sure then. A bench that does not obey (it is being opened
-        or closed) is ended, as by Ctrl-C. Raises InputError: it is not this console's, and does not obey."""
+        """Stop the bench's work; return the devices that are not surely safe then. A bench that does not obey (it
+        is being opened or closed) is ended, as by Ctrl-C. Raises InputError: it is not this console's, and does
+        not obey.
+        """
         try:
             return list(self.ask("stop")["trouble"])
         except InputError:

@@ -30,7 +30,7 @@ _DAY_S = 86400.0
 
 @dataclass(frozen=True)
 class RecordRow:
-    """A kind of record, and what is in force of it."""
+    """A kind of record, and its record in force."""
 
     kind: str
     path: Path | None = None
@@ -52,7 +52,7 @@ class RecordRow:
 
 @dataclass(frozen=True)
 class PlanRow:
-    """A plan of the folder of plans, and what its records say."""
+    """A plan of the folder of plans, and the verdict of its records."""
 
     plan: str
     wants: bool

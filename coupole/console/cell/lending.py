@@ -39,7 +39,7 @@ class Lending:
 
     @property
     def lent_to(self) -> str:
-        """Name of who has the cell, and what for; empty if it is not lent."""
+        """Name of the borrower of the cell, and the purpose; empty if it is not lent."""
         with self._lock:
             if self._loan is not None and select.select([self._loan.process], [], [], 0)[0]:
                 self._end()
@@ -62,7 +62,7 @@ class Lending:
             self._loan = _Loan(pid, process, f"{borrower}: {purpose}")
 
     def interrupt(self) -> None:
-        """End what the cell is lent for, as Ctrl-C does. Raises InputError: it is not lent."""
+        """End the command that the cell is lent to, as Ctrl-C does. Raises InputError: it is not lent."""
         with self._lock:
             if not self.lent_to or self._loan is None:
                 raise InputError("the cell is not lent")

@@ -37,7 +37,7 @@ class NoAnswer(InputError):
 
 
 class GivenUp(InputError):
-    """Whoever waited for an answer does not any more."""
+    """The caller does not wait for an answer any more."""
 
 
 def service_socket(cell: Cell) -> Path:

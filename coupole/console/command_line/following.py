@@ -99,7 +99,7 @@ class _Followed:
             self.stop()
 
     def stop(self) -> list[str]:
-        """Stop what was entered, whether or not it has begun; from any thread. Return what is not sure then.
+        """Stop the entry, whether or not it has begun; from any thread. Return what is not sure then.
 
         A run is asked itself, which obeys whatever its console does, and answers when lights are off and the arm
         was stopped."""

@@ -1,6 +1,6 @@
 """Search for the process that has a cell's console, whether or not it listens.
 
-Whoever asks takes no lock itself, so that a console which begins is never in its way.
+The query takes no lock itself, so it never hinders a console that begins.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class Account:
 
 
 FIRST_ENGINEER = Account("first engineer", Role.ENGINEER)
-"""Whoever signs in with the token, until an engineer has an account."""
+"""The person who signs in with the token, until an engineer has an account."""
 
 
 class Accounts:
@@ -100,7 +100,7 @@ class Accounts:
                 "name: expected at most 64 letters, digits, spaces, dots, hyphens; a letter first, no space last"
             )
         if name == FIRST_ENGINEER.name:
-            raise InputError(f"name: {name} is whoever signs in with the token")
+            raise InputError(f"name: {name} is the name for everybody who signs in with the token")
         if not SHORTEST_PASSWORD <= len(password) <= LONGEST_PASSWORD:
             raise InputError(f"password: expected {SHORTEST_PASSWORD} to {LONGEST_PASSWORD} characters")
         password_hash = self._hasher.hash(password)
@@ -108,7 +108,7 @@ class Accounts:
             if alike := [
                 other_name for other_name in self._stored if _visible_form(other_name) == _visible_form(name)
             ]:
-                raise InputError(f"name: {alike[0]} has an account already")
+                raise InputError(f"name: {alike[0]} already has an account")
             self._keep({**self._stored, name: {"role": role.word, "password": password_hash}})
             if role is Role.ENGINEER:
                 self.first_token = ""

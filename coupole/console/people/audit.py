@@ -1,5 +1,6 @@
-"""Log of who asked for what at the console: `audit.jsonl`, a line for each request that would change something,
-with its answer; also if it was refused."""
+"""Log of requests at the console and their authors: `audit.jsonl`, a line for each request that would change
+something, with its answer; also if it was refused.
+"""
 
 from __future__ import annotations
 

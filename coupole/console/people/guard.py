@@ -1,5 +1,6 @@
 """Guard before all requests. Nothing but the sign-in page is served to somebody who is not signed in. Nothing is
-changed for another site's page, or twice. What was asked and would change something is logged, with its answer."""
+changed for another site's page, or twice. Requests that would change something are logged, with their answers.
+"""
 
 from __future__ import annotations
 

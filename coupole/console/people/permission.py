@@ -1,4 +1,4 @@
-"""Permission for what somebody wants to do: by role, and by who is in control."""
+"""Permission for a request: by the person's role, and by the person in control."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 A console stands still if it is stopped (Ctrl-Z, SIGSTOP), or if its machine sleeps. When it runs again it finds
 requests whose senders have long given up. So nothing begins for a caller whose connection is gone. Where that
 cannot be seen (a page that is still open), nothing begins of what may have come while the console stood still.
-What ends or pauses something always counts.
+Requests that end or pause something are always obeyed.
 """
 
 from __future__ import annotations
@@ -63,6 +63,6 @@ class LoopWatch:
         if stood_s < longest_s:
             return ""
         return (
-            f"the console stood still for {stood_s:.1f} s (it was stopped, or its machine slept), and begins "
-            "nothing that it was asked meanwhile: look at the cell, and ask again"
+            f"the console was frozen for {stood_s:.1f} s (it was stopped, or its machine slept), and ignores "
+            f"requests of this time: look at the cell, and ask again"
         )

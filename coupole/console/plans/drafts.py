@@ -93,8 +93,9 @@ class Desk:
         self._turn = asyncio.Lock()
 
     async def check(self, draft: Draft, is_wanted: Callable[[], bool] = lambda: True) -> Checked | None:
-        """None if it is no longer wanted when its turn comes. Raises InputError: it takes too long, or the process
-        died of it."""
+        """None if the draft is no longer needed when its turn comes. Raises InputError: it takes too long, or the
+        process died of it.
+        """
         async with self._turn:
             checked_draft: Checked | None = await self._do_now(check_draft, draft) if is_wanted() else None
         return checked_draft

@@ -1,4 +1,4 @@
-"""Reads and checks what is to be acquired, and enters it in the queue.
+"""Reads and checks plans and runs to be acquired, and enters them in the queue.
 
 Preflight is made by a process of its own (`entry_preflight`). While something is acquired it does not measure the
 disk's speed, as that takes all of it.
@@ -40,7 +40,7 @@ class Entering:
         """Limit for threads that call `enter` and `move`: each counts what the ones before have entered."""
 
     def close(self) -> None:
-        """End what is being checked."""
+        """End the present check."""
         self.preflight.close()
 
     def enter(

@@ -1,4 +1,4 @@
-"""Preflight of what is entered in the queue, by a process of its own, with words for those who wait for it."""
+"""Preflight of entries of the queue, in a separate process, with text for the people who wait for it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Found:
 
 
 def check_entry(files: Files, *, measure: bool) -> Found:
-    """Preflight of files; what is wrong with them is in `problems`."""
+    """Preflight of files; their mistakes are in `problems`."""
     from coupole.viewing.preflight_table import document_of
 
     name = str(files.resume or files.plan)
@@ -73,7 +73,7 @@ class EntryPreflight:
             self._for = ""
 
     def give_up(self) -> None:
-        """End what is being checked: it is not entered. Raises InputError: nothing is."""
+        """End the present check: the plan is not entered. Raises InputError: nothing is."""
         if not self._for:
             raise InputError("no preflight is being made")
         self._process.end()

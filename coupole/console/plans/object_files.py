@@ -62,7 +62,7 @@ class ObjectFiles:
     def enter_light(self, object_id: str, dose_lux_h: float, note: str) -> None:
         """Light that was given elsewhere. Raises InputError, StorageError."""
         if not note.strip() or not 0 < dose_lux_h < 1e9:
-            raise InputError("expected how many lux hours, above 0, and what that light was")
+            raise InputError("expected lux hours, above 0, and a note about the light")
         ledger_of(self._cell, object_id).enter(dose_lux_h, note.strip())
 
     def set_budget(self, object_id: str, dose_lux_h: float, name: str, reason: str) -> None:

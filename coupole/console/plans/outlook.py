@@ -61,8 +61,8 @@ def too_much_light(
 ) -> dict[str, str]:
     """Refusals of the entries that wait whose object's budget is exceeded when all before them are done, by id.
 
-    `received_lux_h` tells what an object has received by its ledger, `budget_lux_h` what it may receive by that; a
-    plan's own budget can only be stricter.
+    `received_lux_h` is the light that an object has received by its ledger, `budget_lux_h` the light that it may
+    receive; a plan's own budget can only be stricter.
     """
     light: dict[str, float] = {}
     refusals: dict[str, str] = {}
@@ -77,8 +77,8 @@ def too_much_light(
         budgets_lux_h = [budget for budget in (needs.dose_budget_lux_h, budget_lux_h(name)) if budget is not None]
         if budgets_lux_h and light[name] > min(budgets_lux_h):
             refusals[entry.id] = (
-                f"object {name}: {needs.dose_lux_h:.2f} lux.h after {before:.2f} lux.h with what runs and waits "
-                f"before it; its budget is {min(budgets_lux_h):g} lux.h"
+                f"object {name}: {needs.dose_lux_h:.2f} lux.h after {before:.2f} lux.h, including the plans "
+                f"that run and wait before it; its budget is {min(budgets_lux_h):g} lux.h"
             )
     return refusals
 
@@ -99,7 +99,7 @@ def too_little_disk(
         disk = existing.stat().st_dev
         needs_of_disk[disk] = existing, needs_of_disk.get(disk, (existing, 0))[1] + size
     return [
-        f"storage {folder}: all that runs and waits needs {size / 1e9:.2f} GB and {reserve_bytes / 1e9:.2f} GB "
+        f"storage {folder}: the plans that run and wait need {size / 1e9:.2f} GB and {reserve_bytes / 1e9:.2f} GB "
         f"must stay free; {free_bytes(folder) / 1e9:.2f} GB are free"
         for folder, size in needs_of_disk.values()
         if size + reserve_bytes > free_bytes(folder)

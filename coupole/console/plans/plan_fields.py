@@ -76,7 +76,7 @@ def text_with(path: Path, text: str, fields: PlanFields, target_mm: tuple[float,
     try:
         return _rewritten(text, before, fields, target_mm)
     except (TypeError, ValueError, AttributeError) as error:
-        raise InputError("the text has another form than the fields can change: write into it") from error
+        raise InputError("the text has a form that the fields cannot change: edit the text") from error
 
 
 def _rewritten(text: str, before: PlanFields, fields: PlanFields, target_mm: tuple[float, ...] | None) -> str:
@@ -180,7 +180,7 @@ def _with_views(fields: PlanFields, views: Any) -> PlanFields:
 
 def _views(fields: PlanFields, target_mm: tuple[float, ...]) -> CommentedSeq:
     if not (fields.azimuths and fields.elevations_deg and fields.distance_mm):
-        raise InputError("views all round want a distance, elevations and how many at each")
+        raise InputError("views all round need a distance, elevations, and the number of views at each")
     if not 1 <= fields.azimuths <= MOST_AZIMUTHS:
         raise InputError(f"views at each elevation: expected 1 to {MOST_AZIMUTHS}, found {fields.azimuths}")
     grid = CommentedMap(

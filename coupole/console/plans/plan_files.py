@@ -93,7 +93,7 @@ class PlanFiles:
         path = self.path(name)
         with self._lock:
             if not path.is_file() or yamlfile.text_of(path) != before:
-                raise InputError(f"{name}: was changed by somebody else meanwhile; open it again")
+                raise InputError(f"{name}: another person has changed it meanwhile; open it again")
             self._write(path, text)
         return name
 

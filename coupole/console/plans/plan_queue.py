@@ -66,7 +66,7 @@ class Entry(BaseModel):
     result: str = ""
     """Folder of that result, if not the run's with `-reflectance` behind."""
     needs: Needs | None = None
-    """None for a hold, and for what began at once."""
+    """None for a hold, and for an entry that began at once."""
     by: str
     """Name of whoever entered it."""
     entered: str
@@ -174,7 +174,7 @@ class PlanQueue:
         """Raises InputError: none with this id waits."""
         entry = self.entry(number)
         if entry.state != "waiting":
-            raise InputError(f"queue: {number} is {entry.state}; only what waits can be taken out or moved")
+            raise InputError(f"queue: {number} is {entry.state}; only waiting entries can be removed or moved")
         return entry
 
     def _with(self, entry: Entry, before: str, entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
@@ -229,7 +229,7 @@ class PlanQueue:
         decided, is not why it is now."""
         with self._lock:
             if seen_reason is not None and self.halt_reason not in (seen_reason, ""):
-                raise InputError(f"queue: it waits for something else by now: {self.halt_reason}")
+                raise InputError(f"queue: it now waits for something else: {self.halt_reason}")
             self._keep(self.entries, "")
 
     def _keep(self, entries: tuple[Entry, ...], halt_reason: str) -> None:

@@ -1,4 +1,4 @@
-"""Folders of what a console makes for a while, such as pictures: the newest stay."""
+"""Folders of files that a console makes for a while, such as pictures: the newest are kept."""
 
 from __future__ import annotations
 

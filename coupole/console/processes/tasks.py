@@ -138,7 +138,7 @@ class Tasks:
         return list(reversed(self._tasks.values()))
 
     def close(self) -> None:
-        """Stop what is under way; what has not ended after 20 s is killed."""
+        """Stop the running commands; a command that has not ended after 20 s is killed."""
         running = [task for task in self._tasks.values() if task.running]
         for task in running:
             task.stop()

@@ -1,4 +1,5 @@
-"""A process of its own for what computes, forked from one that has imported what plans want.
+"""A separate process for computations, forked from a process that has already imported the modules that plans
+need.
 
 It stays for the next job, with the kernels that it has loaded, and ends with the console, also if that is killed.
 """

@@ -65,7 +65,7 @@ class _Hold:
         self._asked: dict[str, Any] = {}
 
     async def serve(self) -> None:
-        outcome, is_moving = "the button was let go", False
+        outcome, is_moving = "the button was released", False
         try:
             while True:
                 jog_request = await self._socket.receive_json()
@@ -103,11 +103,11 @@ class _Hold:
     def _let_go(self) -> str:
         """End the motion at once: a renewal the other way ends a hold."""
         if self._number is None:
-            return "the button was let go"
+            return "the button was released"
         reversed_jog = {**self._asked, "direction": -self._asked["direction"], "hold": self._number}
         with contextlib.suppress(CoupoleError):
             self._service.bench.ask("jog", **reversed_jog)
-        return "the button was let go, or the connection was lost"
+        return "the button was released, or the connection was lost"
 
     def _account(self) -> Account:
         session = session_of(self._socket, self._service)

@@ -182,12 +182,13 @@ class StateNow(BaseModel):
     devices: dict[str, Any]
     """Identities of the devices that a run, or the bench, has open."""
     lent_to: str
-    """Name of who has borrowed the cell, and for what; empty if it is not lent. Nothing begins meanwhile."""
+    """Name of the borrower of the cell, and the purpose; empty if it is not lent. Nothing begins meanwhile."""
     queue: list[EntryNow]
     """All entries that run or wait, after the 20 that ended last, in their order."""
     checking: str
-    """Preflight that is being made: of what, for whom, since when and how far it is; empty if none is. What else
-    is entered waits for it."""
+    """Preflight that is being made: of what, for whom, since when and how far it is; empty if none is. Other
+    entries wait for it.
+    """
     in_control: str
     """Name of the person who may act; empty: any operator."""
     asked_by: str

@@ -65,7 +65,7 @@ def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
         case FaultNoted():
             return f"fault: {event.message}"
         case InputsChanged():
-            return f"changed on the disk, the run uses what was read: {'; '.join(event.files)}"
+            return f"changed on the disk, but the run uses the files as it read them: {'; '.join(event.files)}"
         case Paused():
             return "paused: lights off, arm still"
         case Continued():

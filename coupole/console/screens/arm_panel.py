@@ -108,7 +108,7 @@ class ArmPanel:
         motions = "one straight motion" if corners == 1 else f"{corners} straight motions"
         self._words.text = (
             f"To {path['to']}: {motions} in joint space, {duration_text(path['duration_s'])}. The blue line is "
-            "the camera's way, violet is the arm at its end."
+            f"the path of the camera, violet is the arm at its end."
         )
 
     async def _drive_path(self) -> None:
@@ -190,8 +190,9 @@ class _Hand:
         self._switch = with_name(ui.label().classes("small"), "enabling-switch")
         self._said = with_name(ui.label("No button is held."), "hand-said").props("role=status")
         ui.label(
-            "Hold a button with pointer, Space or Enter; the arm stops when it is let go, when the page is "
-            "hidden, and 300 ms after it was last heard. Watch the arm, with your hand at the emergency stop."
+            "Hold a button with pointer, Space or Enter. The arm stops when you release it, when the page is "
+            "hidden, and 300 ms after the last signal of the button. Watch the arm, with your hand at the "
+            "emergency stop."
         ).classes("small")
 
     def show(self, enabling_switch: bool | None) -> None:

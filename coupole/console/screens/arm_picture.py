@@ -73,7 +73,7 @@ class ArmPicture:
             return
         with self._place:
             self._model = _Model(self._leds_mm, self._radius_mm)
-            ui.label("Drag to turn, wheel to come nearer; the drawings above show the same.").classes("hint")
+            ui.label("Drag to turn, use the wheel to zoom; the drawings above show the same.").classes("hint")
         self._turned.set_text("Close the 3D model")
         self._draw()
 

@@ -51,9 +51,9 @@ class _InForce:
         self._words.set_text(
             f"{count(len(plans), 'plan')} of this rig in the folder of plans. "
             + (
-                f"{refused_count} would be refused as things are."
+                f"{refused_count} would be refused now."
                 if refused_count
-                else "None is refused by its records."
+                else "No plan is refused because of its records."
             )
         )
         self._plans.set_content(table_html(("plan", "by its records"), [_plan_cells(row) for row in plans]))
@@ -64,7 +64,7 @@ _HEADS = ("record", "state", "made (UTC)", "age", "expires", "margin", "nearest 
 
 def _record_cells(row: RecordRow) -> list[str]:
     if row.path is None:
-        why = "bad|none; plans that want calibrations need it" if row.is_needed else "none in force"
+        why = "bad|none; plans with calibrations need one" if row.is_needed else "none in force"
         return [row.kind, why, "", "", "", "", ""]
     if not row.kind:
         return [row.path.name, f"bad|{' '.join(row.against)}", "", "", "", "", ""]
@@ -99,8 +99,9 @@ class _Campaign:
         self._visit, self._shown = visit, ""
         with panel("New records"):
             ui.label(
-                "Six steps, in this order. Place what the picture shows, go out of the arm's reach, and begin. "
-                "Each step takes its frames and makes its records; what is there already is not made again. "
+                "There are six steps, in this order. Place what the picture shows, go out of the arm's reach, "
+                "and begin. "
+                "Each step takes its frames and makes its records; existing records are not made again. "
                 "An object's place is calibrated by `coupole calibrate mesh`."
             )
             self._where = ui.label("").classes("hint")
@@ -157,7 +158,8 @@ class _Campaign:
         status = self._visit.service.calibrations
         if await sure(
             "Begin anew?",
-            "A new folder is made, and all steps are to be done. Records in force stay in force until you change "
+            "This makes a new folder. All steps must then be done again. Records in force stay in force until "
+            "you change "
             "the rig.",
             "Begin anew",
         ):

@@ -1,4 +1,4 @@
-"""The cell's devices while no run is at work: who they are, how they are, what they do when they are told."""
+"""The cell's devices while no run is acquired: their identities, their states, and commands for them."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class ExportDialog:
             views = {"": "all views"} | {view: view for view in run.about["views"]}
             self._view = Choice("views", views, name="views")
             self._licence = ui.input("licence, such as CC-BY-4.0").props("outlined dense").style("width:100%")
-            self._again = ui.checkbox("overwrite what was exported before")
+            self._again = ui.checkbox("overwrite earlier files")
             self._told = ui.label().classes("hint")
             with ui.row():
                 button("Export", lambda: self._dialog.submit(True), name="yes", kind="main")

@@ -15,10 +15,12 @@ class FaultOfArm:
 
     def __init__(self, visit: Visit) -> None:
         self._visit = visit
-        self._panel = panel("A fault of the arm stands")
+        self._panel = panel("The arm has a fault")
         with self._panel:
             self._words = ui.label().classes("bad")
-            ui.label("Find its cause, see that the cell is clear; then say so, with your name.").classes("hint")
+            ui.label("Find its cause and check that the cell is clear; then confirm, with your name.").classes(
+                "hint"
+            )
             self._cause = with_name(ui.input("What the cause was").classes("field"), "cause")
             self._confirm = button(
                 "I was at the cell: the arm may move", self._confirm_fault, name="confirm", kind="main"
@@ -38,9 +40,9 @@ class FaultOfArm:
 
         def confirm() -> bool:
             if not cause or account is None:
-                raise InputError("expected what the cause was")
+                raise InputError("expected the cause")
             if (standing := faults.standing()) and standing[-1].message != shown_message:
-                raise InputError(f"another fault stands by now: {standing[-1].message}")
+                raise InputError(f"there is another fault now: {standing[-1].message}")
             faults.confirm(account.name, cause)
             return True
 

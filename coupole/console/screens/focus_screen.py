@@ -84,7 +84,7 @@ class _Screen:
                     "White is in the region", self._take_white, icon="colorize", name="white"
                 )
                 button(
-                    "As the sensor sees it", lambda: self._settings.set_white(None), name="no-white", kind="flat"
+                    "Colours of the sensor", lambda: self._settings.set_white(None), name="no-white", kind="flat"
                 )
             self._white_words = with_name(ui.label().classes("small"), "white-words")
         with panel("Light on the object"):
@@ -123,7 +123,7 @@ class _Screen:
     def _enable(self) -> None:
         may = self._visit.may_act
         self._live_button.set_enabled(may)
-        self._live_button.set_text("Live is on: end it" if self._live else "Live")
+        self._live_button.set_text("End live pictures" if self._live else "Live")
         self._live_button.props(f"icon={'videocam_off' if self._live else 'videocam'}")
         self._once.set_enabled(may and not self._live and not self._asking)
         self._white_button.set_enabled(self._white is not None)
@@ -270,7 +270,7 @@ def why_live_ends(*, is_watched: bool, untouched_s: float, is_stopped: bool) -> 
 def _white_words(gains: list[float], region: dict[str, Any] | None, white: list[float] | None) -> str:
     gain_words = "R, G, B times " + ", ".join(f"{gain:.3f}" for gain in gains)
     if region is None:
-        return f"{gain_words}. Draw a region on something neutral for another white point."
+        return f"{gain_words}. Draw a region on a neutral surface to set another white point."
     return (
         gain_words
         if white

@@ -13,7 +13,7 @@ from coupole.console.screens.parts import button
 from coupole.console.screens.visit import Visit
 from coupole.viewing.terminal import duration_text
 
-NO_EMERGENCY_STOP = "Stop here is no emergency stop: that is the red button at the cell."
+NO_EMERGENCY_STOP = "Stop here is not an emergency stop: the emergency stop is the red button at the cell."
 WORDS = {
     "idle": "idle",
     "starting": "starting",
@@ -21,7 +21,7 @@ WORDS = {
     "pausing": "pausing: this burst ends first",
     "paused": "paused: lights off, arm still",
     "stopping": "stopping",
-    "concluding": "concluding: the report is made",
+    "concluding": "concluding: the report is being made",
     "silent": "the run does not answer",
     "halted": "waits for a person",
 }

@@ -72,10 +72,8 @@ class MeterPanel:
         )
 
 
-_IDLE = (
-    "Finds the exposure at which nothing is clipped and the object stands above the noise, at all of its views."
-)
-_NO_PLAN = "Wants devices that were opened with a plan."
+_IDLE = "It finds the exposure at which nothing is clipped and the object is above the noise, in all of its views."
+_NO_PLAN = "It needs devices that were opened with a plan."
 _ASKED = (
     "The arm drives to each view of the plan, with light at several exposures. It counts as light on the object."
 )

@@ -39,7 +39,7 @@ class _Screen:
             with panel("Is this your object?"):
                 self._photograph = ui.column().classes("cell")
                 self._lies = with_name(ui.html("", sanitize=False), "lies").style("width:100%")
-                self._plans = Choice("As this plan has it", {}, self._draw, name="by-plan")
+                self._plans = Choice("As in this plan", {}, self._draw, name="by-plan")
             with panel("Light on it"):
                 self._sums = with_name(ui.html("", sanitize=False), "light").style("width:100%")
                 self._bar = ui.linear_progress(0.0, show_value=False).props('aria-label="light of its budget"')
@@ -91,7 +91,7 @@ class _Screen:
         if budget is not None:
             figures["left"] = f"{max(0.0, budget - total):.3f} lux h"
         if history.unsettled_lux_h:
-            figures["of which at most"] = f"{history.unsettled_lux_h:.3f} lux h: how a burst ended is not known"
+            figures["of which at most"] = f"{history.unsettled_lux_h:.3f} lux h: the end of a burst is not known"
         if history.of_unknown_spectrum_lux_h < total:
             figures["damaging, 300 to 780 nm"] = f"{1e3 * history.damage_wh_m2:.4f} mW h/m2 weighted"
         light_html = facts_html(figures)
@@ -120,7 +120,7 @@ class _Screen:
 
                 def do() -> bool:
                     if not note_text:
-                        raise InputError("expected what that light was")
+                        raise InputError("expected a note about the light")
                     self._objects.enter_light(object_id, dose, note_text + by)
                     return True
 
@@ -144,7 +144,7 @@ class _Screen:
 
                 def do() -> bool:
                     if account is None or budget is None:
-                        raise InputError("expected how many lux hours")
+                        raise InputError("expected a number of lux hours")
                     self._objects.set_budget(object_id, float(budget), account.name, reason_text)
                     return True
 

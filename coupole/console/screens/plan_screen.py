@@ -63,7 +63,7 @@ class _Screen:
         with panel("The cell"):
             with ui.row().classes("bar"):
                 self._draw = button("Draw with paths", self._draw_cell, icon="view_in_ar", name="draw")
-                self._drawing = ui.label("Plans the arm's paths, which may take a minute.").classes("hint")
+                self._drawing = ui.label("This plans the arm's paths, and may take a minute.").classes("hint")
             self._cell = ui.column().classes("cell")
         visit.follow(self._state)
 
@@ -139,9 +139,7 @@ class _Screen:
             self._object = with_name(ui.input("Object: its accession number").classes("field"), "object")
             self._mesh = with_name(ui.input("Mesh: PLY, STL or OBJ").classes("field"), "mesh")
             self._unit = Choice("Unit of the mesh", _UNITS, self._take_field, name="mesh-unit")
-            self._budget = with_name(
-                ui.number("Light in its life at most, lux h", min=0).classes("field"), "budget"
-            )
+            self._budget = with_name(ui.number("Most light in its life, lux h", min=0).classes("field"), "budget")
             self._distance = ui.number("Distance of the camera, mm", min=1, max=3000).classes("field")
             self._elevations = with_name(ui.input("Elevations, degrees").classes("field"), "elevations")
             self._azimuths = with_name(

@@ -30,7 +30,7 @@ class _Screen:
                 self._plan = Choice("Plan", {}, name="plan")
                 button("Put in the queue", self._enter, icon="playlist_add", name="enter", kind="main")
                 self._hold = with_name(
-                    ui.input("Or what is to be done there", placeholder="change the object"), "hold"
+                    ui.input("Or the task for a person", placeholder="change the object"), "hold"
                 )
                 self._hold.classes("field")
                 button("Hold there", self._enter_hold, icon="pan_tool", name="enter-hold")

@@ -22,7 +22,7 @@ _LOOK_EVERY_S = 0.3
 
 
 async def resume(visit: Visit, name: str) -> None:
-    """Enter a run in the queue, to take what is left of it."""
+    """Enter a run in the queue, to take its remaining frames."""
     await enter(visit, NewEntry(resume=name), name)
 
 
@@ -49,14 +49,14 @@ class RunActions:
                 action_button = button(words, do, name=words.split()[0].lower(), icon=icon)
                 action_button.set_enabled(visit.may_act)
         if not visit.may_act:
-            ui.label("Operators at this machine may do these.").classes("hint")
+            ui.label("Only operators at this machine may do this.").classes("hint")
         self._links = ui.row().classes("links")
         self._there: list[bool] = []
         self._look()
         ui.timer(2.0, self._look)
 
     def _look(self) -> None:
-        """Links to what there is by now."""
+        """Links to the files that exist now."""
         run, page = self._run.folder, look_page(self._cell, self._run)
         there = [self._run.report_path.is_file(), (run / "README.txt").is_file(), stands_alone(page)]
         if there == self._there:
@@ -110,8 +110,8 @@ class RunActions:
         if await sure(
             f"Reflectance of {self._name}?",
             f"Normals and materials are fitted to its {self._frames} frames, with the calibrations in force for "
-            f"it: minutes to hours of this machine's processors. The result lands in {out}. When it is stopped, "
-            "it goes on where it was when it is begun again.",
+            f"it: minutes to hours of this machine's processors. The result lands in {out}. If you stop it and "
+            f"begin it again, it continues.",
             "Begin",
         ):
             out.parent.mkdir(parents=True, exist_ok=True)

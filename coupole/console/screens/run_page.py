@@ -138,7 +138,7 @@ class _Page:
             "taken again": f"{status.reshot} shots",
             "light on the object": f"{status.dose_lux_h:.3f} lux h",
             "size": bytes_text(row.bytes) + (", archived" if row.archived else ""),
-            "verified": f"{moment(row.verified)} UTC" if row.verified else "not since it last changed",
+            "verified": f"{moment(row.verified)} UTC" if row.verified else "not since the last change",
             **({"reflectance": status.processing.words} if status.processing else {}),
             **({"why it ended": status.reason} if status.reason and status.state != "done" else {}),
         }
@@ -263,7 +263,7 @@ def _numbers(about: dict[str, Any], status: Status, folder: str) -> dict[str, st
         "folder": folder,
         "software": " ".join(map(str, about.get("software", {}).values())),
         "machine": str(about.get("host", "")),
-        "identity of frames rests on": status.proof,
+        "proof of the frames' identity": status.proof,
         **devices,
         **(
             {f"record {kind}": str(digest)[:16] for kind, digest in records.items()}

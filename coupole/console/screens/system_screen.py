@@ -147,9 +147,7 @@ def _notifications(visit: Visit) -> None:
         if receivers := notifications(visit.service.folder):
             facts(receivers)
         else:
-            ui.label(f"Nobody is told anything: there is no {visit.service.folder / NOTIFICATIONS}.").classes(
-                "hint"
-            )
+            ui.label(f"Nobody is notified: there is no {visit.service.folder / NOTIFICATIONS}.").classes("hint")
 
 
 class _Bundle:
@@ -159,14 +157,14 @@ class _Bundle:
         self._visit = visit
         with panel("Support bundle"):
             ui.label(
-                "One file for whoever is asked for help: rig, plans, journals, logs and versions; no frames, no "
-                "passwords. Names of people and objects are in it. Nothing is sent by itself."
+                "One file for a person who helps you: rig, plans, journals, logs and versions; no frames, no "
+                "passwords. Names of people and objects are in it. Nothing is sent automatically."
             )
             self._make = button("Make one", self._begin, name="make-bundle", icon="folder_zip")
             self._make.set_enabled(visit.is_engineer)
             self._links = ui.column()
             if not visit.is_engineer:
-                ui.label("Engineers at this machine may make one.").classes("hint")
+                ui.label("Only engineers at this machine may make one.").classes("hint")
 
     async def _begin(self) -> None:
         self._make.set_enabled(False)

@@ -32,7 +32,7 @@ class TaskList:
         ui.timer(_LOOK_EVERY_S, self.look)
 
     def look(self) -> None:
-        """Show what is so now."""
+        """Show the present state."""
         tasks = [task for task in self._visit.service.tasks.newest_first if self._wanted(task)][: self._most]
         for task_id in set(self._rows) - {task.id for task in tasks}:
             self._rows.pop(task_id).box.delete()

@@ -65,7 +65,9 @@ class Email(Model):
     @model_validator(mode="after")
     def _no_open_password(self) -> Email:
         if self.password and self.security == "none" and self.server not in _HERE:
-            raise ValueError("expected `security: starttls` or `tls`: the password would be sent in the clear")
+            raise ValueError(
+                "expected `security: starttls` or `tls`: the password would be sent without encryption"
+            )
         return self
 
 
@@ -84,9 +86,9 @@ class Settings(Model):
     schema_version: Literal[1]
     """Version of this format."""
     events: tuple[Kind, ...] = get_args(Kind)
-    """Kinds of events that are told."""
+    """Kinds of events that people are notified of."""
     disk_low_gb: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 20.0
-    """Free space on the disk of the runs below which is told, in GB."""
+    """Free space on the disk of the runs, in GB, below which people are notified."""
     email: Email | None = None
     """Messages by e-mail."""
     webhooks: tuple[Webhook, ...] = ()

@@ -1,4 +1,4 @@
-"""Sees what happens at a cell and tells people of it, in threads of its own: nothing else waits for them."""
+"""Notices events at a cell and notifies people, in separate threads: nothing else waits for them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _RELIEF = 1.1
 
 
 class Occurrences:
-    """Search for what has happened at a cell since it was last asked."""
+    """Search for new events at a cell since the last call."""
 
     def __init__(self, cell: Cell, plans: PlanQueue, disk_low_gb: float) -> None:
         self._cell, self._queue, self._low_bytes = cell, plans, disk_low_gb * 1e9
@@ -83,8 +83,9 @@ class Occurrences:
 
 
 class Notifier:
-    """Sends what has happened, while a context lasts. `trouble` says what the last message met; each delivery has
-    a line in `notifications.jsonl`."""
+    """Sends events, while a context lasts. `trouble` says what the last message met; each delivery has a line in
+    `notifications.jsonl`.
+    """
 
     def __init__(self, settings: Settings | None, occurrences: Occurrences, folder: Path) -> None:
         self._settings, self._occurrences = settings, occurrences
@@ -100,7 +101,7 @@ class Notifier:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the threads; what is still to be sent is given up."""
+        """End the threads; unsent messages are given up."""
         self._ending.set()
         with contextlib.suppress(queue.Full):
             self._messages.put_nowait(None)
@@ -160,5 +161,5 @@ def send_test(settings: Settings, cell: str) -> dict[str, str]:
         except (OSError, ValueError) as error:
             error_of_way[way] = f"{error or type(error).__name__} (after {time.monotonic() - begun_s:.0f} s)"
     if not error_of_way:
-        raise InputError("the settings name no way: expected `email`, `webhooks` or `desktop: true`")
+        raise InputError("the settings name no channel: expected `email`, `webhooks` or `desktop: true`")
     return error_of_way

@@ -127,7 +127,7 @@ def _is_below(line: str, column: int, items: bool) -> bool:
 
 
 class SupportBundles:
-    """Made when somebody asks, and kept until there are newer ones."""
+    """They are made on request, and kept until there are newer ones."""
 
     def __init__(self, cell: Cell, plans: Path, folder: Path) -> None:
         """`folder`: of the console's state."""
@@ -213,7 +213,7 @@ def _below(inside: str, folder: Path, paths: Iterable[Path]) -> Iterator[tuple[s
 
 
 def _text(path: Path) -> str | None:
-    """None for what is not there, no text, or too long to be sent."""
+    """None if the file is not there, is not text, or is too long to be sent."""
     try:
         if not path.is_file() or path.stat().st_size > MOST_FILE_BYTES:
             return None

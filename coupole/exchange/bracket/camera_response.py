@@ -1,9 +1,9 @@
 """A camera's response from photographs of one scene with several exposure times.
 
 Debevec and Malik, "Recovering high dynamic range radiance maps from photographs" (SIGGRAPH 1997), Eq. 3: the
-logarithm of exposure g(z) of each value z, such that g(z) = ln E + ln t for all pixels and photographs. What is
-different: the pixels' ln E are eliminated, so that thousands of pixels cost no more than a few. Noise is that of
-values: g is looked up at the value that a pixel's mean predicts, and the noisy value only adds g' times its
+logarithm of exposure g(z) of each value z, such that g(z) = ln E + ln t for all pixels and photographs. The
+difference is that the pixels' ln E are eliminated, so thousands of pixels cost no more than a few. Noise is that
+of values: g is looked up at the value that a pixel's mean predicts, and the noisy value only adds g' times its
 difference (where g is looked up at noisy values, least squares prefers stairs and waves, which steps of 4 do not
 contradict). And g is a Gaussian process: its slope over ln z wanders, by an amount that the photographs themselves
 make most likely. Where they cannot tell, as with waves of the period of all steps, this is what the uncertainty
@@ -115,8 +115,8 @@ def left_open(exposure_s: Array) -> str:
     if factor < _WIDE:
         return ""
     return (
-        f"no two photographs are nearer than {factor:.1f} times in exposure: waves of the response are known by "
-        "its smoothness alone, and u is wider for them; steps of 2, or raw files, know it better"
+        f"no two photographs are nearer than {factor:.1f} times in exposure: only its smoothness excludes waves "
+        f"of the response, and u is larger for them; steps of 2, or raw files, determine it better"
     )
 
 

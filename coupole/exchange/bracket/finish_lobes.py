@@ -4,8 +4,8 @@ The wider lobe has GGX's distribution, the narrower one a tail of its own betwee
 is proportional to (1 + tan^2(theta_h)/(alpha^2 (g - 1)))^-g / cos^4(theta_h), GGX for g = 2, Beckmann for large g
 (Student's distribution of slopes; Ribardiere and others, Computer Graphics Forum 36, 2017). Shadowing is Smith's
 for GGX, the rise to grazing angles Schlick's, less the dip that metals have before it (Lazanyi and Szirmay-Kalos,
-"Fresnel term approximations for metals", WSCG 2005). The fit is of log f, robust, and knows nothing of the truth:
-what it misses is left to the table.
+"Fresnel term approximations for metals", WSCG 2005). The fit is of log f, robust, and does not know the truth: the
+table takes its residual.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 """The BRDF of a finish from linear photographs of a sphere of it (seed 002, section 3.1).
 
-Each pixel of the sphere has a normal of its own, so that one photograph under one light from afar has
-thousands of samples of an isotropic BRDF; several lights cover it. Two lobes of facets are fitted first
-(`finish_lobes`), then a table of the logarithm of what they miss (`half_angle_table`): it is nearly level, so that
-smoothness between photographs costs a peak nothing. What a pixel's mean takes from the peak is given back by the
-lobes. Each photograph is also predicted from the others, which
-tells what the finish is worth between two of them.
+Each pixel of the sphere has a normal of its own, so that one photograph under one light from afar has thousands of
+samples of an isotropic BRDF; several lights cover it. Two lobes of facets are fitted first (`finish_lobes`), then
+a table of the logarithm of what they miss (`half_angle_table`): it is nearly level, so that smoothness between
+photographs costs a peak nothing. The mean over a pixel lowers the peak; the lobes correct this. Each photograph is
+also predicted from the others, which tells what the finish is worth between two of them.
 """
 
 from __future__ import annotations
@@ -153,8 +152,9 @@ def samples_of(sample: SphereSample, pictures: Sequence[NDArray[np.float32]]) ->
 
 
 def finish_of(samples: Samples) -> Finish:
-    """Fit lobes, then a table of what they miss; its smoothness is the one with which photographs that are left
-    out are predicted best."""
+    """Fit lobes, then a table of their residual. The table's smoothness is the one that predicts left-out
+    photographs best.
+    """
     samples = samples.of(np.random.default_rng(1).permutation(len(samples.f))[:_MOST_SAMPLES])
     ways_in, ways_out, of_photograph = samples.ways_in, samples.ways_out, samples.photograph
     lobes = fitted_lobes(ways_in, ways_out, samples.f)

@@ -26,7 +26,7 @@ _MOST_PLACES = 2000
 """Pixels of which components are found."""
 _BAND_ROWS = 256
 _APART = 8
-"""Every eighth LED is left out to learn what interpolation misses."""
+"""Every eighth LED is left out, to measure the error of interpolation."""
 
 
 @dataclass(frozen=True)

@@ -83,8 +83,9 @@ def jpeg_of(name: str, picture: NDArray[np.uint8], quality: int) -> Block:
 
 
 def log_coded(values: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Values from 1e-4 to 10 in steps of 4.6 %, so at most 2.3 % off: 1 to 255; 0 where there is none. What is
-    outside is put to the nearer end."""
+    """Values from 1e-4 to 10 in steps of 4.6 %, so at most 2.3 % off: 1 to 255; 0 where there is none. Values
+    outside are set to the nearer end.
+    """
     is_finite = np.isfinite(values)
     inside = np.clip(np.where(is_finite, values, LOG_LEAST), LOG_LEAST, LOG_LEAST * LOG_RATIO)
     codes = 1.0 + np.rint(np.log(inside / LOG_LEAST) / np.log(LOG_RATIO) * LOG_STEPS)

@@ -133,9 +133,10 @@ def _about(run: Run, frames: LightFrames, views: list[dict[str, Any]]) -> dict[s
                 else "; colours between the filter's pixels are interpolated, and are the camera's own"
             ),
             "Proof": run.proof,
-            "Places": "LEDs where the rig has them, as the point sees them that the camera is focused on",
-            "Missed": f"Median and rms, shares of the camera's range: {off}. Most of it lies at edges of shadows. "
-            "Between: an eighth of the LEDs was left out for this.",
+            "Places": "LEDs at their places in the rig, as seen from the point in focus",
+            "Missed": f"Median and rms, shares of the camera's range: {off}. Most of the error is at edges of "
+            f"shadows. "
+            "For the figure between LEDs, an eighth of the LEDs was left out.",
         },
     }
 

@@ -1,7 +1,7 @@
 """The page itself: its scripts, shaders and style, and what it shows, in one HTML file.
 
-What makes the file larger than `MOST_BYTES` is put beside it, into `NAME.data/`, as scripts that the page asks for
-by script tags: a page that is opened from a disk may load nothing else.
+Data that would make the file larger than `MOST_BYTES` are put beside it, into `NAME.data/`, as scripts that the
+page loads by script tags: a page that is opened from a disk may load nothing else.
 """
 
 from __future__ import annotations

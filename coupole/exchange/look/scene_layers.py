@@ -73,7 +73,7 @@ def layers_of(material: Material, folder: Path) -> tuple[Layer, ...]:
         case Glass():
             raise InputError(f"material of kind glass: a page does not refract; it shows {SHOWN}")
         case _:
-            raise InputError(f"material of kind {material.kind}: a page does not know it; it shows {SHOWN}")
+            raise InputError(f"material of kind {material.kind}: a page cannot show it; it shows {SHOWN}")
 
 
 def flake_layers(gold: float, roughness: float, longest_mm: float) -> list[tuple[Layer, ...]]:

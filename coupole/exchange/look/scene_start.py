@@ -67,7 +67,9 @@ def start_of(scene: PlainScene, folder: Path) -> dict[str, Any]:
     target = np.asarray(scene.cameras[0].target_mm)
     lamps = [lamp for light in scene.lights for lamp in _lamps(light, folder, target)]
     if len(lamps) > MOST_LIGHTS:
-        raise InputError(f"{scene.name}: has {len(lamps)} lamps, and a page at most {MOST_LIGHTS}; leave some out")
+        raise InputError(
+            f"{scene.name}: has {len(lamps)} lamps; a page can have at most {MOST_LIGHTS}; leave some out"
+        )
     around = [light for light in scene.lights if isinstance(light, Environment)]
     white_cd_m2 = scene.display.white_cd_m2 or max(
         [lamp.illuminance_lux / math.pi for lamp in lamps] + [light.luminance_cd_m2 for light in around]

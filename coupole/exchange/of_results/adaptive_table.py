@@ -1,11 +1,10 @@
 """A table of RGL's format that adapts to its material: as small as misses it by no more than is asked.
 
-What is stored is f cos(theta_o) over `ndf`, the reflectance that the half vector's own elevation accounts for; the
-reader multiplies with it again, and it takes next to no place, as it depends on one angle: 2 x 2048 nodes. What is
-left changes little within a lobe. Angles of incidence crowd towards the horizon, where f changes most with them.
-Their number, how much they crowd, and the number of half vectors grow until the table, as its readers read it,
-misses the material by no more than is asked. Half vectors are not warped by `vndf`: that missed more (decision
-38).
+The stored value is f cos(theta_o) over `ndf`, the part that depends on the half vector's own elevation. The reader
+multiplies with it again. It is small, because it depends on one angle: 2 x 2048 nodes. The quotient changes little
+within a lobe. Angles of incidence crowd towards the horizon, where f changes most with them. Their number, how
+much they crowd, and the number of half vectors grow until the table, as its readers read it, misses the material
+by no more than is asked. Half vectors are not warped by `vndf`: that missed more (decision 38).
 """
 
 from __future__ import annotations
@@ -138,8 +137,9 @@ def _smallest(
         trials = [(larger, _relative_errors(larger, check_pairs)) for larger in _larger(table)]
         if not trials:
             raise InputError(
-                f"--adaptive {most_error:g}: {material.name}: a table of {table.size_bytes / 1e6:.0f} MB misses "
-                f"its fit by {errors[1::2].max():.1e} or more in 5 % of the directions; ask for no less"
+                f"--adaptive {most_error:g}: {material.name}: a table of {table.size_bytes / 1e6:.0f} MB "
+                f"differs from its fit by {errors[1::2].max():.1e} or more in 5 % of the directions; choose a "
+                f"larger value"
             )
         worst = errors[1::2].max()
         gains = [

@@ -98,7 +98,7 @@ def _metadata(surface: MeasuredSurface, triangle: int, channel: str) -> dict[str
             "location": nowhere,
             "email": _NOBODY,
             "contact_person": _NOT_SAID,
-            "comments": "to be filled in by whoever publishes this file",
+            "comments": "to be filled in by the publisher of this file",
         },
         "description": f"Triangle {triangle} of a scanned object, the camera's {channel}; {surface.remark}",
         "method": "simulation" if is_simulated else "measurement",

@@ -5,8 +5,8 @@ Colour is pi kd, roughness the square root of GGX's alpha, ks stands as the refl
 towards grazing by Schlick's formula and takes from the diffuse one what it reflects; what it takes at normal
 incidence is made up for in the colour.
 
-A material of triangles has one texel for each. Of texels, or by a mesh's own texture coordinates, there are maps
-with a normal and ambient occlusion too.
+A material of triangles has one texel for each. With texels, or with a mesh's own texture coordinates, there are
+also maps of the normal and of ambient occlusion.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def materials_of(surface: MeasuredSurface) -> Iterator[Material]:
 def chosen_triangles(surface: MeasuredSurface, *, optional: bool = False) -> NDArray[np.int64]:
     """Raises InputError for one that is not there or has no material, or if none is named."""
     if not surface.options.triangles and not optional:
-        raise InputError("--triangle: expected the numbers of triangles whose samples are options")
+        raise InputError("--triangle: expected the numbers of triangles whose samples are exported")
     for number in surface.options.triangles:
         if number >= len(surface.triangles):
             raise InputError(f"--triangle {number}: the mesh has {len(surface.triangles)}, counted from 0")

@@ -44,8 +44,8 @@ def samples_of(surface: MeasuredSurface, triangle: int, quantile: float) -> Samp
     whole = SamplesOfTriangle(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
     if np.isnan(np.where(np.isfinite(whole.f), whole.low + whole.high, 0.0)).any():
         raise InputError(
-            f"{surface.result.folder}: has no bounds, as no record of the response told its frames' noise; make "
-            "it anew with one (`coupole calibrate response`)"
+            f"{surface.result.folder}: has no bounds, because no record of the response stated its frames' "
+            f"noise; make it again with one (`coupole calibrate response`)"
         )
     return whole
 

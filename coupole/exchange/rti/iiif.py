@@ -189,6 +189,6 @@ def checked_base(base_url: str) -> str:
     if not fits or "?" in base_url or "#" in base_url or not _OF_ADDRESSES.fullmatch(base_url):
         raise InputError(
             f"--base-url {base_url}: expected the http address under which the folder will be found, "
-            f"as {EXAMPLE_URL}, other characters than those of addresses as %20; ids of IIIF hold it"
+            f"for example {EXAMPLE_URL}, with blanks as %20; it is in the ids of IIIF"
         )
     return base_url.rstrip("/")

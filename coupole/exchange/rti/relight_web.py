@@ -28,7 +28,7 @@ _MOST_SAMPLES = 30_000_000
 
 
 def write(view: LitView, folder: Path, basis: str, planes: int, say: Said) -> tuple[list[Path], float]:
-    """Write a view; the files, and the rms in steps of 8 bits of what they miss of the view's own pictures.
+    """Write a view. Return the files, and their rms error against the view's own pictures, in steps of 8 bits.
 
     Raises InputError if there are too few lights for the basis.
     """

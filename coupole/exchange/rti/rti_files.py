@@ -23,7 +23,7 @@ _BLOCK = 1 << 16
 
 def write_ptm(view: LitView, path: Path, say: Said) -> float:
     """Write polynomials of luminance and a colour for each pixel, the bottom row first (Malzbender and others, PTM
-    file format, 1.2); the rms in steps of 8 bits of what they miss of the view's own pictures.
+    file format, 1.2); the rms error against the view's own pictures, in steps of 8 bits.
 
     Raises InputError if the lights do not determine the polynomials.
     """

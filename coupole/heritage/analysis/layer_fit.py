@@ -159,12 +159,14 @@ def predict(
 
 def _check(films: Sequence[Film]) -> None:
     if len(films) < 2:
-        raise InputError(f"expected two or more spectra of films, found {len(films)}: one cannot tell K from S")
+        raise InputError(
+            f"expected two or more spectra of films, found {len(films)}: one spectrum cannot separate K from S"
+        )
     kinds = {(film.ground_name, film.ground is None, film.thickness_mm) for film in films}
     if len(kinds) < 2:
         raise InputError(
             "expected films over two grounds, of two thicknesses, or an opaque one; found films that are alike: "
-            "they cannot tell K from S"
+            "these cannot separate K from S"
         )
 
 

@@ -50,7 +50,7 @@ def deserved_model(coefficients: Coefficients, films: list[Film], face: Face, no
     sure = coefficients.determined_bands
     if not sure.any():
         return Deserved(
-            "K/S only", "the films hide their grounds in every band: they tell K/S, not K and S", 0.0, 0.0
+            "K/S only", "the films hide their grounds in every band: this gives K/S, but not K and S", 0.0, 0.0
         )
     k, s = np.maximum(coefficients.absorption, 0.0), coefficients.scattering
     total = 4.0 / 3.0 * s

@@ -212,7 +212,8 @@ def _check_order(films: Sequence[Film], film_entries: Sequence[FilmGiven], nm: A
             light, dark = (told_b, told_a) if lighter[at] > 0 else (told_a, told_b)
             raise InputError(
                 f"{light.spectrum}: is darker over the lighter ground {light.over} than {dark.spectrum} over "
-                f"{dark.over} at {nm[at]:g} nm; see which spectrum is which, and percent or fractions"
+                f"{dark.over} at {nm[at]:g} nm; check whether the spectra are exchanged, and whether they are "
+                f"percent or fractions"
             )
 
 

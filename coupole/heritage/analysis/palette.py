@@ -50,7 +50,7 @@ def read_palette(sources: Sequence[Path]) -> tuple[Paint, ...]:
         if _is_same(a, b):
             raise InputError(
                 f"{a.source} and {b.source}: {a.name!r} and {b.name!r} have the same K and S; their shares "
-                "cannot be told apart: leave one out"
+                f"cannot be distinguished: leave one out"
             )
         if a.unit != b.unit:
             raise InputError(
@@ -59,8 +59,8 @@ def read_palette(sources: Sequence[Path]) -> tuple[Paint, ...]:
             )
     if "per layer" in {paint.unit for paint in paints} and len(paints) > 1:
         raise InputError(
-            f"{paints[0].source}: K and S are of a layer of unknown thickness, not to be compared with others; "
-            "measure it with its thickness"
+            f"{paints[0].source}: K and S are of a layer of unknown thickness, so it cannot be mixed with "
+            f"others; measure it with its thickness"
         )
     if not paints:
         raise InputError(f"{', '.join(map(str, sources))}: expected paints ({ENDING}, or a library); found none")
@@ -89,7 +89,7 @@ def _of_library(path: Path) -> list[Paint]:
     spectra = read_library(path)
     if all(spectrum.absorption is None for spectrum in spectra):
         raise InputError(
-            f"{path}: expected K and S of each paint, found reflectances: they do not tell how paints mix"
+            f"{path}: expected K and S of each paint, found reflectances, from which mixtures cannot be computed"
         )
     return [_of_row(spectrum) for spectrum in spectra]
 

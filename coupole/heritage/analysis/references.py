@@ -153,7 +153,7 @@ class References:
             if len(names) < _LEAST_CLASSES:
                 raise InputError(
                     f"spectrum {spectrum_name}: expected references of {_LEAST_CLASSES} or more classes in its "
-                    f"bands, found {len(names)}; the library's spectra cover different wavelengths"
+                    f"bands, found {len(names)}; most spectra of the library cover other wavelengths"
                 )
             classes = np.array([names.index(self.class_of[row]) for row in rows])
             values = self.reflectance[np.ix_(rows, bands)]

@@ -1,10 +1,10 @@
 """Significance of many differences: p-values with a noise that the data themselves confirm, and false discoveries.
 
 If noise is correlated from point to point, or surfaces are sampled unevenly, differences scatter more than local
-fits say. Most of an object does not change, so the bulk of all differences shows their true scatter (an
-empirical null: Efron, J. American Statistical Association 99, 2004); uncertainties are enlarged to it, never
-reduced. Of the points marked at most 5 % are expected to be unchanged (Benjamini, Hochberg, J. Royal Statistical
-Society B 57(1), 1995).
+fits say. Most of an object does not change, so the bulk of all differences shows their true scatter (an empirical
+null: Efron, J. American Statistical Association 99, 2004); uncertainties are enlarged to it, never reduced. At
+most 5 % of the marked points are expected to be unchanged (Benjamini, Hochberg, J. Royal Statistical Society B
+57(1), 1995).
 """
 
 from __future__ import annotations

@@ -90,7 +90,7 @@ def compare(
     if not 0.2 < before.size_mm / after.size_mm < 5:
         raise InputError(
             f"{after_path}: {after.size_mm:.3g} mm in size, {before_path.name} is {before.size_mm:.3g} mm: "
-            "another unit, another object, or a part of it only?"
+            "is it in another unit, another object, or only a part of it?"
         )
     say("aligning", 0, 1)
     alignment = align(before, after)

@@ -61,7 +61,7 @@ def align(before: State, after: State) -> Alignment:
         if agreement < _FEATURES_AGREED or _share(coarse[0], coarse[1], motion, pitch_mm) < _LEAST_SHARE:
             raise InputError(
                 f"{before.name} and {after.name}: no motion brings {100 * _LEAST_SHARE:.0f} % or more of one onto "
-                "the other. Another object, another unit, or a part of it only?"
+                "the other. Is it another object, in another unit, or only a part of it?"
             )
     return _robust(fine[0], fine[1], motion, pitch_mm, is_given=is_given)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from coupole.heritage.restoration.restoration_file import Hypothesis
 
 Picture = NDArray[np.uint8]
-DISCLAIMER = "A hypothesis, computed by spectral path tracing: no photograph, and no proof of what was."
+DISCLAIMER = "A hypothesis, computed by spectral path tracing: not a photograph, and not a proof of how it was."
 _MOST_LINES = 7
 _STRIP, _INK = (24, 25, 28), (214, 212, 206)
 _SPACES = {

@@ -74,7 +74,7 @@ def parts_of(mesh: PaintedMesh, document: Document, parts_file: PartsFile) -> Pa
         if count == 0 and not problems:
             at = ("rules", places[name]) if name in places else ("rest",)
             message = (
-                f"the part {name!r} has no triangle: none is there, or later rules took it; "
+                f"the part {name!r} has no triangle: no rule gives it one, or later rules took it; "
                 f"{_remark_text(remarks)}"
             )
             problems.append(document.problem(at, message))
@@ -87,7 +87,7 @@ def parts_of(mesh: PaintedMesh, document: Document, parts_file: PartsFile) -> Pa
 
 
 def _remark_text(remarks: Sequence[str]) -> str:
-    return "; ".join(remarks) or "see to its rule, or leave it out"
+    return "; ".join(remarks) or "correct its rule, or leave it out"
 
 
 def _with_rest(

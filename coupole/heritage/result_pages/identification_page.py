@@ -129,11 +129,12 @@ def _percent(finding: PigmentFinding) -> str:
 def _worth(rates: HeldOutRates) -> Section:
     return Section(
         "library",
-        "What the verdicts are worth",
+        "How reliable the verdicts are",
         words=[
             "Each spectrum of the library was identified as if the library lacked it, and as if it lacked its "
             "class. In "
-            "brackets are 95 % intervals (Clopper and Pearson). Another instrument, binder or ground does worse."
+            "brackets are 95 % intervals (Clopper and Pearson). With another instrument, binder or ground the "
+            "rates are worse."
         ],
         facts={
             "first class right": str(rates.right),

@@ -29,11 +29,11 @@ def layer_page(
             pictures=_coefficients(nm, fit, unit),
             summary=f"K and S were solved from {fit.spectra} spectra of {nm[0]:g} to {nm[-1]:g} nm by "
             f"{model.model}.",
-            quality=f"S is told in {told_bands}; the bands in the picture hold 95 %.",
+            quality=f"S is determined in {told_bands}; the bands in the picture are 95 % intervals.",
             next_step=[
                 "Mix with it: give the paint file to ",
                 Code("coupole recipe --palette"),
-                "." if sure.all() else ". Where S is not told, measure a thinner film or another ground.",
+                "." if sure.all() else ". For the other wavelengths, measure a thinner film or another ground.",
             ],
             facts={
                 "Model": f"{model.model}: {model.because}",

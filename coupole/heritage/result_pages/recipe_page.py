@@ -33,7 +33,7 @@ def recipe_page(name: str, search: Found, matches: Sequence[Sequence[Match]]) ->
             next_step=[
                 "Mix a little by the ",
                 Link("#shares", "shares"),
-                ", let it dry, and compare it with the target under the lights that it will hang in.",
+                ", let it dry, and compare it with the target under the lights of its later place.",
             ],
             sections=[
                 Section("shares", "Shares", tables=[_shares(best)]),
@@ -53,7 +53,8 @@ def recipe_page(name: str, search: Found, matches: Sequence[Sequence[Match]]) ->
 
 
 _SCREEN = (
-    "Patches are adapted to the screen's white (CAT16); colours outside its gamut are nearest ones. dE00: "
+    "Patches are adapted to the screen's white (CAT16); colours outside its gamut are replaced by the nearest "
+    "ones. dE00: "
     "CIEDE2000."
 )
 

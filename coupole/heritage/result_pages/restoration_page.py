@@ -135,8 +135,7 @@ def _files(result: Mapping[str, Any]) -> Section:
     note = (
         f"{result['bands']} bands, {result['observer']}; white is {result['white_cd_m2']:.4g} cd/m2 in all "
         "pictures. "
-        "Mean dE00 is over the pixels of a part, to which noise of the pictures adds; that of mean colours has "
-        "no such "
-        "noise."
+        "Mean dE00 is over the pixels of a part, and includes the noise of the pictures; dE00 of mean colours "
+        "does not include it."
     )
     return Section("files", "Files", tables=[Table("Files", ("file", "holds"), rows)], notes=[note])

@@ -182,8 +182,7 @@ def _refuse_far(poses: ColmapPoses, measured_run: MeasuredRun) -> None:
         else "in the support's frame, in mm, as with one or two views the model must be"
     )
     raise InputError(
-        f"{poses.path}: the camera of {measured_run.views[view].name} is {how_far} from where the records have "
-        f"it, "
+        f"{poses.path}: the camera of {measured_run.views[view].name} is {how_far} from its place in the records, "
         f"{conditions}: {poses.over_u[view, kind]:.1f} times their standard uncertainty; expected {MOST_APART:g} "
         "at most. Is it another run's model, or a reconstruction that failed? Else calibrate hand-eye anew"
     )

@@ -64,7 +64,7 @@ def refine_runs(request: RefineRequest, out: Path, say: Said) -> dict[str, Any]:
     _refuse_other_cameras(runs)
     views = [(measured_run, view) for measured_run in runs for view in measured_run.views]
     if len(views) < 2:
-        raise InputError(f"{request.runs[0]}: has one view; what views disagree about needs two or more")
+        raise InputError(f"{request.runs[0]}: has one view; to compare views, two or more are needed")
     leds = common_leds([view for _, view in views])
     radiometry = {measured_run.run.folder: Radiometry(measured_run) for measured_run in runs}
     pictures = [

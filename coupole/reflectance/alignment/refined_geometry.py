@@ -32,18 +32,18 @@ TOLD = {
     "vertices_mm": "[n, 3] of the mesh, those that triangles use, in its order, base frame",
     "vertex_u_mm": "[n] standard uncertainty along the normal",
     "names": "of the unknowns, with units; cameras by their places in `views`",
-    "steps": "of the unknowns from what records and scan say",
+    "steps": "of the unknowns, from the initial values of records and scan",
     "covariance": "of the steps",
-    "stated_covariance": "of the unknowns before the pictures counted, by records and scan",
+    "stated_covariance": "of the unknowns without the pictures, from records and scan",
     "controls_mm": "[controls, 3] where `shape` is, base frame",
     "middle_mm": "[3] about which `mesh` turns, base frame",
 }
 MATCH_FIELDS = {
-    "reference": "place in `views` of the one that sees the spot in the greatest detail",
-    "other": "of the one that is compared with it",
+    "reference": "place in `views` of the view that sees the spot in the greatest detail",
+    "other": "of the view that is compared with it",
     "blocks": "[n, 2] column and row of blocks of 2 x 2 pixels in the reference",
-    "points_mm": "where the reference puts the spot, base frame",
-    "shifts_mm": "from there to where the other puts it",
+    "points_mm": "place of the spot by the reference, base frame",
+    "shifts_mm": "from there to the place of the spot by the other view",
 }
 
 
@@ -67,7 +67,7 @@ class RefinedGeometry:
         a run that has changed since."""
         if sha256(measured_run.mesh_path) != self.mesh_sha256:
             raise InputError(
-                f"{self.path}: another mesh than {measured_run.mesh_path} was refined; name that with --mesh"
+                f"{self.path}: a mesh other than {measured_run.mesh_path} was refined; name that with --mesh"
             )
         run = measured_run.run.folder.name
         if absent := [view.name for view in measured_run.views if (run, view.name) not in self.base_from_camera]:
@@ -77,8 +77,8 @@ class RefinedGeometry:
             )
         if self.inputs.get(run) != dict(measured_run.frames.inputs):
             raise InputError(
-                f"{self.path}: {run} has other frames than when it was refined; `coupole reflectance refine` it "
-                "anew, with another --out"
+                f"{self.path}: {run} has other frames than when it was refined; refine it again by `coupole "
+                f"reflectance refine`, with another --out"
             )
         views = tuple(
             replace(
@@ -100,7 +100,7 @@ def read_refined(folder: Path) -> RefinedGeometry:
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("schema") != SCHEMA:
-                raise InputError(f"{path}: expected {SCHEMA}; refine anew with this version")
+                raise InputError(f"{path}: expected {SCHEMA}; refine again with this version")
             views = [tuple(name) for name in file["views"].asstr()[()]]
             lens = Intrinsics(**dict(zip(NAMES, map(float, file["lens"][()]), strict=True)))
             poses = dict(zip(views, file["base_from_camera"][()], strict=True))
@@ -156,7 +156,7 @@ def write_refined(
         for number, picture in enumerate(pictures):
             data = file.create_dataset(f"pictures/{number}", data=_preview(picture), track_times=False)
             data.attrs["blocks"] = picture.shape
-            data.attrs["told"] = "what the view was compared by, scaled down; its height and width were `blocks`"
+            data.attrs["told"] = "the picture by which the view was compared, scaled; its size was `blocks`"
 
 
 def _pointings(

@@ -147,9 +147,9 @@ def _find_matches(
     matches = match_views(surfaces_of(unknowns, steps, pictures, threads), search_mm, threads, say)
     if len(matches.blocks) < FEWEST_MATCHES:
         raise InputError(
-            f"views are matched by what they show of the surface: expected {FEWEST_MATCHES} matches or more, "
-            f"found {len(matches.blocks)}. Do views overlap, has the object texture, and is --search-mm as far as "
-            "they disagree?"
+            f"views are matched by the texture that they show: expected {FEWEST_MATCHES} matches or more, "
+            f"found {len(matches.blocks)}. Do the views overlap, has the object texture, and is --search-mm as "
+            f"large as their disagreement?"
         )
     return matches
 

@@ -2,7 +2,7 @@
 
 A window of one view's picture is compared with the other's picture as the mesh says that the first would show it.
 The best whole shift is that of the greatest correlation; Gauss-Newton steps with gain and offset make it finer
-(Lucas and Kanade, IJCAI 1981), and give its covariance from the window's gradients and what is left.
+(Lucas and Kanade, IJCAI 1981), and give its covariance from the window's gradients and the residual.
 """
 
 from __future__ import annotations

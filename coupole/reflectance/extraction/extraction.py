@@ -177,7 +177,7 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface) -> None:
     file["seen"].attrs["told"] = "[h, w] place in `triangles` of what a pixel sees, -1 where it is not used"
     _dataset(file, "triangles", surface.triangles, "numbers of the mesh's triangles, from 0")
     _dataset(file, "pixels", work.reader.pixels, "pixels of each channel on each triangle")
-    description = "relative standard uncertainty that a triangle's samples share, of pixels' own responses"
+    description = "relative standard uncertainty, shared by a triangle's samples, from pixels' own responses"
     _dataset(file, "u_response", work.reader.u_response, description)
     _dataset(file, "centres_mm", work.facets.centres_mm, "of the triangles, mm, base frame")
     _dataset(file, "normals", work.facets.normals, "of the triangles, unit, base frame")
@@ -189,9 +189,7 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface) -> None:
     powers = measured_run.powers.of(leds)
     _dataset(file, "led_u_own", powers.u_own, "relative standard uncertainty of an LED's power, its own")
     u_shared = np.hypot(powers.u_shared, measured_run.u_signal)
-    _dataset(
-        file, "led_u_shared", u_shared, "relative, of what all samples share: powers, response, fall-off, drift"
-    )
+    _dataset(file, "led_u_shared", u_shared, "relative, shared by all samples: powers, response, fall-off, drift")
     scales = np.stack([_dn_share(measured_run, view, int(led)) for led in leds])
     _dataset(file, "full_scales", scales, "of the camera that f cos_i E/Phi of 1 gives in the longest exposure")
 

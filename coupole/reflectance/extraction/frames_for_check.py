@@ -1,6 +1,6 @@
 """Frames of LEDs that are kept for the check, as pictures: one value for each block of 2 x 2 pixels and channel.
 
-Of a block, one pixel of each channel counts, so that green does not count twice (seed 003, 6.3). Pixels are
+In a block, one pixel of each channel counts, so that green does not count twice (seed 003, 6.3). Pixels are
 linear, in shares of the camera's range, dark and flat field taken out, as the samples are.
 """
 

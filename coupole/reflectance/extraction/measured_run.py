@@ -228,7 +228,7 @@ def read_powers(path: Path, channels: Sequence[str]) -> Powers:
     lines = [line for line in table.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
     rows = list(csv.DictReader(lines))
     if absent := [channel for channel in channels if f"power_{channel}" not in rows[0]]:
-        raise InputError(f"{path}: has no power of the channel {absent[0]}; make a record with this camera")
+        raise InputError(f"{path}: has no LED power for the channel {absent[0]}; make a record with this camera")
 
     def column(name: str) -> Floats:
         return np.stack([[float(row[f"{name}_{channel}"]) for channel in channels] for row in rows])
@@ -248,7 +248,8 @@ def refuse_different(measured_runs: Sequence[MeasuredRun]) -> None:
     for other_run in measured_runs[1:]:
         if not np.array_equal(first.corners_mm, other_run.corners_mm):
             raise InputError(
-                f"{other_run.run.folder}: shows another object, or in another place, than {first.run.folder}"
+                f"{other_run.run.folder}: shows another object, or the object in another place, than "
+                f"{first.run.folder}"
             )
         if first.channels != other_run.channels:
             raise InputError(f"{other_run.run.folder}: was taken with another sensor than {first.run.folder}")

@@ -107,8 +107,9 @@ def surface_of_view(result: RunResult, view: ViewSamples) -> Surface:
 
 
 def surface_from(result: RunResult, mesh: PacketMesh, camera: FreeCamera) -> Surface:
-    """Return the surface of the triangles that any view has seen, from a camera anywhere. Those of `mesh` that no
-    view has seen hide what is behind them, as others do. Raises InputError if the camera sees none."""
+    """Return the surface of the triangles that any view has seen, from a camera anywhere. Triangles of `mesh` that
+    no view has seen also hide the surface behind them. Raises InputError if the camera sees none.
+    """
     triangles = result.triangles
     corners_mm = result.corners_mm[triangles].astype(np.float64)
     normals = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
@@ -135,7 +136,9 @@ def surface_from(result: RunResult, mesh: PacketMesh, camera: FreeCamera) -> Sur
 
     in_strips(height, trace)
     if not (triangle_of_pixel >= 0).any():
-        raise InputError("--from: no pixel of this camera sees a measured part of the object; look at it")
+        raise InputError(
+            "--from: no pixel of this camera sees a measured part of the object; turn the camera to the object"
+        )
     return Surface(triangle_of_pixel, places_mm, camera_mm, triangles, corners_mm.mean(axis=1), normals)
 
 

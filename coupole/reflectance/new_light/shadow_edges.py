@@ -1,8 +1,8 @@
 """Pixels of a surface that a beam reaches.
 
 Rays are traced from every fourth pixel in both directions, and from all between where these differ; then shadows'
-edges are followed from cell to cell until they end. What is missed is a spot of light or shadow that lies between
-four rays and touches no edge that was found.
+edges are followed from cell to cell until they end. A spot of light or shadow is missed if it lies between four
+rays and touches no edge that was found.
 """
 
 from __future__ import annotations
@@ -120,8 +120,9 @@ def _begin(triangle_of_pixel, places_mm, facing, place, axis, exponent, codes): 
 
 @numba.njit(cache=True, nogil=True)
 def _close_cells(codes, first, open_cells):  # type: ignore[no-untyped-def]
-    """Close cells of rows [n, cells across] from a `first` one on, which have others below and to the right. Those
-    stay open whose rays at the corners are missing or differ, or where the surface ends."""
+    """Close cells of rows [n, cells across] from a `first` one on, which have others below and to the right.
+    Pixels stay open if their rays at the corners are missing or differ, or if the surface ends there.
+    """
     down, across = open_cells.shape
     for i in range(down):
         for j in range(across - 1):

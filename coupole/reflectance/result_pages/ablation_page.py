@@ -33,12 +33,13 @@ def _page(name: str, document: dict[str, Any]) -> Page:
     return Page(
         title=f"{name}: fewer LEDs, samples, coefficients",
         pictures=[
-            Picture("Mean error of each fit by what it is given", _plot_png(document["mae"]), is_broad=True)
+            Picture("Mean error of each fit by the amount of data", _plot_png(document["mae"]), is_broad=True)
         ],
-        summary=f"Each fit was made again from less, of {document['triangles']:,} triangles spread over the "
+        summary=f"Each fit was repeated with less data, for {document['triangles']:,} triangles spread over the "
         "object.",
         quality=_quality(document["mae"]),
-        next_step="Take the fit that misses least at the LEDs that you can afford; the tables have the figures.",
+        next_step="Take the fit with the smallest error for the number of LEDs that you can afford; the tables "
+        "have the figures.",
         sections=[
             *tables,
             Section(
@@ -46,11 +47,10 @@ def _page(name: str, document: dict[str, Any]) -> Page:
                 "Beside what is published",
                 words=[
                     "Mean absolute error under the LEDs kept for the check, in % of the camera's range. All "
-                    "fits are "
-                    "compared by the same samples.",
-                    "Published (seed 003, 6.3 and 6.4): with half of the photos radial functions miss least of "
-                    "the "
-                    "three that the paper compares (it has no GGX with radial functions), and spherical "
+                    "fits are compared with the same samples.",
+                    "Published (seed 003, 6.3 and 6.4): with half of the photos radial functions have the "
+                    "smallest error of the three fits that the paper compares (it has no GGX with radial "
+                    "functions), and spherical "
                     "harmonics are "
                     "the least robust. Fewer harmonics are lower degrees; fewer radial functions are fewer "
                     "centres.",
@@ -65,7 +65,7 @@ def _quality(mae: dict[str, Any]) -> str:
     value, errors = max(steps, key=lambda step: float(step[0]))
     known_errors = {name: error for name, error in errors.items() if error is not None}
     if not known_errors:
-        return "It is not known: no LEDs were kept for the check."
+        return "The error is not known, because no LEDs were kept for the check."
     best = min(known_errors, key=lambda name: known_errors[name])
     return (
         f"With the most ({setting} {value:g}) {FITS[best].title} misses least: "

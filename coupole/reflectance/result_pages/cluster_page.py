@@ -19,9 +19,9 @@ _GROUND = np.array([0x10, 0x12, 0x14]) / 255
 """Maps for the eye have this colour where no triangle is seen."""
 _TOLD = {
     "own": "triangles by their own material",
-    "clustered": "the same by their cluster's",
-    "harmonics": "the same by its harmonics of both directions",
-    "borrowed": "triangles that have their cluster's for want of samples",
+    "clustered": "the same triangles by their cluster's material",
+    "harmonics": "the same triangles by their cluster's harmonics of both directions",
+    "borrowed": "triangles that borrow their cluster's material, because they have too few samples",
 }
 
 
@@ -39,7 +39,8 @@ def _page(folder: Path, document: dict[str, Any]) -> Page:
         title=f"{name}: {document['clusters']} materials for {document['triangles']:,} triangles",
         pictures=views[0][1] if views else [],
         summary=f"{document['triangles']:,} triangles were grouped into {document['clusters']} materials; "
-        f"{document['borrowed']:,} had too few samples for one of their own, {document['without']:,} have none.",
+        f"{document['borrowed']:,} had too few samples for a material of their own, {document['without']:,} "
+        f"have none.",
         quality=_quality(document),
         next_step=[
             "See it without holes: ",
@@ -68,7 +69,7 @@ def _errors(document: dict[str, Any]) -> Table:
     for name, words in _TOLD.items():
         mae = document["mae"][name]
         rows.append((words, "" if mae is None else f"{100 * mae:.3f}"))
-    return Table("Mean error under LEDs left out", ("triangles", "% of range"), rows)
+    return Table("Mean error under LEDs kept for the check", ("triangles", "% of range"), rows)
 
 
 def _notes(document: dict[str, Any]) -> list[str]:
@@ -77,7 +78,8 @@ def _notes(document: dict[str, Any]) -> list[str]:
         kinds = ((words, document["mae_of_view"][name]) for name, words in _TOLD.items())
         errors = ", ".join(f"{words} {100 * mae:.3f} %" for words, mae in kinds if mae is not None)
         notes.append(
-            f"From the view {document['without_view']}, of which clusters had no samples: {errors} (their own "
+            f"From the view {document['without_view']}, whose samples the clusters did not use: {errors} (their "
+            f"own "
             "materials had them)."
         )
     if document["mae_ratio"] is not None:

@@ -75,7 +75,8 @@ def _page(folder: Path, about: dict[str, Any]) -> Page:
         summary=f"Poses, lens and mesh were moved so that {len(about['cameras'])} views put the same spots of the "
         "surface "
         f"into the same places: {before['matches']:,} matches.",
-        quality=f"Views disagreed by {before['median_mm']:.3f} mm (median), and do by {after['median_mm']:.3f} "
+        quality=f"Views disagreed by {before['median_mm']:.3f} mm (median) before, and disagree by "
+        f"{after['median_mm']:.3f} "
         "mm now.",
         next_step=_next_step(name, about),
         remark="Frames of a simulated cell." if about["simulated"] else "",
@@ -95,8 +96,9 @@ def _page(folder: Path, about: dict[str, Any]) -> Page:
 
 
 _ARROWS = (
-    "From a spot of the surface to where another view puts it, in the picture of the view that shows it in the "
-    f"greatest detail; arrows are {LONGER:g} times as long as what they show. The first two are at the top."
+    "Arrows lead from a spot of the surface to the place where another view puts it, in the picture of the view "
+    "with the greatest detail; they are {LONGER:g} times as long as the true distance. The first two are at the "
+    "top."
 )
 _STEPS = "Steps along the base's axes and about the camera's, with standard uncertainties."
 
@@ -114,8 +116,8 @@ def _unknowns(about: dict[str, Any]) -> str:
         f"steps over what was stated {about['chi2_of_steps']:.0f}. Matches scatter {about['noise_factor']:.1f} "
         "times "
         "as much as noise and texture alone would make them, and are weighted by that; "
-        f"{about['rejected']} were rejected. What pictures cannot tell, as a motion of mesh and cameras together, "
-        "keeps the uncertainty that was stated."
+        f"{about['rejected']} were rejected. Motions that pictures cannot determine, such as that of mesh and "
+        f"cameras together, keep their stated uncertainty."
     )
 
 

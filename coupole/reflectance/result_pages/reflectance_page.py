@@ -40,8 +40,8 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
             "table have them as seen from one point; normals and materials are of single pixels"
         )
     yield (
-        f"{about['pixels']} pixels under {about['lights'] - len(about['left_out'])} lights; the materials leave "
-        f"{100 * about['residual']:.1f} % (median, of square roots)"
+        f"{about['pixels']} pixels under {about['lights'] - len(about['left_out'])} lights; residual of the "
+        f"materials {100 * about['residual']:.1f} % (median, of square roots)"
     )
     if about["not_fitted"]:
         yield f"{about['not_fitted']} pixels saw too few lights and have no normal"
@@ -52,9 +52,9 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
         )
     if about["suspect_pictures"]:
         names = ", ".join(f"{name} ({gain:.2f})" for name, gain in about["suspect_pictures"].items())
-        yield f"pictures brighter or darker than all others say they should be: {names}"
+        yield f"pictures brighter or darker than all others predict: {names}"
     if about["held_out_psnr_db"] is not None:
-        yield f"left-out lights are made with {about['held_out_psnr_db']:.2f} dB (PSNR, linear, inside the mask)"
+        yield f"left-out lights are predicted with {about['held_out_psnr_db']:.2f} dB (PSNR, linear, in the mask)"
 
 
 def _page(result: PictureResult) -> Page:
@@ -96,9 +96,10 @@ def _sentence(remark: str) -> str:
 def _quality(about: dict[str, Any]) -> str:
     if about["held_out_psnr_db"] is not None:
         return (
-            f"Lights that were left out are made with {about['held_out_psnr_db']:.1f} dB (PSNR, inside the mask)."
+            f"Pictures of lights that were left out are predicted with {about['held_out_psnr_db']:.1f} dB "
+            f"(PSNR, inside the mask)."
         )
-    return f"The materials leave {100 * about['residual']:.1f} % of the pictures (median, of square roots)."
+    return f"The median residual of the materials is {100 * about['residual']:.1f} % (of square roots)."
 
 
 def _next_step(name: str, about: dict[str, Any]) -> Inline:
@@ -114,7 +115,7 @@ def _on_the_picture(result: PictureResult, values: NDArray[Any]) -> NDArray[np.f
 
 def _materials(result: PictureResult, fields: dict[str, NDArray[Any]]) -> Section:
     figures: list[Figure] = []
-    notes = ["Where no light stands near the mirror direction, specular and roughness are guesses."]
+    notes = ["Where no light stands near the mirror direction, specular part and roughness are not determined."]
     ks, alpha = fields["ks"], fields["alpha"]
     is_seen = lobes_told.highlights(fields["kd"], ks, alpha) >= lobes_told.LEAST_HIGHLIGHT
     if (share := float(is_seen.mean())) >= lobes_told.LEAST_SHARE:
@@ -132,7 +133,7 @@ def _materials(result: PictureResult, fields: dict[str, NDArray[Any]]) -> Sectio
         reason = f"they add less than {lobes_told.LEAST_HIGHLIGHT:.0%} to the diffuse part"
         notes = [lobes_told.no_lobe_in_words(share, reason)]
     residual = 100 * _on_the_picture(result, fields["residual"])
-    figures.append(value_map("what the materials leave", residual, "% of the diffuse part", 10.0))
+    figures.append(value_map("residual of the materials", residual, "% of the diffuse part", 10.0))
     return Section("materials", "Materials", figures=figures, notes=notes)
 
 
@@ -145,7 +146,7 @@ def _figures(about: dict[str, Any]) -> Section:
         facts={"kernel": about["kernel"], "time": f"{about['seconds']:.1f} s"},
         tables=[
             Table("Left-out lights", ("light", "PSNR, dB", "mean absolute error"), errors),
-            Table("Kernels at lights left out", ("kernel", "rms, of full scale"), kernels),
+            Table("Errors of the kernels at lights left out", ("kernel", "rms, of full scale"), kernels),
         ],
     )
 
@@ -157,7 +158,7 @@ def _uncertainty(result: PictureResult) -> Section:
     words: list[Inline] = []
     if np.isfinite(cones_deg).any():
         words.append(
-            f"Cones that hold 95 % of the normals: half angle {np.nanmedian(cones_deg):.1f} degrees (median)."
+            f"Cones that contain 95 % of the normals: half angle {np.nanmedian(cones_deg):.1f} degrees (median)."
         )
         cones = _on_the_picture(result, cones_deg)
         figures.append(value_map("half angle of the normals' 95 % cones", cones, "degrees", 30.0))

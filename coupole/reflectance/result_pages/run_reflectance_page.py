@@ -1,4 +1,6 @@
-"""`report.html` of the reflectance of runs: maps of each view, what was left out, what the materials miss."""
+"""`report.html` of the reflectance of runs: maps of each view, samples that were left out, errors of the
+materials.
+"""
 
 from __future__ import annotations
 
@@ -52,9 +54,9 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
         yield f"views were refined: they disagreed by {before:.3f} mm (median), and by {after:.3f} mm afterwards"
     if poses := about.get("poses"):
         yield (
-            f"cameras stand where COLMAP has them, {poses['median_moved_mm']:.3g} mm and "
-            f"{poses['median_turned_deg']:.2g} degrees (median) from where the records do; their uncertainty is "
-            "taken to be the records'"
+            f"cameras have the poses of COLMAP, {poses['median_moved_mm']:.3g} mm and "
+            f"{poses['median_turned_deg']:.2g} degrees (median) from those of the records; their uncertainty is "
+            f"assumed to be that of the records"
         )
     if about["not_fitted"]:
         yield f"{about['not_fitted']} triangles have fewer than {FEWEST} samples and no material"
@@ -173,15 +175,15 @@ def _shares(about: dict[str, Any]) -> Section:
     ]
     notes = [
         f"{about['seconds']:.1f} s, at most {about['peak_memory_bytes'] / 1e9:.1f} GB.",
-        f"{_inter_reflection(about)} Veiling glare is not subtracted, and neither is in the bounds.",
+        f"{_inter_reflection(about)} Veiling glare is not subtracted, and is not in the bounds.",
     ]
     if left_out := sum(view["contradicted"] or 0 for view in about["views"]):
         notes.append(
             f"{left_out} samples ({100 * left_out / max(about['samples'], 1):.3f} %) were left out: they are "
-            "darker than those beside them allow, as at the edge of a cable's shadow."
+            f"darker than their neighbours allow, as at the edge of a cable's shadow."
         )
     table = Table("Share of triangles and LEDs", ("view", *codes), rows)
-    return Section("samples", "What became of the samples", tables=[table], notes=notes)
+    return Section("samples", "Samples that were used and left out", tables=[table], notes=notes)
 
 
 def _inter_reflection(about: dict[str, Any]) -> str:
@@ -190,8 +192,9 @@ def _inter_reflection(about: dict[str, Any]) -> str:
     shares_of_views = (view["inter_reflection"] for view in about["views"])
     shares = [f"{100 * half:.1f} % ({100 * far:.1f} %)" for half, far in shares_of_views]
     return (
-        "Inter-reflection was taken off the samples, in the median (and the 95th percentile) of each view: "
-        f"{', '.join(shares)}; the disk under the object is taken to reflect {about['support_reflectance']:g}."
+        "Inter-reflection was subtracted from the samples; median (and 95th percentile) of each view: "
+        f"{', '.join(shares)}; the assumed reflectance of the disk under the object is "
+        f"{about['support_reflectance']:g}."
     )
 
 
@@ -240,9 +243,8 @@ def _material_uncertainty(about: dict[str, Any]) -> Section:
             Table("Median standard uncertainties", ("fit", "normal, degrees", "kd", "ks", "alpha", "inside"), rows)
         ],
         notes=[
-            "Inside: how many of the samples kept for the check lie in the 95 % interval of what is made. Fewer "
-            "than "
-            "95 %: the material misses something that neighbouring LEDs do not share."
+            "Inside: share of the samples kept for the check that lie in the 95 % interval of the prediction. "
+            "Fewer than 95 %: the material has an error that neighbouring LEDs do not share."
         ],
     )
 
@@ -286,8 +288,8 @@ def _table_of_fits(about: dict[str, Any]) -> Section:
 
 def _check_section(view: str, figures: Sequence[Figure]) -> Section:
     words = (
-        "Direct light of one LED in a frame that was kept for the check, made by each fit, and how far each "
-        "is off."
+        "Direct light of one LED in a frame that was kept for the check, its prediction by each fit, and the "
+        "error of each."
     )
     heading = "Measured and made"
     return Section(f"check-{anchor(view)}", heading, words=[words] if figures else [], figures=figures)

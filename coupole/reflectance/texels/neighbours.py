@@ -47,9 +47,10 @@ def settle(
     deviation: Singles, covariance: Singles, is_fitted: NDArray[np.bool_], centre_covariance: Singles
 ) -> None:
     """Draw the deviations [h, w, 5] of a view's pixels from their triangles (tilts, logarithms) towards 0 as far
-    as their neighbours say, and set their covariances [h, w, 15, lower half row by row] to what is left; in place.
-    Only pixels that are `is_fitted` [h, w] are used and changed. `centre_covariance` [h, w, 15] is that of what
-    they are drawn to."""
+    as their neighbours agree, and set their covariances [h, w, 15, lower half row by row] to what is left; in
+    place. Only pixels that are `is_fitted` [h, w] are used and changed. `centre_covariance` [h, w, 15] is that of
+    what they are drawn to.
+    """
     covariance[...] = mean_around(covariance, is_fitted, _ALIKE_PX)
     square = deviation**2
     np.minimum(square, np.float32(_OUTLIER) * mean_around(square, is_fitted, WINDOW_PX), out=square)
@@ -59,8 +60,9 @@ def settle(
 
 def settle_triangles(logs: Singles, covariance: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:
     """Return the steps [h, w, 5] by which materials of triangles change, seen pixel by pixel, when ks and
-    roughness (`logs` [h, w, 2]) are drawn to their means in a window as far as those around say; set the
-    covariances [h, w, 15] to what is left, in place."""
+    roughness (`logs` [h, w, 2]) are drawn to their means in a window as far as the neighbours agree; set the
+    covariances [h, w, 15] to what is left, in place.
+    """
     weight = (1.0 / np.maximum(covariance[..., VARIANCES[3:]], _LEAST)).astype(np.float32)
     middle = mean_around(weight * logs, is_fitted, side_px) / np.maximum(
         mean_around(weight, is_fitted, side_px), _LEAST

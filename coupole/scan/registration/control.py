@@ -157,7 +157,7 @@ def motions_by_targets(sightings: Sightings) -> list[PairMotion]:
         worst = int(np.argmax(off_mm / u_mm))
         if off_mm[worst] > _SIGMAS * u_mm[worst] * np.sqrt(3):
             raise InputError(
-                f"targets: `{shared_names[worst]}` is {off_mm[worst]:.3g} mm away from where the other "
+                f"targets: `{shared_names[worst]}` is {off_mm[worst]:.3g} mm away from the place where the other "
                 f"{len(shared_names) - 1} targets of two scans put it, which state {u_mm[worst]:.2g} mm: another "
                 "target of that name, another unit, or an uncertainty that is too small"
             )
@@ -176,7 +176,9 @@ def _on_a_line(points_mm: Floats) -> bool:
 def read_sightings(targets: Path | None, control: Path | None, names: Sequence[str], unit: str) -> Sightings:
     """Tables of targets and control points; `names` are the scans', in order. Raises InputError with the line."""
     if control is not None and targets is None:
-        raise InputError(f"--control {control}: needs --targets, which say where the scans see these points")
+        raise InputError(
+            f"--control {control}: needs --targets, which give the places of these points in the scans"
+        )
     if targets is None:
         return Sightings()
     numbers = {name: k for k, name in enumerate(names)} | {Path(name).stem: k for k, name in enumerate(names)}

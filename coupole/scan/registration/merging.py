@@ -131,8 +131,8 @@ def _records(scan: PreparedScan, pose: Floats, unit: str, cell_mm: float) -> NDA
         outward = stored_normals[cKDTree(points_mm).query(points)[1]]
     else:
         raise InputError(
-            f"{scan.source}: neither triangles nor a viewpoint say which side of its surface is out; state with "
-            "--seen-from where the scanner stood, or leave out the mesh with --no-mesh"
+            f"{scan.source}: neither triangles nor a viewpoint show which side of its surface is outside; state "
+            f"the scanner's place with --seen-from, or leave out the mesh with --no-mesh"
         )
     incidence = np.sum(normals * outward, axis=1)
     normals *= np.where(incidence < 0, -1.0, 1.0)[:, None]

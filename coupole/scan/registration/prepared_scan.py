@@ -109,7 +109,8 @@ def _expect_fine_steps(source: ScanSource, mesh: Mesh, spacing_mm: float) -> Non
     if step_mm > _COARSEST_STEP * spacing_mm:
         raise InputError(
             f"{source}: points are up to {farthest_mm / 1000:.0f} m from their origin, where 32-bit coordinates "
-            f"have steps of {step_mm:.2g} mm, and {spacing_mm:.2g} mm apart: subtract the same from all scans"
+            f"have steps of {step_mm:.2g} mm, and {spacing_mm:.2g} mm apart: subtract the same vector from all "
+            f"scans"
         )
 
 
@@ -171,7 +172,7 @@ def spacing(points_mm: NDArray[np.float32]) -> float:
 
 
 def vertex_normals(mesh: Mesh) -> Floats | None:
-    """[n, 3] by the triangles, of length 1 or 0; None of a cloud without triangles."""
+    """[n, 3] normals from the triangles, of length 1 or 0; None for a cloud without triangles."""
     vertices, triangles = mesh.vertices, mesh.triangles
     if not len(triangles):
         return None

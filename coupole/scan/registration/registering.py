@@ -101,8 +101,8 @@ def register(
         main = max(groups.members.values(), key=lambda members: (len(members), -min(members)))
         if len(main) < 2:
             raise InputError(
-                f"no two of the {len(scans)} scans overlap by {100 * LEAST_OVERLAP:.0f} % or more in a way that "
-                f"their shape tells: {', '.join(names[:10])}. Take more scans between these, or name shared "
+                f"no two of the {len(scans)} scans overlap by {100 * LEAST_OVERLAP:.0f} % or more with enough "
+                f"shape in common: {', '.join(names[:10])}. Take more scans between these, or name shared "
                 "targets with --targets"
             )
         scan_numbers = sorted(main)

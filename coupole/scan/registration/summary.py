@@ -134,19 +134,18 @@ def remarks(registration: Registration) -> Iterator[str]:
                 f"{worst_mm:.3g} mm at worst"
             )
     else:
-        yield "no loop closes: a wrong pair would not be noticed, and uncertainties are those of noise alone"
+        yield "no loop closes: a wrong pair would not be noticed, and uncertainties are from noise alone"
     if registration.loop_factor > 1.05:
         yield (
             f"loops close {registration.loop_factor:.1f} times worse than noise explains; all uncertainties are "
-            f"enlarged "
-            "by that"
+            f"multiplied by this factor"
         )
     if registration.unplaced_numbers:
-        yield "not placed, as they overlap no other enough: " + ", ".join(
+        yield "not placed, because they overlap no other scan enough: " + ", ".join(
             names[k] for k in registration.unplaced_numbers
         )
     if registration.rejected_motions:
-        yield f"{len(registration.rejected_motions)} pairs were rejected, as others contradict them"
+        yield f"{len(registration.rejected_motions)} pairs were rejected, because others contradict them"
     if off_mm := stated_poses_off_mm(registration):
         worst = max(off_mm, key=lambda name: off_mm[name])
         yield (
@@ -156,7 +155,7 @@ def remarks(registration: Registration) -> Iterator[str]:
     blind = [scan.name for scan in registration.scans if scan.viewpoint.stand == "none"]
     if blind:
         yield (
-            "seen from nowhere that is known, so that empty space before them proves nothing (see --seen-from): "
+            "scanner's place not known, so the empty space before these scans proves nothing (see --seen-from): "
             + ", ".join(blind)
         )
     for sighting in registration.fit.sightings:

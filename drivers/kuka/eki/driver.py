@@ -245,7 +245,7 @@ class KukaEki:
         self._send(verb, target_deg, percent)
 
     def _look(self) -> None:
-        """Whoever watches the motion has looked: tell the controller, often enough."""
+        """The motion was checked: tell the controller, often enough."""
         due = time.monotonic() - self._sent_s > _BEAT_EVERY_S
         if self._attention.look() is None or not due or not self._watch.moving:
             return

@@ -98,8 +98,9 @@ class StandInController:
 
 @contextmanager
 def answering_session(settings: Settings) -> Iterator[tuple[StandInController, bool]]:
-    """The driver's process in a session with a controller here, and True if it runs under SCHED_FIFO. Of the
-    settings, address, controller and limits of lateness are this session's own."""
+    """The driver's process in a session with a controller here, and True if it runs under SCHED_FIFO. Address,
+    controller and limits of lateness replace those of the settings for this session.
+    """
     port = free_port()
     here = {"listen": f"127.0.0.1:{port}", "controller": "", "delay_limit": 10**9, "link_timeout_s": 1e6}
     settings = settings.model_copy(update=here | {"unaccounted_s": 0.0, "connect_timeout_s": 20.0})

@@ -28,7 +28,7 @@ def preflight() -> Iterator[EntryPreflight]:
 def test_it_says_what_check_says_and_all_that_is_wrong(tmp_path: Path, preflight: EntryPreflight) -> None:
     cell = CellFolder(tmp_path)
     assert not preflight.of(Files(cell.plan), "Ada", beside_a_run=False).problems
-    assert preflight._process.step == "paths, heat, light and time are reckoned"
+    assert preflight._process.step == "computing paths, heat, light and time"
     cell.write(object={**cell.plan_data["object"], "dose_budget_lux_h": 0.01})
     found = preflight.of(Files(cell.plan), "Ada", beside_a_run=False)
     checked = cells.here("check", cell.plan, "--json").document

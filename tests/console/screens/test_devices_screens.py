@@ -176,10 +176,12 @@ def test_a_button_moves_the_arm_as_long_as_it_is_held(room: Room) -> None:
     ActionChains(ada.driver, duration=20).release().perform()
     rested = room.at_rest()
     assert rested["joints_deg"][0] < 25.0, "the step itself goes farther"
-    ada.sees("[data-name=hand-said]", "let go")
+    ada.sees("[data-name=hand-said]", "released")
     time.sleep(0.3)
     assert np.allclose(room.joints_deg(), rested["joints_deg"], atol=0.01)
-    cells.wait_until(lambda: any("hold ends: the button was let go" in line for line in room.logged()), "the log")
+    cells.wait_until(
+        lambda: any("hold ends: the button was released" in line for line in room.logged()), "the log"
+    )
     assert room.logged().count("hold begins to move A1 +") == 1, "renewals are not logged"
 
 

@@ -180,7 +180,10 @@ def test_a_server_that_is_silent_or_refuses_holds_up_nobody_and_is_told(
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"email": {**by_mail(25), "server": "smtp.example.org", "user": "a", "password": "b"}}, "in the clear"),
+        (
+            {"email": {**by_mail(25), "server": "smtp.example.org", "user": "a", "password": "b"}},
+            "without encryption",
+        ),
         ({"email": {**by_mail(25), "sender": "dome@example.org\nBcc: all@example.org"}}, "sender"),
         ({"webhooks": [{"url": "file:///etc/passwd"}]}, "url"),
         ({"events": ["lunch"]}, "events"),

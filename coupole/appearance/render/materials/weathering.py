@@ -72,7 +72,7 @@ class Dusty(Model):
     kind: Literal["dusty"]
     over: Annotated[Plain | Coating | MeasuredMaterial | Worn, Field(discriminator="kind")]
     grams_per_m2: Annotated[float, Field(ge=0)]
-    """Mass of dust per area on what faces up."""
+    """Mass of dust per area on surfaces that face up."""
     settles: Literal["up", "everywhere"] = "up"
     """`up`: per area of ground plan, z up; nothing on what faces down."""
     grain_um: Positive = 20.0

@@ -8,6 +8,7 @@ from pathlib import Path
 import cells
 import numpy as np
 import pytest
+import trimesh
 from cells import Ended
 from places import REPO
 
@@ -154,3 +155,22 @@ def test_light_without_a_bound_in_numbers_is_refused(tmp_path: Path) -> None:
     ended = suggest(tmp_path, "--rig", "sim", "--dose", "inf")
     assert ended.code == 2, ended.err
     assert "--dose: expected a number of lux h" in ended.err
+
+
+@pytest.mark.parametrize(
+    ("cut", "words"),
+    [
+        (False, "is 0.1 mm large; expected 1 to 2960 mm. Is its unit right? `--unit m` makes it"),
+        (True, "was cut off"),
+    ],
+)
+def test_a_mesh_that_cannot_be_is_told_without_places_in_a_plan_that_is_not_written(
+    cut: bool, words: str, tmp_path: Path
+) -> None:
+    mesh = tmp_path / "tiny.ply"
+    trimesh.creation.icosphere(2, 0.05).export(mesh)
+    mesh.write_bytes(mesh.read_bytes()[: 300 if cut else None])
+    ended = suggest(tmp_path, "--rig", "sim", mesh=mesh)
+    assert ended.code == 2, ended.err
+    assert words in ended.err
+    assert "tiny.yaml" not in ended.err

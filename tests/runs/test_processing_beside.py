@@ -236,6 +236,18 @@ def test_what_cannot_be_made_is_refused_before_anything_moves(
     assert not (tmp_path / "storage").exists() or not list((tmp_path / "storage").glob("2*"))
 
 
+@pytest.mark.parametrize(("result", "words"), [("/proc/no/result", "/proc: "), ("plan.yaml/result", "is a file")])
+def test_a_result_folder_that_cannot_be_made_is_refused_before_anything_moves(
+    tmp_path: Path, result: str, words: str
+) -> None:
+    cell = cell_of_three_views(tmp_path)
+    ended = cell.acquire("--reflectance", "--result", tmp_path / result)
+    assert ended.code == 3, ended.err
+    assert "expected a folder that can be made" in ended.err
+    assert words in ended.err
+    assert not (tmp_path / "storage").exists() or not list((tmp_path / "storage").glob("2*"))
+
+
 def test_the_result_of_another_run_is_neither_touched_nor_taken_for_this_ones(tmp_path: Path) -> None:
     cell = cell_of_three_views(tmp_path)
     assert cell.acquire("--reflectance", "--result", tmp_path / "first").code == 0

@@ -3,6 +3,7 @@ anything moves."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,7 +15,7 @@ from coupole.calibration.light.led_power_tile import calibrated_positions
 from coupole.calibration.posed_camera import read_posed_camera
 from coupole.calibration.record import Kind
 from coupole.calibration.sources import About
-from coupole.errors import CoupoleError, InputError
+from coupole.errors import CoupoleError, InputError, reason
 from coupole.plan.light_selection import leds_of_plan
 from coupole.plan.reading import PlanFiles, read_plan
 from coupole.plan.rig_devices import described_arm, in_world
@@ -47,10 +48,28 @@ def _of_folder(result: Path | None, run: Path | None) -> Iterator[str]:
         existing = next(parent for parent in result.parents if parent.exists())
         if not existing.is_dir():
             yield f"--result {result}: expected a folder that can be made; {existing} is a file"
+        elif why := _why_not_made(result, existing):
+            yield f"--result {result}: expected a folder that can be made; {existing}: {why}"
         return
     is_own = run is not None and is_of_run(result, run.name)
     if not result.is_dir() or (not is_own and any(result.iterdir())):
         yield f"--result {result}: expected a new folder, or that of this run's result; found other content"
+
+
+def _why_not_made(folder: Path, existing: Path) -> str:
+    """Make the folder, and take it away again. Return why that failed, or nothing; `existing` is the last of its
+    parents that exists."""
+    why = ""
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        why = reason(error)
+    for made in (folder, *folder.parents):
+        if made == existing:
+            break
+        with contextlib.suppress(OSError):
+            made.rmdir()
+    return why
 
 
 def _of_mesh(files: PlanFiles) -> Iterator[str]:

@@ -137,7 +137,7 @@ def suggest_plan(request: SuggestionRequest, say: Said = lambda step, count, tot
     first = LookAt(
         kind="look_at", name="first", target_mm=(0, 0, 0), distance_mm=300, azimuth_deg=0, elevation_deg=80
     )
-    job = read_job(request.path, text=request.text.with_views([first], (1000,), None))
+    job = _job_of(request, request.text.with_views([first], (1000,), None))
     if refusals := calibration_refusals(job):
         raise PreflightRefused(refusals)
     cell = SupposedCell(job)
@@ -149,6 +149,22 @@ def suggest_plan(request: SuggestionRequest, say: Said = lambda step, count, tot
         )
     trial = _Trial(request, job, cell, candidates, say)
     return trial.best()
+
+
+def _job_of(request: SuggestionRequest, text: str) -> Job:
+    """Read a plan that is not written yet. Raises InputError with places of files that exist, and no others."""
+    try:
+        return read_job(request.path, text=text)
+    except InputError as error:
+        unwritten = str(request.path.absolute())
+        reasons = [
+            problem.message if str(Path(problem.file).absolute()) == unwritten else str(problem)
+            for problem in error.problems
+        ]
+        if not reasons:
+            raise
+        text = "\n".join(f"{request.text.mesh}: {why}" for why in reasons)
+        raise InputError(text.replace("`mesh_unit: ", "`--unit ")) from error
 
 
 class _Trial:

@@ -161,8 +161,8 @@ class Plan(Model):
     def _no_sentinels_of_choices(self) -> Plan:
         if self.takes_sentinels and (self.chooses_lights or isinstance(self.exposure, AutoExposure)):
             raise ValueError(
-                "`watch: {frames: darks}` where lights or exposures are chosen in the run: "
-                "sentinels need bursts that the plan determines"
+                "watch: LEDs or exposures of this plan are chosen in the run, so no LED can be planned to be lit "
+                "again and again; expected `watch: {frames: darks}`, or no `watch`"
             )
         return self
 

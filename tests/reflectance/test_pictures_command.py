@@ -87,7 +87,7 @@ def test_the_report_shows_what_was_made(made: Made) -> None:
     _, out, _ = made
     page = (out / "report.html").read_text()
     assert page.count("<img") == 6 + 3 * len(LEFT_OUT)
-    assert "Left-out lights are made with" in page
+    assert "Left-out lights are predicted with" in page
     assert "half angle" in page
     assert "--interval" in page
 

@@ -109,7 +109,7 @@ def test_a_run_with_other_frames_than_when_it_was_refined_is_refused(tmp_path: P
     measured = measured_run(tmp_path)
     refined = read(tmp_path, VERTICES[USED])
     resumed = replace(measured, frames=SimpleNamespace(inputs=(INPUTS[0], (INPUTS[1][0], "cc"))))
-    with pytest.raises(InputError, match=r"vase has other frames than when it was refined; .* anew"):
+    with pytest.raises(InputError, match=r"vase has other frames than when it was refined; .* again"):
         refined.of(resumed)
 
 

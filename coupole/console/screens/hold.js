@@ -20,7 +20,7 @@
 
   function press(button) {
     if (button.disabled) return;
-    release("let go");
+    release("released");
     const {axis, direction} = button.dataset;
     const share = Number(document.querySelector("[data-name=share]").value);
     const asked = JSON.stringify({axis, direction: Number(direction), share});
@@ -52,7 +52,7 @@
     event.preventDefault();
     if (!event.repeat) press(button);
   });
-  const letGo = () => release("let go: the arm stops");
+  const letGo = () => release("released: the arm stops");
   for (const kind of ["pointerup", "pointercancel", "keyup"]) document.addEventListener(kind, letGo);
   document.addEventListener("pointerout", event => {
     if (held && buttonOf(event) === held.button && !held.button.contains(event.relatedTarget)) letGo();

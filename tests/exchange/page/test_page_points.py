@@ -76,7 +76,7 @@ def test_the_ruler_measures_what_the_object_measures(page: Page, tmp_path: Path)
         ActionChains(page.driver).move_to_element_with_offset(canvas, offset, 0).click().perform()
     shorter = min(canvas.size["width"], canvas.size["height"])
     expected_mm = 120 * 2 * 300.0 * math.tan(math.radians(FIELD_DEG / 2)) / shorter
-    told_mm = float(re.findall(r"([\d.]+) mm", page.browser.text("#status"))[0])
+    told_mm = float(re.findall(r"distance ([\d.]+)", page.browser.text("#status"))[0])
     assert told_mm == pytest.approx(expected_mm, rel=0.01)
 
 

@@ -36,8 +36,8 @@ class TileCache {
   }
 
   want(names) {
-    this.wanted = names;
-    for (const name of names.filter((one) => this.lacks(one))) {
+    this.wanted = [...new Set(names)];
+    for (const name of this.wanted.filter((one) => this.lacks(one))) {
       if (this.coming.size >= MOST_COMING) return;
       this.coming.add(name);
       this.bring(name);

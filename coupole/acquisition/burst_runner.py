@@ -73,11 +73,8 @@ class BurstRunner:
         max_frames_per_s: float,
         tell: Callable[[Burst, int], None],
         wait_while_paused: Callable[[], None],
-        see_mark: Callable[[int, Burst, int], None] = lambda slot, burst, step: None,
     ) -> None:
         self._cell, self._recorder, self._arm, self._dose = cell, recorder, arm, dose
-        self._see_mark = see_mark
-        """Looks at a mark that is not kept, in this slot, of this step of the burst."""
         self._outcome, self._gain_db, self._max_frames_per_s = outcome, gain_db, max_frames_per_s
         self._tell = tell
         self._by_host = HostBurst(cell, recorder, arm, tell, wait_while_paused, dose, self._note)
@@ -256,17 +253,24 @@ class BurstRunner:
                 continue
             record = StepRecord(*log[frame_match.step_of_frame[frame]].tolist())
             label = running.burst.labels[record.step]
-            if label is None:
-                self._see_mark(grabber.slot(frame), running.burst, record.step)
-            elif not record.invalid_exposure:
+            if label and not record.invalid_exposure:
                 shot = ShotId(running.burst.view, label)
                 self._recorder.prove(grabber.slot(frame), shot, step_fields(record, record.t_trigger_ns))
                 running.proven.add(frame)
+
+    def _see_marks(self, running: _RunningBurst) -> None:
+        """Show the recorder the marks without a label, which are not kept."""
+        steps = running.match.step_of_frame if running.match is not None else ()
+        for frame, row in enumerate(steps):
+            step = int(running.log[row]["step"]) if row != UNLABELLED else UNLABELLED
+            if step != UNLABELLED and running.burst.labels[step] is None:
+                self._recorder.see_mark(running.grabber.slot(frame), running.burst, step)
 
     def _end(self, running: _RunningBurst, camera: CameraStatistics | None) -> None:
         """Record dose and figures, release unproven frames, commit the proven ones."""
         log, grabber, dark_ns = running.log, running.grabber, self._dark_ns(running)
         grabber.stop()
+        self._see_marks(running)
         for frame in range(grabber.count):
             if frame not in running.proven:
                 self._recorder.free(grabber.slot(frame))

@@ -118,7 +118,7 @@ class HostBurst:
                     if index in marks and picture.alone:
                         marks.remove(index)
                         reason = reason or too_bright(picture.frame, frame_format)
-                    kept_frames += self._keep(picture, picture.frame, burst, shot)
+                    kept_frames += self._keep(picture, picture.frame, burst, index)
                 if burst.marks == "none":
                     self._prove(kept_frames)
                 self._tell(burst, index)
@@ -138,13 +138,18 @@ class HostBurst:
             self._note(burst, log, arm_before, arm_after, panel_s=self._panel_s, frames=taken_frames)
         return Verdict(replace(NOTHING_TO_MATCH, reason=reason), dead)
 
-    def _keep(self, exposure: _Taken, frame: Frame, burst: Burst, shot: ShotId | None) -> list[_Kept]:
-        """The frame, stored but not proven yet; None if it cannot be proven."""
-        if shot is None or not exposure.alone or exposure.record.invalid_exposure:
+    def _keep(self, exposure: _Taken, frame: Frame, burst: Burst, step: int) -> list[_Kept]:
+        """The frame, stored but not proven yet; nothing if it cannot be proven, or is a mark without a label."""
+        if not exposure.alone or exposure.record.invalid_exposure:
             frame.release()
             return []
         slot = self._recorder.store(frame, burst.timing.exposure_us)
         frame.release()
+        shot = burst.shots[step]
+        if shot is None:
+            self._recorder.see_mark(slot, burst, step)
+            self._recorder.free(slot)
+            return []
         return [_Kept(slot, shot, step_fields(exposure.record, exposure.t_trigger_ns))]
 
     def _prove(self, stored_frames: list[_Kept]) -> None:

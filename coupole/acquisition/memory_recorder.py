@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from coupole.acquisition.frame_samples import FrameSamples
 from coupole.devices import ArmState, Frame, FrameFormat
 from coupole.geometry import Transform
+from coupole.plan.bursts import Burst
 from coupole.plan.choices import FrameSample
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.exposure_advice import Metered, sample_of
@@ -58,6 +59,9 @@ class MemoryRecorder:
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
         self._samples.prove(slot, shot)
         self._proven.add(shot)
+
+    def see_mark(self, slot: int, burst: Burst, step: int) -> None:
+        """Nothing of it is kept."""
 
     def free(self, slot: int) -> None:
         self._samples.free(slot)

@@ -14,6 +14,7 @@ from coupole.bounded import DISK, NOW, Workers, hangs, left_behind, on_disk, run
 from coupole.devices import ArmState, Frame, FrameFormat
 from coupole.errors import StorageError
 from coupole.geometry import Transform
+from coupole.plan.bursts import Burst
 from coupole.plan.choices import FrameSample
 from coupole.plan.shot_id import ShotId
 from coupole.storage import journal, run_dose
@@ -78,6 +79,11 @@ class Recorder(Protocol):
         ...
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None: ...
+
+    def see_mark(self, slot: int, burst: Burst, step: int) -> None:
+        """See the frame of a mark that has no label and is freed afterwards. Such marks are those of a burst that
+        is taken again, or that a resumed run completes: the frames of its first marks are kept already."""
+        ...
 
     def free(self, slot: int) -> None: ...
 
@@ -214,6 +220,9 @@ class RunRecorder:
             FrameProven(shot=shot, file=self._file, index=slot, frame_id=frame_id, xxh3=f"{digest:016x}")
         )
         self._uncommitted.append(shot)
+
+    def see_mark(self, slot: int, burst: Burst, step: int) -> None:
+        """Nothing of it is kept."""
 
     def free(self, slot: int) -> None:
         self._samples.free(slot)

@@ -89,7 +89,6 @@ class Sequencer:
             gain_db=job.plan.gain_db,
             max_frames_per_s=job.cell.rig.sensor.max_frames_per_s,
             tell=self._tell,
-            see_mark=self._recorder.see_mark,
             wait_while_paused=self._wait_while_paused,
         )
         compile_now()

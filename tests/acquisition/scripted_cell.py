@@ -137,6 +137,8 @@ class Cell:
     slots: list[int] = field(default_factory=list)
     """Frame of each slot."""
     freed: list[int] = field(default_factory=list)
+    marks_seen: list[int] = field(default_factory=list)
+    """Steps of marks without a label, in slots that were not freed yet."""
     proven_frames: list[int] = field(default_factory=list)
     now_us: float = 0.0
     started_us: float = np.inf
@@ -251,6 +253,10 @@ class Cell:
         assert shot not in self.proven
         self.proven[shot] = fields
         self.proven_frames.append(self.slots[slot])
+
+    def see_mark(self, slot: int, burst: Burst, step: int) -> None:
+        assert slot not in self.freed
+        self.marks_seen.append(step)
 
     def free(self, slot: int) -> None:
         self.freed.append(slot)

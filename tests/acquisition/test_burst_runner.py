@@ -224,6 +224,16 @@ def test_a_burst_that_cannot_begin_leaves_a_safe_cell(error: Exception) -> None:
     assert cell.done == ["camera armed", "started", "made safe", "BurstEnded"]
 
 
+def test_marks_of_what_is_taken_again_are_seen_before_they_are_freed() -> None:
+    burst = BURST.only({label for label in BURST.labels[10:20] if label})
+    cell = Cell(burst, take(burst))
+    cell.fire()
+    unkept = [step for step, label in enumerate(burst.labels) if label is None]
+    assert len(unkept) >= 2
+    assert cell.marks_seen == unkept
+    assert len(cell.proven) == 10
+
+
 def test_slots_of_frames_without_proof_are_freed() -> None:
     what = take(BURST, surplus_us=(1e6 * MIDDLE_S + 3000.0,))
     cell = Cell(BURST, what)

@@ -60,6 +60,8 @@ class Cell:
     done: list[str] = field(default_factory=list)
     proven: dict[ShotId, Mapping[str, int]] = field(default_factory=dict)
     freed: list[int] = field(default_factory=list)
+    marks_seen: list[int] = field(default_factory=list)
+    """Steps of marks without a label, in slots that were not freed yet."""
     noted: list[Any] = field(default_factory=list)
     asked: list[int] = field(default_factory=list)
     too_much_at: int = -1
@@ -136,6 +138,10 @@ class Cell:
     def prove(self, slot: int, shot: str, fields: Mapping[str, int]) -> None:
         self.proven[shot] = fields
 
+    def see_mark(self, slot: int, burst: Burst, step: int) -> None:
+        assert slot not in self.freed
+        self.marks_seen.append(step)
+
     def free(self, slot: int) -> None:
         self.freed.append(slot)
 
@@ -172,6 +178,17 @@ def test_all_frames_are_proven_where_all_is_well() -> None:
     assert set(cell.proven) == set(burst.shots)
     assert sorted(leds_proven(cell)) == sorted(LEDS)
     assert cell.freed == []
+
+
+def test_marks_of_what_is_taken_again_are_seen_and_not_kept() -> None:
+    cell, whole = Cell(), burst_of()
+    lost = next(label for label in whole.labels if label and label.is_shot)
+    burst = whole.only({lost})
+    assert burst.labels == (None, lost, None)
+    assert cell.fire(burst).match.reason == ""
+    assert cell.marks_seen == [0, 2]
+    assert len(cell.freed) == 2
+    assert [str(shot) for shot in cell.proven] == [f"v/{lost}"]
 
 
 def test_each_step_is_armed_in_the_dark_lit_triggered_taken_and_ended_in_this_order() -> None:

@@ -10,7 +10,7 @@ import trimesh
 from places import REPO
 
 from coupole.errors import InputError
-from coupole.exchange.atlas.atlas_layout import PADDING_PX, Atlas, lay_out
+from coupole.exchange.atlas.atlas_layout import PADDING_PX, Atlas, MapSize, lay_out
 from coupole.exchange.atlas.charts import chart_axes, cut_charts, double_areas, neighbours_of, unit
 from coupole.exchange.atlas.open_sky import open_sky
 
@@ -49,7 +49,7 @@ def mesh(request: pytest.FixtureRequest) -> trimesh.Trimesh:
 
 @pytest.fixture(scope="module")
 def atlas(mesh: trimesh.Trimesh) -> Atlas:
-    return lay_out(np.asarray(mesh.triangles), np.asarray(mesh.faces), TEXEL_MM, 16384)
+    return lay_out(np.asarray(mesh.triangles), np.asarray(mesh.faces), MapSize(TEXEL_MM, 16384))
 
 
 def places_on(mesh: trimesh.Trimesh, atlas: Atlas, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -119,23 +119,26 @@ def test_padding_goes_on_from_the_nearest_triangle(mesh: trimesh.Trimesh, atlas:
 def test_what_is_too_large_says_what_would_do() -> None:
     ball = MESHES["ball"]
     with pytest.raises(InputError, match="--texel-mm") as refused:
-        lay_out(np.asarray(ball.triangles), np.asarray(ball.faces), 0.05, 2048)
+        lay_out(np.asarray(ball.triangles), np.asarray(ball.faces), MapSize(0.05, 2048))
     enough = re.search(r"give --texel-mm ([0-9.]+)", str(refused.value))
     assert enough is not None
-    assert lay_out(np.asarray(ball.triangles), np.asarray(ball.faces), float(enough[1]), 2048).side_px <= 2048
+    assert (
+        lay_out(np.asarray(ball.triangles), np.asarray(ball.faces), MapSize(float(enough[1]), 2048)).side_px
+        <= 2048
+    )
 
 
 def test_texels_become_coarser_until_a_map_is_as_small_as_asked() -> None:
     """And a map in which not even padding has room says how large it has to be."""
     relief = MESHES["relief"]
     corners_mm, triangles = np.asarray(relief.triangles), np.asarray(relief.faces)
-    small = lay_out(corners_mm, triangles, 0.01, 1024, may_be_coarser=True)
+    small = lay_out(corners_mm, triangles, MapSize(0.01, 1024, may_be_coarser=True))
     assert 900 < small.side_px <= 1024
     assert small.texel_mm > 0.05
     with pytest.raises(InputError, match=r"charts need a map (\d+) px wide; give --map-px \1") as refused:
-        lay_out(corners_mm, triangles, 0.5, 64, may_be_coarser=True)
+        lay_out(corners_mm, triangles, MapSize(0.5, 64, may_be_coarser=True))
     enough = int(str(refused.value).rpartition(" ")[2])
-    assert lay_out(corners_mm, triangles, 0.5, enough, may_be_coarser=True).side_px <= enough
+    assert lay_out(corners_mm, triangles, MapSize(0.5, enough, may_be_coarser=True)).side_px <= enough
 
 
 def test_the_open_sky_of_a_corner_and_of_a_groove() -> None:

@@ -207,3 +207,27 @@ def test_a_frame_lost_in_one_view_is_not_judged_by_the_same_light_in_the_view_be
     assert ended.code == 0, ended.err
     assert ended.document["reshot"] > 0
     assert _found(cell) == []
+
+
+def test_a_lamp_that_comes_on_in_a_burst_that_a_resumed_run_completes_is_found(tmp_path: Path) -> None:
+    """The burst's first marks are in the file already; those of the new session are looked at all the same."""
+    cell = CellFolder(tmp_path, speed=1.0)
+    cell.join()
+    cell.write(lights={"kind": "every", "every": 6})
+    with cell.world() as world:
+        process = cell.start_acquire()
+        cells.wait_until(lambda: cells.events(cell.run_folder, "frame"), "frames")
+        process.kill()
+        cells.finish(process)
+        cells.wait_until(lambda: not world.ask("state")["shining"], "the dark")
+    before = {event["shot"] for event in cells.events(cell.run_folder, "frame")}
+    assert 0 < len(before) < 160  # of 180 and dark ones
+    with cell.world({"kind": "room_lamp", "lux": 10, "at_edge": 10}):
+        cell.confirm()
+        resumed = cell.acquire("--resume", cell.run_folder)
+    assert resumed.code == 0, resumed.err
+    (found,) = _found(cell)
+    assert found["kind"] == "ambient light"
+    assert found["shots"]
+    assert not before & set(found["shots"])
+    cells.assert_each_shot_proven_once(cell.run_folder)

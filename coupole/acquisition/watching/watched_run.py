@@ -133,8 +133,7 @@ class WatchedRecorder:
             self._recorder.prove(slot, shot, fields)
 
     def see_mark(self, slot: int, burst: Burst, step: int) -> None:
-        """Look at a dark mark that is not kept, because what is taken again has its marks already: it tells of the
-        room. With a panel marks are not dark."""
+        """Keep the look at a dark mark: it tells of the room. With a panel marks are not dark."""
         if slot in self._looks and not burst.panel:
             self._seen[_unkept_mark(burst, step)] = self._looks[slot]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numba
@@ -31,6 +31,16 @@ _SAME_PLACE, _MOST_SHARED = 1e-6, 0.01
 _MOST_ROUNDS = 12
 _FILL = 0.85
 """Share of a texture that rectangles may be expected to fill; the side grows if they do not fit."""
+
+
+@dataclass(frozen=True)
+class MapSize:
+    """Wanted width of texels, and the greatest width of a texture."""
+
+    texel_mm: float
+    most_side_px: int
+    may_be_coarser: bool = False
+    """Texels become larger until the texture is narrow enough."""
 
 
 @dataclass(frozen=True)
@@ -66,23 +76,17 @@ class Atlas:
         return self.places_mm(np.broadcast_to(np.eye(3), (len(self.chart), 3, 3)), texels)
 
 
-def lay_out(
-    corners_mm: Floats,
-    triangles: NDArray[np.integer],
-    texel_mm: float,
-    most_side_px: int,
-    *,
-    may_be_coarser: bool = False,
-) -> Atlas:
+def lay_out(corners_mm: Floats, triangles: NDArray[np.integer], size: MapSize) -> Atlas:
     """Lay out triangles [n, 3, 3], whose corners are rows of vertices [n, 3]. No two places of the surface share a
-    texel. With `may_be_coarser` texels become larger until the texture is no wider than `most_side_px`.
+    texel.
 
-    Raises InputError if the texture would be wider.
+    Raises InputError if the texture would be wider than it may be.
     """
     neighbours = neighbours_of(triangles)
     chart = cut_charts(corners_mm, neighbours)
     for round_number in range(_MOST_ROUNDS):
-        texel_mm, corners_px, side_px = _pack_charts(corners_mm, chart, texel_mm, most_side_px, may_be_coarser)
+        texel_mm, corners_px, side_px = _pack_charts(corners_mm, chart, size)
+        size = replace(size, texel_mm=texel_mm)
         triangle_of_texel = np.full((side_px, side_px), -1, np.int32)
         is_expelled = np.zeros(len(chart), np.bool_)
         _rasterise(corners_px, triangle_of_texel, is_expelled)
@@ -93,28 +97,20 @@ def lay_out(
     return Atlas(side_px, texel_mm, chart, corners_px, _pad(triangle_of_texel), is_inside)
 
 
-def lay_out_by(
-    places: Floats,
-    corners_mm: Floats,
-    triangles: NDArray[np.integer],
-    texel_mm: float,
-    most_side_px: int,
-    *,
-    may_be_coarser: bool = False,
-) -> Atlas:
+def lay_out_given(places: Floats, corners_mm: Floats, triangles: NDArray[np.integer], size: MapSize) -> Atlas:
     """The same, where the corners' places [n, 3, 2] in the texture are given: 0 to 1, rightwards and downwards.
-    Half of the surface has texels smaller than `texel_mm`.
+    Half of the surface has smaller texels than are wanted.
 
     Raises InputError if the texture would be wider, or if triangles lie on each other in it.
     """
     area_mm2 = np.linalg.norm(double_areas(corners_mm), axis=1)
     area = np.abs(_double_areas_in_map(places))
     px_by_mm = np.sqrt(area / np.maximum(area_mm2, 1e-300))
-    side = 1.0 / max(texel_mm * _median_by(px_by_mm, area_mm2), 1e-300)
+    side = 1.0 / max(size.texel_mm * _median_by(px_by_mm, area_mm2), 1e-300)
     side_px = 4 * max(math.ceil(min(side, 1e9) / 4.0), 1)
-    if side_px > most_side_px and not may_be_coarser:
-        raise InputError(_too_large(texel_mm, side_px, most_side_px))
-    side_px = min(side_px, most_side_px)
+    if side_px > size.most_side_px and not size.may_be_coarser:
+        raise InputError(_too_large(size.texel_mm, side_px, size.most_side_px))
+    side_px = min(side_px, size.most_side_px)
     corners_px = places * side_px
     triangle_of_texel = np.full((side_px, side_px), -1, np.int32)
     is_expelled = np.zeros(len(corners_px), np.bool_)
@@ -151,21 +147,19 @@ def _charts_by(places: Floats, triangles: NDArray[np.integer]) -> Integers:
     return parts_of(neighbours_of(number.reshape(-1, 3)), is_mirrored.astype(np.int32))
 
 
-def _pack_charts(
-    corners_mm: Floats, chart: Integers, texel_mm: float, most_side_px: int, may_be_coarser: bool
-) -> tuple[float, Floats, int]:
+def _pack_charts(corners_mm: Floats, chart: Integers, size: MapSize) -> tuple[float, Floats, int]:
     """Width of a texel, mm, places of the corners [n, 3, 2], px, and side of the texture, px."""
-    coarsest_mm = float(np.ptp(corners_mm.reshape(-1, 3), axis=0).max())
+    coarsest_mm, texel_mm = float(np.ptp(corners_mm.reshape(-1, 3), axis=0).max()), size.texel_mm
     while True:
         flat_px, sizes_px = _flatten(corners_mm, chart, texel_mm)
         side_px, origins_px = _pack(sizes_px)
-        if side_px <= most_side_px:
+        if side_px <= size.most_side_px:
             return texel_mm, flat_px + origins_px[chart][:, None, :], side_px
-        if not may_be_coarser:
-            raise InputError(_too_large(texel_mm, side_px, most_side_px))
+        if not size.may_be_coarser:
+            raise InputError(_too_large(texel_mm, side_px, size.most_side_px))
         if texel_mm > coarsest_mm:
             raise InputError(f"{len(sizes_px):,} charts need a map {side_px:,} px wide; give --map-px {side_px}")
-        texel_mm *= 1.02 * side_px / most_side_px
+        texel_mm *= 1.02 * side_px / size.most_side_px
 
 
 def _too_large(texel_mm: float, side_px: int, most_side_px: int) -> str:

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from coupole.exchange.atlas.atlas_layout import Atlas, lay_out, lay_out_by, nearest_known
+from coupole.exchange.atlas.atlas_layout import Atlas, MapSize, lay_out, lay_out_given, nearest_known
 from coupole.exchange.atlas.charts import double_areas, unit
 from coupole.exchange.atlas.open_sky import open_sky
-from coupole.exchange.atlas.own_places import OwnPlaces, read_own_places
+from coupole.exchange.atlas.textured_mesh import TexturedMesh, read_textured_mesh
 from coupole.exchange.material_values import UNCERTAIN, red_green_blue
 from coupole.exchange.of_results.measured_surface import MeasuredSurface
 from coupole.geometry import apply
@@ -103,33 +103,32 @@ def flatten(surface: MeasuredSurface) -> FlatSurface:
     Raises InputError if the maps would be wider than the options say, or than `MOST_SIDE_PX`, or if nothing has a
     material.
     """
-    own_places = read_own_places(surface.options.uv_mesh) if surface.options.uv_mesh else None
+    textured_mesh = read_textured_mesh(surface.options.uv_mesh) if surface.options.uv_mesh else None
     views = open_views(surface.result) if surface.fit == TEXELS else []
     rows = _rows_to_show(surface, views)
     surface.options.say("charts", 0, 1)
-    rows, atlas = _lay_out(surface, rows, views, own_places)
+    rows, atlas = _lay_out(surface, rows, views, textured_mesh)
     surface.options.say("charts", 1, 1)
     return _fill(surface, rows, atlas, _Known(surface, views, rows, surface.vertices_mm[surface.triangles[rows]]))
 
 
 def _lay_out(
-    surface: MeasuredSurface, rows: NDArray[np.int64], views: list[TexelView], own_places: OwnPlaces | None
+    surface: MeasuredSurface, rows: NDArray[np.int64], views: list[TexelView], textured_mesh: TexturedMesh | None
 ) -> tuple[NDArray[np.int64], Atlas]:
-    """Places of triangles `rows`, or of those that a mesh with texture coordinates of its own has, too."""
+    """Places of triangles `rows`; with a mesh that has texture coordinates, of those that it shares."""
     options = surface.options
     corners_mm = surface.vertices_mm[surface.triangles[rows]]
     texel_mm = options.texel_mm or _finest_mm(views, corners_mm)
-    most_px, may_be_coarser = options.map_px or MOST_SIDE_PX, options.texel_mm is None
-    if own_places is None:
-        triangles = surface.triangles[rows]
-        return rows, lay_out(corners_mm, triangles, texel_mm, most_px, may_be_coarser=may_be_coarser)
-    rows_there, places = own_places.on(corners_mm)
+    size = MapSize(texel_mm, options.map_px or MOST_SIDE_PX, may_be_coarser=options.texel_mm is None)
+    if textured_mesh is None:
+        return rows, lay_out(corners_mm, surface.triangles[rows], size)
+    rows_there, places = textured_mesh.shared_with(corners_mm)
     if lost := len(rows) - len(rows_there):
-        options.tell(f"{lost:,} of {len(rows):,} measured triangles are not in {own_places.path.name}: left out")
+        options.tell(
+            f"{lost:,} of {len(rows):,} measured triangles are not in {textured_mesh.path.name}: left out"
+        )
     triangles = surface.triangles[rows[rows_there]]
-    return rows[rows_there], lay_out_by(
-        places, corners_mm[rows_there], triangles, texel_mm, most_px, may_be_coarser=may_be_coarser
-    )
+    return rows[rows_there], lay_out_given(places, corners_mm[rows_there], triangles, size)
 
 
 def _rows_to_show(surface: MeasuredSurface, views: list[TexelView]) -> NDArray[np.int64]:

@@ -10,8 +10,8 @@ import trimesh
 from places import REPO
 
 from coupole.errors import InputError
-from coupole.exchange.atlas.atlas_layout import lay_out, lay_out_by
-from coupole.exchange.atlas.own_places import OwnPlaces, read_own_places
+from coupole.exchange.atlas.atlas_layout import MapSize, lay_out, lay_out_given
+from coupole.exchange.atlas.textured_mesh import TexturedMesh, read_textured_mesh
 
 TURN = trimesh.transformations.rotation_matrix(1.1, [0.3, -0.5, 0.8])[:3, :3]
 
@@ -65,7 +65,7 @@ def test_triangles_are_found_in_files_of_others(
         mixed = np.take_along_axis(mixed, (np.arange(3) + turns[:, None]) % 3, axis=1)
     uv = seen_from_above(np.asarray(scan.vertices))
     path = written(scan, tmp_path / f"model{suffix}", mixed, uv)
-    rows, places = read_own_places(path).on(np.asarray(scan.triangles))
+    rows, places = read_textured_mesh(path).shared_with(np.asarray(scan.triangles))
     np.testing.assert_array_equal(rows, np.sort(numbers))
     np.testing.assert_allclose(places, (uv * [1, -1] + [0, 1])[faces[rows]], atol=2e-6)
 
@@ -78,7 +78,7 @@ def test_another_mesh_is_refused(scan: trimesh.Trimesh, tmp_path: Path) -> None:
         other, tmp_path / "other.ply", np.asarray(other.faces), seen_from_above(np.asarray(other.vertices))
     )
     with pytest.raises(InputError, match=r"has 0 of the result's 16,946 triangles; expected the mesh"):
-        read_own_places(path).on(np.asarray(scan.triangles))
+        read_textured_mesh(path).shared_with(np.asarray(scan.triangles))
 
 
 QUAD = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
@@ -101,7 +101,7 @@ def test_files_that_cannot_be_are_refused(tmp_path: Path, text: str, told: str) 
     path = tmp_path / "bad.obj"
     path.write_text(text)
     with pytest.raises(InputError, match="--uv") as refused:
-        read_own_places(path)
+        read_textured_mesh(path)
     assert told in str(refused.value)
 
 
@@ -110,13 +110,13 @@ def test_names_that_cannot_be_are_refused(tmp_path: Path, name: str) -> None:
     if name.endswith("stl"):
         (tmp_path / name).write_bytes(trimesh.creation.box().export(file_type="stl"))
     with pytest.raises(InputError, match="--uv"):
-        read_own_places(tmp_path / name)
+        read_textured_mesh(tmp_path / name)
 
 
 def test_each_place_has_its_texel_where_charts_are_given(scan: trimesh.Trimesh) -> None:
     corners_mm, faces = np.asarray(scan.triangles), np.asarray(scan.faces)
     places = (seen_from_above(np.asarray(scan.vertices)) * [1, -1] + [0, 1])[faces]
-    atlas = lay_out_by(places, corners_mm, faces, 0.3, 4096)
+    atlas = lay_out_given(places, corners_mm, faces, MapSize(0.3, 4096))
     assert large_parts(atlas.chart) == 3
     assert (atlas.handedness == 1.0).mean() > 0.99
     texels = np.flatnonzero(atlas.is_inside.reshape(-1))
@@ -125,7 +125,7 @@ def test_each_place_has_its_texel_where_charts_are_given(scan: trimesh.Trimesh) 
     expected = np.stack([(column + 0.5) / atlas.side_px, 1.0 - (row + 0.5) / atlas.side_px], axis=1)
     np.testing.assert_allclose(shown[: len(texels)], expected, atol=1e-6)
     assert atlas.texel_mm == pytest.approx(0.3, rel=0.03)
-    ours = lay_out(corners_mm, faces, 0.3, 4096)
+    ours = lay_out(corners_mm, faces, MapSize(0.3, 4096))
     assert atlas.is_inside.sum() == pytest.approx(ours.is_inside.sum(), rel=0.15)
 
 
@@ -138,10 +138,10 @@ def test_mirrored_charts_are_told_and_stacked_ones_refused(scan: trimesh.Trimesh
     stacked = places.copy()
     stacked[is_right, :, 0] = 2.0 * middle - places[is_right, :, 0]
     with pytest.raises(InputError, match=r"% of the surface lies on other parts"):
-        lay_out_by(stacked, corners_mm, faces, 0.3, 4096)
+        lay_out_given(stacked, corners_mm, faces, MapSize(0.3, 4096))
     apart = 0.5 * stacked
     apart[is_right, :, 0] += 0.5
-    atlas = lay_out_by(apart, corners_mm, faces, 0.3, 4096)
+    atlas = lay_out_given(apart, corners_mm, faces, MapSize(0.3, 4096))
     for sides in (atlas.chart[atlas.handedness > 0], atlas.chart[atlas.handedness < 0]):
         assert large_parts(sides) >= 1
     assert not np.intersect1d(atlas.chart[atlas.handedness > 0], atlas.chart[atlas.handedness < 0]).size
@@ -153,12 +153,12 @@ def test_given_charts_have_the_sizes_that_are_asked(scan: trimesh.Trimesh) -> No
     corners_mm, faces = np.asarray(scan.triangles), np.asarray(scan.faces)
     places = (seen_from_above(np.asarray(scan.vertices)) * [1, -1] + [0, 1])[faces]
     with pytest.raises(InputError, match="give --texel-mm"):
-        lay_out_by(places, corners_mm, faces, 0.01, 512)
-    assert lay_out_by(places, corners_mm, faces, 0.01, 512, may_be_coarser=True).side_px == 512
+        lay_out_given(places, corners_mm, faces, MapSize(0.01, 512))
+    assert lay_out_given(places, corners_mm, faces, MapSize(0.01, 512, may_be_coarser=True)).side_px == 512
 
 
 def test_a_file_of_few_triangles_has_no_shape_to_go_by() -> None:
     corners = np.random.default_rng(1).normal(size=(5, 3, 3))
-    own = OwnPlaces(Path("few.obj"), corners, np.zeros((5, 3, 2)))
+    own = TexturedMesh(Path("few.obj"), corners, np.zeros((5, 3, 2)))
     with pytest.raises(InputError, match="has 0 of the result's 40 triangles"):
-        own.on(np.random.default_rng(2).normal(size=(40, 3, 3)))
+        own.shared_with(np.random.default_rng(2).normal(size=(40, 3, 3)))

@@ -35,7 +35,7 @@ _LEAST_SHARE = 0.5
 
 
 @dataclass(frozen=True)
-class OwnPlaces:
+class TexturedMesh:
     """Triangles of a mesh file, and where they lie in its texture."""
 
     path: Path
@@ -44,7 +44,7 @@ class OwnPlaces:
     places: Floats
     """[m, 3, 2] 0 to 1, rightwards and downwards from the texture's top left corner."""
 
-    def on(self, corners_mm: Floats) -> tuple[NDArray[np.int64], Floats]:
+    def shared_with(self, corners_mm: Floats) -> tuple[NDArray[np.int64], Floats]:
         """Rows of the triangles [n, 3, 3] that the file has, and their corners' places [k, 3, 2].
 
         Raises InputError if the file has fewer than half of them.
@@ -109,7 +109,7 @@ class OwnPlaces:
         return rows[is_same], best_places[is_same]
 
 
-def read_own_places(path: Path) -> OwnPlaces:
+def read_textured_mesh(path: Path) -> TexturedMesh:
     """Read the triangles and texture coordinates of an OBJ, PLY or glTF.
 
     Raises InputError if the file is none of these, has no texture coordinates, or has some outside the texture.
@@ -132,7 +132,7 @@ def read_own_places(path: Path) -> OwnPlaces:
             f"--uv {path}: {is_outside.sum():,} of {len(uv):,} triangles lie outside the texture (0 to 1): "
             "several textures (UDIM) and repeated ones cannot be used"
         )
-    return OwnPlaces(path, corners, np.stack([uv[..., 0], 1.0 - uv[..., 1]], axis=2))
+    return TexturedMesh(path, corners, np.stack([uv[..., 0], 1.0 - uv[..., 1]], axis=2))
 
 
 def _parts(path: Path) -> list[tuple[Floats, Any]]:

@@ -43,7 +43,7 @@ PROMISES: dict[str, Callable[[State], bool]] = {
     "A confirmation ends no pause while the cell is still being made safe, or before the session has paused": (
         lambda now: now.pause or not (now.held or now.halting)
     ),
-    "After a stop nothing moves and no LED is lit": (
+    "After a stop nothing moves and no lamp is lit": (
         lambda now: not (now.stop and now.since >= AT_ONCE and (now.lamps or now.arm == MOVES))
     ),
     "A motion that is checked in time is never ended by the watch": lambda now: not now.false_lapse,

@@ -97,7 +97,7 @@ def look_at(
 
 def farthest_first(points: ArrayLike, first: int) -> Iterator[tuple[int, float]]:
     """Give the index of each of points [n, d], after `first` always the one that is farthest from all before it,
-    with that distance (infinite for the first). Among equals the lowest index is returned.
+    with that distance (infinite for the first). Among equals the lowest index comes first.
     """
     points_array = np.asarray(points, dtype=np.float64)
     index, distance = first, np.inf

@@ -23,7 +23,7 @@ _SLOWEST_BYTES_S, _REPORT_S = 10e6, 60.0
 
 
 def open_for_session(run: Run) -> None:
-    """Remove the files that the session may write from the manifest."""
+    """Remove from the manifest the files that the session may write."""
     manifest.open_for_session(run.folder, complete_views(run))
 
 

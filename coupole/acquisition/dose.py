@@ -85,7 +85,7 @@ class LightOnObject:
 
     @property
     def lux_h_at_most(self) -> float:
-        """The same, with all planned light whose true amount was never entered."""
+        """The same, with all planned light whose true amount is not entered yet."""
         return self.lux_h if self._planned is None else float((self._given_lux_h + self._planned.at_most).max())
 
     @property

@@ -57,8 +57,8 @@ class Control:
     """The operator's stop and pause: set from signal handlers and other threads.
 
     A *pause* waits for the end of the burst. A *hold* does not: something stopped the program, or the arm, that
-    nobody had asked for, or that cannot wait. A pause switches lights off and stops the arm (`halting`), and only
-    a person ends it.
+    nobody had asked for, or that cannot wait. A hold switches lights off and stops the arm (`halting`), and only a
+    person ends it.
     """
 
     session: Control | None = None
@@ -75,7 +75,7 @@ class Control:
     """Set while lights are switched off and the arm is stopped for a hold: nobody can let the session go on."""
     held_because: str = ""
     unsure: Sequence[str] = ()
-    """Sentences on devices that a pause could not confirm to be safe: then the session ends."""
+    """Sentences on devices that a hold could not confirm to be safe: then the session ends."""
     pulse_s: float = math.inf
     """Time when this process last proved that it runs, monotonic s. A thread that does nothing else sets it
     (`coupole.acquisition.signals`); infinite where there is none."""

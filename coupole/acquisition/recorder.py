@@ -292,7 +292,7 @@ class RunRecorder:
         if self._run.folder != before:
             raise StorageError(
                 f"{before}: the run's folder was moved while frames were taken; it is {self._run.folder} now, "
-                f"with all proven frames. Resume it there."
+                "with all proven frames. Resume it there."
             )
 
     def _follow_folder(self) -> None:

@@ -277,7 +277,7 @@ def _say_what_comes_first(job: Job, faults: ArmFaults) -> None:
         if run_bounded(faults.standing):
             alarm(
                 f"  first   coupole confirm {job.cell.document.path} --name NAME   "
-                "(the arm is in a fault: find the cause, see that the cell is clear)"
+                "(the arm has a fault: find the cause, check that the cell is clear)"
             )
 
 

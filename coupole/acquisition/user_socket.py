@@ -151,7 +151,7 @@ def _silence(pid: int, patience_s: float) -> str:
         return (
             f"process {pid} is stopped (Ctrl-Z, SIGSTOP). An arm that moved has braked, and the box's watchdog "
             f"switches lamps off; `kill -CONT {pid}` lets the process run again; a run then asks a person "
-            f"before it continues"
+            "before it continues"
         )
     return f"nothing within {patience_s:.2g} s from process {pid}"
 

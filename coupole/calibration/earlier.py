@@ -57,8 +57,8 @@ def refuse_read_otherwise(path: Path, record: Record, given_kinds: Collection[st
         if read_with == 0.0 and kind in given_kinds:
             raise InputError(
                 f"{path}: was made without a {kind} record; with such a record the frames would be read "
-                f"differently, and all results would be wrong. Leave it out, or calibrate the LEDs' powers "
-                f"again with it"
+                "differently, and all results would be wrong. Leave it out, or calibrate the LEDs' powers "
+                "again with it"
             )
 
 

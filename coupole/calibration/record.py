@@ -228,7 +228,8 @@ def write_sealed(path: Path, plain: dict[str, Any], head: str) -> None:
         partial.replace(path)
     except OSError as error:
         raise StorageError(
-            f"{path}: cannot write the record: {error.strerror}. Make its folder readable, or mount it."
+            f"{path}: cannot write the record: {error.strerror}. Free space for it, make its folder writable, or "
+            "mount it."
         ) from error
     finally:
         partial.unlink(missing_ok=True)

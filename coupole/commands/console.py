@@ -41,7 +41,7 @@ def serve(
     tls_key: Annotated[Path | None, typer.Option("--tls-key", help="PEM file.")] = None,
     test_notifications: Annotated[
         bool,
-        typer.Option("--test-notifications", help="Send a message through each channel of notification, and end."),
+        typer.Option("--test-notifications", help="Send a message through each channel that is set up, and end."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -103,7 +103,7 @@ def _test_notifications(rig: Path, *, as_json: bool) -> None:
     if settings is None:
         raise InputError(
             f"{folder / NAME}: no such file, so nobody is notified; docs/reference/console.md describes its "
-            f"content"
+            "content"
         )
     troubles_by_way = send_test(settings, cell.rig.name)
     for way, trouble in troubles_by_way.items():

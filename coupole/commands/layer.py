@@ -288,7 +288,7 @@ def _say(document: dict[str, Any], console: Console) -> None:
     if document["model"]["difference"] > 0.0:
         console.print(
             f"spectra under directional light differ by up to {document['model']['difference']:.3f} from those "
-            f"under diffuse light"
+            "under diffuse light"
         )
     if (misfit := document["misfit"]) is not None:
         console.print(f"the films differ from a single K and S by {misfit:.1f} times what noise explains")

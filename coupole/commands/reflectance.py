@@ -254,7 +254,7 @@ def cluster(
         typer.Option(
             "--clusters",
             min=1,
-            help="Number of clusters; by default one for each 400 triangles, 16 to 1000.",
+            help="Largest number of clusters; by default one for each 400 triangles, 16 to 1000.",
         ),
     ] = None,
     degrees: Annotated[

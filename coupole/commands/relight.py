@@ -80,7 +80,7 @@ SizeOption = Annotated[str | None, _option("--size", "Size of its picture, WIDTH
 FieldOption = Annotated[
     float | None,
     _option(
-        "--field-of-view", "Width of its field, degrees; by default as narrow as possible.", min=0.01, max=170.0
+        "--field-of-view", "Width of its field, degrees; by default as the object needs.", min=0.01, max=170.0
     ),
 ]
 FitOption = Annotated[

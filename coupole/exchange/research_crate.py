@@ -43,7 +43,7 @@ class CrateFacts:
     licence: str | None = None
     """A URL, or words; None: what the run's plan says."""
     authors: tuple[str, ...] = ()
-    """`NAME <https://orcid.org/...> at HOUSE` each, or a name alone."""
+    """`NAME <https://orcid.org/...> at INSTITUTION` each, or a name alone."""
     publisher: str | None = None
     name: str | None = None
     """Title; None: the folder's name."""
@@ -73,7 +73,9 @@ def write_crate(
     if not licence:
         raise InputError("--licence: RO-Crate demands one and the plan names none; give its URL, or words")
     if not facts.authors:
-        raise InputError("--author: expected at least one, 'NAME <https://orcid.org/...> at HOUSE' or a name")
+        raise InputError(
+            "--author: expected at least one, 'NAME <https://orcid.org/...> at INSTITUTION' or a name"
+        )
     people = _people(facts.authors)
     root = source if in_place else out
     if not in_place and source.resolve().is_relative_to(root.resolve()):
@@ -232,8 +234,8 @@ def _person(text: str) -> tuple[Entity, Entity | None]:
     url = within.removesuffix(">")
     if not name or (within and not _ORCID.fullmatch(url)):
         raise InputError(
-            f"--author {text!r}: expected 'NAME', 'NAME <https://orcid.org/0000-0000-0000-0000>', and ' at HOUSE' "
-            "behind it if it is to be named"
+            f"--author {text!r}: expected 'NAME', 'NAME <https://orcid.org/0000-0000-0000-0000>', and behind it "
+            "' at INSTITUTION' if it is to be named"
         )
     person = {"@id": url or f"#person-{_part_of_id(name)}", "@type": "Person", "name": name}
     if not house:

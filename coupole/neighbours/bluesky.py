@@ -168,7 +168,7 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
-        """Begin a flight. If the command refuses the view, `complete` raises the error."""
+        """Begin a flight. If the acquisition is refused, `complete` raises the error."""
         if self._acquisition is not None:
             raise InputError("the cell is in a flight; complete it first")
         plan = await self.next_plan()

@@ -52,7 +52,7 @@ def read_plan(plan_path: Path, rig_path: Path | None = None, *, text: str | None
     if cell.rig.arm is None:
         message = (
             f"expected the arm that `{cell.rig.robot.driver}` moves, as its file: preflight must know what it "
-            f"could touch"
+            "could touch"
         )
         problems.append(cell.document.problem(("arm",), message))
     wrong = missing_lights(plan, cell.leds, cell.rig.support.base_from_support.matrix())

@@ -21,7 +21,7 @@ Booleans = NDArray[np.bool_]
 FULL = 0.95
 """Share of the range above black that counts as full, so that noise does not reach saturation."""
 QUANTILES = 48
-"""Rates from which the rates of all pixels in an LED's light are estimated."""
+"""Number of rates that stand for the rates of all pixels in an LED's light."""
 _JUDGED_MARGIN, _HELP_MARGIN = 1.03, 1.05
 """Ratio over that which is asked for, by which frames are judged: a pixel's ratio is known from noisy pixels."""
 _SOME_PIXELS = 1000

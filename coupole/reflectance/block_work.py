@@ -124,7 +124,7 @@ class Cluster:
         except (CancelledError, CommClosedError) as error:
             raise InputError(
                 f"--scheduler: the scheduler {self._address} is gone; start it, and give this command again: "
-                f"finished work is kept"
+                "finished work is kept"
             ) from error
 
     def everywhere(self, function: Callable[[], Any]) -> None:

@@ -98,7 +98,7 @@ def refuse_uncalibrated(result: PictureResult) -> None:
     if not (result.folder / INTERVALS).exists():
         raise InputError(
             f"{result.folder}: has no intervals: they need {FEWEST_LIGHTS} lights, and a result of this "
-            f"version; repeat the command that made the result"
+            "version; repeat the command that made the result"
         )
 
 

@@ -35,7 +35,7 @@ def open_cell(rig: str | os.PathLike[str] = "sim", *, support_is_empty: bool = F
     if not (support_is_empty or in_world(cell.rig, dry_run=False)):
         raise InputError(
             f"{cell.document.path}: is a real cell, where this function checks no path and counts no light: "
-            f"remove the object and give support_is_empty=True, or acquire a plan"
+            "remove the object and give support_is_empty=True, or acquire a plan"
         )
     faults_of(cell).refuse(cell.document.path)
     refuse_uncommissioned(cell)

@@ -97,7 +97,7 @@ class ArmFaults:
                 expected="a confirmation by a person who has been to the cell",
                 happened=f"since {standing[-1].t} the arm has a fault: {standing[-1].message.rstrip('.')}",
                 remedy=f"Find the cause, check that the cell is clear, then give `coupole confirm {rig} --name "
-                f"NAME` (`--yes` is not enough).",
+                "NAME` (`--yes` is not enough).",
             )
 
     def note(self, message: str, run: str = "") -> None:

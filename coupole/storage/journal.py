@@ -154,7 +154,7 @@ def _events(path: Path, lines: Iterable[bytes]) -> Iterator[Event]:
             raise StorageError(
                 f"{path}: line {number} is not an event of a journal that this version knows "
                 f"({'.'.join(map(str, problem['loc']))}: {problem['msg']}). Was it changed, or written by a "
-                f"later version?"
+                "later version?"
             ) from error
         if isinstance(event, JournalBegun) and event.version > JOURNAL_VERSION:
             raise StorageError(

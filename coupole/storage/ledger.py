@@ -1,6 +1,6 @@
 """The dose ledger of each object: all light that it has received, `<ledger folder>/<object id>.jsonl`.
 
-A caller that gives light enters the planned light before (`Ledger.plan`), and the light that was given afterwards
+A caller that gives light enters the planned light first (`Ledger.plan`), and afterwards the light that was given
 (`Ledger.correct`); both are on disk when the call returns. So a process that is killed, or a power cut, can only
 leave too high a figure: that of the last plan. Writers hold a lock on the object's file.
 
@@ -103,8 +103,8 @@ class Ledger:
         if history.lacks_lines:
             raise StorageError(
                 f"{self.path}: has light of a plan that is not in it, so earlier lines are missing: it was "
-                f"moved or replaced while light was given, and nobody knows what the object may still receive. "
-                f"Put the whole ledger back; if it is lost, give "
+                "moved or replaced while light was given, and nobody knows what the object may still receive. "
+                "Put the whole ledger back; if it is lost, give "
                 f"`coupole dose {self.object_id} --add LUX_H --note WHY` with what it had, or with 0"
             )
 

@@ -185,7 +185,7 @@ def _at_work(result: Path) -> str:
     pid = holder_of(result / _LOCK)
     return (
         f"{result}: {f'process {pid}' if pid else 'another process'} makes this result during the acquisition; "
-        f"`coupole status RUN` shows its progress. Wait until it has ended, or name another folder with --out"
+        "`coupole status RUN` shows its progress. Wait until it has ended, or name another folder with --out"
     )
 
 

@@ -261,7 +261,7 @@ class Run:
                 raise InputError(
                     f"{self.folder}: cannot be resumed, because the run's own files were changed after it began: "
                     f"{'; '.join(altered_files.values())}. Only these files say what the plan and the rig were: "
-                    f"put the old files back (from a copy of the run), or start a new run."
+                    "put the old files back (from a copy of the run), or start a new run."
                 )
             raise InputError(
                 f"{self.folder}: cannot be resumed, because this changed since the run began: "

@@ -275,7 +275,7 @@ def _changes_of(
     try:
         then = yamlfile.parse(Path(before["path"]), _plain(before["text"])).validate(model)
     except InputError:
-        yield f"the {kind} {path} is another file, and the old one cannot be read any more"
+        yield f"the {kind} {path} is another file, and this version does not understand the old one"
         return
     now = yamlfile.read_document(path, files).validate(model)
     if changes := differences(then, now, apart):

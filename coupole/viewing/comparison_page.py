@@ -104,7 +104,7 @@ def remarks(comparison: Comparison) -> Iterator[str]:
     if comparison.noise_factor > 1.5 or comparison.colour_factor > 1.5:
         yield (
             f"differences scatter {max(comparison.noise_factor, comparison.colour_factor):.1f} times more than "
-            f"points about their own surface: uncertainties were multiplied by this factor"
+            "points about their own surface: uncertainties were multiplied by this factor"
         )
     if comparison.before.outward is None:
         yield "without triangles it is not known which side is outside: signs of distances have no meaning"

@@ -199,7 +199,7 @@ def _loops(registration: Registration) -> Section:
     count = len(registration.loops)
     words = (
         f"{count} ring{'s' if count > 1 else ''} of pairs, each pair adjusted by itself. The worst closing "
-        f"error is "
+        "error is "
         f"{worst_loop_mm(registration):.3g} mm. All uncertainties include a factor of "
         f"{registration.loop_factor:.2f} from the loops."
     )

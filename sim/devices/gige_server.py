@@ -238,7 +238,9 @@ class GigeServer:
         self._registers.set_integer(reg.SESSION, self._sessions if on else 0)
 
     def _fit_image(self) -> None:
-        """An image that is larger than the sensor gives is completed; a smaller one stays as it is."""
+        """A side of the image that reaches beyond what the sensor gives is set to all that it gives; a smaller one
+        stays as it is.
+        """
         registers = self._registers
         for size, offset, most, step in (
             (reg.WIDTH, reg.OFFSET_X, registers.widest(), 4),

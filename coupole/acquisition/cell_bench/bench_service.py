@@ -177,8 +177,8 @@ class BenchService:
         return work.figures()
 
     def _stop(self) -> list[str]:
-        """Stop everything; return the devices that are not surely safe then. Pictures that are under way have
-        ended, with their light, when this returns.
+        """Stop everything; return sentences on devices that are not surely safe then. Pictures that are under way
+        have ended, with their light, when this returns.
         """
         self.works.stop()
         trouble = unsure(self._opened.halt(), _STOPPED_WITHIN_S)

@@ -78,7 +78,7 @@ def _moved_until_pressed(bench: Bench) -> np.ndarray:
     robot.stop()
     raise StepFailedError(
         f"no fault of the arm was seen within {_PRESSED_WITHIN_S:g} s: if the emergency stop was pressed, the "
-        f"controller does not report it; otherwise repeat the step"
+        "controller does not report it; otherwise repeat the step"
     )
 
 

@@ -112,8 +112,8 @@ def _ask_for_volumes(bench: Bench) -> None:
     volumes = bench.cell.rig.keep_out
     for volume in volumes:
         bench.ask_whether(
-            f"{_volume_text(volume)}. Measure with your ruler: does it enclose its thing completely, wherever "
-            f"the arm reaches?"
+            f"{_volume_text(volume)}. Measure with your ruler: does it enclose the thing that it is there for "
+            "completely, wherever the arm reaches?"
         )
     names = ", ".join(volume.name for volume in volumes) or "none"
     bench.ask_whether(

@@ -133,9 +133,8 @@ def watchdog(bench: Bench) -> None:
             "the rig switches the box's watchdog off: set `watchdog_s` of the led box, 2 for example"
         )
     bench.ask_before(
-        "Step watchdog: LEDs are lit in turn, then this machine sends no more commands. The box must switch off "
-        "by itself after "
-        f"{seconds:g} s."
+        "Step watchdog: LEDs are lit in turn, then this machine sends no more commands. The box must switch its "
+        f"LEDs off by itself after {seconds:g} s."
     )
     ids = bench.cell.leds.ids
     metered_ids = ids[np.unique(np.linspace(0, len(ids) - 1, _METERED).astype(int))].tolist()

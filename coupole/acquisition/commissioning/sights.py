@@ -28,7 +28,7 @@ class Sight:
 
 @dataclass(frozen=True)
 class Deviations:
-    """Difference between the pose of the board by all sights together and its true pose; support frame."""
+    """Pose of the board by all sights together, minus the pose in which it lies; support frame."""
 
     height_mm: float
     """Height of the board's middle; above 0, it is seen higher."""

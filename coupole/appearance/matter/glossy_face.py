@@ -75,7 +75,7 @@ class Face:
             raise InputError(
                 f"a paint under this face is seen with a reflectance of {low:.3g} to {high:.3g}; found "
                 f"{np.asarray(measured_reflectance.values)[wrong][0]:.3g}, R inside the binder beyond 0 to 1: "
-                f"check whether gloss is included, and whether the sample has a glossy face"
+                "check whether gloss is included, and whether the sample has a glossy face"
             )
         return InternalReflectance(internal)
 

@@ -69,6 +69,6 @@ def real_index(refraction: Refraction, folder: Path) -> Array:
     if np.any(index.imag > 1e-3):
         raise InputError(
             f"index: expected a transparent material, found k up to {index.imag.max():g}; give the index of a "
-            f"binder"
+            "binder"
         )
     return within("index of a binder", index.real, 1.0 + 1e-9, 3.0)

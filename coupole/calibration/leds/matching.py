@@ -196,7 +196,7 @@ def _unseen(sightings: LedSightings, found_mm: Floats, ids: NDArray[np.int64]) -
                 "astray",
                 (led,),
                 f"LED {led}: the spots of {views[row]} views meet in no point near the dome: they are "
-                f"reflections, or the camera's poses are wrong",
+                "reflections, or the camera's poses are wrong",
             )
 
 

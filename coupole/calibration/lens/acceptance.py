@@ -24,7 +24,7 @@ HAND_EYE = (
     *DOUBTS,
     Allowed("centre_mm", "camera centre on the flange", 0.3, "mm"),
     Allowed("turn_deg", "camera's turn", 0.05, "deg"),
-    Allowed("robot_ratio", "robot's noise, found over stated", 3.0),
+    Allowed("robot_ratio", "robot's noise, estimated over stated value", 3.0),
 )
 """`centre_mm`: standard uncertainty, all directions together (seed 003: 300 um)."""
 CHROMATIC = (

@@ -74,7 +74,7 @@ class Diagnosis:
         lines = []
         if self.contradicts:
             lines.append(
-                f"robot and camera contradict each other: by the poses, the board's place scatters by "
+                "robot and camera contradict each other: by the poses, the board's place scatters by "
                 f"{self.scatter_mm:.3g} mm and {self.scatter_deg:.3g} deg, where noise explains "
                 f"{self.noise_scatter.position_mm:.2g} mm and {self.noise_scatter.orientation_deg:.2g} deg"
             )

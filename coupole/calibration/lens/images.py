@@ -49,6 +49,6 @@ def find_board(
         why = f"; {left_out[0]}" if left_out else ""
         raise InputError(
             f"the board was found in none of {len(sources.images)} images{why}. Is it the board of "
-            f"the description?"
+            "the description?"
         )
     return Found(tuple(sightings), np.array(numbers, dtype=np.intp), size_px, tuple(left_out))

@@ -8,6 +8,6 @@ MESH = (
     Allowed("place_mm", "place of the worst sticker", 0.1, "mm"),
     Allowed("missing", "stickers not found", 0.5),
     Allowed("residual_px", "residual of stickers", 0.5, "px"),
-    Allowed("robot_ratio", "robot's noise, found over stated", 3.0),
+    Allowed("robot_ratio", "robot's noise, estimated over stated value", 3.0),
 )
 """`place_mm`: standard uncertainty of its place in the base (seed 003: 100 um)."""

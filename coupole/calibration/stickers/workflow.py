@@ -199,7 +199,7 @@ def _figures(pose: MeshPose, scan: Scan, u_mm: Floats) -> dict[str, float]:
 def _remarks(pose: MeshPose) -> tuple[str, ...]:
     remarks = [
         f"points in space differ from the scanner's table by {pose.point_rms_mm:.3f} mm (rms) before the "
-        f"adjustment"
+        "adjustment"
     ]
     if pose.missing:
         remarks.append(f"{len(pose.missing)} stickers of the table were not found: {', '.join(pose.missing[:20])}")

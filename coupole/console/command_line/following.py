@@ -159,7 +159,7 @@ class _Followed:
         keys = {"p": self._pause_or_go_on, "q": self.stop}
         with key_actions(keys) as has_keys, self._bars:
             if has_keys:
-                self._console.print("keys: p pauses after the burst, and goes on; q stops")
+                self._console.print("keys: p pauses after the burst, and continues; q stops")
             for output in self._outputs():
                 self._entry = output["entry"]
                 self._say(output["said"])

@@ -166,7 +166,7 @@ def why_unwanted(request: Request, service: Service) -> str:
     """Return why nothing is begun for a request: its sender has gone, or it may have lain here long; else
     empty."""
     if hung_up(request.state.connection):
-        return "whoever asked has gone: not begun"
+        return "the caller has disconnected: not begun"
     return service.loop_watch.refusal()
 
 

@@ -63,6 +63,6 @@ class LoopWatch:
         if stood_s < longest_s:
             return ""
         return (
-            f"the console was frozen for {stood_s:.1f} s (it was stopped, or its machine slept), and ignores "
-            f"requests of this time: look at the cell, and ask again"
+            f"the console was frozen for {stood_s:.1f} s (it was stopped, or its machine slept), and begins "
+            "nothing that was requested in this time: look at the cell, and ask again"
         )

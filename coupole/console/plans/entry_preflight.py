@@ -73,7 +73,7 @@ class EntryPreflight:
             self._for = ""
 
     def give_up(self) -> None:
-        """End the present check: the plan is not entered. Raises InputError: nothing is."""
+        """End the present check: its plan or run is not entered. Raises InputError: nothing is being checked."""
         if not self._for:
             raise InputError("no preflight is being made")
         self._process.end()

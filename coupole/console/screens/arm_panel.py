@@ -108,7 +108,7 @@ class ArmPanel:
         motions = "one straight motion" if corners == 1 else f"{corners} straight motions"
         self._words.text = (
             f"To {path['to']}: {motions} in joint space, {duration_text(path['duration_s'])}. The blue line is "
-            f"the path of the camera, violet is the arm at its end."
+            "the path of the camera, violet is the arm at its end."
         )
 
     async def _drive_path(self) -> None:

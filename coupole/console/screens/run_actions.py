@@ -111,7 +111,7 @@ class RunActions:
             f"Reflectance of {self._name}?",
             f"Normals and materials are fitted to its {self._frames} frames, with the calibrations in force for "
             f"it: minutes to hours of this machine's processors. The result lands in {out}. If you stop it and "
-            f"begin it again, it continues.",
+            "begin it again, it continues.",
             "Begin",
         ):
             out.parent.mkdir(parents=True, exist_ok=True)

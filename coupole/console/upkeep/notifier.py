@@ -50,7 +50,7 @@ class Occurrences:
                 words = (
                     f"{fault}\nUntil somebody has been there and says `coupole confirm`, the arm does not move."
                 )
-                yield self._message("arm-fault", "the arm is in a fault", words)
+                yield self._message("arm-fault", "the arm has a fault", words)
         yield from self._disk()
 
     def _ending(self, entry: Entry) -> Message:

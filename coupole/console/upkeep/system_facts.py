@@ -92,8 +92,8 @@ def log_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def notifications(folder: Path) -> dict[str, str]:
-    """Return the people and their events by `notifications.yaml` in the console's folder, without its passwords;
-    empty if there is no such file.
+    """Return who is notified, and of which events, by `notifications.yaml` in the console's folder, without its
+    passwords; empty if there is no such file.
     """
     path = folder / NOTIFICATIONS
     if not path.is_file():

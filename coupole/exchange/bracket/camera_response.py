@@ -116,7 +116,7 @@ def left_open(exposure_s: Array) -> str:
         return ""
     return (
         f"no two photographs are nearer than {factor:.1f} times in exposure: only its smoothness excludes waves "
-        f"of the response, and u is larger for them; steps of 2, or raw files, determine it better"
+        "of the response, and u is larger for them; steps of 2, or raw files, determine it better"
     )
 
 

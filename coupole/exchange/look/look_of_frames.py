@@ -135,7 +135,7 @@ def _about(run: Run, frames: LightFrames, views: list[dict[str, Any]]) -> dict[s
             "Proof": run.proof,
             "Places": "LEDs at their places in the rig, as seen from the point in focus",
             "Missed": f"Median and rms, shares of the camera's range: {off}. Most of the error is at edges of "
-            f"shadows. "
+            "shadows. "
             "For the figure between LEDs, an eighth of the LEDs was left out.",
         },
     }

@@ -139,7 +139,7 @@ def _smallest(
             raise InputError(
                 f"--adaptive {most_error:g}: {material.name}: a table of {table.size_bytes / 1e6:.0f} MB "
                 f"differs from its fit by {errors[1::2].max():.1e} or more in 5 % of the directions; choose a "
-                f"larger value"
+                "larger value"
             )
         worst = errors[1::2].max()
         gains = [

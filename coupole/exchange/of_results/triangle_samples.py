@@ -45,7 +45,7 @@ def samples_of(surface: MeasuredSurface, triangle: int, quantile: float) -> Samp
     if np.isnan(np.where(np.isfinite(whole.f), whole.low + whole.high, 0.0)).any():
         raise InputError(
             f"{surface.result.folder}: has no bounds, because no record of the response stated its frames' "
-            f"noise; make it again with one (`coupole calibrate response`)"
+            "noise; make it again with one (`coupole calibrate response`)"
         )
     return whole
 

@@ -189,6 +189,7 @@ def checked_base(base_url: str) -> str:
     if not fits or "?" in base_url or "#" in base_url or not _OF_ADDRESSES.fullmatch(base_url):
         raise InputError(
             f"--base-url {base_url}: expected the http address under which the folder will be found, "
-            f"for example {EXAMPLE_URL}, with blanks as %20; it is in the ids of IIIF"
+            f"for example {EXAMPLE_URL}; write characters that an address may not have with %, a blank as %20; "
+            "the ids of IIIF contain this address"
         )
     return base_url.rstrip("/")

@@ -213,7 +213,7 @@ def _check_order(films: Sequence[Film], film_entries: Sequence[FilmGiven], nm: A
             raise InputError(
                 f"{light.spectrum}: is darker over the lighter ground {light.over} than {dark.spectrum} over "
                 f"{dark.over} at {nm[at]:g} nm; check whether the spectra are exchanged, and whether they are "
-                f"percent or fractions"
+                "percent or fractions"
             )
 
 

@@ -50,7 +50,7 @@ def read_palette(sources: Sequence[Path]) -> tuple[Paint, ...]:
         if _is_same(a, b):
             raise InputError(
                 f"{a.source} and {b.source}: {a.name!r} and {b.name!r} have the same K and S; their shares "
-                f"cannot be distinguished: leave one out"
+                "cannot be distinguished: leave one out"
             )
         if a.unit != b.unit:
             raise InputError(
@@ -60,7 +60,7 @@ def read_palette(sources: Sequence[Path]) -> tuple[Paint, ...]:
     if "per layer" in {paint.unit for paint in paints} and len(paints) > 1:
         raise InputError(
             f"{paints[0].source}: K and S are of a layer of unknown thickness, so it cannot be mixed with "
-            f"others; measure it with its thickness"
+            "others; measure it with its thickness"
         )
     if not paints:
         raise InputError(f"{', '.join(map(str, sources))}: expected paints ({ENDING}, or a library); found none")

@@ -97,7 +97,7 @@ class Found:
         lacks = "absorbs" if best.worst > 0.0 else "absorbs less, or scatters more,"
         return (
             f"no mixture of this palette matches the target: the best one differs by {best.misfit:.1f} times "
-            f"its uncertainty, "
+            "its uncertainty, "
             f"most about {best.worst_nm:g} nm, where the recipe is {abs(best.worst):.3f} {kind}. A paint is "
             f"missing that {lacks} there"
         )
@@ -191,7 +191,7 @@ class _Problem:
             at = int(np.argmax(np.abs(clipped_target - target)))
             raise InputError(
                 f"the target is {target[at]:.3g} at {WAVELENGTHS_NM[bands][at]:g} nm, which no paint under this "
-                f"face can have: check whether gloss is included, and percent or fractions"
+                "face can have: check whether gloss is included, and percent or fractions"
             )
         inside = np.maximum(self.face.inside(MeasuredReflectance(clipped_target)).values, _DARKEST)
         q = kubelka_munk.k_over_s(inside)

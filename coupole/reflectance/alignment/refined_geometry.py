@@ -78,7 +78,7 @@ class RefinedGeometry:
         if self.inputs.get(run) != dict(measured_run.frames.inputs):
             raise InputError(
                 f"{self.path}: {run} has other frames than when it was refined; refine it again by `coupole "
-                f"reflectance refine`, with another --out"
+                "reflectance refine`, with another --out"
             )
         views = tuple(
             replace(

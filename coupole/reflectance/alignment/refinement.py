@@ -149,7 +149,7 @@ def _find_matches(
         raise InputError(
             f"views are matched by the texture that they show: expected {FEWEST_MATCHES} matches or more, "
             f"found {len(matches.blocks)}. Do the views overlap, has the object texture, and is --search-mm as "
-            f"large as their disagreement?"
+            "large as their disagreement?"
         )
     return matches
 

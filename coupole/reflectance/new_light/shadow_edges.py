@@ -121,7 +121,7 @@ def _begin(triangle_of_pixel, places_mm, facing, place, axis, exponent, codes): 
 @numba.njit(cache=True, nogil=True)
 def _close_cells(codes, first, open_cells):  # type: ignore[no-untyped-def]
     """Close cells of rows [n, cells across] from a `first` one on, which have others below and to the right.
-    Pixels stay open if their rays at the corners are missing or differ, or if the surface ends there.
+    Cells stay open if their rays at the corners are missing or differ, or if the surface ends there.
     """
     down, across = open_cells.shape
     for i in range(down):

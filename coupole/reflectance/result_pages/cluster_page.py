@@ -40,7 +40,7 @@ def _page(folder: Path, document: dict[str, Any]) -> Page:
         pictures=views[0][1] if views else [],
         summary=f"{document['triangles']:,} triangles were grouped into {document['clusters']} materials; "
         f"{document['borrowed']:,} had too few samples for a material of their own, {document['without']:,} "
-        f"have none.",
+        "have none.",
         quality=_quality(document),
         next_step=[
             "See it without holes: ",
@@ -79,7 +79,7 @@ def _notes(document: dict[str, Any]) -> list[str]:
         errors = ", ".join(f"{words} {100 * mae:.3f} %" for words, mae in kinds if mae is not None)
         notes.append(
             f"From the view {document['without_view']}, whose samples the clusters did not use: {errors} (their "
-            f"own "
+            "own "
             "materials had them)."
         )
     if document["mae_ratio"] is not None:

@@ -97,7 +97,7 @@ def _page(folder: Path, about: dict[str, Any]) -> Page:
 
 _ARROWS = (
     "Arrows lead from a spot of the surface to the place where another view puts it, in the picture of the view "
-    "with the greatest detail; they are {LONGER:g} times as long as the true distance. The first two are at the "
+    f"with the greatest detail; they are {LONGER:g} times as long as the true distance. The first two are at the "
     "top."
 )
 _STEPS = "Steps along the base's axes and about the camera's, with standard uncertainties."
@@ -117,7 +117,7 @@ def _unknowns(about: dict[str, Any]) -> str:
         "times "
         "as much as noise and texture alone would make them, and are weighted by that; "
         f"{about['rejected']} were rejected. Motions that pictures cannot determine, such as that of mesh and "
-        f"cameras together, keep their stated uncertainty."
+        "cameras together, keep their stated uncertainty."
     )
 
 

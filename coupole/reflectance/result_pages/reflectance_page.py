@@ -97,7 +97,7 @@ def _quality(about: dict[str, Any]) -> str:
     if about["held_out_psnr_db"] is not None:
         return (
             f"Pictures of lights that were left out are predicted with {about['held_out_psnr_db']:.1f} dB "
-            f"(PSNR, inside the mask)."
+            "(PSNR, inside the mask)."
         )
     return f"The median residual of the materials is {100 * about['residual']:.1f} % (of square roots)."
 

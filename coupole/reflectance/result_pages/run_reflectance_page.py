@@ -56,7 +56,7 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
         yield (
             f"cameras have the poses of COLMAP, {poses['median_moved_mm']:.3g} mm and "
             f"{poses['median_turned_deg']:.2g} degrees (median) from those of the records; their uncertainty is "
-            f"assumed to be that of the records"
+            "assumed to be that of the records"
         )
     if about["not_fitted"]:
         yield f"{about['not_fitted']} triangles have fewer than {FEWEST} samples and no material"
@@ -180,7 +180,7 @@ def _shares(about: dict[str, Any]) -> Section:
     if left_out := sum(view["contradicted"] or 0 for view in about["views"]):
         notes.append(
             f"{left_out} samples ({100 * left_out / max(about['samples'], 1):.3f} %) were left out: they are "
-            f"darker than their neighbours allow, as at the edge of a cable's shadow."
+            "darker than their neighbours allow, as at the edge of a cable's shadow."
         )
     table = Table("Share of triangles and LEDs", ("view", *codes), rows)
     return Section("samples", "Samples that were used and left out", tables=[table], notes=notes)

@@ -132,7 +132,7 @@ def _records(scan: PreparedScan, pose: Floats, unit: str, cell_mm: float) -> NDA
     else:
         raise InputError(
             f"{scan.source}: neither triangles nor a viewpoint show which side of its surface is outside; state "
-            f"the scanner's place with --seen-from, or leave out the mesh with --no-mesh"
+            "the scanner's place with --seen-from, or leave out the mesh with --no-mesh"
         )
     incidence = np.sum(normals * outward, axis=1)
     normals *= np.where(incidence < 0, -1.0, 1.0)[:, None]

@@ -110,7 +110,7 @@ def _expect_fine_steps(source: ScanSource, mesh: Mesh, spacing_mm: float) -> Non
         raise InputError(
             f"{source}: points are up to {farthest_mm / 1000:.0f} m from their origin, where 32-bit coordinates "
             f"have steps of {step_mm:.2g} mm, and {spacing_mm:.2g} mm apart: subtract the same vector from all "
-            f"scans"
+            "scans"
         )
 
 

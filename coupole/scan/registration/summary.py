@@ -138,7 +138,7 @@ def remarks(registration: Registration) -> Iterator[str]:
     if registration.loop_factor > 1.05:
         yield (
             f"loops close {registration.loop_factor:.1f} times worse than noise explains; all uncertainties are "
-            f"multiplied by this factor"
+            "multiplied by this factor"
         )
     if registration.unplaced_numbers:
         yield "not placed, because they overlap no other scan enough: " + ", ".join(

@@ -24,6 +24,9 @@ from coupole.plan.cell import Cell
 from coupole.plan.controller_places import places_of_arm
 from coupole.plan.rig_devices import in_world
 
+OPEN_ELSEWHERE = (
+    "another process has this cell's devices open (acquire, live, meter, bench, calibrate, commission)"
+)
 _KIND = "in-use"
 _LOCK = "hhqqi4x"
 """`struct flock` of 64-bit Linux: type, whence, start, length (0: the whole file), process (0)."""
@@ -45,10 +48,7 @@ def in_use(cell: Cell) -> Iterator[None]:
                 file = stack.enter_context(named_after(place, _KIND).open("a+b"))
                 _lock(file.fileno(), alone=alone)
             except BlockingIOError as error:
-                raise InputError(
-                    f"{cell.document.path}: another process has this cell's devices open (acquire, live, meter, "
-                    "bench, calibrate, commission); end it first"
-                ) from error
+                raise InputError(f"{cell.document.path}: {OPEN_ELSEWHERE}; end it first") from error
             except (OSError, InputError) as error:
                 if alone:
                     raise StorageError(f"{place}: cannot mark the cell as in use: {reason(error)}") from error

@@ -220,6 +220,7 @@ def _exit_code_of_command() -> int:
         code = error.exit_code
     except SignalReceived as received:
         interruption = Interrupted("stopped", received.number)
+        text_outlet.lead_blocked_nowhere(text_outlet.PATIENCE_S)
         _say(interruption)
         code = interruption.exit_code
     except typer.Abort:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from coupole.plan.base_model import Degrees, FilePath, Length, Model, Name, Pose, Vector, Words
 from coupole.plan.exposures import AutoExposure, Exposures, FixedExposure
@@ -98,6 +98,10 @@ class Optics(Model):
     """F-number to which the aperture is to be set."""
 
 
+def _way(watch: bool | Watch) -> Watch:
+    return {True: EVERYTHING, False: NOTHING}[watch] if isinstance(watch, bool) else watch
+
+
 class Plan(Model):
     """One acquisition."""
 
@@ -140,6 +144,18 @@ class Plan(Model):
     contact: Words | None = None
     """Whom to ask about the data; None: the rig's."""
 
+    @field_validator("watch")
+    @classmethod
+    def _no_sentinels_of_choices(cls, watch: bool | Watch, info: ValidationInfo) -> bool | Watch:
+        selections = [view.lights or info.data.get("lights") for view in info.data.get("views", ())]
+        chosen = any(isinstance(selection, AdaptiveLights) for selection in selections)
+        if _way(watch).frames == "all" and (chosen or isinstance(info.data.get("exposure"), AutoExposure)):
+            raise ValueError(
+                "`watch: {frames: darks}`, or no `watch`: LEDs or exposures of this plan are chosen in the run, so "
+                "no LED can be planned to be lit again and again"
+            )
+        return watch
+
     @model_validator(mode="after")
     def _something_to_shoot(self) -> Plan:
         lights = [view.lights or self.lights for view in self.views]
@@ -150,21 +166,12 @@ class Plan(Model):
     @property
     def watching(self) -> Watch:
         """The way in which the run is watched."""
-        return {True: EVERYTHING, False: NOTHING}[self.watch] if isinstance(self.watch, bool) else self.watch
+        return _way(self.watch)
 
     @property
     def takes_sentinels(self) -> bool:
         """True if LEDs are lit again and again to tell what changes."""
         return self.watching.frames == "all"
-
-    @model_validator(mode="after")
-    def _no_sentinels_of_choices(self) -> Plan:
-        if self.takes_sentinels and (self.chooses_lights or isinstance(self.exposure, AutoExposure)):
-            raise ValueError(
-                "watch: LEDs or exposures of this plan are chosen in the run, so no LED can be planned to be lit "
-                "again and again; expected `watch: {frames: darks}`, or no `watch`"
-            )
-        return self
 
     @property
     def skips_hidden_lights(self) -> bool:

@@ -261,6 +261,11 @@ class FaultNoted(JournalEvent):
     device: str = ""
     """The device that failed, by its kind in the rig; empty if none did."""
 
+    @property
+    def is_hold(self) -> bool:
+        """Tell whether nothing failed: the session was held until a person's word, after Ctrl-Z or a freeze."""
+        return self.kind == "Held"
+
 
 class InputsChanged(JournalEvent):
     """Files of the run were changed on the disk after they were read; the run goes on with what was read."""

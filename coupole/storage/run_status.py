@@ -87,6 +87,8 @@ class Status:
     reshot: int = 0
     faults: list[str] = field(default_factory=list)
     """Failures of the run. That somebody stopped the run is none."""
+    holds: list[str] = field(default_factory=list)
+    """Why it was held until a person's word, each time: Ctrl-Z, a freeze."""
     findings: list[str] = field(default_factory=list)
     """Findings of watching the measurement: view, name, what was seen, and the picture's path in the run."""
     sessions: list[Session] = field(default_factory=list)
@@ -167,7 +169,7 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
     status.stopped_pid = holder if holder and is_stopped(holder) else None
     if (status.frames_left or status.open_views) and not in_use:
         status.go_on = run.go_on_command
-        if status.faults:
+        if status.faults or status.holds:
             status.before_that = _confirmation(run)
     if result:
         frames_left = bool(status.frames_left or status.open_views)
@@ -199,6 +201,7 @@ def _note_event(found: Status, event: Event) -> None:
             found.sessions.append(session)
         case Continued():
             found.state = RUNNING
+            found.reason = "" if found.reason in found.holds else found.reason
             session.paused_s += _seconds(before, event.t)
         case Paused():
             found.state = PAUSED
@@ -209,9 +212,7 @@ def _note_event(found: Status, event: Event) -> None:
         case ReshootBegun():
             found.reshot += len(event.shots)
         case FaultNoted():
-            found.reason = event.message
-            if event.kind != _STOPPED_IN_0_1:
-                found.faults.append(event.message)
+            _note_fault(found, event)
         case FindingNoted():
             picture = f" ({event.picture})" if event.picture else ""
             found.findings.append(f"{event.view}: {event.kind}: {event.message}{picture}")
@@ -224,6 +225,14 @@ def _note_event(found: Status, event: Event) -> None:
         case _:
             assert_never(event)
     session.ended = event.t
+
+
+def _note_fault(found: Status, event: FaultNoted) -> None:
+    found.reason = event.message
+    if event.is_hold:
+        found.holds.append(event.message)
+    elif event.kind != _STOPPED_IN_0_1:
+        found.faults.append(event.message)
 
 
 def _seconds(begin_time: str, end_time: str) -> float:

@@ -147,7 +147,8 @@ def troubles(events: Iterable[Event], views: Iterable[SampledView], run_status: 
     lines: list[Inline] = []
     for event in events:
         if isinstance(event, FaultNoted) and event.kind != _STOPPED_IN_0_1:
-            lines.append([Moment(event.t), " ", Verdict(event.message, "bad")])
+            words = f"held: {event.message}" if event.is_hold else Verdict(event.message, "bad")
+            lines.append([Moment(event.t), " ", words])
         elif isinstance(event, FindingNoted):
             figure = f"{event.figure:.3g} {event.unit}, the limit is {event.limit:.3g}"
             words = f" view {event.view}: {event.kind}: {event.message}; {len(event.shots)} shots ({figure}) "

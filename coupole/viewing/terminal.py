@@ -229,6 +229,8 @@ def show_status(console: Console, status: Status) -> None:
             console.print(
                 f"  continue from the present state by: {status.processing.remedy}", markup=False, soft_wrap=True
             )
+    for hold in status.holds:
+        console.print("  [yellow]held:[/]", Text(hold))
     for fault in status.faults:
         console.print("  [red]fault:[/]", Text(fault))
     if status.go_on:

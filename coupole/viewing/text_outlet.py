@@ -189,6 +189,17 @@ def say_now(text: str, patience_s: float) -> None:
             os.write(sys.stderr.fileno(), text.encode())
 
 
+def lead_blocked_nowhere(patience_s: float) -> None:
+    """After a signal: drop the text of a standard stream whose reader takes nothing for this time, so that nothing
+    which is written at the end waits for him. Streams with a queue drop by themselves."""
+    for fd, name in ((1, "stdout"), (2, "stderr")):
+        with contextlib.suppress(OSError):
+            if name not in _outlets and not select.select([], [fd], [], patience_s)[1]:
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, fd)
+                os.close(nowhere)
+
+
 def finish(patience_s: float = PATIENCE_S, document_s: float = DOCUMENT_PATIENCE_S) -> None:
     """Wait a bounded time until the readers have taken everything; `document_s`: for that of standard output."""
     for name, outlet in _outlets.items():

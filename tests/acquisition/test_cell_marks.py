@@ -14,6 +14,7 @@ from cells import CellFolder
 from forks import fork_context
 
 from coupole.acquisition import cell_marks, runtime_folder
+from coupole.acquisition.cell_bench.bench_client import ask_bench
 from coupole.acquisition.cell_marks import in_use, is_in_use
 from coupole.errors import InputError, StorageError
 from coupole.plan.cell import Cell, read_cell
@@ -117,6 +118,14 @@ def test_a_copied_rig_with_another_storage_folder_is_the_same_cell(real: CellFol
     with in_use(first):
         assert not _may_begin(read_cell(copy))
         assert is_in_use(read_cell(copy))
+
+
+def test_who_asks_for_a_bench_where_another_command_has_the_cell_is_told_so(real: CellFolder) -> None:
+    cell = read_cell(real.rig)
+    with pytest.raises(InputError, match="no bench of this user holds this cell"):
+        ask_bench(cell, "state")
+    with in_use(cell), pytest.raises(InputError, match="another process has this cell's devices open"):
+        ask_bench(cell, "state")
 
 
 def test_sessions_with_a_world_of_their_own_share_no_device_and_are_marked(cell: CellFolder) -> None:

@@ -238,5 +238,26 @@ def test_a_last_word_waits_for_no_reader_where_no_queue_lies_between() -> None:
     assert subprocess.run(words, capture_output=True, cwd=REPO, check=True).stderr == b"a word"
 
 
+@pytest.mark.parametrize("kind", ["full pipe", "stopped terminal"])
+def test_a_command_without_a_cell_that_nobody_reads_is_ended_by_ctrl_c(kind: str) -> None:
+    command = [sys.executable, "-m", "coupole.commands.cli", "schema", "plan"]
+    with (
+        READERS[kind]() as nobody,
+        subprocess.Popen(command, stdout=nobody, stderr=nobody, cwd=REPO) as process,
+    ):
+        cells.wait_until(lambda: writes(process.pid), "a write that waits for its reader")
+        process.send_signal(signal.SIGINT)
+        try:
+            assert process.wait(cells.PATIENCE_S) == 130
+        finally:
+            process.kill()
+
+
+def writes(pid: int) -> bool:
+    """Tell whether the main thread of a process is in `write` to a standard stream."""
+    number, *arguments = Path(f"/proc/{pid}/syscall").read_text().split()
+    return number in {"1", "64"} and arguments[0] in {"0x1", "0x2"}
+
+
 def test_nobody_listens_to_descriptors_that_were_closed() -> None:
     assert subprocess.run([sys.executable, "-c", CLOSE_ALL], cwd=REPO, timeout=60, check=False).returncode == 0

@@ -99,7 +99,8 @@ def test_sentinels_are_refused_where_lights_are_chosen(cell: CellFolder) -> None
     cell.write(watch=True, lights=lights)
     ended = cells.here("check", cell.plan)
     assert ended.code == 2
-    assert "watch: {frames: darks}" in ended.err
+    line = next(n for n, line in enumerate(cell.plan.read_text().splitlines(), 1) if '"watch"' in line)
+    assert f"{cell.plan}:{line}:11: watch: expected `watch: {{frames: darks}}`" in ended.err
 
 
 # -- light, frames and words, whatever happens ----------------------------------------------------------------

@@ -29,12 +29,12 @@ from coupole.viewing import report
 T = "2026-01-01T00:00:{:06.3f}Z"
 
 
-def told(run: Run, events: Sequence[Event]) -> Status:
+def told(run: Run, events: Sequence[Event], *, in_use: bool | None = None) -> Status:
     """Status of a run whose journal has these events, a second apart, before its frames."""
     lines = [line for line in run.journal_path.read_text().splitlines(keepends=True) if '"frame"' in line]
     lines += [event_line(event.model_copy(update={"t": T.format(n)})) for n, event in enumerate(events)]
     run.journal_path.write_text("".join(lines))
-    return status(run)
+    return status(run, in_use=in_use)
 
 
 @pytest.fixture
@@ -56,6 +56,17 @@ def test_a_stop_that_version_0_1_noted_as_a_fault_is_none(run: Run) -> None:
     found = told(run, [SessionStarted(), by_operator, SessionStopped(outcome="interrupted")])
     assert (found.reason, found.faults) == ("stopped by the operator", [])
     assert "Nothing went wrong" in report.write(run).read_text()
+
+
+def test_a_hold_is_no_fault_and_the_reason_until_the_session_goes_on(run: Run) -> None:
+    hold = FaultNoted(kind="Held", message="Ctrl-Z: the process stood for 3.0 s")
+    held = told(run, [SessionStarted(), hold, Paused()], in_use=True)
+    assert (held.state, held.reason, held.holds, held.faults) == ("paused", hold.message, [hold.message], [])
+    later = [Continued(), SessionStopped(outcome="done")]
+    done = told(run, [SessionStarted(), hold, Paused(), *later])
+    assert (done.state, done.reason, done.holds, done.faults) == ("done", "", [hold.message], [])
+    page = report.write(run).read_text()
+    assert f"held: {hold.message}" in page
 
 
 def test_a_failure_is_a_fault_and_the_reason(run: Run) -> None:

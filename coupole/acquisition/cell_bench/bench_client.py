@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from coupole.acquisition.cell_bench.bench_requests import VERSION
+from coupole.acquisition.cell_marks import OPEN_ELSEWHERE, is_in_use
 from coupole.acquisition.runtime_folder import named_after
 from coupole.acquisition.user_socket import PATIENCE_S, exchange, told_if_given_up
 from coupole.errors import InputError
@@ -41,11 +42,15 @@ def ask_bench(
                 lambda why: say(f"{rig}: no answer of its bench yet: {why}"),
             )
     except (FileNotFoundError, ConnectionRefusedError) as error:
-        raise InputError(
-            f"{rig}: no bench of this user holds this cell on this machine (`coupole bench`)"
-        ) from error
+        raise InputError(f"{rig}: {_why_no_bench(cell)}") from error
     except (OSError, ValueError) as error:
         raise InputError(f"{rig}: its bench does not answer: {error}") from error
+
+
+def _why_no_bench(cell: Cell) -> str:
+    if is_in_use(cell):
+        return f"{OPEN_ELSEWHERE}, and it is no bench that could be asked; end it first"
+    return "no bench of this user holds this cell on this machine (`coupole bench`)"
 
 
 def checked_answer(answer: dict[str, Any]) -> dict[str, Any]:

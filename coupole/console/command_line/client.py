@@ -93,8 +93,15 @@ def call(
     finally:
         connection.close()
     if reply.status >= 400:
-        raise InputError(str(answer.get("detail", answer)))
+        raise _refusal(answer)
     return answer
+
+
+def _refusal(answer: dict[str, Any]) -> InputError:
+    """The service's words, with the exit code that the same refusal has without a console."""
+    error = InputError(str(answer.get("detail", answer)))
+    error.exit_code = answer.get("exit_code", InputError.exit_code)
+    return error
 
 
 def _place(cell: Cell) -> str:

@@ -95,7 +95,12 @@ def _answer_errors(app: FastAPI) -> None:
     @app.exception_handler(InputError)
     async def wrong(_: Request, error: InputError) -> Response:
         return JSONResponse(
-            {"detail": str(error), "problems": [asdict(problem) for problem in error.problems]}, 422
+            {
+                "detail": str(error),
+                "problems": [asdict(problem) for problem in error.problems],
+                "exit_code": error.exit_code,
+            },
+            422,
         )
 
     @app.exception_handler(RequestValidationError)
@@ -104,7 +109,7 @@ def _answer_errors(app: FastAPI) -> None:
 
     @app.exception_handler(CoupoleError)
     async def answer_failure(_: Request, error: CoupoleError) -> Response:
-        return _no(409, str(error))
+        return JSONResponse({"detail": str(error), "exit_code": error.exit_code}, 409)
 
     @app.exception_handler(NotAllowed)
     async def not_allowed(_: Request, refusal: NotAllowed) -> Response:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from coupole.console.plans.entry_preflight import EntryPreflight
 from coupole.console.plans.outlook import at_work_of, too_little_disk, too_much_light
 from coupole.console.plans.plan_queue import Entry, Needs, PlanQueue
 from coupole.console.routes.messages import NewEntry
-from coupole.errors import InputError, Problem
+from coupole.errors import InputError, PreflightRefused, Problem
 from coupole.plan.base_model import possible_path
 from coupole.plan.cell import Cell, read_cell
 from coupole.plan.reading import PlanFiles, read_plan
@@ -27,6 +27,14 @@ from coupole.plan.yamlfile import read_document
 from coupole.preflight.files import Files
 from coupole.storage.ledger import ledger_of
 from coupole.storage.run import Run
+
+
+class EntryRefused(InputError):
+    """The entry may not be run; `exit_code` is that of `coupole check`."""
+
+    def __init__(self, problems: Sequence[Problem], exit_code: int = PreflightRefused.exit_code) -> None:
+        super().__init__(problems)
+        self.exit_code = exit_code
 
 
 class Entering:
@@ -81,7 +89,7 @@ class Entering:
         """Raises InputError: it does not wait, or another order exceeds an object's budget; StorageError."""
         reordered_entries = self._queue.order_after(number, before)
         if more := self._more_light(reordered_entries):
-            raise InputError(
+            raise EntryRefused(
                 [_problem(entry.words, more[entry.id]) for entry in reordered_entries if entry.id in more]
             )
         self._queue.move(number, before)
@@ -106,14 +114,14 @@ class Entering:
     # -- preflight --------------------------------------------------------------------------------------------
 
     def _needs(self, files: PlanFiles, fields: dict[str, Any], by: str) -> Needs:
-        """Raises InputError: preflight refuses it, with all refusals."""
+        """Raises EntryRefused: preflight refuses it, with all refusals."""
         run = Path(fields["resume"]) if fields["resume"] else None
         plan, rig = (Path(fields["plan"]), self._rig) if fields["plan"] else (files.document.path, None)
         entry_files = Files(plan, rig, run, Path(fields["output"]) if fields["output"] else None)
         begun_s = time.monotonic()
         verdict = self.preflight.of(entry_files, by, beside_a_run=self._acquisitions.state is not None)
         if verdict.problems:
-            raise InputError(verdict.problems)
+            raise EntryRefused(verdict.problems, verdict.exit_code)
         document = verdict.document
         thing = files.plan.object
         return Needs(
@@ -147,7 +155,7 @@ class Entering:
             )
         ]
         if problems:
-            raise InputError(problems)
+            raise EntryRefused(problems)
 
     def _more_light(self, entries: tuple[Entry, ...] | list[Entry]) -> dict[str, str]:
         """Refusals of light that these entries have in this order, and have not as they are."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from coupole.console.processes.warm_process import WarmProcess, say
-from coupole.errors import CoupoleError, InputError, Problem
+from coupole.errors import CoupoleError, InputError, PreflightRefused, Problem
 from coupole.preflight.files import Files, check_files
 from coupole.storage.line_file import utc_now
 
@@ -27,6 +27,8 @@ class Found:
     """Mistakes in the files, or refusals; with any nothing can be run."""
     document: dict[str, Any] = field(default_factory=dict)
     """Figures, as of `coupole check --json`."""
+    exit_code: int = InputError.exit_code
+    """Of `coupole check`, where there are problems."""
 
 
 def check_entry(files: Files, *, measure: bool) -> Found:
@@ -39,8 +41,9 @@ def check_entry(files: Files, *, measure: bool) -> Found:
     except InputError as error:
         return Found(problems=tuple(error.problems) or (Problem(name, 0, 0, "", str(error)),))
     except CoupoleError as error:
-        return Found(problems=(Problem(name, 0, 0, "", str(error)),))
-    return Found(tuple(Problem(name, 0, 0, "", refusal) for refusal in report.refusals), document_of(report))
+        return Found(problems=(Problem(name, 0, 0, "", str(error)),), exit_code=error.exit_code)
+    problems = tuple(Problem(name, 0, 0, "", refusal) for refusal in report.refusals)
+    return Found(problems, document_of(report), PreflightRefused.exit_code)
 
 
 class EntryPreflight:

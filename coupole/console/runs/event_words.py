@@ -63,7 +63,7 @@ def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
         case FindingNoted():
             return f"{event.view}: {event.kind}: {event.message}; {len(event.shots)} shots are concerned"
         case FaultNoted():
-            return f"fault: {event.message}"
+            return f"{'held' if event.is_hold else 'fault'}: {event.message}"
         case InputsChanged():
             return f"changed on the disk, but the run uses the files as it read them: {'; '.join(event.files)}"
         case Paused():

@@ -220,6 +220,16 @@ def test_who_is_in_control_at_the_page_is_not_overruled_unasked(standing: Standi
     assert standing.state()["in_control"] == "", "a command is over when it is answered"
 
 
+def test_the_queue_refuses_with_the_code_that_the_check_has(standing: Standing) -> None:
+    far, waiting = standing.cell.folder / "far.yaml", len(standing.state()["queue"])
+    plan = standing.cell.plan_data | {"views": [{**cells.TOP, "distance_mm": 2500}]}
+    for change, code in (({}, 3), ({"repeats": "often"}, 2)):
+        far.write_text(json.dumps(plan | change))
+        for ended in (cells.here("queue", standing.cell.rig, far), cells.here("check", far)):
+            assert ended.code == code, ended
+    assert len(standing.state()["queue"]) == waiting
+
+
 def test_light_by_hand_goes_through_the_console_whose_log_says_who_and_what(standing: Standing) -> None:
     entered = cells.here(
         "dose", "relief", "--rig", standing.cell.rig, "--add", "0.5", "--note", "studio", "--json"

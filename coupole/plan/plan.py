@@ -151,7 +151,7 @@ class Plan(Model):
         chosen = any(isinstance(selection, AdaptiveLights) for selection in selections)
         if _way(watch).frames == "all" and (chosen or isinstance(info.data.get("exposure"), AutoExposure)):
             raise ValueError(
-                "`watch: {frames: darks}`, or no `watch`: LEDs or exposures of this plan are chosen in the run, so "
+                "expected `watch: {frames: darks}`, or no `watch`: LEDs or exposures are chosen in the run, so "
                 "no LED can be planned to be lit again and again"
             )
         return watch

@@ -83,7 +83,10 @@ def run_all(cases: list[Case], jobs: int) -> Iterator[dict[str, Any]]:
     """Cases as they come; each job is a process whose main thread takes the signals."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, initializer=begin_job, initargs=(os.getpid(),)) as pool:
-        yield from (future.result() for future in as_completed([pool.submit(run_one, case) for case in cases]))
+        try:
+            yield from (future.result() for future in as_completed([pool.submit(run_one, case) for case in cases]))
+        finally:  # Ctrl-C: cases under way are ended, no further one is begun
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def main() -> int:

@@ -18,6 +18,8 @@ from coupole.storage.frame_file_creation import Collections
 from coupole.storage.journal_events import Event
 from coupole.viewing.progress import ViewExposure
 
+_NOTHING_EARLIER = "{}: no frames of an earlier session are kept"
+
 
 class MemoryRecorder:
     """Part of a `coupole.acquisition.recorder.Recorder`: keeps events and proven shots in memory. Its kinds store
@@ -55,6 +57,9 @@ class MemoryRecorder:
 
     def sample(self, shot: ShotId) -> FrameSample:
         return self._samples.of_shot(shot, _refuse_to_read)
+
+    def earlier_pixels(self, shot: ShotId) -> NDArray[np.uint16]:
+        raise KeyError(_NOTHING_EARLIER.format(shot))
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
         self._samples.prove(slot, shot)
@@ -110,7 +115,7 @@ class DryRecorder(MemoryRecorder):
 
 
 def _refuse_to_read(shot: ShotId) -> FrameSample:
-    raise KeyError(f"{shot}: no frames of an earlier session are kept")
+    raise KeyError(_NOTHING_EARLIER.format(shot))
 
 
 class MeterRecorder(MemoryRecorder):

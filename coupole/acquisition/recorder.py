@@ -9,6 +9,9 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from coupole.acquisition.frame_samples import FrameSamples, frame_sample
 from coupole.bounded import DISK, NOW, Workers, hangs, left_behind, on_disk, run_bounded, under_way
 from coupole.devices import ArmState, Frame, FrameFormat
@@ -76,6 +79,10 @@ class Recorder(Protocol):
     def sample(self, shot: ShotId) -> FrameSample:
         """The sample of a proven frame of the current view; of a frame of an earlier session, from the disk.
         Raises StorageError."""
+        ...
+
+    def earlier_pixels(self, shot: ShotId) -> NDArray[np.uint16]:
+        """[H, W], DN: a frame that an earlier session has proven, from the disk. Raises StorageError."""
         ...
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None: ...
@@ -199,6 +206,13 @@ class RunRecorder:
         return self._samples.of_shot(shot, self._read_sample)
 
     def _read_sample(self, shot: ShotId) -> FrameSample:
+        view, pixels = self._read_earlier(shot)
+        return frame_sample(pixels, view.black_dn, view.white_dn)
+
+    def earlier_pixels(self, shot: ShotId) -> NDArray[np.uint16]:
+        return self._read_earlier(shot)[1]
+
+    def _read_earlier(self, shot: ShotId) -> tuple[View, NDArray[np.uint16]]:
         """Read the frame from the file of an earlier session, checked against its journal."""
         if shot.view not in self._read_back:
             path = self._run.view_path(shot.view)
@@ -207,7 +221,7 @@ class RunRecorder:
                 self._read_back = {shot.view: (read_view(path, list(frames.values())), frames)}
         view, frames = self._read_back[shot.view]
         with under_way(DISK, str(view.path)):
-            return frame_sample(view.proven_pixels(frames[shot]), view.black_dn, view.white_dn)
+            return view, view.proven_pixels(frames[shot])
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
         if shot in self._proven:

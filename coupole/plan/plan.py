@@ -148,8 +148,8 @@ class Plan(Model):
     @classmethod
     def _no_sentinels_of_choices(cls, watch: bool | Watch, info: ValidationInfo) -> bool | Watch:
         selections = [view.lights or info.data.get("lights") for view in info.data.get("views", ())]
-        chosen = any(isinstance(selection, AdaptiveLights) for selection in selections)
-        if _way(watch).frames == "all" and (chosen or isinstance(info.data.get("exposure"), AutoExposure)):
+        has_choice = any(isinstance(selection, AdaptiveLights) for selection in selections)
+        if _way(watch).frames == "all" and (has_choice or isinstance(info.data.get("exposure"), AutoExposure)):
             raise ValueError(
                 "expected `watch: {frames: darks}`, or no `watch`: LEDs or exposures are chosen in the run, so "
                 "no LED can be planned to be lit again and again"

@@ -88,7 +88,7 @@ class Status:
     faults: list[str] = field(default_factory=list)
     """Failures of the run. That somebody stopped the run is none."""
     holds: list[str] = field(default_factory=list)
-    """Why it was held until a person's word, each time: Ctrl-Z, a freeze."""
+    """Reason of each hold until a person's word: Ctrl-Z, a freeze."""
     findings: list[str] = field(default_factory=list)
     """Findings of watching the measurement: view, name, what was seen, and the picture's path in the run."""
     sessions: list[Session] = field(default_factory=list)
@@ -227,12 +227,12 @@ def _note_event(found: Status, event: Event) -> None:
     session.ended = event.t
 
 
-def _note_fault(found: Status, event: FaultNoted) -> None:
-    found.reason = event.message
+def _note_fault(status: Status, event: FaultNoted) -> None:
+    status.reason = event.message
     if event.is_hold:
-        found.holds.append(event.message)
+        status.holds.append(event.message)
     elif event.kind != _STOPPED_IN_0_1:
-        found.faults.append(event.message)
+        status.faults.append(event.message)
 
 
 def _seconds(begin_time: str, end_time: str) -> float:

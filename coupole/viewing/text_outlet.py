@@ -190,8 +190,8 @@ def say_now(text: str, patience_s: float) -> None:
 
 
 def lead_blocked_nowhere(patience_s: float) -> None:
-    """After a signal: drop the text of a standard stream whose reader takes nothing for this time, so that nothing
-    which is written at the end waits for him. Streams with a queue drop by themselves."""
+    """Drop from now on the text of a standard stream whose reader takes nothing for this time: after a signal
+    nothing may wait for him. Streams with a queue drop by themselves."""
     for fd, name in ((1, "stdout"), (2, "stderr")):
         with contextlib.suppress(OSError):
             if name not in _outlets and not select.select([], [fd], [], patience_s)[1]:

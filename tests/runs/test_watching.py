@@ -210,6 +210,35 @@ def test_a_frame_lost_in_one_view_is_not_judged_by_the_same_light_in_the_view_be
     assert _found(cell) == []
 
 
+BETWEEN = {
+    "moved": {"kind": "bump", "what": "object", "mm": [0.3, 0.0, 0.0], "at_edge": 1},
+    "drift": {"kind": "exposure_step", "factor": 1.05, "at_edge": 1},
+}
+
+
+@pytest.mark.parametrize("kind", [None, *BETWEEN])
+def test_what_changed_between_two_sessions_of_a_view_is_found(tmp_path: Path, kind: str | None) -> None:
+    """The later session's sentinels are compared with the first ones of the earlier."""
+    cell = _cell_of_its_own_world(tmp_path, True)
+    cell.world_settings["camera"] = {"samples_per_side": 3}
+    cell.write(lights={"kind": "every", "every": 6})
+    with cell.world() as world:
+        process = cell.start_acquire()
+        cells.wait_until(lambda: len(cells.events(cell.run_folder, "frame")) > 20, "frames")
+        process.kill()
+        cells.finish(process)
+        cells.wait_until(lambda: not world.ask("state")["shining"], "the dark")
+    before = {event["shot"] for event in cells.events(cell.run_folder, "frame")}
+    assert len(before) < 160  # of 180, and sentinels
+    with cell.world(*([BETWEEN[kind]] if kind else [])):
+        cell.confirm()
+        resumed = cell.acquire("--resume", cell.run_folder)
+    assert resumed.code == 0, resumed.err
+    assert [finding["kind"] for finding in _found(cell)] == ([kind] if kind else [])
+    assert all(not before & set(finding["shots"]) for finding in _found(cell))
+    cells.assert_each_shot_proven_once(cell.run_folder)
+
+
 def test_a_lamp_that_comes_on_in_a_burst_that_a_resumed_run_completes_is_found(tmp_path: Path) -> None:
     """The burst's first marks are in the file already; those of the new session are looked at all the same."""
     cell = CellFolder(tmp_path, speed=1.0)

@@ -22,6 +22,9 @@ _OPAQUE = 0.3
 covers only a part of the aperture."""
 _STILL_THERE = 0.5
 """Share of a change in a place that the last frame of its LED must show: noise is below half of what is found."""
+_COMES_BACK_MM = 0.1
+"""Displacement of the picture that is nobody's doing where the arm has left the view and come back: industrial
+arms state a pose repeatability (ISO 9283) of some 0.02 to 0.06 mm, for each of the two poses."""
 Floats = NDArray[np.float64]
 
 
@@ -44,9 +47,18 @@ class FirstFrames:
     sentinels: dict[int, dict[int, FrameLook]] = field(default_factory=dict)
     """The view's first frame of each LED, by exposure, us."""
 
+    earlier: set[int] = field(default_factory=set)
+    """Exposures, us, whose sentinels were first lit in an earlier session."""
+
     def begin_view(self) -> None:
         """The camera looks from elsewhere."""
         self.sentinels.clear()
+        self.earlier.clear()
+
+    def note_earlier(self, exposure_us: int, led: int, look: FrameLook) -> None:
+        """An earlier session has the view's first frame of this LED."""
+        self.sentinels.setdefault(exposure_us, {})[led] = look
+        self.earlier.add(exposure_us)
 
 
 @dataclass(frozen=True)
@@ -131,7 +143,7 @@ class BurstJudge:
                 changes.append(change)
         if len(changes) < SENTINELS:
             return None
-        series = _Series(lit, known_places, changes, first)
+        series = _Series(lit, known_places, changes, first, exposure_us in self.first.earlier)
         for look_for in (self._thing, self._displacement, self._smudge, self._of_light):
             if finding := look_for(series):
                 return finding
@@ -194,7 +206,8 @@ class BurstJudge:
         """The object or the camera: the sentinels' pictures are displaced, and stay so."""
         shifts_mm = np.array([np.linalg.norm(change.shift_bins) for change in series.changes]) * self.mm_per_bin
         sigmas_mm = np.array([change.shift_sigma_bins for change in series.changes]) * self.mm_per_bin
-        limits_mm = np.maximum(self.limits.least_mm, self.limits.sigmas * sigmas_mm)
+        least_mm = self.limits.least_mm + (_COMES_BACK_MM if series.is_since_earlier else 0.0)
+        limits_mm = np.maximum(least_mm, self.limits.sigmas * sigmas_mm)
         is_displacement = np.array([change.by_shift > change.by_places for change in series.changes])
         since = _lasting((shifts_mm > limits_mm) & is_displacement)
         if since is None or len(shifts_mm) - since < SENTINELS:
@@ -224,6 +237,9 @@ class BurstJudge:
             words = f"{Led(led)} changed by {share} from flash to flash, the other sentinels did not"
             finding = series.finding("LED", largest, None, abs(figure), limit, OF_THE_LIGHT, words)
             return replace(finding, labels=labels)
+        if since == 0 and series.is_since_earlier:
+            words = f"all light differs by {share} from that of the session before: LEDs, camera or its settings"
+            return series.finding("drift", since, None, abs(figure), limit, OF_THE_LIGHT, words)
         if _is_step(np.array(series.places, float), gains):
             words = f"all light changed by {share} in one step: gain or exposure of the camera"
             return series.finding("exposure step", since, None, abs(figure), limit, OF_THE_LIGHT, words)
@@ -251,6 +267,8 @@ class _Series:
     """Place of each among the frames that are lit."""
     changes: Sequence[Change]
     first: Mapping[int, FrameLook]
+    is_since_earlier: bool
+    """The first frames are those of an earlier session: the arm has left the view meanwhile, and come back."""
 
     def finding(
         self, kind: Kind, begin: int, end: int | None, figure: float, limit: float, unit: str, words: str

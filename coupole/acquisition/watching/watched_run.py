@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coupole.acquisition.observer import Control, Observer
 from coupole.acquisition.recorder import Recorder
@@ -24,7 +26,7 @@ from coupole.geometry import Transform, apply
 from coupole.plan.bursts import Burst
 from coupole.plan.choices import FrameSample
 from coupole.plan.schedule import ViewPose
-from coupole.plan.shot_id import Dark, Led, ShotId, ShotLabel
+from coupole.plan.shot_id import Dark, Led, Sentinel, ShotId, ShotLabel
 from coupole.plan.watch import NOTHING
 from coupole.preflight.job import Job
 from coupole.storage.frame_file_creation import Collections
@@ -70,6 +72,8 @@ class WatchedRecorder:
         self._watch = job.plan.watching
         self._views = {view.name: view for view in job.schedule.views}
         self._first = FirstFrames()
+        self._earlier = {shot for shot in recorder.proven() if isinstance(shot.light, Sentinel)}
+        """Sentinels of earlier sessions."""
         self._grid: LookGrid | None = None
         self._judge: BurstJudge | None = None
         self._looks: dict[int, FrameLook] = {}
@@ -110,6 +114,25 @@ class WatchedRecorder:
         self._timeline = []
         self._grid = LookGrid(frame_format, is_sparse=self._watch.frames == "darks")
         self._judge = None
+        if self._watch.frames == "all":
+            self._compare_with_earlier(view)
+
+    def _compare_with_earlier(self, view: str) -> None:
+        """Have the first sentinels of an earlier session be what those of this one are compared with."""
+        sentinels = sorted(
+            (shot for shot in self._earlier if shot.view == view),
+            key=lambda shot: (shot.label.repeat, cast("Sentinel", shot.light).number),
+        )
+        firsts: dict[tuple[int, int], ShotId] = {}
+        for shot in sentinels:
+            firsts.setdefault((shot.label.exposure, cast("Sentinel", shot.light).led), shot)
+        for (exposure_index, led), shot in firsts.items():
+            try:
+                look = cast("LookGrid", self._grid).look(self._recorder.earlier_pixels(shot))
+            except StorageError as error:
+                self._observer.note(f"{view}: not compared with the session before: {error}")
+                return
+            self._first.note_earlier(self._job.plan.exposure.exposures_us[exposure_index], led, look)
 
     def store(self, frame: Frame, exposure_us: int) -> int:
         slot = self._recorder.store(frame, exposure_us)
@@ -122,6 +145,9 @@ class WatchedRecorder:
 
     def sample(self, shot: ShotId) -> FrameSample:
         return self._recorder.sample(shot)
+
+    def earlier_pixels(self, shot: ShotId) -> NDArray[np.uint16]:
+        return self._recorder.earlier_pixels(shot)
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
         look = self._looks.pop(slot, None)

@@ -98,7 +98,7 @@ def call(
 
 
 def _refusal(answer: dict[str, Any]) -> InputError:
-    """The service's words, with the exit code that the same refusal has without a console."""
+    """Return an error with the service's words, and the exit code that the refusal has without a console."""
     error = InputError(str(answer.get("detail", answer)))
     error.exit_code = answer.get("exit_code", InputError.exit_code)
     return error

@@ -28,7 +28,7 @@ class Found:
     document: dict[str, Any] = field(default_factory=dict)
     """Figures, as of `coupole check --json`."""
     exit_code: int = InputError.exit_code
-    """Of `coupole check`, where there are problems."""
+    """Exit code of `coupole check`, if there are problems."""
 
 
 def check_entry(files: Files, *, measure: bool) -> Found:

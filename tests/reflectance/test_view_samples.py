@@ -32,7 +32,7 @@ def view_of(exposures_us: list[tuple[float, ...]], random: Any, emission: str, n
     radiometry: Any = SimpleNamespace(
         channel=channel, channels=3, flat=random.uniform(0.7, 1.1, seen.shape).astype(np.float32), curve=curve,
         noise=noise, u_pixel=np.zeros(3), white_dn=4095, black_dn=64,
-        dark=lambda frame: dark + np.float32(1e-4 * frame.exposure_us),
+        dark=lambda frame: dark + np.float32(1e-4 * frame.exposure_us), veils=lambda frames: None,
     )  # fmt: skip
     by_led: dict[int, list[LightFrame]] = {}
     for led, mine in enumerate(exposures_us):

@@ -89,7 +89,9 @@ def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normal
             for led in range(f.shape[1]):
                 f[row, led, channel], u_own[row, led, channel] = bits[0, led], bits[1, led]
             if len(glare):
-                store_halves(if_less(size, np.float32(MOST_F), veil / absolute(signal), _NAN), bits[2])
+                share = veil / absolute(signal)
+                share = if_less(share, np.float32(MOST_F), share, np.float32(MOST_F))
+                store_halves(if_less(size, np.float32(MOST_F), share, _NAN), bits[2])
                 for led in range(f.shape[1]):
                     glare[row, led, channel] = bits[2, led]
 

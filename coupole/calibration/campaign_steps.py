@@ -43,3 +43,5 @@ STEPS = (
     Step("spectralon", "the white tile at the centre", ({"kind": "spectralon_tile"},), ("led-power",)),
     Step(MESH, "the scanned object with its stickers", (OBJECT,), (MESH,)),
 )
+BESIDE = (Step("glare", "the white card with black traps at the centre", ({"kind": "glare_target"},), ("glare",)),)
+"""Steps that `calibrate all` does not take."""

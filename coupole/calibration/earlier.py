@@ -13,6 +13,8 @@ from coupole.errors import InputError
 _SAME_FIGURE = 1e-3
 SHAPE_SIGNAL = ("response", "flat-field")
 """Kinds of records that say how signal follows from DN."""
+GLARE = "glare"
+"""The same of what is subtracted from it; a record of LEDs' powers says only if it was."""
 READ_WITH = "read_with."
 """Begins the names of a powers' record's figures that say with which of them it was made: 1, or 0."""
 
@@ -44,10 +46,11 @@ def read_accepted(path: Path, kind: Kind) -> Record:
 
 
 def refuse_read_otherwise(path: Path, record: Record, given_kinds: Collection[str]) -> None:
-    """Raise InputError if a record of LEDs' powers was made with a response or a flat field and none is among the
-    kinds `given_kinds`, or the other way round: frames must be read as those were that the powers come from."""
-    for kind in SHAPE_SIGNAL:
-        read_with = record.fixed.get(READ_WITH + kind)
+    """Raise InputError if a record of LEDs' powers was made with a response, a flat field or a glare and none is
+    among the kinds `given_kinds`, or the other way round: frames must be read as those were that the powers come
+    from."""
+    for kind in (*SHAPE_SIGNAL, GLARE):
+        read_with = record.fixed.get(READ_WITH + kind, 0.0 if kind == GLARE else None)
         beside = _made_with(path, record, kind)
         if (read_with or (read_with is None and beside)) and kind not in given_kinds:
             raise InputError(

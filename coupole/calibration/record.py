@@ -42,6 +42,7 @@ Kind = Literal[
     "led-power",
     "drift",
     "colour",
+    "glare",
 ]
 SEAL = "# A calibration of Coupole"
 """First words of a record's file."""

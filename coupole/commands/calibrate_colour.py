@@ -91,6 +91,7 @@ def colour(
             known.dark_record,
             known.response_record,
             known.flat,
+            known.glare,
             emission_of(known.emission),
             tuple(path for path in files if path is not None),
         )

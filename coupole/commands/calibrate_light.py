@@ -1,4 +1,4 @@
-"""`coupole calibrate dark`, `response`, `flat-field`, `led-power` and `drift`."""
+"""`coupole calibrate dark`, `response`, `flat-field`, `glare`, `led-power` and `drift`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coupole.calibration.light.acceptance import DARK, DRIFT, LED_POWER, RESPONSE
+from coupole.calibration.light.acceptance import DARK, DRIFT, GLARE, LED_POWER, RESPONSE
 from coupole.commands.calibrating import EmissionOption, Work, arm_of, bar, calibration, emission_of, rig_of
 
 if TYPE_CHECKING:
@@ -27,6 +27,9 @@ DarkOption = Annotated[
 ]
 ResponseOption = Annotated[Path | None, typer.Option("--response", help="A record of `calibrate response`.")]
 FlatOption = Annotated[Path | None, typer.Option("--flat", help="A record of `calibrate flat-field`.")]
+GlareOption = Annotated[
+    Path | None, typer.Option("--glare", help="A record of `calibrate glare`: the veil is taken off.")
+]
 CameraOption = Annotated[
     Path | None, typer.Option("--camera", help="A camera's record; the rig's lens if not given.")
 ]
@@ -53,6 +56,7 @@ class TargetCalibrations:
     dark_record: DarkOption = None
     response_record: ResponseOption = None
     flat: FlatOption = None
+    glare: GlareOption = None
     emission: EmissionOption = "lambertian"
 
 
@@ -108,6 +112,31 @@ def flat_field(
             return flat_field_outcome(
                 frames, request, dark_record, response_record, panel_mm, progress, hand_eye=hand_eye
             )
+
+    return work
+
+
+@calibration("glare", limits=GLARE)
+def glare(
+    runs: Runs,
+    target: Annotated[
+        Path | None,
+        typer.Option("--target", help="Description of the target (YAML): its name, light of its traps."),
+    ] = None,
+    dark_record: DarkOption = None,
+    response_record: ResponseOption = None,
+) -> Work:
+    """Veiling glare of lens and camera, per channel, from views of black traps in a white card.
+
+    With the record extraction takes the glare off, and its uncertainty is in that of each sample.
+    """
+    from coupole.calibration.light.frames import open_light_frames
+    from coupole.calibration.light.glare_records import glare_outcome
+
+    def work(console: Console, request: Request) -> Outcome:
+        frames = open_light_frames(runs)
+        with bar(console, "views of the traps") as progress:
+            return glare_outcome(frames, request, target, dark_record, response_record, progress)
 
     return work
 
@@ -191,6 +220,7 @@ def _setting(frames: LightFrames, tile: Path, rig: Path, calibrations: TargetCal
         calibrations.dark_record,
         calibrations.response_record,
         calibrations.flat,
+        calibrations.glare,
         emission_of(calibrations.emission),
         tuple(path for path in files if path is not None),
     )

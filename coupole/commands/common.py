@@ -29,7 +29,7 @@ RecordsOption = Annotated[
     list[Path] | None,
     typer.Option(
         "--calibrations",
-        help="A record (hand-eye, leds, led-power; dark, response, flat-field, drift) or a folder "
+        help="A record (hand-eye, leds, led-power; dark, response, flat-field, glare, drift) or a folder "
         "of records; repeat for more. By default the records that the run names.",
         show_default=False,
     ),

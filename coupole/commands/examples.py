@@ -59,6 +59,10 @@ EXAMPLES: dict[str, tuple[str, str]] = {
         "calibrate flat-field RUN --dark dark.yaml",
         "calibrate flat-field RUN --response response.yaml --out records",
     ),
+    "calibrate glare": (
+        "calibrate glare RUN --target glare-target.yaml",
+        "calibrate glare RUN --dark dark.yaml --response response.yaml --limit form=0.15",
+    ),
     "calibrate led-power": (
         "calibrate led-power RUN --tile tile.yaml",
         "calibrate led-power RUN --tile tile.yaml --flat flat-field.yaml",

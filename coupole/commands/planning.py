@@ -213,13 +213,13 @@ def plan_new(
 def _on_the_support(template: str, rig: Path, name: str) -> Path | None:
     """A copy of the rig of a simulated cell, with what a calibration needs on its support; None if it needs
     nothing, or if the cell is real."""
-    from coupole.calibration.campaign_steps import STEPS
+    from coupole.calibration.campaign_steps import BESIDE, STEPS
     from coupole.commands.simulated_support import place_for
     from coupole.plan.cell import read_cell
     from coupole.plan.rig_devices import in_world
     from coupole.viewing.terminal import make_console
 
-    step = next((step for step in STEPS if step.name == template and step.things), None)
+    step = next((step for step in (*STEPS, *BESIDE) if step.name == template and step.things), None)
     if step is None or not in_world(read_cell(rig).rig, dry_run=False):
         return None
     paths = place_for(template, step.things, rig, name)

@@ -22,9 +22,16 @@ schema_version: 1
 side_mm: 50.0
 support_from_tile: {translation_mm: [0, 0, 10]}
 """
+GLARE_TARGET = """\
+schema_version: 1
+name: simulated card with nine black traps
+trap_share: 0.0003
+u_trap_share: 0.0002
+"""
 CERTIFICATE_OF_SIMULATED_TILE = "minnaert: 1.0\n"
 _DESCRIPTIONS = {
     "charuco": ("board", BOARD),
+    "glare": ("target", GLARE_TARGET),
     "spectralon": ("tile", TILE + CERTIFICATE_OF_SIMULATED_TILE),
 }
 

@@ -63,7 +63,7 @@ def budget(
         list[Path] | None,
         typer.Argument(
             help="Records, or folders of them: camera, hand-eye, leds, mesh, flat-field, response, "
-            "led-power, drift. Without a record, figures of seed 003 or assumed figures are used.",
+            "led-power, drift, glare. Without a record, figures of seed 003 or assumed figures are used.",
             metavar="RECORD_OR_FOLDER",
         ),
     ] = None,

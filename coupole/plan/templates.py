@@ -145,4 +145,25 @@ hidden_lights: skip
 exposure: {{kind: bracket, exposures_us: [2000, 6000]}}
 darks_per_view: 8
 """,
+    "glare": """\
+# A white card with black traps, for `coupole calibrate glare` (docs/how-to/calibrate-glare.md). It fills the first
+# four views; in the others something dark fills nearly half of the picture, so that glare from afar shows.
+schema_version: 1
+name: {name}
+rig: {rig}
+calibrations: none
+views:
+  - {{kind: look_at, name: full1, target_mm: [0, 0, 2], distance_mm: 335, azimuth_deg: -90, elevation_deg: 85}}
+  - {{kind: look_at, name: full2, target_mm: [18, 12, 2], distance_mm: 335, azimuth_deg: -90, elevation_deg: 85}}
+  - {{kind: look_at, name: full3, target_mm: [-18, 6, 2], distance_mm: 335, azimuth_deg: -90, elevation_deg: 85}}
+  - {{kind: look_at, name: full4, target_mm: [6, -12, 2], distance_mm: 335, azimuth_deg: -90, elevation_deg: 85}}
+  - {{kind: look_at, name: right, target_mm: [100, 0, 2], distance_mm: 335, azimuth_deg: -90, elevation_deg: 85}}
+  - {{kind: look_at, name: left, target_mm: [-100, 0, 2], distance_mm: 335, azimuth_deg: -90, elevation_deg: 85}}
+  - {{kind: look_at, name: upper, target_mm: [0, 78, 2], distance_mm: 335, azimuth_deg: -90, elevation_deg: 85}}
+  - {{kind: look_at, name: lower, target_mm: [0, -78, 2], distance_mm: 335, azimuth_deg: -90, elevation_deg: 85}}
+lights: {{kind: panels, panels: [1]}}
+repeats: 4
+exposure: {{kind: bracket, exposures_us: [4000, 8000]}}
+darks_per_view: 8
+""",
 }

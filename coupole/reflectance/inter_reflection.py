@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from coupole.motion.occlusion import RAY_START_MM, blocked_segments, ray_mesh
+from coupole.reflectance.extraction.frame_veils import GLARE
 from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.result_folder import complete
 from coupole.reflectance.run_result import AS_MEASURED, INTER_REFLECTION, SAMPLES, RunResult, ViewSamples
@@ -335,6 +336,8 @@ def _subtract_view(
                 some = share[:: 1 + len(f) // 512]
                 shares.append(some[np.isfinite(some)])
                 file["f"][rows], file["u_own"][rows] = f * (1 - share), file["u_own"][rows] / (1 - share)
+                if GLARE in file:
+                    file[GLARE][rows] = file[GLARE][rows] / (1 - share)
                 share_dataset[rows] = share.astype(np.float16)
                 sample_count += int(np.count_nonzero(np.isfinite(share)))
             every = np.concatenate(shares)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from coupole.errors import InputError, Problem, reason
 from coupole.intake.plain_data import read_json
 from coupole.reflectance.cluster_file import Clusters, read_clusters
+from coupole.reflectance.extraction.frame_veils import GLARE, U_GLARE
 from coupole.reflectance.fits import MATERIALS, SLICES
 from coupole.reflectance.ggx import UNKNOWNS
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples
@@ -229,12 +230,14 @@ class RunResult:
 
     def view_noise(self, view: ViewSamples, rows: slice, leds: NDArray[np.bool_]) -> NDArray[np.float64]:
         """[n, leds, channels] relative standard uncertainty of `view_samples` by noise, each LED's power, and the
-        inter-reflection that was taken off."""
+        inter-reflection and the glare that were taken off."""
         columns = np.flatnonzero(leds)
         with h5py.File(view.path, "r") as file:
             noise = np.hypot(file["u_own"][rows][:, columns], file["led_u_own"][columns])
             if view.inter_reflection is not None:
                 noise = np.hypot(noise, u_inter_reflection(file[INTER_REFLECTION][rows][:, columns]))
+            if GLARE in file:
+                noise = np.hypot(noise, np.nan_to_num(file[GLARE][rows][:, columns]) * file[U_GLARE][()][columns])
             return np.asarray(noise, np.float64)
 
     def direct_shares(self, view: ViewSamples, rows: slice, leds: NDArray[np.bool_]) -> NDArray[np.float32]:

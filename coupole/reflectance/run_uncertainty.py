@@ -55,6 +55,8 @@ def uncertainty_of(
     without = {}
     for number, (source, description) in enumerate(SOURCES.items(), start=1):
         say("uncertainty", number, len(SOURCES))
+        if source == "u_glare" and not sources.u_glare.any():
+            continue  # none was taken off
         without[description] = table(sources_drawn.without(source))
     return {
         "interval": percentiles(*bounds(places, sources, QUANTILE)) | {"coverage": COVERAGE},

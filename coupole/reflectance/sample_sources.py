@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from coupole.errors import InputError
+from coupole.reflectance.extraction.frame_veils import GLARE, U_GLARE
 from coupole.reflectance.extraction.sample_codes import REACHED
 from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples, u_inter_reflection
 from coupole.reflectance.sample_uncertainty import Places, Sources
@@ -73,10 +75,9 @@ def channel_samples(
         f, shares = each_f.mean(axis=0), np.abs(each_f) / np.maximum(np.abs(each_f).sum(axis=0), 1e-30)
         u_noise = np.sum(shares * tables("u_own"), axis=0)
         dark = _table(file["codes"], file_rows, leds, None) != REACHED
-        indirect = np.zeros(f.shape)
-        if view.inter_reflection is not None:
-            u_indirect = u_inter_reflection(tables(INTER_REFLECTION).astype(np.float16))
-            indirect = np.sum(shares * u_indirect, axis=0)
+        indirect, glare = _u_taken_off(
+            file, tables, shares, file[U_GLARE][()][leds][:, channels] if GLARE in file else None
+        )
         u_response = file["u_response"][()][rows][:, channels].mean(axis=1)
         u_own, u_shared = (
             file[name][()][leds][:, channels].mean(axis=1) for name in ("led_u_own", "led_u_shared")
@@ -100,6 +101,7 @@ def channel_samples(
         along(u_shared, (1, -1)),
         np.full(grid, scan_noise_um).ravel(),
         np.full(grid, led_u_mm).ravel(),
+        glare[row_places].ravel(),
     )
     row, led = (places.ravel() for places in np.meshgrid(rows, leds, indexing="ij"))
     corners = result.corners_mm[view.triangles[row]].astype(np.float64)
@@ -175,6 +177,20 @@ def triangles_beside(result: RunResult, view: ViewSamples, rows: Integers) -> Be
         there = away_mm < far_mm  # past the edge of what the view sees there is nothing
         square_mm2[:, side] = np.where(there, np.sum(across**2, axis=1), 0.0)
     return Beside(neighbours, square_mm2)
+
+
+def _u_taken_off(
+    file: h5py.File, tables: Callable[[str], Floats], shares: Floats, u_veils: Floats | None
+) -> tuple[Floats, Floats]:
+    """[rows, leds] relative standard uncertainties by inter-reflection and by glare that were taken off, mean of
+    channels by their `shares` [channels, rows, leds]; `u_veils` [leds, channels] are those of the glare in the
+    LEDs' frames."""
+    indirect, glare = np.zeros(shares.shape[1:]), np.zeros(shares.shape[1:])
+    if INTER_REFLECTION in file:
+        indirect = np.sum(shares * u_inter_reflection(tables(INTER_REFLECTION).astype(np.float16)), axis=0)
+    if u_veils is not None:
+        glare = np.sum(shares * np.nan_to_num(tables(GLARE)) * u_veils.T[:, None], axis=0)
+    return indirect, glare
 
 
 def _cosines(centres_mm: Floats, normals: Floats, led_mm: Floats) -> Floats:

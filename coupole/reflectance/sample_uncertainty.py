@@ -28,6 +28,7 @@ SOURCES = {
     "u_shared": "power of all LEDs, response, fall-off, drift",
     "vertex_um": "vertices of the mesh",
     "led_mm": "places of the LEDs",
+    "u_glare": "veiling glare taken off",
 }
 """Fields of `Sources`, and what they are."""
 
@@ -52,11 +53,13 @@ class Sources:
     """[n] of each coordinate of a vertex, independent."""
     led_mm: Floats
     """[n] of each coordinate of an LED."""
+    u_glare: Floats
+    """[n] relative, of the veil that was taken off."""
 
     @property
     def u_signal(self) -> Floats:
         """[n] relative."""
-        parts = (self.u_noise, self.u_response, self.u_indirect, self.u_place)
+        parts = (self.u_noise, self.u_response, self.u_indirect, self.u_place, self.u_glare)
         u_relative: Floats = np.sqrt(np.sum(np.square(parts), axis=0))
         return u_relative
 

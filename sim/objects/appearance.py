@@ -23,6 +23,9 @@ SPECTRALON = Material("Spectralon", (0.99, 0.99, 0.99))
 """Labsphere's SRS-99: 99 % over the whole visible range."""
 GREY_CARD = Material("grey card", (0.18, 0.18, 0.18))
 """18 % by definition."""
+MATT_WHITE = Material("matt white", (0.90, 0.90, 0.90))
+BLACK_TRAP = Material("black trap", (2e-4, 2e-4, 2e-4))
+"""Opening of a deep hollow lined with black velvet (assumed): light that gets in hardly comes out."""
 WHITE_PRINT = Material("white of a printed board", (0.85, 0.85, 0.85))
 BLACK_PRINT = Material("black of a printed board", (0.035, 0.035, 0.035))
 """Matt print on aluminium composite; both values are assumed, the ratio is that of offset print."""

@@ -1,4 +1,4 @@
-"""Calibration targets: white tile, grey card, chrome ball, stickers."""
+"""Calibration targets: white tile, grey card, glare target, chrome ball, stickers."""
 
 from __future__ import annotations
 
@@ -17,6 +17,14 @@ _BORDER = 10.0 / 6.0
 """Ratio of a sticker's diameter to that of its bright disk."""
 _THICKNESS_MM = 0.05
 _CELL_MM = 2.0
+_TRAPS_MM = tuple(
+    (x_mm, y_mm, side_mm)
+    for row, y_mm in enumerate((-46.0, 0.0, 46.0))
+    for x_mm, side_mm in zip(
+        (-64.0, 0.0, 64.0), ((12.0, 28.0, 12.0), (20.0, 12.0, 20.0), (12.0, 28.0, 12.0))[row], strict=True
+    )
+)
+"""Middle and side of each trap of the glare target."""
 _TRIES = 20_000
 
 
@@ -28,6 +36,21 @@ def spectralon_tile(side_mm: float = 50.0, *, thickness_mm: float = 10.0) -> Sur
 def grey_card(width_mm: float = 210.0, depth_mm: float = 148.0, *, thickness_mm: float = 2.0) -> Surface:
     """A card of 18 % reflectance standing on z = 0; its face is at z = `thickness_mm`."""
     return _tile(width_mm, depth_mm, thickness_mm, appearance.GREY_CARD)
+
+
+def glare_target(width_mm: float = 240.0, depth_mm: float = 180.0, *, thickness_mm: float = 2.0) -> Surface:
+    """A white card standing on z = 0 with nine square black traps of three sizes; its face is at z =
+    `thickness_mm`."""
+    columns, rows = (round(length_mm / _CELL_MM) for length_mm in (width_mm, depth_mm))
+    face = rectangle(width_mm, depth_mm, columns, rows, z_mm=thickness_mm)
+    x_mm, y_mm = face.mean(axis=1)[:, :2].T
+    is_trap = np.zeros(len(face), np.bool_)
+    for middle_x_mm, middle_y_mm, side_mm in _TRAPS_MM:
+        is_trap |= np.maximum(np.abs(x_mm - middle_x_mm), np.abs(y_mm - middle_y_mm)) < side_mm / 2.0
+    white = np.concatenate([face[~is_trap], skirt(face)])
+    return joined_surface(
+        [of_material(white, appearance.MATT_WHITE), of_material(face[is_trap], appearance.BLACK_TRAP)]
+    )
 
 
 def chrome_ball(diameter_mm: float = 30.0, *, triangles: int = 80_000) -> Surface:

@@ -91,6 +91,7 @@ class Photographer:
         self._around = [(support_disk(scene.support_diameter_mm), base_from_support)]
         self._things = placed_surfaces(settings.things, base_from_support, settings.strangers.target)
         self._strangers = settings.strangers
+        self._glare = settings.glare
         self._up = base_from_support[:3, 2]
         self._emission = scene.emission
         table = read_leds(scene.leds)
@@ -189,12 +190,14 @@ class Photographer:
         }
         glows = self._glows(look, exposure)
         scale = self._electrons * seconds
-        if self._camera.blur or self._strangers.lens.coma_px or disturbance.covers:
+        if self._camera.blur or self._strangers.lens.coma_px or disturbance.covers or self._glare is not None:
             sharp = electrons(look.view.site, radiance, self._falloff, electrons_per_radiance=scale)
             mean_e = self._blurred_electrons(look, sharp)
             if glows is not None:
                 mean_e += glows
             mean_e = disturbance.cover_up(mean_e)
+            if self._glare is not None:
+                mean_e = self._glare.over(mean_e, self.sensor.channels())
             expose_electrons(out, mean_e, **sensor_arguments)
         else:
             expose(

@@ -114,6 +114,7 @@ class Sample(_Thing):
         "spectralon_tile",
         "grey_card",
         "colour_chart",
+        "glare_target",
         "gilt_step_wedge",
         "paint_wedge",
         "makie_tile",
@@ -137,6 +138,8 @@ class Sample(_Thing):
                 return standards.grey_card()
             case "colour_chart":
                 return colour_chart.colour_chart()
+            case "glare_target":
+                return standards.glare_target()
             case "gilt_step_wedge":
                 return wedges.gilt_step_wedge()
             case "paint_wedge":

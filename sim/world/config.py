@@ -16,6 +16,7 @@ from sim.devices.ledbox_stand_in import LedBoxSettings
 from sim.devices.ledbox_stand_in import impossible as impossible_for_box
 from sim.devices.robot import RobotSettings, impossible
 from sim.optics.dome import DomeErrors
+from sim.optics.glare import Glare
 from sim.optics.led_light import STEADY, LedModel
 from sim.optics.panels import Panel
 from sim.optics.sensor_model import SensorModel
@@ -195,6 +196,8 @@ class Settings(_Model):
     """`{}`: realistic LEDs, each with its own flux and colour, temperature dependence and flicker."""
     dome: DomeErrors = DomeErrors()
     """Deviations of the dome from its table."""
+    glare: Glare | None = None
+    """Veiling glare of the camera; `{}`: 1 % of white; None: none."""
     strangers: Strangers = Strangers()
     """Causes that no calibration has a term for."""
     exposures_remembered: Annotated[int, Field(ge=0)] = 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mmap
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +39,9 @@ class Taken:
 
 
 def write_light_run(folder: Path, frames: Sequence[Taken]) -> Path:
-    """A run with these frames, all proven; returns its folder."""
+    """A run with these frames, all proven and of one size; returns its folder."""
+    height_px, width_px = frames[0].pixels.shape
+    frame_format = replace(FORMAT, height_px=height_px, width_px=width_px)
     folder.mkdir(parents=True)
     for name in ("plan.yaml", "rig.yaml"):
         (folder / name).write_text(f"# {name}\n")
@@ -53,12 +55,12 @@ def write_light_run(folder: Path, frames: Sequence[Taken]) -> Path:
         mine = [frame for frame in frames if frame.shot.split("/")[0] == view]
         path = run.view_path(view)
         metadata = {**METADATA, "title": view, "focus_distance_mm": 335.0, "pixel_pitch_um": PITCH_UM}
-        create(path, len(mine), FORMAT, metadata)
+        create(path, len(mine), frame_format, metadata)
         writer = ViewWriter(path, {})
         arm = ArmState((0, -90, 90, 0, 90, 0), np.eye(4), 7, moving=False)
         pose = writer.add_pose(arm, mine[0].base_from_camera)
         for number, frame in enumerate(mine):
-            pixels = np.frombuffer(mmap.mmap(-1, FORMAT.frame_bytes), np.uint16).reshape(frame.pixels.shape)
+            pixels = np.frombuffer(mmap.mmap(-1, frame_format.frame_bytes), np.uint16).reshape(frame.pixels.shape)
             pixels[:] = frame.pixels
             slot = writer.store(pixels, frame_id=number, camera_ns=number, exposure_us=frame.exposure_us)
             digest = writer.prove(

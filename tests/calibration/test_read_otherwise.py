@@ -5,7 +5,7 @@ from __future__ import annotations
 import cells
 import pytest
 
-from coupole.calibration.earlier import READ_WITH, SHAPE_SIGNAL, refuse_read_otherwise
+from coupole.calibration.earlier import GLARE, READ_WITH, SHAPE_SIGNAL, refuse_read_otherwise
 from coupole.calibration.record import read_record
 from coupole.errors import InputError
 
@@ -23,3 +23,15 @@ def test_powers_say_with_which_records_they_were_made(kind: str, made_with: floa
     otherwise = [one for one in SHAPE_SIGNAL if (one in as_made) != (one == kind)]
     with pytest.raises(InputError, match=f"{why} {kind} record"):
         refuse_read_otherwise(POWERS, same, otherwise)
+
+
+def test_powers_of_a_tile_with_its_glare_do_not_fit_frames_without_and_the_other_way_round() -> None:
+    record = read_record(POWERS)
+    told = record.model_copy(update={"fixed": record.fixed | {READ_WITH + one: 1.0 for one in SHAPE_SIGNAL}})
+    refuse_read_otherwise(POWERS, told, SHAPE_SIGNAL)
+    with pytest.raises(InputError, match="was made without a glare record"):
+        refuse_read_otherwise(POWERS, told, [*SHAPE_SIGNAL, GLARE])
+    with_glare = told.model_copy(update={"fixed": told.fixed | {READ_WITH + GLARE: 1.0}})
+    refuse_read_otherwise(POWERS, with_glare, [*SHAPE_SIGNAL, GLARE])
+    with pytest.raises(InputError, match="was made with a glare record"):
+        refuse_read_otherwise(POWERS, with_glare, SHAPE_SIGNAL)

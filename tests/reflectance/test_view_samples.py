@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 from coupole.calibration.light.frames import LightFrame
+from coupole.calibration.light.glare_correction import GlareCorrection
+from coupole.calibration.light.veil import at_pixels, light_of_blocks
 from coupole.plan.shot_id import ShotId
+from coupole.reflectance.extraction.frame_veils import FrameVeils, dark_of_blocks
 from coupole.reflectance.extraction.lamp_sight import Facets
 from coupole.reflectance.extraction.radiance import SignalReader
 from coupole.reflectance.extraction.sample_codes import REACHED, SHADED
@@ -32,7 +35,7 @@ def view_of(exposures_us: list[tuple[float, ...]], random: Any, emission: str, n
     radiometry: Any = SimpleNamespace(
         channel=channel, channels=3, flat=random.uniform(0.7, 1.1, seen.shape).astype(np.float32), curve=curve,
         noise=noise, u_pixel=np.zeros(3), white_dn=4095, black_dn=64,
-        dark=lambda frame: dark + np.float32(1e-4 * frame.exposure_us),
+        dark=lambda frame: dark + np.float32(1e-4 * frame.exposure_us), veils=lambda frames: None,
     )  # fmt: skip
     by_led: dict[int, list[LightFrame]] = {}
     for led, mine in enumerate(exposures_us):
@@ -112,6 +115,71 @@ def test_samples_are_those_of_the_formula_within_a_step_of_their_halves(
             wanted[:, triangle, led, channel] = by_formula(work, radiometry, seen, triangle, led, channel)
     assert np.isfinite(wanted[0]).mean() > 0.5
     np.testing.assert_allclose(found, wanted, rtol=2.0**-11 + 2e-6)
+
+
+def test_glare_is_taken_off_by_the_light_of_all_exposures_of_an_led() -> None:
+    random = np.random.default_rng(8)
+    work, radiometry, seen = view_of(SOME, random, "lambertian", NOISE)
+    glare = GlareCorrection(
+        ("R", "G", "B"), random.uniform(0.0, 0.01, (3, 5)), np.tile(1e-8 * np.eye(5), (3, 1, 1)), np.full(3, 0.03),
+        (WIDTH, HEIGHT),
+    )  # fmt: skip
+    darks = {t: dark_of_blocks(radiometry.dark(SimpleNamespace(exposure_us=t)), radiometry.channel, glare)
+             for t in (1000.0, 4000.0, 16000.0)}  # fmt: skip
+    codes = np.zeros((len(SOME), TRIANGLES), np.uint8)
+    plain, found = (np.full((TRIANGLES, len(SOME), 3), np.nan) for _ in range(2))
+    u_plain, u_found, taken_off = (np.full(plain.shape, np.nan) for _ in range(3))
+    for some in work.samples(lambda part, pool: codes[part], 2):
+        plain[some.rows, some.leds], u_plain[some.rows, some.leds] = some.f, some.u_own
+        assert some.glare.shape == (0, 0, 0)
+    curve = radiometry.curve
+    radiometry.veils = lambda frames: FrameVeils(glare, radiometry.channel, curve, TOP_DN, darks)
+    for some in work.samples(lambda part, pool: codes[part], 2):
+        found[some.rows, some.leds], u_found[some.rows, some.leds] = some.f, some.u_own
+        taken_off[some.rows, some.leds] = some.glare
+    checked = 0
+    for led in range(len(SOME)):
+        light, clipped = light_of_led(work.view.by_led[led], radiometry)
+        for channel in range(3):
+            mask = radiometry.channel == channel
+            veil, u_veil = glare.veil(light_of_blocks(light, mask, 2), channel)
+            u_all = np.hypot(u_veil, light[mask & clipped].sum() / light[mask].sum())
+            assert work.reader.u_glare[led][channel] == pytest.approx(u_all, rel=1e-3)
+            for triangle in np.flatnonzero(np.isfinite(plain[:, led, channel])):
+                rows, columns = np.nonzero(mask & (seen == triangle))
+                veil_rate = np.mean(at_pixels(veil, rows, columns, 2) / radiometry.flat[rows, columns])
+                per_rate = plain[triangle, led, channel] / signal_of(
+                    work, radiometry, seen, triangle, led, channel
+                )
+                left = plain[triangle, led, channel] - veil_rate * per_rate
+                assert found[triangle, led, channel] == pytest.approx(left, rel=2e-3)
+                assert taken_off[triangle, led, channel] == pytest.approx(veil_rate * per_rate / left, rel=3e-3)
+                checked += 1
+    assert checked > 500
+    np.testing.assert_allclose(u_found * found, u_plain * plain, rtol=3e-3)
+
+
+def signal_of(work: Any, radiometry: Any, seen: Any, triangle: int, led: int, channel: int) -> float:
+    """Mean signal of a triangle, DN/s, with its glare: f without what light and power make of it."""
+    f, _ = by_formula(work, radiometry, seen, triangle, led, channel)
+    (place,), (axis,) = work.measured_run.leds.of(np.array([led]))
+    way = place - work.facets.centres_mm[triangle]
+    distance = np.linalg.norm(way)
+    leaving, arriving = -way @ axis / distance, way @ work.facets.normals[triangle] / distance
+    lit = leaving / (np.pi * (distance * 1e-3) ** 2)
+    return float(f * work.measured_run.power_of(work.view.by_led[led][0])[channel] * lit * arriving)
+
+
+def light_of_led(frames: list[LightFrame], radiometry: Any) -> tuple[Any, Any]:
+    """[h, w] linear signal, DN/s, by the longest exposure that does not clip; and what all exposures clip."""
+    rate, is_open = np.zeros((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH), bool)
+    for frame in sorted(frames, key=lambda frame: -frame.exposure_us):
+        signal = frame.read() - radiometry.dark(frame).astype(float)
+        x = signal / RANGE_DN
+        c2, c3 = np.moveaxis(CURVE[radiometry.channel], -1, 0)
+        rate = np.where(is_open, rate, signal * (1 + x * (c2 + x * c3)) / (1e-6 * frame.exposure_us))
+        is_open |= frame.read() < TOP_DN
+    return rate, ~is_open
 
 
 def test_a_sample_that_no_half_can_hold_is_none() -> None:

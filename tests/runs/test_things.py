@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 from cells import TOP, CellFolder
 
-KINDS = ["spectralon_tile", "grey_card", "gilt_step_wedge", "paint_wedge", "makie_tile", "fabric", "chrome_ball"]
+KINDS = [
+    "spectralon_tile",
+    "grey_card",
+    "glare_target",
+    "gilt_step_wedge",
+    "paint_wedge",
+    "makie_tile",
+    "fabric",
+    "chrome_ball",
+]
 
 
 def with_thing(tmp_path: Path, **thing: object) -> CellFolder:

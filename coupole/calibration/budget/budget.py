@@ -51,6 +51,7 @@ STATED = {
     "lens": "assumed",
     "flat field": "assumed",
     "response": "assumed",
+    "glare": "assumed, not taken off",
     "LED power, own": "assumed",
     "LED power, common": "assumed",
     "drift": "assumed",
@@ -86,6 +87,9 @@ class Known:
     """Relative change of albedo along the surface."""
     flat_field: float = 0.003
     response: float = 0.002
+    glare: float = 0.005
+    """Uncertainty of the veil over the sample, in shares of a white target's signal: of what is left with a
+    record, else of all that a good lens makes of a scene half as bright as white."""
     power_own: float = 0.003
     power_common: float = 0.01
     drift: float = 0.002
@@ -112,6 +116,7 @@ class Known:
             "lens": f"{self.lens_px:.2g} px",
             "flat field": f"{self.flat_field:.2%}",
             "response": f"{self.response:.2%}",
+            "glare": f"{self.glare:.2%} of white",
             "LED power, own": f"{self.power_own:.2%}",
             "LED power, common": f"{self.power_common:.2%}",
             "drift": f"{self.drift:.2%}",
@@ -186,7 +191,8 @@ def sample_inputs(
         uncertainties.edge_mm / np.sqrt(3.0) * np.stack([np.cos(around), np.sin(around), 0.0 * around], axis=1)
     )
     cosine = np.cos(a) * np.cos(b) ** (2 if emission == "paper" else 1)
-    signal = uncertainties.full_scale_dn * geometry.exposure_share * geometry.reflectance * cosine
+    white = uncertainties.full_scale_dn * geometry.exposure_share * cosine
+    signal = white * geometry.reflectance
     noise = np.sqrt(
         (uncertainties.read_noise_dn**2 + 1.0 / 12.0 + uncertainties.gain_dn_per_e * signal) / uncertainties.pixels
     )
@@ -217,6 +223,7 @@ def sample_inputs(
         Quantity("flat", 1.0, 0.0, source="at the field's middle", group="flat field"),
         quantity_of("flat_field", 1.0, uncertainties.flat_field, "flat field"),
         quantity_of("response", 1.0, uncertainties.response, "response"),
+        quantity_of("veil_dn", 0.0, uncertainties.glare * white, "glare"),
         Quantity("power_dn_m2_sr_per_s", 1e4, 0.0, source="scale", group="LED power, common"),
         quantity_of("power.own", 1.0, uncertainties.power_own, "LED power, own"),
         quantity_of("power.common", 1.0, uncertainties.power_common, "LED power, common"),

@@ -55,9 +55,9 @@ def reflectance_of(q: Mapping[str, Floats], led_normal: Floats, *, emission: Emi
 
     Point and normal are computed from the triangle's `VERTICES` in the base frame, moved by `MESH_STEP` (a small
     step of base_from_mesh about the triangle's middle); the LED's normal [3] is turned by `LED_TURN` about two
-    axes across it. `response`, `flat_field`, `power.own`, `power.common` and `drift` are factors about 1. The
-    mesh's step along x and `SEEN_OFF` are the error of the place at which the surface is seen; its albedo changes
-    there by `contrast_per_mm`.
+    axes across it. `response`, `flat_field`, `power.own`, `power.common` and `drift` are factors about 1,
+    `veil_dn` is what is left of glare over the pixel. The mesh's step along x and `SEEN_OFF` are the error of the
+    place at which the surface is seen; its albedo changes there by `contrast_per_mm`.
     """
     corners = np.stack([q[name] for name in VERTICES], axis=-1)
     corners = corners.reshape(*corners.shape[:-1], 3, 3)
@@ -73,7 +73,7 @@ def reflectance_of(q: Mapping[str, Floats], led_normal: Floats, *, emission: Emi
     beside_mm = q[SEEN_OFF[0]] + q[SEEN_OFF[1]] - step[..., 0]
     power = q["power_dn_m2_sr_per_s"] * q["power.own"] * q["power.common"] * q["drift"]
     return reflectance(
-        q["signal_dn"] * q["response"] * (1.0 + q["contrast_per_mm"] * beside_mm),
+        (q["signal_dn"] * (1.0 + q["contrast_per_mm"] * beside_mm) - q["veil_dn"]) * q["response"],
         q["exposure_s"],
         q["flat"] * q["flat_field"],
         power,

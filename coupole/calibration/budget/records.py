@@ -125,6 +125,10 @@ def _of_flat_field(record: Record, path: Path) -> Said:
     return Said({"flat_field": _limit_found(record, path, "uncertainty")}, ("flat field",))
 
 
+def _of_glare(record: Record, path: Path) -> Said:
+    return Said({"glare": _limit_found(record, path, "uncertainty of the veil")}, ("glare",))
+
+
 def _of_drift(record: Record, path: Path) -> Said:
     return Said({"drift": _limit_found(record, path, "uncertainty")}, ("drift",))
 
@@ -203,6 +207,8 @@ def reader_of(kind: Kind) -> Callable[[Record, Path], Said] | None:
             return _of_led_power
         case "drift":
             return _of_drift
+        case "glare":
+            return _of_glare
         case "chromatic" | "dark" | "colour":
             return None
         case _:

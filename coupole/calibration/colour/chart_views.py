@@ -12,6 +12,7 @@ from coupole.calibration import optics
 from coupole.calibration.colour.chart import Chart
 from coupole.calibration.colour.chart_signals import MONO, ChartPicture
 from coupole.calibration.light.frames import CHANNELS, LightFrame, LightFrames, channel_mask
+from coupole.calibration.light.glare_correction import read_glare
 from coupole.calibration.light.irradiance import Emission, irradiance_per_flux
 from coupole.calibration.light.records import dark_signal, linearise, map_beside, record_input
 from coupole.calibration.light.tile_views import Positions
@@ -39,6 +40,7 @@ class ChartSetting:
     dark: Path | None = None
     response: Path | None = None
     flat: Path | None = None
+    glare: Path | None = None
     emission: Emission = "lambertian"
     files: tuple[Path, ...] = ()
     """Files of chart, support and LEDs: inputs of the record."""
@@ -46,7 +48,7 @@ class ChartSetting:
     @property
     def inputs(self) -> tuple[tuple[str, str], ...]:
         """Name and SHA-256 of all these files."""
-        made_with = (*self.files, self.dark, self.response, self.flat)
+        made_with = (*self.files, self.dark, self.response, self.flat, self.glare)
         return tuple(pair for path in made_with for pair in record_input(path))
 
 
@@ -64,6 +66,7 @@ class ChartReader:
         self._straight = {channel: linearise(setting.response, channel, frames) for channel in CHANNELS}
         self._masks = {channel: channel_mask((height, width), frames.pattern, channel) for channel in CHANNELS}
         self._flat = None if setting.flat is None else map_beside(setting.flat, "flat-field", "g", frames)
+        self._glare = None if setting.glare is None else read_glare(setting.glare, frames)
         self._base_from_chart = self._find_chart()
 
     def pictures(self) -> Iterator[tuple[LightFrame, ChartPicture]]:
@@ -89,6 +92,8 @@ class ChartReader:
         signal = (raw - self._dark(frame)).astype(np.float64)
         for channel, mask in self._masks.items():
             signal[mask] = self._straight[channel](signal[mask])
+        if self._glare is not None:
+            signal = self._glare.without_veil(signal, self._masks)
         if self._flat is not None:
             signal = signal / self._flat
         signal /= frame.exposure_us * 1e-6

@@ -6,5 +6,6 @@
     dark.py photon_transfer.py linearity.py flat_field*.py  offset, gain and linearity of the sensor; fall-off
     led_power*.py   power of each LED, by a white tile: tile_views.py, spectralon.py, irradiance.py
     drift*.py       change of the power until a run, by a tile that is in the run's views
-    records.py      from frames to records; acceptance.py, drawing.py: acceptance limits and pictures
+    glare*.py       veiling glare, by black traps beside white; veil.py: its form, glare_correction.py: taken off
+    frames records.py      from frames to records; acceptance.py, drawing.py: acceptance limits and pictures
 """

@@ -17,3 +17,8 @@ DRIFT = (
     Allowed("factor", "uncertainty of the factor, worst frame", 0.01),
     Allowed("left_out", "share of readings left out", 0.2),
 )
+GLARE = (
+    Allowed("veil", "uncertainty of the veil in the middle of white, shares of it", 0.001),
+    Allowed("left_out", "veil of traps left out, off by shares of white", 0.0005),
+    Allowed("form", "veil of traps left out, relative, worst view", 0.1),
+)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from coupole.calibration.acceptance import against_limits
-from coupole.calibration.earlier import read_accepted, refuse_read_otherwise
+from coupole.calibration.earlier import GLARE, read_accepted, refuse_read_otherwise
 from coupole.calibration.light.acceptance import DRIFT
 from coupole.calibration.light.drift import NAMES, Drift, Reading, fit_drift
 from coupole.calibration.light.drift_drawing import draw_drift
@@ -90,7 +90,7 @@ def drift_outcome(
     Raises InputError: no view shows the tile, or as `fit_drift` does.
     """
     powers = read_powers(led_power)
-    read_with = {"response": setting.response, "flat-field": setting.flat}
+    read_with = {"response": setting.response, "flat-field": setting.flat, GLARE: setting.glare}
     refuse_read_otherwise(
         led_power, read_accepted(led_power, "led-power"), [kind for kind, path in read_with.items() if path]
     )

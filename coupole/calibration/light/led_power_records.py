@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from coupole.calibration.acceptance import against_limits
-from coupole.calibration.earlier import READ_WITH
+from coupole.calibration.earlier import GLARE, READ_WITH
 from coupole.calibration.light import drawing as pictures
 from coupole.calibration.light.acceptance import LED_POWER
 from coupole.calibration.light.frames import LightFrame, LightFrames, channels_of
@@ -70,6 +70,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
             "gain_db": frames.gain_db,
             READ_WITH + "response": float(setting.response is not None),
             READ_WITH + "flat-field": float(setting.flat is not None),
+            **({} if setting.glare is None else {READ_WITH + GLARE: 1.0}),
         },
         remarks=(f"emission profile `{setting.emission}`", *remarks),
         more_inputs=setting.inputs,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from coupole.calibration import optics
 from coupole.calibration.earlier import read_accepted
 from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask, channels_of
+from coupole.calibration.light.glare_correction import read_glare
 from coupole.calibration.light.irradiance import Emission
 from coupole.calibration.light.records import dark_signal, linearise, map_beside, record_input
 from coupole.calibration.light.spectralon import Tile
@@ -36,6 +38,7 @@ class Setting:
     dark: Path | None = None
     response: Path | None = None
     flat: Path | None = None
+    glare: Path | None = None
     emission: Emission = "lambertian"
     files: tuple[Path, ...] = ()
     """Files of tile, support and LEDs: inputs of the record."""
@@ -47,7 +50,7 @@ class Setting:
     @property
     def inputs(self) -> tuple[tuple[str, str], ...]:
         """Name and SHA-256 of all these files."""
-        made_with = (*self.files, self.dark, self.response, self.flat)
+        made_with = (*self.files, self.dark, self.response, self.flat, self.glare)
         return tuple(pair for path in made_with for pair in record_input(path))
 
 
@@ -74,6 +77,7 @@ class TileReader:
         }
         self._masks = {channel: channel_mask(self.shape, frames.pattern, channel) for channel in channels}
         self._flat = None if setting.flat is None else map_beside(setting.flat, "flat-field", "g", frames)
+        self._glare = None if setting.glare is None else read_glare(setting.glare, frames)
 
     def view(self, view_frames: Sequence[LightFrame], tell: Callable[[], None]) -> dict[str, TileView]:
         """The tile in the frames of one view, each under one LED, by channel; `tell` is called after each.
@@ -139,13 +143,15 @@ class TileReader:
         """Return for each channel: mean signal of each patch over flat field, DN/s; its uncertainty; whether
         saturated."""
         raw = frame.read()
-        signal = raw - self._dark(frame)
+        signal = self._linear_signal(raw, frame)
         means_of = {}
         for channel, mask in self._masks.items():
             means, u_means, full = np.zeros(len(patches)), np.zeros(len(patches)), False
             for p, pixels in enumerate(patches):
                 rows, columns = pixels[mask[pixels[:, 0], pixels[:, 1]]].T
-                values = self._straight[channel](signal[rows, columns].astype(np.float64))
+                values = signal[rows, columns].astype(np.float64)
+                if self._glare is None:
+                    values = self._straight[channel](values)
                 if self._flat is not None:
                     values = values / self._flat[rows, columns]
                 values = values / (frame.exposure_us * 1e-6)
@@ -153,6 +159,16 @@ class TileReader:
                 full |= bool((raw[rows, columns] >= self._white_dn).any())
             means_of[channel] = means, u_means, full
         return means_of
+
+    def _linear_signal(self, raw: NDArray[np.uint16], frame: LightFrame) -> NDArray[Any]:
+        """[h, w] signal above dark; made linear and without its veil if there is a record of the glare."""
+        signal = raw - self._dark(frame)
+        if self._glare is None:
+            return signal
+        linear = signal.astype(np.float64)
+        for channel, mask in self._masks.items():
+            linear[mask] = self._straight[channel](linear[mask])
+        return self._glare.without_veil(linear, self._masks)
 
 
 def _refuse_few(least: int) -> None:

@@ -28,7 +28,7 @@ from coupole.reflectance.extraction.measured_run import (
 )
 from coupole.scan.mesh_files import read_mesh
 
-_CHECKED: tuple[Kind, ...] = ("dark", "response", "flat-field")
+_CHECKED: tuple[Kind, ...] = ("dark", "response", "flat-field", "glare")
 
 
 def reasons_against(plan: Path, rig: Path | None, result: Path | None, run: Path | None) -> list[str]:

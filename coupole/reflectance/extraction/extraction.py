@@ -19,6 +19,7 @@ from coupole.errors import InputError
 from coupole.geometry import apply
 from coupole.motion import occlusion
 from coupole.motion.packet_rays import PacketMesh
+from coupole.reflectance.extraction.frame_veils import GLARE, U_GLARE
 from coupole.reflectance.extraction.lamp_sight import Facets, lamp_codes, neighbours_of
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
@@ -85,13 +86,22 @@ def extract_view(
             data = _begin_samples(file, work)
             frame_count = 0
             for some in work.samples(codes_of, threads):
-                for name, values in (("codes", some.codes), ("f", some.f), ("u_own", some.u_own)):
-                    _write_chunk(data[name], some, values)
+                for name, values in (
+                    ("codes", some.codes),
+                    ("f", some.f),
+                    ("u_own", some.u_own),
+                    (GLARE, some.glare),
+                ):
+                    if name in data:
+                        _write_chunk(data[name], some, values)
                 sample_count += int(np.count_nonzero(np.isfinite(some.f)))
                 of_code[:] += np.bincount(some.codes.ravel(), minlength=len(CODES))
                 if some.rows.stop == len(surface.triangles):
                     frame_count += sum(len(view.by_led[int(led)]) for led in work.leds[some.leds])
                     say(f"samples of {view.name}", frame_count, len(view.frames))
+            if work.reader.u_glare:
+                u_glare = np.stack([work.reader.u_glare[int(led)] for led in work.leds])
+                _dataset(file, U_GLARE, u_glare, "relative standard uncertainty of the glare in an LED's frames")
 
     complete(path, write, unless=path.with_suffix(".json"))
     return {
@@ -215,6 +225,8 @@ def _begin_samples(file: h5py.File, work: ViewPass) -> dict[str, h5py.Dataset]:
         "u_own": (np.float16, (count, leds, channels), "relative standard uncertainty, of noise"),
         "codes": (np.uint8, (count, leds), f"of a triangle and an LED: {codes}"),
     }
+    if "glare" in work.measured_run.records:
+        kinds[GLARE] = (np.float16, (count, leds, channels), "veil of glare that was taken off, over what is left")
     data = {}
     for name, (kind, shape, description) in kinds.items():
         chunks = (min(BLOCK, count), min(work.together, leds), channels)[: len(shape)]

@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.light.frames import LightFrame
+from coupole.calibration.light.veil import at_pixels
+from coupole.reflectance.extraction.frame_veils import FrameVeils
 from coupole.reflectance.extraction.measured_run import MeasuredView
 from coupole.reflectance.extraction.radiance import RANGE_LEFT_OUT, Radiometry
 from coupole.reflectance.extraction.sample_codes import REACHED
@@ -44,10 +46,15 @@ def write_frames(
     offsets = block_offsets(radiometry.channel, radiometry.channels)
     height, width = place_of_pixel.shape
 
+    veils = radiometry.veils(view.frames)
+
     def picture(led: int) -> tuple[NDArray[np.float16], float]:
         frame = max(view.by_led[led], key=lambda frame: frame.exposure_us)
         is_lit = np.append(codes[:, leds.index(led)] == REACHED, False)  # the last one: what is not seen
-        return _picture(radiometry, frame, place_of_pixel, is_lit, offsets)
+        share, noise = _picture(radiometry, frame, place_of_pixel, is_lit, offsets)
+        if veils is not None:
+            share -= _veil_picture(radiometry, veils, view.by_led[led], frame.exposure_us, offsets)
+        return share.astype(np.float16), noise
 
     with h5py.File(to, "w") as file, ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         shape = (len(leds), height // 2, width // 2, radiometry.channels)
@@ -76,7 +83,7 @@ def _picture(
     place_of_pixel: NDArray[np.int32],
     is_lit: NDArray[np.bool_],
     offsets: NDArray[np.int64],
-) -> tuple[NDArray[np.float16], float]:
+) -> tuple[NDArray[np.float32], float]:
     """One LED's picture, and its mean absolute error by noise."""
     height, width = place_of_pixel.shape
     range_dn = radiometry.white_dn - radiometry.black_dn
@@ -89,7 +96,26 @@ def _picture(
         float(range_dn), share, noise,
     )  # fmt: skip
     some = noise[np.isfinite(noise)]
-    return share.astype(np.float16), float(np.sqrt(2 / np.pi) * some.mean()) if len(some) else float("nan")
+    return share, float(np.sqrt(2 / np.pi) * some.mean()) if len(some) else float("nan")
+
+
+def _veil_picture(
+    radiometry: Radiometry,
+    veils: FrameVeils,
+    frames: Sequence[LightFrame],
+    exposure_us: float,
+    offsets: NDArray[np.int64],
+) -> NDArray[np.float32]:
+    """[h / 2, w / 2, channels] glare in an exposure of one LED, as the shares of `_picture`, from all its
+    frames."""
+    veil, _ = veils.of_led([(frame.exposure_us, frame.read().ravel()) for frame in frames])
+    height, width = radiometry.flat.shape
+    share = np.empty((height // 2, width // 2, len(offsets)), np.float32)
+    for c, (down, right) in enumerate(offsets):
+        rows, columns = np.mgrid[down : height // 2 * 2 : 2, right : width // 2 * 2 : 2]
+        rates = at_pixels(veil[c], rows.ravel(), columns.ravel(), veils.glare.block_px).reshape(rows.shape)
+        share[..., c] = rates * exposure_us * 1e-6 / radiometry.flat[rows, columns]
+    return share / np.float32(radiometry.white_dn - radiometry.black_dn)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -38,7 +38,7 @@ from coupole.storage.run import Run
 Floats = NDArray[np.float64]
 
 NEEDED = ("hand-eye", "leds", "led-power")
-USED = (*NEEDED, "dark", "response", "flat-field", "camera", "drift")
+USED = (*NEEDED, "dark", "response", "flat-field", "glare", "camera", "drift")
 U_SIGNAL = {"response": "uncertainty of linearity", "flat-field": "uncertainty", "drift": "uncertainty"}
 """Records of what makes all samples uncertain alike, and how the limit that says how much begins."""
 TYPICAL_PER_K = -0.003

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from coupole.calibration.earlier import read_earlier
 from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask
+from coupole.calibration.light.glare_correction import GlareCorrection, read_glare
 from coupole.calibration.light.records import dark_signal, linearise, map_beside
+from coupole.reflectance.extraction.frame_veils import FrameVeils, dark_of_blocks
 from coupole.reflectance.extraction.measured_run import MeasuredRun
 from coupole.reflectance.extraction.seen_surface import SeenSurface
 
@@ -35,6 +37,7 @@ class Radiometry:
             self.channel[channel_mask((height, width), frames.pattern, channel)] = number
         self.channels = len(measured_run.channels)
         self.flat = np.ones((height, width), np.float32)
+        self.glare: GlareCorrection | None = read_glare(records["glare"], frames) if "glare" in records else None
         self.curve, self.noise, self.u_pixel = _response(measured_run)
         if "flat-field" in records:
             self.flat, u_pixel = _flat_field(measured_run)
@@ -45,6 +48,19 @@ class Radiometry:
         before it. Later views have no say: a view's samples are the same whether they are taken as soon as it is
         complete or when the run has ended."""
         return self._dark_of_view(frame.view)(frame)
+
+    def veils(self, frames: Sequence[LightFrame]) -> FrameVeils | None:
+        """All that gives the glare of frames of one view; None without a record of it."""
+        if self.glare is None:
+            return None
+        alike = {frame.exposure_us: frame for frame in frames}
+        darks = {t: dark_of_blocks(self.dark(frame), self.channel, self.glare) for t, frame in alike.items()}
+        return FrameVeils(self.glare, self.channel, self.curve, self.top_dn, darks)
+
+    @property
+    def top_dn(self) -> float:
+        """Upper end of the camera's range that is used."""
+        return self.white_dn - RANGE_LEFT_OUT * (self.white_dn - self.black_dn)
 
 
 class PixelLists(NamedTuple):
@@ -100,9 +116,15 @@ class SignalReader:
         """Rows of `darks`, by exposures in us."""
         self.darks = np.empty((0, len(places)), np.float32)
         """[exposures, pixels] what frames have without light, DN, in the order of the lists."""
+        self.veils: FrameVeils | None = None
+        """All that gives the frames' glare; None without a record of it."""
+        self.u_glare: dict[int, NDArray[np.float64]] = {}
+        """[channels] relative standard uncertainty of the glare in the frames of each LED that were read."""
 
     def prepare(self, frames: Sequence[LightFrame]) -> None:
-        """Set `exposures` and `darks`: what frames of these exposures have without light."""
+        """Set `exposures`, `darks` and `veils`: what frames of these exposures have without light, and by
+        glare."""
+        self.veils = self._radiometry.veils(frames)
         alike = {frame.exposure_us: frame for frame in frames}
         self.exposures = {exposure_us: number for number, exposure_us in enumerate(alike)}
         self.darks = np.empty((len(alike), len(self.lists.places)), np.float32)

@@ -12,6 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.reflectance.extraction.frame_veils import NO_VEILS, Veils
 from coupole.reflectance.extraction.sample_codes import REACHED
 from coupole.reflectance.lanes import (
     absolute,
@@ -47,6 +48,8 @@ class Shots(NamedTuple):
     """[passes] exposures."""
     exposures: NDArray[np.int64]
     """[passes] rows of the dark signals."""
+    veils: Veils = NO_VEILS
+    """Glare of the LEDs' frames."""
 
 
 class Lamps(NamedTuple):
@@ -63,11 +66,12 @@ class Lamps(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normals, codes, f, u_own):  # type: ignore[no-untyped-def]
+def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normals, codes, f, u_own, glare):  # type: ignore[no-untyped-def]
     """Fill `f` and `u_own` [b, leds, channels], bits of float16, with the samples of b triangles from the `first`
-    on, where `codes` [b, 8] say that light has reached them; `lists` are the view's PixelLists, `darks`
-    [exposures, pixels] what its frames have without light, `response` the camera's."""
-    bits = np.empty((2, 8), np.uint16)
+    on, where `codes` [b, 8] say that light has reached them, and `glare` [b, leds, channels], which may be empty,
+    with the veil that was taken off, over what is left; `lists` are the view's PixelLists, `darks` [exposures,
+    pixels] what its frames have without light, `response` the camera's."""
+    bits = np.empty((3, 8), np.uint16)
     for row in range(len(f)):
         if REACHED not in codes[row]:
             continue
@@ -77,13 +81,19 @@ def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normal
         for channel in range(f.shape[2]):
             list_number = (first + row) * f.shape[2] + channel
             begin, end = lists.starts[list_number], lists.starts[list_number + 1]
-            signal, u_signal = _signal(begin, end, channel, lists, response, darks, shots)
+            signal, u_signal, veil = _signal(begin, end, channel, lists, response, darks, shots)
             value = signal * per_irradiance / load_row(lamps.powers, channel)
             size = absolute(value)
             store_halves(if_less(size, np.float32(MOST_F), value, _NAN), bits[0])
             store_halves(if_less(size, np.float32(MOST_F), u_signal, _NAN), bits[1])
             for led in range(f.shape[1]):
                 f[row, led, channel], u_own[row, led, channel] = bits[0, led], bits[1, led]
+            if len(glare):
+                share = veil / absolute(signal)
+                share = if_less(share, np.float32(MOST_F), share, np.float32(MOST_F))
+                store_halves(if_less(size, np.float32(MOST_F), share, _NAN), bits[2])
+                for led in range(f.shape[1]):
+                    glare[row, led, channel] = bits[2, led]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -109,7 +119,7 @@ def fill_pixels(first_entry, entry_ends, lists, response, darks, shots, lamps, p
                 straight[0, led] = direct[row, led, channel]
             share = if_less(off, np.float32(0.5), load_row(straight, 0), _NAN) / load_row(lamps.powers, channel)
             while pixel < end:
-                signal, u_signal = _signal(pixel, pixel + 1, channel, lists, response, darks, shots)
+                signal, u_signal, _ = _signal(pixel, pixel + 1, channel, lists, response, darks, shots)
                 signal = signal + absolute(signal) * _lost_by_root(u_signal)
                 value = signal * share * _per_normal_irradiance(places_mm[pixel - first_entry], lamps)
                 store_halves(if_less(absolute(value), np.float32(MOST_F), value, _NAN), bits)
@@ -161,20 +171,48 @@ def _per_irradiance(centre_mm, normal, lamps):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _signal(begin, end, channel, lists, response, darks, shots):  # type: ignore[no-untyped-def]
-    """Mean of linear signal over the flat field, DN/s, and its relative uncertainty by noise. Passes are weighted
-    by their variances; by their times where noise is not known."""
+    """Mean of linear signal over the flat field, DN/s, without glare; its relative uncertainty by noise; and the
+    glare. Passes are weighted by their variances; by their times where noise is not known."""
+    veil = _veil(begin, end, channel, lists, shots.veils)
     total, weights = lanes(np.float32(0.0)), lanes(np.float32(0.0))
     noisy = not np.isnan(response.noise[channel, 0])
     for number in range(len(shots.slots)):
         mean, variance = _mean(begin, end, channel, lists, response, darks, shots, number)
         if len(shots.slots) == 1:
-            return mean, root(variance) / absolute(mean)
+            mean = mean - veil
+            return mean, root(variance) / absolute(mean), veil
         weight = np.float32(1.0) / variance if noisy else lanes(shots.times_s[number])
         weights = weights + if_less(absolute(mean), np.float32(np.inf), weight, np.float32(0.0))
         total = total + if_less(absolute(mean), np.float32(np.inf), weight * mean, np.float32(0.0))
-    mean = total / weights
+    mean = total / weights - veil
     u_mean = np.float32(1.0) / (root(weights) * absolute(mean)) if noisy else lanes(_NAN)
-    return mean, u_mean
+    return mean, u_mean, veil
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _veil(begin, end, channel, lists, veils):  # type: ignore[no-untyped-def]
+    """Mean over pixels of the veil over the flat field, DN/s: linear between the middles of blocks. 0 without
+    one."""
+    none, unity, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+    total = lanes(none)
+    if len(veils.rates) == 0:
+        return total
+    block_px, rows, columns, width = veils.grid
+    first_block = channel * rows * columns
+    for pixel in range(begin, end):
+        y_px, x_px = divmod(np.int64(lists.places[pixel]), width)
+        y = min(max((np.float32(y_px) + half) / np.float32(block_px) - half, none), np.float32(rows - 1))
+        x = min(max((np.float32(x_px) + half) / np.float32(block_px) - half, none), np.float32(columns - 1))
+        row, column = np.int64(y), np.int64(x)
+        below, right = min(row + 1, rows - 1), min(column + 1, columns - 1)
+        down, across = y - np.float32(row), x - np.float32(column)
+        upper, lower = first_block + row * columns, first_block + below * columns
+        left = (
+            load_row(veils.rates, upper + column) * (unity - down) + load_row(veils.rates, lower + column) * down
+        )
+        other = load_row(veils.rates, upper + right) * (unity - down) + load_row(veils.rates, lower + right) * down
+        total = total + (left * (unity - across) + other * across) * lists.even[pixel]
+    return total * (unity / np.float32(end - begin))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

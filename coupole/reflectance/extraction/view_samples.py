@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from coupole.calibration.light.frames import LightFrame
 from coupole.reflectance.extraction.frame_ring import FrameRing
+from coupole.reflectance.extraction.frame_veils import NO_VEILS, Veils
 from coupole.reflectance.extraction.lamp_sight import Facets
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import SignalReader
@@ -47,6 +48,8 @@ class Samples:
     """[triangles, leds, channels] 1/sr; NaN where there is none."""
     u_own: NDArray[np.float16]
     """Relative standard uncertainty, of noise."""
+    glare: NDArray[np.float16]
+    """Veil that was taken off, over what is left; [0, 0, 0] without a record of the glare."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,23 @@ class ViewPass:
             slot_of[number, list(pass_slots)], there[number, list(pass_slots)] = list(pass_slots.values()), 1
         times_s = np.array([1e-6 * exposure_us for exposure_us, _ in passes], np.float32)
         exposures = np.array([self.reader.exposures[exposure_us] for exposure_us, _ in passes])
-        return Shots(pixels, slot_of, there, times_s, exposures)
+        return Shots(pixels, slot_of, there, times_s, exposures, self._veils(frames, pixels, slots))
+
+    def _veils(self, frames: list[LightFrame], pixels: NDArray[np.uint16], slots: list[int]) -> Veils:
+        """Glare of the LEDs of these frames, a lane each as they come."""
+        veils = self.reader.veils
+        if veils is None:
+            return NO_VEILS
+        of_led: dict[int, list[tuple[float, NDArray[np.uint16]]]] = {}
+        for frame, slot in zip(frames, slots, strict=True):
+            of_led.setdefault(int(frame.led or 0), []).append((frame.exposure_us, pixels[slot]))
+        rates = np.zeros((int(np.prod(veils.grid[1:3])) * len(veils.glare.channels), LANES), np.float32)
+        with ThreadPoolExecutor() as pool:
+            for lane, (led, (veil, u_veil)) in enumerate(
+                zip(of_led, pool.map(veils.of_led, of_led.values()), strict=True)
+            ):
+                rates[:, lane], self.reader.u_glare[led] = veil.ravel(), u_veil
+        return Veils(rates, veils.grid)
 
     def _lamps(self, part: slice) -> Lamps:
         leds = self.leds[part]
@@ -131,11 +150,13 @@ class ViewPass:
         of_lanes[:, :leds] = codes.T
         shape = (len(of_lanes), leds, self.reader.pixels.shape[1])
         f, u_own = np.full(shape, NO_VALUE, np.uint16), np.full(shape, NO_VALUE, np.uint16)
+        glare = np.full(shape if len(shots.veils.rates) else (0, 0, 0), NO_VALUE, np.uint16)
         fill_samples(
             rows.start, self.reader.lists, self.reader.response, self.reader.darks, shots, lamps,
-            self.facets.centres_mm[rows], self.facets.normals[rows], of_lanes, f, u_own,
+            self.facets.centres_mm[rows], self.facets.normals[rows], of_lanes, f, u_own, glare,
         )  # fmt: skip
-        return Samples(part, rows, of_lanes[:, :leds], f.view(np.float16), u_own.view(np.float16))
+        halves = (values.view(np.float16) for values in (f, u_own, glare))
+        return Samples(part, rows, of_lanes[:, :leds], *halves)
 
 
 def _in_order(work: Iterable[Future[Samples]], most: int) -> Iterator[Samples]:

@@ -167,6 +167,12 @@ def _next_step(name: str, about: dict[str, Any]) -> Inline:
     return ["See it under any light: ", Code(f"coupole show {name} --out {name}.html"), "."]
 
 
+def _glare(about: dict[str, Any]) -> str:
+    if all("glare" in records for records in about["records"]):
+        return "Veiling glare was taken off; the uncertainty of that is in the bounds."
+    return "Veiling glare is not subtracted, and is not in the bounds."
+
+
 def _shares(about: dict[str, Any]) -> Section:
     codes = list(about["views"][0]["share_by_code"])
     rows = [
@@ -175,7 +181,7 @@ def _shares(about: dict[str, Any]) -> Section:
     ]
     notes = [
         f"{about['seconds']:.1f} s, at most {about['peak_memory_bytes'] / 1e9:.1f} GB.",
-        f"{_inter_reflection(about)} Veiling glare is not subtracted, and is not in the bounds.",
+        f"{_inter_reflection(about)} {_glare(about)}",
     ]
     if left_out := sum(view["contradicted"] or 0 for view in about["views"]):
         notes.append(

@@ -1,0 +1,182 @@
+"""Make the record of veiling glare from views of black traps beside white."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from coupole.calibration.acceptance import against_limits
+from coupole.calibration.light.acceptance import GLARE
+from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask, channels_of
+from coupole.calibration.light.glare_drawing import draw_glare
+from coupole.calibration.light.glare_fit import GlareFit, TrapLight, TrapView, fit_glare, trap_view
+from coupole.calibration.light.glare_traps import find_traps
+from coupole.calibration.light.records import (
+    Progress,
+    block_diagonal,
+    dark_signal,
+    linearise,
+    mean_of,
+    record_input,
+    sealed_outcome,
+)
+from coupole.calibration.light.veil import PARTS
+from coupole.calibration.record import Parameter
+from coupole.calibration.report import Outcome
+from coupole.calibration.request import Request
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError
+from coupole.plan import yamlfile
+from coupole.plan.base_model import Model
+from coupole.plan.shot_id import Light
+
+SHARE = "share"
+"""Begins the names of the shares: `share.even.G`."""
+U_FORM = "u_form"
+"""Begins the names of the relative uncertainties of a veil by its form: `u_form.G`."""
+_MOST_SATURATED = 1e-4
+"""Greatest share of saturated pixels of a frame: their light is not known, and makes glare."""
+
+
+class GlareTarget(Model):
+    """A white target with black traps, as its description says."""
+
+    schema_version: int = 1
+    name: str = "black traps in a white card (not described)"
+    certificate: str = ""
+    """Name of who measured the traps, and the date."""
+    trap_share: Annotated[float, Field(ge=0, le=0.02)] = 0.0003
+    """Light that comes out of a trap over that of the white beside it."""
+    u_trap_share: Annotated[float, Field(ge=0, le=0.02)] = 0.0002
+
+
+def read_target(path: Path | None) -> GlareTarget:
+    """The description of a target (YAML); usual figures without one. Raises InputError with all problems."""
+    return GlareTarget() if path is None else yamlfile.read_document(path).validate(GlareTarget)
+
+
+def glare_outcome(
+    frames: LightFrames,
+    request: Request,
+    target_path: Path | None,
+    dark_record: Path | None,
+    response_record: Path | None,
+    progress: Progress,
+) -> Outcome:
+    """Shares of the veil's parts per channel, from views of a target. Raises InputError as `fit_glare` does."""
+    target = read_target(target_path)
+    groups = _usable_frames(frames)
+    dark, channels = dark_signal(frames, dark_record), channels_of(frames.pattern)
+    straight = {channel: linearise(response_record, channel, frames) for channel in channels}
+    width, height = frames.size_px
+    masks = {channel: channel_mask((height, width), frames.pattern, channel) for channel in channels}
+    views: dict[str, list[TrapView]] = {channel: [] for channel in channels}
+    empty = []
+    for number, ((view, light), group) in enumerate(groups.items()):
+        signal = np.asarray(mean_of(group) - dark(group[0]), np.float64)
+        for channel, mask in masks.items():
+            signal[mask] = straight[channel](signal[mask])
+        traps = find_traps(_even_brightness(signal, masks))
+        for channel, mask in masks.items() if traps else ():
+            views[channel].append(trap_view(f"{view}/{light}", signal.astype(np.float32), mask, traps))
+        empty += [] if traps else [f"{view}/{light}: no black trap with white all around it; not used"]
+        progress(number + 1, len(groups))
+    trap_light = TrapLight(target.trap_share, target.u_trap_share)
+    fits = {channel: fit_glare(views[channel], trap_light, channel) for channel in channels}
+    return _outcome_of(fits, request, frames, target, empty, (target_path, dark_record, response_record))
+
+
+def _outcome_of(
+    fits: Mapping[str, GlareFit],
+    request: Request,
+    frames: LightFrames,
+    target: GlareTarget,
+    remarks: Sequence[str],
+    files: Sequence[Path | None],
+) -> Outcome:
+    width, height = frames.size_px
+    places = np.array([((width - 1) / 2, (height - 1) / 2), (0, 0), (0, (height - 1) / 2)])
+    indices = {channel: fit.index(places) for channel, fit in fits.items()}
+    figures = {
+        "veil": max(float(u[0]) for _, u in indices.values()),
+        "left_out": max(fit.off for fit in fits.values()),
+        "form": max(fit.u_form for fit in fits.values()),
+    }
+    fixed_figures: dict[str, float] = {
+        "target.trap_share": target.trap_share,
+        "target.u_trap_share": target.u_trap_share,
+    }
+    for channel, (index, u) in indices.items():
+        for place, value, u_value in zip(("middle", "corner", "side"), index, u, strict=True):
+            fixed_figures |= {f"veil_{place}.{channel}": float(value), f"u_veil_{place}.{channel}": float(u_value)}
+        fixed_figures[f"{U_FORM}.{channel}"] = fits[channel].u_form
+    by_words = [
+        f"{channel}: a black point in the middle of a white picture has {index[0]:.2%} (u {u[0]:.3%}) of the "
+        f"white, at a side {index[2]:.2%}, in a corner {index[1]:.2%}"
+        for channel, (index, u) in indices.items()
+    ]
+    artefact = f"target: {target.name}" + (f", {target.certificate}" if target.certificate else "")
+    light = f"its traps have {target.trap_share:.2%} (u {target.u_trap_share:.2%}) of the white beside them"
+    return sealed_outcome(
+        "glare",
+        request,
+        frames,
+        (width, height),
+        *_parameters(fits),
+        partial(draw_glare, fits),
+        limits=against_limits(GLARE, request.limits, figures),
+        fixed_figures=fixed_figures,
+        remarks=(*by_words, f"{artefact}; {light}", *remarks),
+        more_inputs=tuple(pair for path in files for pair in record_input(path)),
+    )
+
+
+def _parameters(fits: Mapping[str, GlareFit]) -> tuple[list[Parameter], Floats]:
+    parameters = [
+        Parameter(
+            name=f"{SHARE}.{part}.{channel}",
+            value=float(value),
+            u=float(u),
+            degrees_of_freedom=fit.degrees_of_freedom,
+            dominated_by="what lies nearer than the traps' rims"
+            if part == "near"
+            else "differences between views",
+        )
+        for channel, fit in fits.items()
+        for part, value, u in zip(PARTS, fit.shares, np.sqrt(np.diag(fit.covariance)), strict=True)
+    ]
+    return parameters, block_diagonal([fit.covariance for fit in fits.values()])
+
+
+def _usable_frames(frames: LightFrames) -> dict[tuple[str, Light], list[LightFrame]]:
+    """Frames by view and light, of the longest exposure in which hardly a pixel is saturated. Raises InputError if
+    there is none."""
+    if not frames.lit:
+        raise InputError("glare: no frame with light; acquire `coupole plan new glare`")
+    groups: dict[tuple[str, Light], list[LightFrame]] = {}
+    for frame in sorted(frames.lit, key=lambda frame: -frame.exposure_us):
+        group = groups.setdefault((frame.view, frame.shot.light), [])
+        usable = not group and bool(np.mean(frame.read() >= frames.white_dn) < _MOST_SATURATED)
+        if usable or (group and group[0].exposure_us == frame.exposure_us):
+            group.append(frame)
+    bright = {key: group for key, group in groups.items() if group}
+    if not bright:
+        raise InputError(
+            f"glare: all {len(groups)} views have saturated pixels, whose light is not known; expose less, and "
+            "keep lamps and their mirror images out of the picture"
+        )
+    return dict(sorted(bright.items(), key=lambda item: item[0][0]))
+
+
+def _even_brightness(signal: Floats, masks: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.float32]:
+    """[h, w] all channels at the brightness of white, for finding traps."""
+    even = np.empty(signal.shape, np.float32)
+    for mask in masks.values():
+        even[mask] = signal[mask] / max(float(np.quantile(signal[mask], 0.9)), 1e-9)
+    return even

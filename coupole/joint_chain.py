@@ -9,7 +9,7 @@ with the forward kinematics.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -39,12 +39,12 @@ class JointChain:
     link_6_from_flange: tuple[tuple[float, ...], ...]
     """4x4, row by row, mm."""
 
-    @property
+    @cached_property
     def axis_numbers(self) -> tuple[int, ...]:
         """0 for x, 1 for y, 2 for z."""
         return tuple("xyz".index(axis[1]) for axis in self.axes)
 
-    @property
+    @cached_property
     def senses(self) -> tuple[float, ...]:
         """1 for each joint whose axis is a positive coordinate axis of its frame, -1 for a negative one."""
         return tuple(-1.0 if axis[0] == "-" else 1.0 for axis in self.axes)

@@ -109,8 +109,10 @@ def count(paths: list[str], workers: int) -> int:
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # who outlives its parent is waited for here
     worker_options = ["-n", str(workers), "--dist", "loadscope", "--no-loadscope-reorder"] if workers > 1 else []
     command = [sys.executable, "-m", "pytest", *worker_options, f"--account={KEPT}", *paths]
-    # As tools/test does: hundreds of processes would each compile every module again.
+    # As tools/test does: hundreds of processes would each compile every module again, and threads that wait would
+    # take the other workers' cores.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    environment["OMP_WAIT_POLICY"] = "passive"
     tests = subprocess.Popen(command, cwd=ROOT, env=environment)
     code = 0
     with (KEPT / "outside.jsonl").open("w") as file:

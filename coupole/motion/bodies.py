@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.geometry import apply
 from coupole.intake.input_files import InputFiles
 from coupole.joint_chain import FLANGE
 from coupole.kinematics import Arm, link_frames
+from coupole.motion.remembered import Remembered
 from coupole.motion.sphere_tree import Floats, Spheres, spheres_of, surface_points
 from coupole.plan.arm_description import ArmDescription
 from coupole.plan.link_meshes import LINKS, link_mesh_path
@@ -26,6 +28,7 @@ _METRES_BELOW = 10.0
 """A link mesh no larger than this is taken as metres (the ROS convention), otherwise as mm."""
 
 _LARGEST_MM = 5000.0
+_PARTS: Remembered[NDArray[np.bool_]] = Remembered(most=16)
 
 
 @dataclass(frozen=True)
@@ -133,12 +136,23 @@ def part_apart(
 ) -> Body | None:
     """The part of a body whose spheres are more than `by_mm` from another in all of some postures; None if there
     is none."""
+    apart = _PARTS.result(
+        (arm, body.link, *body.spheres, other_body.link, *other_body.spheres, np.array(postures_deg), by_mm),
+        lambda: _are_apart(arm, body, other_body, postures_deg, by_mm),
+    )
+    if not apart.any():
+        return None
+    return Body(body.name, body.link, Spheres(body.spheres.centers_mm[apart], body.spheres.radii_mm[apart]))
+
+
+def _are_apart(
+    arm: Arm, body: Body, other_body: Body, postures_deg: Sequence[Sequence[float]], by_mm: float
+) -> NDArray[np.bool_]:
+    """[spheres of the body] True for those that are apart."""
     apart = np.ones(len(body.spheres.radii_mm), dtype=bool)
     for joints_deg in postures_deg:
         frames = link_frames(arm, joints_deg)
         at, other_centers_mm = (apply(frames[b.link], b.spheres.centers_mm) for b in (body, other_body))
         distances_mm = np.linalg.norm(at[:, None] - other_centers_mm, axis=2) - other_body.spheres.radii_mm
         apart &= distances_mm.min(axis=1) > body.spheres.radii_mm + by_mm
-    if not apart.any():
-        return None
-    return Body(body.name, body.link, Spheres(body.spheres.centers_mm[apart], body.spheres.radii_mm[apart]))
+    return apart

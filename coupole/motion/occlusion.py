@@ -22,6 +22,7 @@ from coupole.kinematics import link_frames
 from coupole.motion.bodies import Capsule, capsules_of
 from coupole.motion.itinerary import undescribed_arm_error
 from coupole.motion.patches import PATCHES, Patches, patches_at, patches_of
+from coupole.motion.remembered import Remembered
 from coupole.plan.arm_description import ArmDescription
 from coupole.plan.led_table import LedTable
 from coupole.plan.rig import Rig
@@ -33,6 +34,8 @@ several apply, the smallest is given; REACHED if none does."""
 RAY_START_MM = 0.1
 """Rays start this far off the surface, along the patch's normal, so that a patch does not hide itself by rounding
 (Embree computes with 24 bits: 0.00006 mm at 1 m). Lower steps of the surface cast no shadow."""
+_OBJECTS: Remembered[tuple[Patches, NDArray[np.uint8]]] = Remembered(most=2)
+"""Patches of objects, and their codes."""
 
 
 @dataclass(frozen=True)
@@ -160,11 +163,17 @@ def occlusions_of(
     arm = described_arm(rig)
     if arm is None:
         raise undescribed_arm_error(rig)
-    patches = patches_of(corners_mm, count) if len(corners_mm) else patches_at(targets_mm)
+    targets = np.asarray(targets_mm, dtype=np.float64)
     support_from_base = inverse(rig.support.base_from_support.matrix())
     leds_mm = apply(support_from_base, leds.positions_mm)
+    led_normals = leds.normals @ support_from_base[:3, :3].T
     mesh = ray_mesh(corners_mm)
-    codes = own_codes(patches, mesh, leds_mm, leds.normals @ support_from_base[:3, :3].T)
+
+    def patches_and_codes() -> tuple[Patches, NDArray[np.uint8]]:
+        patches = patches_of(corners_mm, count) if len(corners_mm) else patches_at(targets)
+        return patches, own_codes(patches, mesh, leds_mm, led_normals)
+
+    patches, codes = _OBJECTS.result((corners_mm, targets, leds_mm, led_normals, count), patches_and_codes)
     return Occlusions(rig, arm, patches, mesh, leds_mm, codes)
 
 

@@ -14,12 +14,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.motion.remembered import Remembered
+
 Floats = NDArray[np.float64]
 
 MESH_STEP_MM = 6.0
 """Spacing of the points on an object's surface."""
 _CHAIN_EXCESS_MM = 1.0
 """Largest excess of a chain of spheres over the capsule that it covers."""
+_TREES: Remembered[Floats] = Remembered(most=64)
 
 
 class Spheres(NamedTuple):
@@ -85,7 +88,7 @@ def _one_per_cell(points: Floats, cell_mm: float) -> Floats:
 
 def sphere_trees_of(shapes: Sequence[Spheres]) -> SphereTrees:
     """Trees over shapes, in their order. Each shape has at least one sphere."""
-    trees = [_tree(shape) for shape in shapes]
+    trees = [_TREES.result((*shape,), lambda shape=shape: _tree(shape)) for shape in shapes]  # type: ignore[misc]
     sizes = [len(nodes) for nodes in trees]
     return SphereTrees(
         np.concatenate(trees), np.column_stack([np.cumsum([0, *sizes[:-1]]), [size // 2 for size in sizes]])

@@ -12,7 +12,8 @@ from pathlib import Path
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.view_writer import WRITERS
 
-_BLOCK_BYTES = 8 * 2**20
+_BLOCK_BYTES, _RANDOM_BYTES = 8 * 2**20, 2**20
+"""A block consists of random bytes, repeated: no file system compresses more than those at once."""
 _LEAST_BLOCKS, _MOST_BLOCKS, _FRAMES = 8, 16, 20
 
 
@@ -29,7 +30,7 @@ def measure_write_speed(folder: Path, *, frame_bytes: int = 0, room_bytes: int) 
         return 0.0
     path = folder / f".speed-{os.getpid()}"
     block = mmap.mmap(-1, _BLOCK_BYTES)
-    block.write(os.urandom(_BLOCK_BYTES))
+    block.write(os.urandom(_RANDOM_BYTES) * (_BLOCK_BYTES // _RANDOM_BYTES))
     try:
         try:
             fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_DIRECT, 0o600)

@@ -113,10 +113,11 @@ def write_run(
         create(path, len(labels), FORMAT, {**METADATA, "title": view, "focus_distance_mm": 335.0})
         writer = ViewWriter(path, {})
         at = writer.add_pose(ArmState((0, -90, 90, 0, 90, 0), pose, 7, moving=False), pose @ FLANGE_FROM_CAMERA)
+        coloured = _bayer(200 + 3000 * picture, red_scale)
         for number, label in enumerate(labels):
             share = 0.0 if label.startswith("dark") else bright * (1.0, 0.625)[number - 1]
             pixels = np.frombuffer(mmap.mmap(-1, FORMAT.frame_bytes), np.uint16).reshape(picture.shape)
-            signal = 64 + share * _bayer(200 + 3000 * picture, red_scale) + random.normal(0, 6, picture.shape)
+            signal = 64 + share * coloured + random.normal(0, 6, picture.shape)
             pixels[:] = np.clip(np.rint(signal), 0, 4095)
             slot = writer.store(pixels, frame_id=number, camera_ns=number, exposure_us=8000)
             warmth = {"board_temperature_dc": round(10 * room_c), "led_current_ma": 700}
@@ -139,9 +140,9 @@ def _bayer(picture: Array, red_scale: float) -> Array:
 
     coloured = picture.copy()
     coloured[0::2, 1::2] *= 0.45
-    centre = np.array(LENS.centre_px[::-1])
-    red = affine_transform(
-        picture, np.full(2, 1 / red_scale), centre * (1 - 1 / red_scale), order=3, mode="nearest"
-    )
+    red = picture
+    if red_scale != 1.0:
+        shift = np.array(LENS.centre_px[::-1]) * (1 - 1 / red_scale)
+        red = affine_transform(picture, np.full(2, 1 / red_scale), shift, order=3, mode="nearest")
     coloured[1::2, 0::2] = 0.6 * red[1::2, 0::2]
     return coloured

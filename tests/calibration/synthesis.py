@@ -7,6 +7,7 @@ distributions. Rotations are scipy's.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -135,15 +136,12 @@ def render(
     Each pixel is the mean of 2 x 2 looks through the lens, whose distortion is undone by fixed-point iteration;
     the lens spreads a point over 0.6 px (one sigma). Beside the board all is grey.
     """
-    width, height = size_px
     offsets = (-0.25, 0.25)
-    total = np.zeros((height, width))
+    total = np.zeros(size_px[::-1])
     normal, origin = camera_from_board[:3, 2], camera_from_board[:3, 3]
     for dy in offsets:
         for dx in offsets:
-            x, y = np.meshgrid(np.arange(width) + dx, np.arange(height) + dy)
-            a, b = _undistorted(lens, x, y)
-            rays = np.stack([a, b, np.ones_like(a)], axis=-1)
+            rays = _rays(lens, size_px, dx, dy)
             points = rays * ((normal @ origin) / (rays @ normal))[..., None]
             on_board = (points - origin) @ camera_from_board[:3, :3]
             total += _sampled(
@@ -151,6 +149,15 @@ def render(
             )
     blurred: Array = gaussian_filter(total / 4, PSF_PX)
     return blurred
+
+
+@lru_cache(maxsize=8)
+def _rays(lens: TrueLens, size_px: tuple[int, int], dx: float, dy: float) -> Array:
+    """[H, W, 3] of all pixels, shifted by an offset: the same for every picture through a lens."""
+    width, height = size_px
+    x, y = np.meshgrid(np.arange(width) + dx, np.arange(height) + dy)
+    a, b = _undistorted(lens, x, y)
+    return np.stack([a, b, np.ones_like(a)], axis=-1)
 
 
 def _undistorted(lens: TrueLens, x: Array, y: Array) -> tuple[Array, Array]:

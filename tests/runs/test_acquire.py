@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -22,6 +21,7 @@ import numpy as np
 import pytest
 from cells import SIDE, TOP, CellFolder, Ended
 from expected_pictures import Expectation, mislabelled
+from nursery import NURSERY
 
 TWO_LIGHTS = {"kind": "ids", "ids": [0, 700]}
 
@@ -206,11 +206,10 @@ def on_a_terminal(cell: CellFolder) -> Iterator[tuple[subprocess.Popen[str], int
 
     watcher = threading.Thread(target=watch)
     watcher.start()
-    environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "140", "LINES": "40"}
     modes = termios.tcgetattr(terminal_end)
-    process = cells.start(
-        "acquire", cell.plan, stdin=terminal_end, stderr=terminal_end, env=environment,
-        start_new_session=True, preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    process = NURSERY.function(
+        "terminals:on_terminal", ["acquire", str(cell.plan)],
+        stdin=terminal_end, stdout=subprocess.PIPE, stderr=terminal_end, text=True,
     )  # fmt: skip
     try:
         cells.wait_until(lambda: b"keys: p pauses" in shown, "the keys")

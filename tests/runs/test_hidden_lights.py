@@ -9,7 +9,7 @@ import cells
 import h5py
 import numpy as np
 import pytest
-from cells import LOW, TOP, CellFolder
+from cells import LOW, TOP, CellFolder, Ended
 from expected_pictures import mislabelled
 
 from coupole.motion.occlusion import REACHED
@@ -17,18 +17,27 @@ from coupole.motion.occlusion import REACHED
 STEEP = {**TOP, "name": "steep", "elevation_deg": 88}
 
 
-def hidden_in(folder: Path, **plan: Any) -> CellFolder:
+def hidden_in(folder: Path, *, arm_shadows: bool = False, **plan: Any) -> CellFolder:
     """A cell with views in which some LEDs reach nothing: the camera hangs between them and the object. By its
     shading every fifth LED is told from its neighbours only on fine triangles."""
     cell = CellFolder(folder)
     cell.plan_data["object"]["mesh"] = str(cells.RELIEF)
+    cell.world_settings["arm_shadows"] = arm_shadows
     cell.write(views=[STEEP, LOW], lights={"kind": "every", "every": 5}, **plan)
     return cell
 
 
-def test_hidden_leds_are_marked_in_journal_and_views_and_taken_where_the_plan_says_nothing(tmp_path: Path) -> None:
-    hidden = hidden_in(tmp_path)
-    ended = hidden.acquire()
+@pytest.fixture(scope="module")
+def marked(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellFolder, Ended]:
+    """A run whose plan says nothing of hidden LEDs, in a world whose arm blocks light."""
+    hidden = hidden_in(tmp_path_factory.mktemp("marked"), arm_shadows=True)
+    return hidden, hidden.acquire()
+
+
+def test_hidden_leds_are_marked_in_journal_and_views_and_taken_where_the_plan_says_nothing(
+    marked: tuple[CellFolder, Ended],
+) -> None:
+    hidden, ended = marked
     assert ended.code == 0
     assert ended.document["shots"] == 2 * 216
     views = {event["view"]: event["hidden_leds"] for event in cells.events(hidden.run_folder, "view")}
@@ -63,35 +72,42 @@ def test_hidden_leds_are_left_out_as_preflight_says_where_the_plan_says_so(tmp_p
     assert mislabelled(hidden, run) == []
 
 
-def test_a_run_is_resumed_without_what_it_began_without(tmp_path: Path) -> None:
-    hidden = hidden_in(tmp_path, hidden_lights="skip")
-    hidden.faults({"kind": "unplug_camera", "at_edge": 250})
-    assert hidden.acquire().code == 4
-    run = hidden.run_folder
+def test_a_run_is_resumed_without_what_it_began_without(cell: CellFolder) -> None:
+    cell.write(views=[STEEP, LOW], hidden_lights="skip")
+    cell.faults({"kind": "unplug_camera", "at_edge": 70})
+    assert cell.acquire().code == 4
+    run = cell.run_folder
     before = cells.about(run)["hidden_leds"]
-    resumed = hidden.acquire("--resume", run)  # the rest has fewer edges than 250
+    assert before["steep"]
+    resumed = cell.acquire("--resume", run)  # the rest has fewer edges than 70
     assert resumed.code == 0, resumed.err
     assert cells.about(run)["hidden_leds"] == before
     assert cells.here("verify", run).code == 0
 
 
-@pytest.mark.parametrize("arm", ["kuka", pytest.param("ur10e", marks=pytest.mark.full)])
-def test_an_led_that_preflight_calls_hidden_gives_a_dark_frame(tmp_path: Path, arm: str) -> None:
-    """The world's arm and the controller's are two pictures of one thing: where the controller finds that an LED
-    reaches nothing of what is seen, the simulated frame has hardly any light."""
-    cell = CellFolder(tmp_path, speed=1.0 if arm == "ur10e" else 5.0)
-    if arm == "ur10e":
-        pytest.importorskip("rtde_control", reason="ur-rtde is an optional extra")
-        cell.moved_by_ur(arm)
+def test_an_led_that_preflight_calls_hidden_gives_a_dark_frame(marked: tuple[CellFolder, Ended]) -> None:
+    assert_hidden_leds_give_dark_frames(marked[0].run_folder)
+
+
+@pytest.mark.full
+def test_an_led_that_preflight_calls_hidden_by_a_ur_gives_a_dark_frame(tmp_path: Path) -> None:
+    pytest.importorskip("rtde_control", reason="ur-rtde is an optional extra")
+    cell = CellFolder(tmp_path, speed=1.0)
+    cell.moved_by_ur("ur10e")
     cell.world_settings["arm_shadows"] = True
     cell.write(views=[STEEP], lights={"kind": "every", "every": 5})
     assert cell.acquire().code == 0
-    run = cell.run_folder
-    hidden = set(next(event for event in cells.events(run, "view"))["hidden_leds"])
+    assert_hidden_leds_give_dark_frames(cell.run_folder)
+
+
+def assert_hidden_leds_give_dark_frames(run: Path) -> None:
+    """The world's arm and the controller's are two pictures of one thing: where the controller finds that an LED
+    reaches nothing of what is seen, the simulated frame has hardly any light."""
+    hidden = set(next(event for event in cells.events(run, "view") if event["view"] == "steep")["hidden_leds"])
     means = {
         int(frame.record["led"]): float(frame.pixels.mean()) - cells.BLACK_DN
         for shot, frame in cells.stored(run).items()
-        if cells.is_light(shot)
+        if cells.is_light(shot) and shot.startswith("steep/")
     }
     dark = [mean for led, mean in means.items() if led in hidden]
     lit = [mean for led, mean in means.items() if led not in hidden]

@@ -183,7 +183,7 @@ def test_bars_of_samples_are_the_95_percent_of_all_that_is_uncertain(tmp_path: P
     none = each(0.0)
     of_signal = each(u["u_own"]), each(u["u_response"]), none, none
     sources = Sources(
-        *of_signal, each(u["led_u_own"]), each(u["led_u_shared"]), each(scan_noise_um), each(u["led_u_mm"])
+        *of_signal, each(u["led_u_own"]), each(u["led_u_shared"]), each(scan_noise_um), each(u["led_u_mm"]), none
     )
     ratios = drawn_ratios(places, sources, 20_000, np.random.default_rng(1))
     low, high = np.quantile(ratios, [0.025, 0.975], axis=1)

@@ -117,17 +117,18 @@ def test_samples_are_those_of_the_formula_within_a_step_of_their_halves(
     np.testing.assert_allclose(found, wanted, rtol=2.0**-11 + 2e-6)
 
 
-def test_glare_is_taken_off_by_the_light_of_all_exposures_of_an_led() -> None:
+@pytest.mark.parametrize("exposures_us", [SOME, ONE])
+def test_glare_is_taken_off_by_the_light_of_all_exposures_of_an_led(exposures_us: list[tuple[float, ...]]) -> None:
     random = np.random.default_rng(8)
-    work, radiometry, seen = view_of(SOME, random, "lambertian", NOISE)
+    work, radiometry, seen = view_of(exposures_us, random, "lambertian", NOISE)
     glare = GlareCorrection(
         ("R", "G", "B"), random.uniform(0.0, 0.01, (3, 5)), np.tile(1e-8 * np.eye(5), (3, 1, 1)), np.full(3, 0.03),
         (WIDTH, HEIGHT),
     )  # fmt: skip
     darks = {t: dark_of_blocks(radiometry.dark(SimpleNamespace(exposure_us=t)), radiometry.channel, glare)
              for t in (1000.0, 4000.0, 16000.0)}  # fmt: skip
-    codes = np.zeros((len(SOME), TRIANGLES), np.uint8)
-    plain, found = (np.full((TRIANGLES, len(SOME), 3), np.nan) for _ in range(2))
+    codes = np.zeros((len(exposures_us), TRIANGLES), np.uint8)
+    plain, found = (np.full((TRIANGLES, len(exposures_us), 3), np.nan) for _ in range(2))
     u_plain, u_found, taken_off = (np.full(plain.shape, np.nan) for _ in range(3))
     for some in work.samples(lambda part, pool: codes[part], 2):
         plain[some.rows, some.leds], u_plain[some.rows, some.leds] = some.f, some.u_own
@@ -138,7 +139,7 @@ def test_glare_is_taken_off_by_the_light_of_all_exposures_of_an_led() -> None:
         found[some.rows, some.leds], u_found[some.rows, some.leds] = some.f, some.u_own
         taken_off[some.rows, some.leds] = some.glare
     checked = 0
-    for led in range(len(SOME)):
+    for led in range(len(exposures_us)):
         light, clipped = light_of_led(work.view.by_led[led], radiometry)
         for channel in range(3):
             mask = radiometry.channel == channel

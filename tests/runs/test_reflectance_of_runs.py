@@ -282,7 +282,9 @@ def noisy_samples(noisy: Path, clean: Path) -> tuple[np.ndarray, Places, Sources
         corners = file["corners_mm"][()].astype(float)[triangles[triangle]]
     same = np.ones(len(led))
     noise, own = u_own[triangle, led].astype(float), u_response[triangle]
-    sources = Sources(noise, own, 0 * same, 0 * same, u_led[led], u_leds[led], 30.0 * same, led_mm * same)
+    sources = Sources(
+        noise, own, 0 * same, 0 * same, u_led[led], u_leds[led], 30.0 * same, led_mm * same, 0 * same
+    )
     return truth / f[triangle, led], Places(corners, leds[led], axes[led]), sources
 
 

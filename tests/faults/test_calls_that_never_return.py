@@ -22,9 +22,8 @@ FEW_LIGHTS = {"kind": "every", "every": 60}
 
 @pytest.fixture
 def cell(tmp_path: Path) -> CellFolder:
-    """One view of 18 LEDs, in a world that outlives its controllers. It runs in real time: while a call hangs, the
-    controller's limits are the machine's, and a faster world would only compute more cycles of the arm."""
-    made = CellFolder(tmp_path, speed=1.0)
+    """One view of 18 LEDs, in a world that outlives its controllers."""
+    made = CellFolder(tmp_path)
     made.rig_data["ledbox"]["settings"]["watchdog_s"] = 5.0
     made.join()
     made.write(views=[TOP], lights=FEW_LIGHTS)

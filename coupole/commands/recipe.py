@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from coupole.appearance.matter.glossy_face import Face
     from coupole.appearance.spectra.light import Observer
     from coupole.heritage.analysis.colour_match import Match
+    from coupole.heritage.analysis.palette import Paint
     from coupole.heritage.analysis.recipe_search import Found, Recipe
 
 _FEWER = 3
@@ -51,25 +52,37 @@ def recipe(
     instrument: Instrument,
     observer: Annotated[str, typer.Option(help="Standard observer: 10 deg or 2 deg.")] = "10 deg",
     out: Annotated[Path | None, typer.Option("--out", help="Write this page (HTML).")] = None,
+    paint: Annotated[
+        Path | None,
+        typer.Option(
+            "--paint", help="Write the mixture as a paint file (NAME.paint.csv), for scenes and restorations."
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find paints of a palette whose opaque mixture has a colour: shares, match under several lights, error with
     one paint less.
     """
     from coupole.appearance.matter.glossy_face import face
+    from coupole.heritage.analysis.mixed_paint import expect_paint_name, write_mixture
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     try:
+        if paint is not None:
+            expect_paint_name(paint)
         names = [name.strip() for name in light.split(",") if name.strip()]
         if not names:
             raise InputError("--light: expected names of lights, such as D65,A; found none")
         geometry, seen_by = instrument.known_geometry(), _known_observer(observer)
         with console.status("mixing"):
-            search, matches = _search_recipes(
+            paints, search, matches = _search_recipes(
                 target, palette, names, at_most, noise, face(instrument.binder_index, geometry), seen_by
             )
         document = _document(search, matches)
+        if paint is not None:
+            write_mixture(paint, search.best, paints, instrument.binder_index, target.name)
+            document["paint"] = str(paint)
         if out is not None:
             _write(out, target.stem, search, matches)
             document["page"] = str(out)
@@ -80,8 +93,9 @@ def recipe(
         print(json.dumps(document))
     else:
         _say(search, matches, console)
-        if out is not None:
-            console.print(str(out), markup=False)
+        for path in (out, paint):
+            if path is not None:
+                console.print(str(path), markup=False)
 
 
 # -- helpers --------------------------------------------------------------------------------------------------
@@ -106,7 +120,7 @@ def _search_recipes(
     noise: float,
     face: Face,
     observer: Observer,
-) -> tuple[Found, list[tuple[Match, ...]]]:
+) -> tuple[tuple[Paint, ...], Found, list[tuple[Match, ...]]]:
     from coupole.heritage.analysis.colour_match import matches
     from coupole.heritage.analysis.layer_samples import spectrum_on_grid
     from coupole.heritage.analysis.palette import read_palette
@@ -117,7 +131,8 @@ def _search_recipes(
         search = find(spectrum_on_grid(target), paints, face, noise, at_most)
     except InputError as error:
         raise InputError(f"{target}: {error}" if str(target) not in str(error) else str(error)) from error
-    return search, [matches(search.target, mixture.reflectance, lights, observer) for mixture in search.recipes]
+    under_lights = [matches(search.target, mixture.reflectance, lights, observer) for mixture in search.recipes]
+    return paints, search, under_lights
 
 
 def _document(search: Found, matches: Sequence[Sequence[Match]]) -> dict[str, Any]:

@@ -76,7 +76,7 @@ def main() -> None:
         shutil.rmtree(options.out / name, ignore_errors=True)
         (options.out / name).mkdir(parents=True)
     random = np.random.default_rng(options.seed)
-    today, in_1998 = weathered(options.seed, lost=True), weathered(options.seed, lost=False)
+    today, in_1998 = weathered_body(options.seed, has_flake=False), weathered_body(options.seed, has_flake=True)
     vertices_mm, triangles = surface(FINE_MM, today)
     _scan(trimesh.Trimesh(vertices_mm, triangles, process=False), options.out, random)
     _write_cast(in_1998, options.out / "earlier/cast-1998.ply", random)
@@ -89,8 +89,8 @@ def main() -> None:
     print(f"{options.out}: {size / 1e6:.2f} MB")
 
 
-def weathered(seed: int, *, lost: bool) -> Callable[[Field], Field]:
-    """The bust after centuries; `lost`: after 1998, without the flake of its mantle."""
+def weathered_body(seed: int, *, has_flake: bool) -> Callable[[Field], Field]:
+    """The bust after centuries; `has_flake`: before the flake of its mantle was lost, after 1998."""
     random = np.random.default_rng(seed + 1)
     waves = random.normal(size=(24, 3)) * (2.0 * np.pi / random.uniform(18.0, 90.0, (24, 1))) / np.sqrt(3.0)
     phases = random.uniform(0.0, 2.0 * np.pi, 24)
@@ -101,7 +101,7 @@ def weathered(seed: int, *, lost: bool) -> Callable[[Field], Field]:
             field = field + np.float32(0.35) * np.sin(places @ wave + np.float32(phase))
         field = smooth_difference(field, ellipsoid(places, (-58.0, -58.0, 392.0), (26.0, 26.0, 21.0)), 2.0)
         field = smooth_difference(field, ellipsoid(places, (96.0, -38.0, 30.0), (20.0, 24.0, 18.0)), 2.0)
-        if lost:
+        if not has_flake:
             field = smooth_difference(field, ellipsoid(places, *FLAKE), 1.5)
         return np.asarray(field, np.float32)
 
@@ -117,20 +117,20 @@ def _scan(mesh: trimesh.Trimesh, out: Path, random: np.random.Generator) -> None
     for number, (azimuth_deg, height_deg) in enumerate(STANDS, 1):
         name = f"scan-{number}.ply"
         site_from_scan = _stand(azimuth_deg, height_deg, random)
-        points_mm = _seen(mesh, site_from_scan, random)
+        points_mm = _scanned_points(mesh, site_from_scan, random)
         _write_points(out / "scans" / name, points_mm, "simulated range scan, mm, from the origin")
         poses[name] = site_from_scan.round(6).tolist()
         for target, place_mm in TARGETS_MM.items():
             towards = site_from_scan[:2, 3] @ np.array(place_mm)[:2]
             if towards > -0.25 * DISTANCE_MM * np.linalg.norm(place_mm[:2]):
-                seen = (np.array(place_mm) - site_from_scan[:3, 3]) @ site_from_scan[:3, :3]
-                seen = seen + random.normal(0.0, U_TARGET_MM, 3)
-                sightings.append(f"{name},{target},{','.join(f'{value:.3f}' for value in seen)},{U_TARGET_MM}")
+                seen_mm = (np.array(place_mm) - site_from_scan[:3, 3]) @ site_from_scan[:3, :3]
+                seen_mm = seen_mm + random.normal(0.0, U_TARGET_MM, 3)
+                sightings.append(f"{name},{target},{','.join(f'{value:.3f}' for value in seen_mm)},{U_TARGET_MM}")
     (out / "scans/targets.csv").write_text("\n".join(sightings) + "\n", encoding="utf-8")
     control = ["name,x,y,z,u_mm"]
     for target, place_mm in TARGETS_MM.items():
-        known = np.array(place_mm) + random.normal(0.0, U_CONTROL_MM, 3)
-        control.append(f"{target},{','.join(f'{value:.2f}' for value in known)},{U_CONTROL_MM}")
+        known_mm = np.array(place_mm) + random.normal(0.0, U_CONTROL_MM, 3)
+        control.append(f"{target},{','.join(f'{value:.2f}' for value in known_mm)},{U_CONTROL_MM}")
     (out / "scans/control.csv").write_text("\n".join(control) + "\n", encoding="utf-8")
     (out / "truth/poses.json").write_text(json.dumps({"site_from_scan": poses}) + "\n", encoding="utf-8")
 
@@ -151,7 +151,7 @@ def _stand(azimuth_deg: float, height_deg: float, random: np.random.Generator) -
     return pose
 
 
-def _seen(mesh: trimesh.Trimesh, site_from_scan: Points, random: np.random.Generator) -> Points:
+def _scanned_points(mesh: trimesh.Trimesh, site_from_scan: Points, random: np.random.Generator) -> Points:
     """[n, 3] in the scanner's frame; no points at places that are seen flatter than 75 degrees."""
     reach = np.arange(-330.0, 330.0, SPACING_MM) / DISTANCE_MM
     x, y = np.meshgrid(reach, reach)
@@ -206,7 +206,7 @@ def part_of(places_mm: Points) -> NDArray[np.int64]:
 
 
 def _write_painted(body: Callable[[Field], Field], path: Path) -> None:
-    """What the page of `coupole restore pick` saves after somebody has painted all parts."""
+    """Write what the page of `coupole restore pick` saves after somebody has painted all parts."""
     vertices_mm, triangles = surface(PAINTED_MM, body)
     rows = part_of(vertices_mm[triangles].mean(axis=1))
     arrays = {"vertices_mm": (vertices_mm, "<f4"), "triangles": (triangles, "<u4"), "parts": (rows + 1, "u1")}
@@ -216,10 +216,10 @@ def _write_painted(body: Callable[[Field], Field], path: Path) -> None:
     path.write_text(json.dumps(document) + "\n", encoding="utf-8")
 
 
-def _take_pictures(walked: Path) -> None:
+def _take_pictures(case: Path) -> None:
     for lights in ("day", "candles"):
         path = ROOT / f"docs/pictures/statue-{lights}.png"
-        shutil.copyfile(walked / lights / "side-by-side-front.png", path)
+        shutil.copyfile(case / lights / "side-by-side-front.png", path)
         print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 

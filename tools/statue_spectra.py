@@ -96,7 +96,7 @@ def film(k: Array, s: Array, thickness_mm: float, ground: float) -> Array:
     return np.asarray((1.0 - ground * (a - b * coth)) / (a - ground + b * coth))
 
 
-def seen(inside: Array) -> Array:
+def reflectance_in_air(inside: Array) -> Array:
     """Reflectance in air, gloss excluded (Saunderson 1942)."""
     return np.asarray((1.0 - FACE) * (1.0 - INNER) * inside / (1.0 - INNER * inside))
 
@@ -117,7 +117,7 @@ def _write_library(folder: Path, random: np.random.Generator) -> None:
     for paint in SHAPE_OF:
         for number, strength in enumerate(np.geomspace(0.45, 2.2, 5), 1):
             q = strength * random.uniform(0.93, 1.07) * k_over_s(paint)
-            rows[f"{paint} {number}"] = seen(opaque(q, np.ones_like(q)))
+            rows[f"{paint} {number}"] = reflectance_in_air(opaque(q, np.ones_like(q)))
             classes[f"{paint} {number}"] = paint
     for number, (thickness_nm, bare) in enumerate(((60, 0.0), (90, 0.1), (120, 0.2), (160, 0.05), (200, 0.0)), 1):
         rows[f"gold leaf {number}"] = gold_leaf(thickness_nm, bare)
@@ -133,7 +133,9 @@ def _write_library(folder: Path, random: np.random.Generator) -> None:
 def _write_films(folder: Path, random: np.random.Generator) -> None:
     """Films on cards of black and white, one file for `coupole layer` for each paint."""
     for ground, inside in (("black", CARD_BLACK), ("white", CARD_WHITE)):
-        _write_spectrum(folder / f"card-{ground}.csv", seen(np.full(len(NM), inside)), U_FILM, random)
+        _write_spectrum(
+            folder / f"card-{ground}.csv", reflectance_in_air(np.full(len(NM), inside)), U_FILM, random
+        )
     for paint in SCATTERING_PER_MM:
         k, s = coefficients(paint)
         thickness_um = THICKNESS_UM[paint]
@@ -141,7 +143,7 @@ def _write_films(folder: Path, random: np.random.Generator) -> None:
         lines = [f"name: {paint}", f"noise: {U_FILM}", f"binder_index: {BINDER_INDEX}", "films:"]
         for ground, inside in (("black", CARD_BLACK), ("white", CARD_WHITE)):
             name = f"{paint}-over-{ground}.csv"
-            _write_spectrum(folder / name, seen(film(k, s, thickness_mm, inside)), U_FILM, random)
+            _write_spectrum(folder / name, reflectance_in_air(film(k, s, thickness_mm, inside)), U_FILM, random)
             lines.append(
                 f"  - {{spectrum: {name}, over: card-{ground}.csv, thickness_um: {thickness_um:g}, "
                 f"u_thickness_um: {U_THICKNESS * thickness_um:.2g}}}"
@@ -152,7 +154,7 @@ def _write_films(folder: Path, random: np.random.Generator) -> None:
 def _write_spots(out: Path, random: np.random.Generator) -> None:
     for spot in SPOTS:
         k, s = (sum(share * coefficients(paint)[at] for paint, share in spot.shares.items()) for at in (0, 1))
-        values = seen(opaque(np.asarray(k), np.asarray(s)))
+        values = reflectance_in_air(opaque(np.asarray(k), np.asarray(s)))
         _write_spectrum(out / f"spectra/{spot.name}.csv", values, U_SPOT, random)
     _write_spectrum(out / "spectra/hair.csv", gold_leaf(110.0, 0.12), U_SPOT, random)
     # a synthetic dye of a later repair, which no class of the library is like

@@ -35,20 +35,23 @@ def example(
     try:
         case = _case(shipped_folder() / "examples", name)
         out = folder or Path(name)
-        new, kept, changed = _copy(case, out)
+        new_names, kept_names, changed_names = _copy(case, out)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
     missing = [library for library in _NEEDED if find_spec(library) is None]
     if as_json:
-        lists = {"new": new, "kept": kept, "changed": changed, "missing_libraries": missing}
-        print(json.dumps({"folder": str(out.resolve()), **lists, "simulated": True}))
+        file_lists = {"new": new_names, "kept": kept_names, "changed": changed_names}
+        missing_libraries = {"missing_libraries": missing, "simulated": True}
+        print(json.dumps({"folder": str(out.resolve()), **file_lists, **missing_libraries}))
         return
-    console.print(f"{out}: {len(new)} files, simulated; begin with README.txt", markup=False)
-    if kept:
-        console.print(f"{len(kept)} files were there already, and are kept", markup=False)
-    if changed:
-        console.print(f"not as they come (remove them to have them anew): {', '.join(changed)}", markup=False)
+    console.print(f"{out}: {len(new_names)} files, simulated; begin with README.txt", markup=False)
+    if kept_names:
+        console.print(f"{len(kept_names)} files were there already, and are kept", markup=False)
+    if changed_names:
+        console.print(
+            f"not as they come (remove them to have them anew): {', '.join(changed_names)}", markup=False
+        )
     if missing:
         console.print(f"some steps need {', '.join(missing)}: pip install 'coupole[bench]'", markup=False)
 
@@ -76,15 +79,17 @@ def _copy(case: Path, out: Path) -> tuple[list[str], list[str], list[str]]:
     is_begun = any((out / name).is_file() for name in names)
     if out.is_dir() and any(out.iterdir()) and not is_begun:
         raise InputError(f"{out}: holds other files; name a new folder for the example")
-    new, kept, changed = [], [], []
+    new_names: list[str] = []
+    kept_names: list[str] = []
+    changed_names: list[str] = []
     try:
         for path, name in zip(paths, names, strict=True):
             if (out / name).is_file():
-                (kept if (out / name).read_bytes() == path.read_bytes() else changed).append(name)
+                (kept_names if (out / name).read_bytes() == path.read_bytes() else changed_names).append(name)
                 continue
             (out / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, out / name)
-            new.append(name)
+            new_names.append(name)
     except OSError as error:
         raise StorageError(f"{out}: {reason(error)}. Choose another folder, or free space.") from error
-    return new, kept, changed
+    return new_names, kept_names, changed_names

@@ -27,18 +27,26 @@ if TYPE_CHECKING:
 _FEWER = 3
 """Numbers of paints shown: the chosen one, one less, two less."""
 
+PaletteOption = Annotated[
+    list[Path],
+    typer.Option(
+        "--palette",
+        help="Folder of paint files, a paint file, or a library of K and S; repeat for more.",
+        show_default=False,
+    ),
+]
+PaintOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--paint", help="Write the mixture as a paint file (NAME.paint.csv), for scenes and restorations."
+    ),
+]
+
 
 @flatten_options
 def recipe(
     target: Annotated[Path, typer.Argument(help="Spectrum of the colour to match.", show_default=False)],
-    palette: Annotated[
-        list[Path],
-        typer.Option(
-            "--palette",
-            help="Folder of paint files, a paint file, or a library of K and S; repeat for more.",
-            show_default=False,
-        ),
-    ],
+    palette: PaletteOption,
     light: Annotated[
         str, typer.Option("--light", help="Names of illuminants; the match is made under the first.")
     ] = "D65,A",
@@ -52,12 +60,7 @@ def recipe(
     instrument: Instrument,
     observer: Annotated[str, typer.Option(help="Standard observer: 10 deg or 2 deg.")] = "10 deg",
     out: Annotated[Path | None, typer.Option("--out", help="Write this page (HTML).")] = None,
-    paint: Annotated[
-        Path | None,
-        typer.Option(
-            "--paint", help="Write the mixture as a paint file (NAME.paint.csv), for scenes and restorations."
-        ),
-    ] = None,
+    paint: PaintOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find paints of a palette whose opaque mixture has a colour: shares, match under several lights, error with

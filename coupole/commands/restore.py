@@ -19,6 +19,18 @@ if TYPE_CHECKING:
 
 MeshArgument = Annotated[Path, typer.Argument(help="The mesh: PLY, OBJ, STL, GLB, glTF, OFF.", show_default=False)]
 UnitOption = Annotated[str, typer.Option("--unit", help="Unit of the mesh: mm, cm, m, um or in.")]
+HypothesisOption = Annotated[
+    list[str] | None,
+    typer.Option("--hypothesis", help="Render only this hypothesis; repeat for more.", show_default=False),
+]
+LightsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--lights",
+        help="Render under this set of the file's `other_lights`, in place of its `lights`.",
+        show_default=False,
+    ),
+]
 _JOB = "from"
 
 
@@ -50,18 +62,8 @@ def restore(
         typer.Option("--materials", help="Hypotheses with sources and materials (YAML).", show_default=False),
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder for pictures and report.", show_default=False)],
-    hypothesis: Annotated[
-        list[str] | None,
-        typer.Option("--hypothesis", help="Render only this hypothesis; repeat for more.", show_default=False),
-    ] = None,
-    lights: Annotated[
-        str | None,
-        typer.Option(
-            "--lights",
-            help="Render under this set of the file's `other_lights`, in place of its `lights`.",
-            show_default=False,
-        ),
-    ] = None,
+    hypothesis: HypothesisOption = None,
+    lights: LightsOption = None,
     unit: UnitOption = "mm",
     samples: Annotated[
         int | None,

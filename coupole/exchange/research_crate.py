@@ -123,7 +123,7 @@ def _source_facts(source: Path) -> dict[str, Any]:
         return {
             "kind": "result",
             "ended": timestamp,
-            "simulated": bool(about.get("simulated")),
+            "nature": _nature(is_simulated=bool(about.get("simulated"))),
             "software": about["software"],
             "inputs": {name: digest for files in runs.values() for name, digest in files.items()},
             "told": f"Reflectance of the surface of an object, from {', '.join(sorted(runs))}",
@@ -134,7 +134,7 @@ def _source_facts(source: Path) -> dict[str, Any]:
     return {
         "kind": "run",
         "ended": run.about["created"],
-        "simulated": run.is_simulated,
+        "nature": _nature(is_simulated=run.is_simulated),
         "software": {run.about["software"]["name"]: run.about["software"]["version"]},
         "inputs": {},
         "licence": run.about.get("licence"),
@@ -142,6 +142,10 @@ def _source_facts(source: Path) -> dict[str, Any]:
         f"the dome La Coupole; frames are proven by: {run.proof}",
         "devices": run.about.get("devices") or {},
     }
+
+
+def _nature(*, is_simulated: bool) -> str:
+    return "simulated, no real object or light" if is_simulated else "measured"
 
 
 def _restoration_facts(source: Path) -> dict[str, Any]:
@@ -155,7 +159,6 @@ def _restoration_facts(source: Path) -> dict[str, Any]:
     return {
         "kind": "restoration",
         "ended": timestamp.isoformat(timespec="seconds"),
-        "simulated": True,
         "nature": "computed, not measured",
         "software": {name: version},
         "inputs": {str(result["mesh"]["name"]): str(result["mesh"]["sha256_of_shape"])},
@@ -189,13 +192,11 @@ def _entities(
         for name, digest in source_facts["inputs"].items()
     ]
     terms = _licence(licence)
-    kind = "simulated, no real object or light" if source_facts["simulated"] else "measured"
-    kind = source_facts.get("nature", kind)
     root: Entity = {
         "@id": "./",
         "@type": "Dataset",
         "name": facts.name or source.resolve().name,
-        "description": f"{source_facts['told']} ({kind}).",
+        "description": f"{source_facts['told']} ({source_facts['nature']}).",
         "datePublished": datetime.now(UTC).date().isoformat(),
         "license": _to(terms),
         "author": _to_all(authors),

@@ -33,10 +33,10 @@ def write_mixture(path: Path, recipe: Recipe, palette: Sequence[Paint], binder_i
     unit: Unit = "per mm" if next(iter(paints.values())).unit == "per mm" else "relative"
     shares = np.array([recipe.shares[name] for name in paints])
     of_paints = list(paints.values())
-    k = _mixed([paint.absorption for paint in of_paints], shares)
-    s = _mixed([paint.scattering for paint in of_paints], shares)
-    u_k = np.sqrt(_mixed([paint.u_absorption**2 for paint in of_paints], shares**2))
-    u_s = np.sqrt(_mixed([paint.u_scattering**2 for paint in of_paints], shares**2))
+    k = _sum_by_share([paint.absorption for paint in of_paints], shares)
+    s = _sum_by_share([paint.scattering for paint in of_paints], shares)
+    u_k = np.sqrt(_sum_by_share([paint.u_absorption**2 for paint in of_paints], shares**2))
+    u_s = np.sqrt(_sum_by_share([paint.u_scattering**2 for paint in of_paints], shares**2))
     bands = np.isfinite(k) & np.isfinite(s) & np.isfinite(recipe.reflectance)
     head = {
         "mixed_for": colour,
@@ -55,12 +55,12 @@ def write_mixture(path: Path, recipe: Recipe, palette: Sequence[Paint], binder_i
 
 
 def _on_one_line(numbers: Mapping[str, float]) -> CommentedMap:
-    """As YAML in braces: lines of a paint file's head have no indentation."""
+    """Return numbers as YAML in braces: lines of a paint file's head have no indentation."""
     mapping = CommentedMap({name: round(number, 5) for name, number in numbers.items()})
     mapping.fa.set_flow_style()
     return mapping
 
 
-def _mixed(values: Sequence[Array], weights: Array) -> Array:
+def _sum_by_share(values: Sequence[Array], weights: Array) -> Array:
     """Sum [81] by weights; NaN where a paint is not known."""
     return np.asarray(np.sum([weight * value for weight, value in zip(weights, values, strict=True)], axis=0))

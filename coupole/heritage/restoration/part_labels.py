@@ -146,12 +146,12 @@ def _by_rule(mesh: PaintedMesh, rule: Rule, document: Document) -> tuple[list[st
             return list(picked_parts.names), picked_parts.parts[faces].astype(np.int64) - 1, ""
 
 
-def _expect_one_frame(mesh: PaintedMesh, picked: Picked, path: Path) -> None:
+def _expect_one_frame(mesh: PaintedMesh, picked_parts: Picked, path: Path) -> None:
     """Raise InputError if the painted mesh and this one lie in different places (another frame or unit)."""
     from scipy.spatial import cKDTree
 
-    step = max(1, len(picked.vertices_mm) // _TRIED)
-    away_mm = cKDTree(mesh.vertices_mm).query(picked.vertices_mm[::step])[0]
+    step = max(1, len(picked_parts.vertices_mm) // _TRIED)
+    away_mm = cKDTree(mesh.vertices_mm).query(picked_parts.vertices_mm[::step])[0]
     size_mm = float(np.linalg.norm(np.ptp(mesh.vertices_mm, axis=0)))
     far = float(np.mean(away_mm > _NEAR_SHARE * size_mm))
     if far > _MOST_FAR:

@@ -134,8 +134,8 @@ class RestorationFile(Model):
         names = [hypothesis.name for hypothesis in self.hypotheses]
         if len(set(names)) < len(names):
             raise ValueError("two hypotheses have the same name; their pictures would overwrite each other")
-        sets = [other.name for other in self.other_lights]
-        if len(set(sets)) < len(sets):
+        set_names = [light_set.name for light_set in self.other_lights]
+        if len(set(set_names)) < len(set_names):
             raise ValueError("two of `other_lights` have the same name; nobody could tell them apart")
         if not self.outputs.xyz:
             raise ValueError("`outputs: {xyz: false}`: pictures are shown and compared by X, Y, Z; leave it out")
@@ -164,7 +164,7 @@ def read_restoration(path: Path) -> tuple[Document, RestorationFile]:
 
 @dataclass(frozen=True)
 class Choice:
-    """What of a restoration file is rendered, and how finely."""
+    """Part of a restoration file that is rendered, and its fineness."""
 
     hypotheses: tuple[str, ...] = ()
     """Names; none: all."""
@@ -182,10 +182,10 @@ def chosen_file(document: Document, restoration_file: RestorationFile, choice: C
         raise InputError(f"--step: expected 5, 10, 20 or 40, found {choice.step_nm}; choose one of them")
     changes: dict[str, Any] = {"other_lights": ()}
     if choice.lights:
-        by_name = {other.name: other.lights for other in restoration_file.other_lights}
+        by_name = {light_set.name: light_set.lights for light_set in restoration_file.other_lights}
         if choice.lights not in by_name:
-            known = ", ".join(by_name) or "none; name some as `other_lights`"
-            raise InputError(f"--lights {choice.lights}: expected one of those of {document.path}: {known}")
+            known_names = ", ".join(by_name) or "none; name some as `other_lights`"
+            raise InputError(f"--lights {choice.lights}: expected one of those of {document.path}: {known_names}")
         changes["lights"] = by_name[choice.lights]
     if choice.samples:
         changes["samples"] = choice.samples

@@ -53,9 +53,9 @@ class _Copies:
         """Return the path of a file's copy, as a scene in a folder of a hypothesis names it."""
         path = (self._folder / named_path).resolve()
         if path not in self._names:
-            taken = set(self._names.values())
-            stems = [path.name, *(f"{number}-{path.name}" for number in range(2, len(taken) + 3))]
-            self._names[path] = next(name for name in stems if name not in taken)
+            used_names = set(self._names.values())
+            stems = [path.name, *(f"{number}-{path.name}" for number in range(2, len(used_names) + 3))]
+            self._names[path] = next(name for name in stems if name not in used_names)
             (self._out / FILES).mkdir(exist_ok=True)
             copy = self._out / FILES / self._names[path]
             if not (copy.exists() and copy.samefile(path)):

@@ -7,6 +7,7 @@ surface is found by marching cubes (Lorensen and Cline 1987). Lengths are mm; z 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,26 +44,29 @@ def main() -> None:
     print(f"{options.out}: {len(triangles)} triangles, {options.out.stat().st_size / 1e6:.1f} MB")
 
 
-def surface(cell_mm: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices [n, 3] and triangles [m, 3], outwards counter-clockwise."""
+def whole(places: Field) -> Field:
+    """Distances in mm of places [..., 3] from the bust's surface, negative inside."""
+    parts = bodies(places)
+    head = _smooth_union(parts["skin"], parts["lips"], 2.5)
+    head = _smooth_union(head, parts["eyes"], 1.0)
+    head = _smooth_union(head, parts["hair"], 4.0)
+    robe = _smooth_union(_smooth_union(parts["tunic"], parts["mantle"], 5.0), parts["border"], 2.0)
+    with_crown = _smooth_union(_smooth_union(head, robe, 6.0), parts["crown"], 1.5)
+    return _smooth_union(with_crown, parts["pedestal"], 3.0)
+
+
+def surface(
+    cell_mm: float, body: Callable[[Field], Field] = whole
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices [n, 3] and triangles [m, 3] of a body, outwards counter-clockwise."""
     from skimage import measure
 
     marching_cubes: Any = measure.marching_cubes  # without types
     corners_mm = zip(LOW_MM.tolist(), HIGH_MM.tolist(), strict=True)
     axes = [np.arange(low, high, cell_mm, dtype=np.float32) for low, high in corners_mm]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    points, faces, _, _ = marching_cubes(_whole(grid), 0.0, spacing=(cell_mm,) * 3, gradient_direction="descent")
+    points, faces, _, _ = marching_cubes(body(grid), 0.0, spacing=(cell_mm,) * 3, gradient_direction="descent")
     return points.astype(float) + LOW_MM, faces.astype(np.int64)
-
-
-def _whole(places: Field) -> Field:
-    parts = bodies(places)
-    head = _smooth_union(parts["skin"], parts["lips"], 2.5)
-    head = _smooth_union(head, parts["eyes"], 1.0)
-    head = _smooth_union(head, parts["hair"], 4.0)
-    robe = _smooth_union(_smooth_union(parts["tunic"], parts["mantle"], 5.0), parts["border"], 2.0)
-    whole = _smooth_union(_smooth_union(head, robe, 6.0), parts["crown"], 1.5)
-    return _smooth_union(whole, parts["pedestal"], 3.0)
 
 
 def bodies(p: Field) -> dict[str, Field]:
@@ -73,12 +77,12 @@ def bodies(p: Field) -> dict[str, Field]:
     return {
         "pedestal": _pedestal(x, y, z),
         "mantle": _mantle(x, y, z, turn),
-        "tunic": np.maximum(_ellipsoid(p, (0, 2, 122), (98, 64, 98)), 46.0 - z)
+        "tunic": np.maximum(ellipsoid(p, (0, 2, 122), (98, 64, 98)), 46.0 - z)
         + 1.5 * np.cos(24.0 * turn) * _ramp(z, 215, 150),
         "border": _border(p, turn),
         "skin": _skin(p, side),
         "lips": _lips(p, side),
-        "eyes": _ellipsoid(side, (23, -66.5, 316), (12.5, 12.5, 10.0)),
+        "eyes": ellipsoid(side, (23, -66.5, 316), (12.5, 12.5, 10.0)),
         "hair": _hair(p, side),
         "crown": _crown(x, y, z),
     }
@@ -95,10 +99,10 @@ def _mantle(x: Field, y: Field, z: Field, turn: Field) -> Field:
     down = _ramp(z, 225, 60)
     folds = 6.5 * down * np.sin(13.0 * turn + 0.03 * z) + 3.0 * down * np.sin(29.0 * turn + 1.3 - 0.05 * z)
     side = np.stack([np.abs(x), y, z], axis=-1)
-    chest = _ellipsoid(side, (0, 8, 105), (128, 76, 92))
+    chest = ellipsoid(side, (0, 8, 105), (128, 76, 92))
     body = _smooth_union(chest, _segment(side, (18, 12, 186), (106, 14, 146), 36.0, 40.0), 30.0) + folds
     edge = np.abs(x) - (26.0 + 0.42 * np.maximum(200.0 - z, 0.0) + 4.0 * np.sin(0.09 * z))
-    open_mantle = _smooth_difference(body, np.maximum(edge, y + 20.0), 7.0)
+    open_mantle = smooth_difference(body, np.maximum(edge, y + 20.0), 7.0)
     return np.asarray(np.maximum(open_mantle, 46.0 - z))
 
 
@@ -109,19 +113,19 @@ def _border(p: Field, turn: Field) -> Field:
 
 
 def _skin(p: Field, side: Field) -> Field:
-    skull = _ellipsoid(p, (0, -8, 322), (58, 68, 70))
-    jaw = _ellipsoid(p, (0, -30, 283), (43, 45, 50))
+    skull = ellipsoid(p, (0, -8, 322), (58, 68, 70))
+    jaw = ellipsoid(p, (0, -30, 283), (43, 45, 50))
     head = _smooth_union(skull, jaw, 22.0)
-    head = _smooth_union(head, _ellipsoid(side, (28, -56, 291), (19, 18, 20)), 12.0)
-    head = _smooth_union(head, _ellipsoid(p, (0, -68, 246), (15, 11, 12)), 10.0)
-    head = _smooth_difference(head, _ellipsoid(side, (24, -84, 318), (15, 11, 10)), 8.0)
+    head = _smooth_union(head, ellipsoid(side, (28, -56, 291), (19, 18, 20)), 12.0)
+    head = _smooth_union(head, ellipsoid(p, (0, -68, 246), (15, 11, 12)), 10.0)
+    head = smooth_difference(head, ellipsoid(side, (24, -84, 318), (15, 11, 10)), 8.0)
     brow = _segment(side, (9, -77, 333), (40, -62, 331), 5.0, 4.0)
     head = _smooth_union(head, brow, 9.0)
     nose = _segment(p, (0, -74, 329), (0, -87, 293), 4.5, 6.8)
-    wings = _ellipsoid(side, (7.5, -78, 289), (6, 7.5, 5.5))
+    wings = ellipsoid(side, (7.5, -78, 289), (6, 7.5, 5.5))
     head = _smooth_union(_smooth_union(head, nose, 8.0), wings, 4.0)
-    lids = np.maximum(_ellipsoid(side, (23, -66.5, 316), (15.5, 14.6, 12.2)), 318.5 - p[..., 2])
-    lower = np.maximum(_ellipsoid(side, (23, -66.5, 316), (14.6, 13.6, 11.4)), p[..., 2] - 310.5)
+    lids = np.maximum(ellipsoid(side, (23, -66.5, 316), (15.5, 14.6, 12.2)), 318.5 - p[..., 2])
+    lower = np.maximum(ellipsoid(side, (23, -66.5, 316), (14.6, 13.6, 11.4)), p[..., 2] - 310.5)
     head = _smooth_union(_smooth_union(head, lids, 3.0), lower, 3.0)
     neck = _segment(p, (0, 4, 185), (0, -8, 280), 44.0, 40.0)
     return _smooth_union(head, neck, 12.0)
@@ -130,7 +134,7 @@ def _skin(p: Field, side: Field) -> Field:
 def _lips(p: Field, side: Field) -> Field:
     upper = _smooth_union(
         _segment(side, (4, -76.5, 272.5), (17, -68.5, 268), 4.2, 2.2),
-        _ellipsoid(p, (0, -77, 271), (5, 4, 3.2)),
+        ellipsoid(p, (0, -77, 271), (5, 4, 3.2)),
         3.0,
     )
     lower = _segment(side, (0, -75.5, 264.5), (14, -69, 266.5), 4.6, 2.4)
@@ -141,12 +145,12 @@ def _hair(p: Field, side: Field) -> Field:
     """A cap without the face, and locks that fall to the shoulders."""
     x, y, z = np.moveaxis(p, -1, 0)
     strands = 1.9 * np.sin(0.55 * np.abs(x) + 0.16 * z + 3.0 * np.sin(0.045 * z))
-    cap = _ellipsoid(p, (0, 2, 322), (69, 76, 76)) + strands
-    cap = _smooth_difference(cap, _ellipsoid(p, (0, -84, 298), (50, 62, 62)), 6.0)
+    cap = ellipsoid(p, (0, 2, 322), (69, 76, 76)) + strands
+    cap = smooth_difference(cap, ellipsoid(p, (0, -84, 298), (50, 62, 62)), 6.0)
     wave = np.sin(0.105 * z)
     shifted_side = side - np.stack([5.0 * wave, 7.0 * np.cos(0.105 * z), 0.0 * z], axis=-1)
     lock = _segment(shifted_side, (60, -14, 330), (74, -2, 232), 17.0, 19.0)
-    curl = _ellipsoid(side, (78, -8, 222), (22, 22, 19))
+    curl = ellipsoid(side, (78, -8, 222), (22, 22, 19))
     lock = _smooth_union(lock, curl, 10.0) + 2.3 * np.sin(0.5 * np.abs(x) - 0.42 * y + 0.3 * z)
     back = _segment(p, (0, 48, 320), (0, 58, 215), 44.0, 48.0) + strands
     return _smooth_union(_smooth_union(cap, lock, 7.0), back, 12.0)
@@ -170,7 +174,7 @@ def _crown(x: Field, y: Field, z: Field) -> Field:
 # -- distances and how they are joined ------------------------------------------------------------------------
 
 
-def _ellipsoid(p: Field, middle: tuple[float, float, float], radii: tuple[float, float, float]) -> Field:
+def ellipsoid(p: Field, middle: tuple[float, float, float], radii: tuple[float, float, float]) -> Field:
     """Near its surface a distance (Quilez, Distance functions)."""
     way = (p - np.array(middle, np.float32)) / np.array(radii, np.float32)
     share = np.linalg.norm(way, axis=-1)
@@ -193,7 +197,7 @@ def _smooth_union(a: Field, b: Field, round_mm: float) -> Field:
     return np.asarray(b + share * (a - b) - round_mm * share * (1.0 - share))
 
 
-def _smooth_difference(a: Field, b: Field, round_mm: float) -> Field:
+def smooth_difference(a: Field, b: Field, round_mm: float) -> Field:
     """Return the part of `a` that is not in `b`, with a rounded edge."""
     return -_smooth_union(-a, b, round_mm)
 

@@ -16,6 +16,7 @@ from PIL.PngImagePlugin import PngImageFile, PngInfo
 from coupole.appearance.render import studio
 from coupole.commands import restore
 from coupole.commands.render_scene import read_scene, render_scene
+from coupole.heritage.restoration.restoration_file import Choice
 from coupole.heritage.restoration.restoring import render_all
 from coupole.heritage.restoration.shown_hypotheses import show_all
 
@@ -37,7 +38,7 @@ QUICK = {
     "makie-box": (16, 360, 40),
 }
 """Samples, width in pixels, nm between bands."""
-BUST, BUST_QUICK = "restored-bust", (18, 400, None)
+BUST, BUST_QUICK = "restored-bust", Choice(samples=18, width_px=400)
 """Bust of configs/restorations/, for docs/pictures/gallery."""
 
 
@@ -64,9 +65,7 @@ def _bust() -> None:
     folder = ROOT / "configs" / "restorations"
     parts, hypotheses = folder / "bust-parts.yaml", folder / "bust.yaml"
     with tempfile.TemporaryDirectory() as out:
-        restoration = restore.checked_restoration(
-            folder / "bust.ply", parts, hypotheses, (), "mm", BUST_QUICK, _quiet
-        )
+        restoration = restore.checked_restoration(folder / "bust.ply", parts, hypotheses, BUST_QUICK, "mm", _quiet)
         show_all(restoration, render_all(restoration, Path(out), _quiet), Path(out), _quiet)
         picture = ROOT / "docs" / "pictures" / "gallery" / f"{BUST}.png"
         _smaller(Path(out) / "side-by-side-front.png", picture)

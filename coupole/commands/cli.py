@@ -53,6 +53,7 @@ GROUPS = {
         "meter": "running.meter",
         "acquire": "running.acquire",
         "demo": "demo.demo",
+        "example": "example.example",
     },
     "Cell": {
         "devices": "running.devices",

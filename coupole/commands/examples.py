@@ -19,6 +19,7 @@ EXAMPLES: dict[str, tuple[str, str]] = {
     "meter": ("meter first.yaml", "meter first.yaml --snr 50 --write metered.yaml"),
     "acquire": ("acquire first.yaml --reflectance", "acquire --resume RUN"),
     "demo": ("demo --open", "demo my-demo --short"),
+    "example": ("example statue", "example statue my-statue"),
     # cell
     "devices": ("devices --rig sim", "devices --rig my-cell.yaml --json"),
     "doctor": ("doctor --rig sim", "doctor --rig my-cell.yaml --seconds 60"),

@@ -23,7 +23,8 @@ ToOption = Annotated[
         "--to",
         help=f"Of runs: {', '.join(formats_of(Source.RUN))}. "
         f"Of results of runs: {', '.join(formats_of(Source.RESULT))}; "
-        f"of results of pictures: {', '.join(formats_of(Source.PICTURES))}.",
+        f"of results of pictures: {', '.join(formats_of(Source.PICTURES))}; "
+        f"of restorations: {', '.join(formats_of(Source.RESTORATION))}.",
         show_default=False,
         autocompletion=formats,
     ),

@@ -21,23 +21,32 @@ if TYPE_CHECKING:
     from coupole.appearance.matter.glossy_face import Face
     from coupole.appearance.spectra.light import Observer
     from coupole.heritage.analysis.colour_match import Match
+    from coupole.heritage.analysis.palette import Paint
     from coupole.heritage.analysis.recipe_search import Found, Recipe
 
 _FEWER = 3
 """Numbers of paints shown: the chosen one, one less, two less."""
 
+PaletteOption = Annotated[
+    list[Path],
+    typer.Option(
+        "--palette",
+        help="Folder of paint files, a paint file, or a library of K and S; repeat for more.",
+        show_default=False,
+    ),
+]
+PaintOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--paint", help="Write the mixture as a paint file (NAME.paint.csv), for scenes and restorations."
+    ),
+]
+
 
 @flatten_options
 def recipe(
     target: Annotated[Path, typer.Argument(help="Spectrum of the colour to match.", show_default=False)],
-    palette: Annotated[
-        list[Path],
-        typer.Option(
-            "--palette",
-            help="Folder of paint files, a paint file, or a library of K and S; repeat for more.",
-            show_default=False,
-        ),
-    ],
+    palette: PaletteOption,
     light: Annotated[
         str, typer.Option("--light", help="Names of illuminants; the match is made under the first.")
     ] = "D65,A",
@@ -51,25 +60,32 @@ def recipe(
     instrument: Instrument,
     observer: Annotated[str, typer.Option(help="Standard observer: 10 deg or 2 deg.")] = "10 deg",
     out: Annotated[Path | None, typer.Option("--out", help="Write this page (HTML).")] = None,
+    paint: PaintOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find paints of a palette whose opaque mixture has a colour: shares, match under several lights, error with
     one paint less.
     """
     from coupole.appearance.matter.glossy_face import face
+    from coupole.heritage.analysis.mixed_paint import expect_paint_name, write_mixture
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     try:
+        if paint is not None:
+            expect_paint_name(paint)
         names = [name.strip() for name in light.split(",") if name.strip()]
         if not names:
             raise InputError("--light: expected names of lights, such as D65,A; found none")
         geometry, seen_by = instrument.known_geometry(), _known_observer(observer)
         with console.status("mixing"):
-            search, matches = _search_recipes(
+            paints, search, matches = _search_recipes(
                 target, palette, names, at_most, noise, face(instrument.binder_index, geometry), seen_by
             )
         document = _document(search, matches)
+        if paint is not None:
+            write_mixture(paint, search.best, paints, instrument.binder_index, target.name)
+            document["paint"] = str(paint)
         if out is not None:
             _write(out, target.stem, search, matches)
             document["page"] = str(out)
@@ -80,8 +96,9 @@ def recipe(
         print(json.dumps(document))
     else:
         _say(search, matches, console)
-        if out is not None:
-            console.print(str(out), markup=False)
+        for path in (out, paint):
+            if path is not None:
+                console.print(str(path), markup=False)
 
 
 # -- helpers --------------------------------------------------------------------------------------------------
@@ -106,7 +123,7 @@ def _search_recipes(
     noise: float,
     face: Face,
     observer: Observer,
-) -> tuple[Found, list[tuple[Match, ...]]]:
+) -> tuple[tuple[Paint, ...], Found, list[tuple[Match, ...]]]:
     from coupole.heritage.analysis.colour_match import matches
     from coupole.heritage.analysis.layer_samples import spectrum_on_grid
     from coupole.heritage.analysis.palette import read_palette
@@ -117,7 +134,8 @@ def _search_recipes(
         search = find(spectrum_on_grid(target), paints, face, noise, at_most)
     except InputError as error:
         raise InputError(f"{target}: {error}" if str(target) not in str(error) else str(error)) from error
-    return search, [matches(search.target, mixture.reflectance, lights, observer) for mixture in search.recipes]
+    under_lights = [matches(search.target, mixture.reflectance, lights, observer) for mixture in search.recipes]
+    return paints, search, under_lights
 
 
 def _document(search: Found, matches: Sequence[Sequence[Match]]) -> dict[str, Any]:

@@ -71,7 +71,7 @@ def register(
     as_json: JsonOption = False,
 ) -> None:
     """Find the poses of scans from their overlaps, test them by loops, and merge the scans."""
-    from coupole.scan.registration.summary import about, remarks
+    from coupole.scan.registration.summary import about, frame_of_mesh, remarks
     from coupole.scan.scan import new_scan_folder
     from coupole.scripting import analyses
     from coupole.viewing import registration_page
@@ -98,7 +98,8 @@ def register(
         raise
     for remark in remarks(registration):
         console.print(remark)
-    console.print(f"[bold]{out}[/]: report.html, registration.json" + ("" if no_mesh else ", mesh.ply"))
+    of_mesh = "" if mesh is None else f", mesh.ply (frame: {frame_of_mesh(registration, mesh)})"
+    console.print(f"[bold]{out}[/]: report.html, registration.json{of_mesh}")
     if as_json:
         print(json.dumps(document))
 
@@ -128,8 +129,9 @@ def _merge_scans(
     from coupole.scan.registration.merging import default_cell_mm, merge
 
     scans = [registration.scans[k] for k in registration.placed_numbers]
-    poses = [registration.first_from_scan[k] for k in registration.placed_numbers]
-    return merge(scans, poses, unit, mesh_mm or default_cell_mm(scans), levels_mm, folder, say)
+    cell_mm = mesh_mm or default_cell_mm(scans)
+    poses = registration.merged_from_scan(cell_mm)
+    return merge(scans, poses, unit, cell_mm, levels_mm, folder, say)
 
 
 def _levels(text: str) -> list[float]:

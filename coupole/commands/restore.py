@@ -14,10 +14,23 @@ from coupole.errors import CoupoleError, InputError, StorageError, reason
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from coupole.heritage.restoration.restoration_file import Choice
     from coupole.heritage.restoration.restoring import Restoration, Say
 
 MeshArgument = Annotated[Path, typer.Argument(help="The mesh: PLY, OBJ, STL, GLB, glTF, OFF.", show_default=False)]
 UnitOption = Annotated[str, typer.Option("--unit", help="Unit of the mesh: mm, cm, m, um or in.")]
+HypothesisOption = Annotated[
+    list[str] | None,
+    typer.Option("--hypothesis", help="Render only this hypothesis; repeat for more.", show_default=False),
+]
+LightsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--lights",
+        help="Render under this set of the file's `other_lights`, in place of its `lights`.",
+        show_default=False,
+    ),
+]
 _JOB = "from"
 
 
@@ -49,10 +62,8 @@ def restore(
         typer.Option("--materials", help="Hypotheses with sources and materials (YAML).", show_default=False),
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder for pictures and report.", show_default=False)],
-    hypothesis: Annotated[
-        list[str] | None,
-        typer.Option("--hypothesis", help="Render only this hypothesis; repeat for more.", show_default=False),
-    ] = None,
+    hypothesis: HypothesisOption = None,
+    lights: LightsOption = None,
     unit: UnitOption = "mm",
     samples: Annotated[
         int | None,
@@ -71,7 +82,9 @@ def restore(
 
     Pictures that are there already with the same settings are not rendered again.
     """
+    from coupole.heritage.restoration.restoration_file import Choice
     from coupole.heritage.restoration.restoring import render_all
+    from coupole.heritage.restoration.scene_of_hypothesis import write_scenes
     from coupole.heritage.restoration.shown_hypotheses import show_all
     from coupole.heritage.result_pages import restoration_page
     from coupole.viewing.terminal import make_console, step_bars
@@ -81,11 +94,11 @@ def restore(
         if out.exists() and not out.is_dir():
             raise InputError(f"--out {out}: expected a folder, found a file; name another one")
         with step_bars(console) as say:
-            restoration = checked_restoration(
-                mesh, parts, materials, hypothesis or (), unit, (samples, width, step), say
-            )
+            choice = Choice(tuple(hypothesis or ()), lights, samples, width, step)
+            restoration = checked_restoration(mesh, parts, materials, choice, unit, say)
             pictures = render_all(restoration, out, say)
             result = show_all(restoration, pictures, out, say)
+            write_scenes(restoration, out)
             _write_page(restoration_page, result, out)
     except CoupoleError as error:
         fail(error, as_json=as_json)
@@ -100,9 +113,8 @@ def checked_restoration(
     mesh: Path,
     parts: Path,
     materials: Path,
-    names: tuple[str, ...] | list[str],
+    choice: Choice,
     unit: str,
-    reductions: tuple[int | None, int | None, int | None],
     say: Say,
 ) -> Restoration:
     """All that is asked for, checked. Raises InputError."""
@@ -111,8 +123,8 @@ def checked_restoration(
     from coupole.heritage.restoration.restoring import Restoration
 
     document, materials_file = restoration_file.read_restoration(materials)
-    materials_file = restoration_file.reduced_file(materials_file, *reductions)
-    hypotheses = restoration_file.chosen_hypotheses(document, materials_file, names)
+    materials_file = restoration_file.chosen_file(document, materials_file, choice)
+    hypotheses = restoration_file.chosen_hypotheses(document, materials_file, choice.hypotheses)
     rules_document, rules = parts_file.read_parts(parts)
     say("reading the mesh", 0, 2)
     painted_mesh = read_painted(mesh, unit)
@@ -120,7 +132,7 @@ def checked_restoration(
     labels = part_labels.parts_of(painted_mesh, rules_document, rules)
     say("reading the mesh", 2, 2)
     restoration_file.expect_parts(document, materials_file, labels.names, parts)
-    return Restoration(painted_mesh, labels, document, materials_file, hypotheses)
+    return Restoration(painted_mesh, labels, document, materials_file, hypotheses, choice.lights)
 
 
 @restore_app.command()
@@ -182,3 +194,7 @@ def _say(result: dict[str, Any], out: Path, console: Console) -> None:
         markup=False,
     )
     console.print(f"{out / 'report.html'}: {len(result['hypotheses'])} hypotheses", markup=False)
+    for hypothesis in result["hypotheses"]:
+        console.print(
+            f"{out / hypothesis['name'] / 'scene.yaml'}: for coupole show and coupole render", markup=False
+        )

@@ -178,6 +178,8 @@ def _look(source: Path, options: ShowOptions, say: Callable[[str, int, int], Non
             return with_environment(look_of_result(source, say, choice), options.environment, OF_RUNS)
     except (OSError, KeyError) as error:
         raise InputError(f"{source}: is damaged ({error}); make the result again into another folder") from error
+    if scenes := sorted(source.glob("*/scene.yaml")):
+        raise InputError(f"{source}: is a restoration; show one of its hypotheses, such as {scenes[0]}")
     raise InputError(f"{source}: holds no run or result (`coupole reflectance RUN --out FOLDER` makes one)")
 
 

@@ -20,6 +20,7 @@ class Source(Enum):
     RUN = "a run"
     RESULT = "a result"
     PICTURES = "a result of pictures"
+    RESTORATION = "a restoration"
 
 
 class Writer(Enum):
@@ -44,6 +45,8 @@ class Format:
     options: tuple[str, ...] = ()
 
 
+RESTORATION_RESULT = "result.json"
+"""File that only folders of `coupole restore` have."""
 MAPS = ("texel-mm", "map-px", "uv")
 """Options of formats with maps."""
 _RUN, _PICTURES_TOO = (Source.RUN,), (Source.RUN, Source.PICTURES)
@@ -83,7 +86,7 @@ _TABLE = (
         "rocrate",
         "the whole folder as a research crate (RO-Crate), with a licence",
         Writer.CRATE,
-        (Source.RUN, Source.RESULT),
+        (Source.RUN, Source.RESULT, Source.RESTORATION),
         _OF_A_CRATE,
     ),
 )
@@ -95,7 +98,9 @@ def source_of(folder: Path) -> Source:
     """Tell which kind of source a folder is, by the files that only one kind has."""
     if (folder / "object.h5").exists():
         return Source.RESULT
-    return Source.PICTURES if (folder / "normals.npy").exists() else Source.RUN
+    if (folder / "normals.npy").exists():
+        return Source.PICTURES
+    return Source.RESTORATION if (folder / RESTORATION_RESULT).exists() else Source.RUN
 
 
 def formats_of(source: Source, writer: Writer | None = None) -> list[str]:

@@ -16,7 +16,9 @@ from typing import Any
 from urllib.parse import quote
 
 from coupole.errors import InputError
+from coupole.exchange.formats import RESTORATION_RESULT, Source, source_of
 from coupole.exchange.target_folder import writing_into
+from coupole.intake.plain_data import read_json
 from coupole.reflectance.run_result import ABOUT, read_about
 from coupole.storage.durable import sha256, write_synced
 from coupole.storage.run import Run
@@ -32,6 +34,11 @@ _TOLD = {
     ".jsonl": "application/jsonl",
     ".ply": "application/octet-stream",
     ".sha256": "text/plain",
+}
+_ACTIONS = {
+    "run": "acquisition",
+    "result": "measurement of reflectance",
+    "restoration": "virtual restoration",
 }
 Entity = dict[str, Any]
 
@@ -107,6 +114,8 @@ def write_crate(
 
 def _source_facts(source: Path) -> dict[str, Any]:
     """Kind, time, software and inputs of the source."""
+    if source_of(source) is Source.RESTORATION:
+        return _restoration_facts(source)
     if (source / ABOUT).exists():
         about = read_about(source)
         timestamp = datetime.fromtimestamp((source / ABOUT).stat().st_mtime, UTC).isoformat(timespec="seconds")
@@ -114,7 +123,7 @@ def _source_facts(source: Path) -> dict[str, Any]:
         return {
             "kind": "result",
             "ended": timestamp,
-            "simulated": bool(about.get("simulated")),
+            "nature": _nature(is_simulated=bool(about.get("simulated"))),
             "software": about["software"],
             "inputs": {name: digest for files in runs.values() for name, digest in files.items()},
             "told": f"Reflectance of the surface of an object, from {', '.join(sorted(runs))}",
@@ -125,13 +134,35 @@ def _source_facts(source: Path) -> dict[str, Any]:
     return {
         "kind": "run",
         "ended": run.about["created"],
-        "simulated": run.is_simulated,
+        "nature": _nature(is_simulated=run.is_simulated),
         "software": {run.about["software"]["name"]: run.about["software"]["version"]},
         "inputs": {},
         "licence": run.about.get("licence"),
         "told": f"Photographs of {run.about.get('object') or 'an object without a name'} under single lights of "
         f"the dome La Coupole; frames are proven by: {run.proof}",
         "devices": run.about.get("devices") or {},
+    }
+
+
+def _nature(*, is_simulated: bool) -> str:
+    return "simulated, no real object or light" if is_simulated else "measured"
+
+
+def _restoration_facts(source: Path) -> dict[str, Any]:
+    """Raises InputError if its result.json is none of `coupole restore`."""
+    result = read_json(source / RESTORATION_RESULT, allow_nan=True)
+    if not isinstance(result, dict) or not {"restoration", "hypotheses", "software", "mesh"} <= result.keys():
+        raise InputError(f"{source / RESTORATION_RESULT}: expected what `coupole restore` writes; restore again")
+    name, _, version = str(result["software"]).partition(" ")
+    titles = "; ".join(str(hypothesis["title"]) for hypothesis in result["hypotheses"])
+    timestamp = datetime.fromtimestamp((source / RESTORATION_RESULT).stat().st_mtime, UTC)
+    return {
+        "kind": "restoration",
+        "ended": timestamp.isoformat(timespec="seconds"),
+        "nature": "computed, not measured",
+        "software": {name: version},
+        "inputs": {str(result["mesh"]["name"]): str(result["mesh"]["sha256_of_shape"])},
+        "told": f"Hypotheses of how {result['restoration']} may have looked: {titles}",
     }
 
 
@@ -161,12 +192,11 @@ def _entities(
         for name, digest in source_facts["inputs"].items()
     ]
     terms = _licence(licence)
-    kind = "simulated, no real object or light" if source_facts["simulated"] else "measured"
     root: Entity = {
         "@id": "./",
         "@type": "Dataset",
         "name": facts.name or source.resolve().name,
-        "description": f"{source_facts['told']} ({kind}).",
+        "description": f"{source_facts['told']} ({source_facts['nature']}).",
         "datePublished": datetime.now(UTC).date().isoformat(),
         "license": _to(terms),
         "author": _to_all(authors),
@@ -188,8 +218,8 @@ def _entities(
     action: Entity = {
         "@id": "#made",
         "@type": "CreateAction",
-        "name": "acquisition" if source_facts["kind"] == "run" else "measurement of reflectance",
-        "endTime" if source_facts["kind"] == "result" else "startTime": source_facts["ended"],
+        "name": _ACTIONS[source_facts["kind"]],
+        "startTime" if source_facts["kind"] == "run" else "endTime": source_facts["ended"],
         "result": {"@id": "./"},
     }
     devices = [

@@ -18,7 +18,7 @@ from coupole.scan.mesh_ply import read_ply
 from coupole.scan.registration.merging import Merged
 from coupole.scan.registration.registering import Registration
 from coupole.scan.registration.small_motions import moved_points
-from coupole.scan.registration.summary import point_uncertainty_mm, remarks, worst_loop_mm
+from coupole.scan.registration.summary import frame_of_mesh, point_uncertainty_mm, remarks, worst_loop_mm
 from coupole.viewing.view_canvas import Canvas, Lookout, seen_faces
 from coupole.viewing.view_solids import Points, Solid, with_fewer_faces
 
@@ -49,7 +49,7 @@ def write(registration: Registration, merged_mesh: Merged | None, folder: Path, 
             _scans(registration),
             _loops(registration),
             Section("targets", "Targets", tables=[_targets(registration)]),
-            Section("files", "Files", tables=[_files(merged_mesh)]),
+            Section("files", "Files", tables=[_files(registration, merged_mesh)]),
         ],
     )
     (folder / REPORT).write_text(render(page), encoding="utf-8")
@@ -71,7 +71,7 @@ def _next_step(registration: Registration, merged_mesh: Merged | None, name: str
 
 
 def _pictures(registration: Registration, merged_mesh: Merged | None, folder: Path) -> list[Picture]:
-    points, colours = _scan_points(registration)
+    points, colours = _scan_points(registration, merged_mesh)
     scans = picture_of(
         sheet_of_sides(points, lambda canvas: canvas.dots(points, colours, 1.5)),
         "Each scan in its place in a colour of its own, from three sides",
@@ -92,11 +92,16 @@ def picture_of(sheet: Any, title: str) -> Picture:
     return Picture(title, buffer.getvalue(), is_broad=True)
 
 
-def _scan_points(registration: Registration) -> tuple[Points, Points]:
-    """The scans' coarse points [n, 3], mm, in the first scan's frame, and their colours, one for each scan."""
+def _scan_points(registration: Registration, merged_mesh: Merged | None) -> tuple[Points, Points]:
+    """The scans' coarse points [n, 3], mm, in the frame of the mesh, else of the first scan, and their colours,
+    one for each scan."""
+    if merged_mesh is None:
+        poses = [registration.first_from_scan[k] for k in registration.placed_numbers]
+    else:
+        poses = registration.merged_from_scan(merged_mesh.cell_mm)
     clouds = [
-        moved_points(registration.first_from_scan[k], registration.scans[k].coarse.points_mm)
-        for k in registration.placed_numbers
+        moved_points(pose, registration.scans[k].coarse.points_mm)
+        for k, pose in zip(registration.placed_numbers, poses, strict=True)
     ]
     colours = [np.tile(_hue(k / len(clouds)), (len(cloud), 1)) for k, cloud in enumerate(clouds)]
     points, colour = np.concatenate(clouds), np.concatenate(colours)
@@ -158,10 +163,11 @@ def _hue(share: float) -> NDArray[np.float64]:
     return np.asarray(0.5 + 0.35 * np.cos(thirds))
 
 
-def _files(merged_mesh: Merged | None) -> Table:
+def _files(registration: Registration, merged_mesh: Merged | None) -> Table:
     rows: list[Sequence[Inline]] = [(Link("registration.json"), "poses with covariances, loops, rejected pairs")]
     if merged_mesh is not None:
-        cells = f"{merged_mesh.triangles:,} triangles, from cells of {merged_mesh.cell_mm:.3g} mm"
+        frame = frame_of_mesh(registration, merged_mesh)
+        cells = f"{merged_mesh.triangles:,} triangles, from cells of {merged_mesh.cell_mm:.3g} mm; frame: {frame}"
         rows.append((Link("mesh.ply"), cells))
         rows += [(Link(name), f"{count:,} points") for name, count in merged_mesh.levels.items()]
     return Table("Files", ("file", "holds"), rows)

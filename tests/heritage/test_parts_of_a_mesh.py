@@ -21,7 +21,12 @@ from coupole.errors import InputError
 from coupole.heritage.restoration.painted_mesh import read_painted
 from coupole.heritage.restoration.part_labels import Parts, parts_of
 from coupole.heritage.restoration.parts_file import read_parts
-from coupole.heritage.restoration.restoration_file import read_restoration
+from coupole.heritage.restoration.restoration_file import (
+    Choice,
+    RestorationFile,
+    chosen_file,
+    read_restoration,
+)
 from coupole.heritage.restoration.restoring import Restoration
 from coupole.heritage.restoration.seen_parts import SeenParts
 
@@ -104,9 +109,8 @@ def restoration(folder: Path, text: str, *names: str) -> Restoration:
     mesh = plate_ply(folder / "plate.ply")
     (folder / "parts.yaml").write_text(PARTS)
     (folder / "r.yaml").write_text(text)
-    nothing = (None, None, None)
     return checked_restoration(
-        mesh, folder / "parts.yaml", folder / "r.yaml", names, "mm", nothing, lambda *_: None
+        mesh, folder / "parts.yaml", folder / "r.yaml", Choice(names), "mm", lambda *_: None
     )
 
 
@@ -191,9 +195,8 @@ def test_shipped_restorations_are_whole() -> None:
         folder / "bust.ply",
         folder / "bust-parts.yaml",
         document.path,
-        (),
+        Choice(),
         "mm",
-        (None, None, None),
         lambda *_: None,
     )
     assert len(wanted.hypotheses) == len(given.hypotheses) == 3
@@ -227,3 +230,21 @@ def test_a_triangle_takes_the_part_of_two_of_its_corners_or_the_first_that_is_kn
     mixed.export(tmp_path / "mixed.ply")
     parts = found(tmp_path / "mixed.ply", PARTS, tmp_path)
     assert [parts.names[label] for label in parts.labels] == ["right", "right", "left"]
+
+
+def test_parts_that_were_painted_on_a_mesh_elsewhere_are_refused(tmp_path: Path) -> None:
+    points, triangles = grid()
+    moved = np.add(points, (300.0, 0.0, 0.0))
+    path = picked(tmp_path / "parts.json", moved, triangles, [1] * (len(triangles) - 1) + [2])
+    with pytest.raises(InputError, match="painted on a mesh that lies elsewhere: 100 % of it"):
+        parts_of(read_painted(plate_ply(tmp_path / "plate.ply")), *read_parts(path))
+
+
+def test_other_lights_are_taken_by_their_name(tmp_path: Path) -> None:
+    candle = "{kind: environment, luminance_cd_m2: 5, spectrum: {kind: illuminant, name: A}}"
+    text = f"{RESTORATION}other_lights:\n  - {{name: candles, lights: [{candle}]}}\n"
+    document = restoration(tmp_path, text).document
+    asked = chosen_file(document, document.validate(RestorationFile), Choice(lights="candles"))
+    assert [light.luminance_cd_m2 for light in asked.lights if light.kind == "environment"] == [5.0]
+    with pytest.raises(InputError, match=r"--lights sun: expected one of those of .*: candles"):
+        chosen_file(document, document.validate(RestorationFile), Choice(lights="sun"))

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cells
 import numpy as np
 import pytest
 from lazily import lazily
@@ -13,6 +14,7 @@ from painted_films import in_air
 from places import REPO
 
 from coupole.appearance.matter.glossy_face import face
+from coupole.appearance.matter.paint_file import read_paint
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM
 from coupole.commands import cli
 from coupole.errors import InputError
@@ -246,3 +248,35 @@ def test_the_command_tells_shares_lights_costs_and_draws_them(
     assert (code, "moonlight" in err) == (2, True)
     code, _, err = run("--geometry", "d:8")
     assert (code, "--geometry: expected" in err) == (2, True)
+
+
+def test_the_mixture_is_a_paint_that_looks_as_the_recipe(tmp_path: Path) -> None:
+    """Its K and S are sums by share; opaque under the binder's face it is the target."""
+    library(tmp_path, list(paints()))
+    rows = "\n".join(f"{nm};{value:.6f}" for nm, value in zip(NM, target(SHARES), strict=True))
+    (tmp_path / "sleeve.csv").write_text(f"nm;reflectance\n{rows}\n")
+    arguments = (
+        "recipe",
+        tmp_path / "sleeve.csv",
+        "--palette",
+        tmp_path / "paints.rs",
+        "--noise",
+        "0.002",
+        "--json",
+    )
+
+    ended = cells.here(*arguments, "--paint", tmp_path / "mixed/sleeve.paint.csv")
+
+    assert ended.code == 0, ended.err
+    told = json.loads(ended.out)
+    mixture = read_paint(tmp_path / "mixed/sleeve.paint.csv")
+    assert (mixture.name, mixture.unit) == ("sleeve", "relative")
+    assert dict(mixture.head_lines["shares"]) == pytest.approx(
+        told["recipes"][told["chosen"] - 1]["shares"], abs=1e-5
+    )
+    at = np.searchsorted(mixture.wavelengths_nm, NM)
+    seen = opaque_in_air(mixture.absorption[at], mixture.scattering[at])
+    assert np.abs(seen - target(SHARES)).max() < 4.0 * NOISE
+    refused = cells.here(*arguments, "--paint", tmp_path / "sleeve.txt")
+    assert refused.code == 2
+    assert ".paint.csv" in refused.out + refused.err

@@ -8,6 +8,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import cells
 import numpy as np
 import OpenEXR
 import pytest
@@ -122,3 +123,33 @@ def test_pictures_that_are_there_are_not_rendered_again(restored: Restored, tmp_
     found = again.run("--hypothesis", "dark")
     assert (found["made_anew"], found["taken_as_they_were"], len(found["hypotheses"])) == (1, 0, 1)
     assert np.median(again.exr("dark")[1][4:12, 3:7] / restored.exr("dark")[1][4:12, 3:7]) == pytest.approx(1.5)
+
+
+def test_each_hypothesis_is_a_scene_that_can_be_moved_rendered_and_shown(
+    restored: Restored, tmp_path: Path
+) -> None:
+    shutil.copytree(restored.out, tmp_path / "elsewhere")
+    scene = tmp_path / "elsewhere/light/scene.yaml"
+    rendered = cells.here("render", scene, "--out", tmp_path / "rendered", "--json")
+    assert rendered.code == 0, rendered.err
+    with OpenEXR.File(str(tmp_path / "rendered/plate-light-front.exr"), separate_channels=True) as file:
+        names = sorted(name for name in file.channels() if name.startswith("S0."))
+        radiance = np.stack([np.array(file.channels()[name].pixels) for name in names], axis=-1)
+    assert np.allclose(radiance[:, : PX // 2], restored.exr("light")[1][:, : PX // 2], rtol=0.02)
+    shown = cells.here("show", scene, "--out", tmp_path / "page.html", "--json")
+    assert shown.code == 0, shown.err
+    assert "diffuse" in " ".join(json.loads(shown.out)["about"]["materials"])
+    refused = cells.here("show", tmp_path / "elsewhere", "--out", tmp_path / "no.html")
+    assert refused.code == 2
+    assert "dark/scene.yaml" in (refused.out + refused.err).replace("\n", "")
+
+
+def test_a_restoration_is_exported_as_a_crate_that_says_it_is_computed(restored: Restored, tmp_path: Path) -> None:
+    words = ("--licence", "CC BY 4.0", "--author", "A. Person", "--out", tmp_path / "crate")
+    ended = cells.here("export", restored.out, "--to", "rocrate", *words)
+    assert ended.code == 0, ended.err
+    graph = json.loads((tmp_path / "crate/ro-crate-metadata.json").read_text())["@graph"]
+    (root,) = [entity for entity in graph if entity["@id"] == "./"]
+    assert "A light left half" in root["description"]
+    assert "computed, not measured" in root["description"]
+    assert (tmp_path / "crate/data/light/scene.yaml").is_file()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from ray_scanner import RayScan, RayScanner, tower
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from coupole.commands import cli
 from coupole.errors import InputError
 from coupole.scan.mesh_defects import find_defects
 from coupole.scan.mesh_files import read_mesh
@@ -22,6 +24,7 @@ from coupole.scan.registration.joining import join
 from coupole.scan.registration.merging import Merged, merge
 from coupole.scan.registration.pair_matching import PairMotion
 from coupole.scan.registration.registering import Registration, register
+from coupole.scan.registration.small_motions import moved_points
 from coupole.scan.registration.summary import about
 from coupole.scan.registration.viewpoint import DepthPicture, Viewpoint, choose_viewpoints, folds
 
@@ -175,6 +178,41 @@ def test_control_points_place_the_scans_in_the_site(surveyed: Surveyed, tmp_path
         site_from_scan = found.site_from_first @ found.first_from_scan[number]
         points = surveyed.scans[name].points_mm
         assert off_mm(site_from_scan, surveyed.scans[name].world_from_scan, points) < 1.0
+    merged_from_scan = found.merged_from_scan(cell_mm=3.0)
+    assert np.allclose(merged_from_scan[0], found.site_from_first @ found.first_from_scan[0])
+    national_grid = found.site_from_first.copy()
+    national_grid[:3, 3] += 5e8  # 32 bits are 32 mm there
+    far = replace(found, site_from_first=national_grid)
+    assert np.allclose(far.merged_from_scan(cell_mm=3.0)[0], found.first_from_scan[0])
+
+
+def test_with_control_points_the_command_writes_the_mesh_in_their_frame(
+    surveyed: Surveyed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spheres = {"s1": (900.0, 0.0, -300.0), "s2": (600.0, 700.0, 100.0), "s3": (100.0, 950.0, 400.0)}
+    lines = ["scan,name,x,y,z,u_mm"]
+    for name in ("side0.ply", "side1.ply"):
+        scan_from_world = np.linalg.inv(surveyed.scans[name].world_from_scan)
+        for sphere, place in spheres.items():
+            x, y, z = scan_from_world[:3, :3] @ place + scan_from_world[:3, 3]
+            lines.append(f"{name},{sphere},{x},{y},{z},0.2")
+    (tmp_path / "targets.csv").write_text("\n".join(lines))
+    known = [f"{sphere},{x + 2000},{y},{z},0.1" for sphere, (x, y, z) in spheres.items()]
+    (tmp_path / "control.csv").write_text("\n".join(known))
+    monkeypatch.chdir(tmp_path)
+    scans = [str(surveyed.folder / f"side{k}.ply") for k in range(2)]
+    tables = ["--targets", "targets.csv", "--control", "control.csv", "--mesh-mm", "16", "--out", "on-site"]
+    monkeypatch.setattr(sys, "argv", ["coupole", "register", *scans, *tables])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 0
+    assert "frame: site" in capsys.readouterr().err.replace("\n", " ")
+    assert json.loads((tmp_path / "on-site/registration.json").read_text())["mesh"]["frame"] == "site"
+    mesh = trimesh.load(tmp_path / "on-site/mesh.ply")
+    of_sides = [surveyed.scans[f"side{k}.ply"] for k in range(2)]
+    world = np.concatenate([moved_points(scan.world_from_scan, scan.points_mm) for scan in of_sides])
+    nearest = cKDTree(np.add(world, (2000.0, 0.0, 0.0))).query(mesh.vertices)[0]
+    assert np.median(nearest) < 10.0
 
 
 def test_a_view_along_an_axis_is_told_from_one_out_of_the_origin() -> None:

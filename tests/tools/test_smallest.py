@@ -108,7 +108,14 @@ TESTED_ELSEWHERE = {
 }
 """Tools that another test runs, and that test; the last of `bench_console.py` is a bench's own process."""
 
-MAKE_PICTURES = {"make_bust.py", "make_gallery.py", "make_pictures.py", "make_renderings.py"}
+MAKE_PICTURES = {
+    "make_bust.py",
+    "make_gallery.py",
+    "make_pictures.py",
+    "make_renderings.py",
+    "make_statue_case.py",
+    "statue_spectra.py",
+}
 """They write what the docs show, in minutes, and measure nothing."""
 
 

@@ -17,6 +17,7 @@ from coupole.heritage.restoration.parts_file import (
     Box,
     HalfSpace,
     PartsFile,
+    Picked,
     PickedFile,
     Rule,
     Texture,
@@ -28,6 +29,10 @@ from coupole.plan.yamlfile import Document
 Labels = NDArray[np.int16]
 NONE = -1
 _SHOWN = 5
+_TRIED = 2000
+"""Number of points of a painted mesh by which its frame is tried."""
+_NEAR_SHARE, _MOST_FAR = 0.05, 0.5
+"""Share of the mesh's size within which a painted mesh lies on it; share of the points that may lie farther."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,10 +139,27 @@ def _by_rule(mesh: PaintedMesh, rule: Rule, document: Document) -> tuple[list[st
             return [rule.part], np.where(beyond, 0, NONE), ""
         case PickedFile():
             picked_parts = read_picked(document.resolve(rule.path))
+            _expect_one_frame(mesh, picked_parts, document.resolve(rule.path))
             faces = nearest_faces(
                 mesh, picked_parts.vertices_mm.astype(np.float64), picked_parts.triangles.astype(np.int64)
             )
             return list(picked_parts.names), picked_parts.parts[faces].astype(np.int64) - 1, ""
+
+
+def _expect_one_frame(mesh: PaintedMesh, picked_parts: Picked, path: Path) -> None:
+    """Raise InputError if the painted mesh and this one lie in different places (another frame or unit)."""
+    from scipy.spatial import cKDTree
+
+    step = max(1, len(picked_parts.vertices_mm) // _TRIED)
+    away_mm = cKDTree(mesh.vertices_mm).query(picked_parts.vertices_mm[::step])[0]
+    size_mm = float(np.linalg.norm(np.ptp(mesh.vertices_mm, axis=0)))
+    far = float(np.mean(away_mm > _NEAR_SHARE * size_mm))
+    if far > _MOST_FAR:
+        raise InputError(
+            f"{path}: was painted on a mesh that lies elsewhere: {100 * far:.0f} % of it is more than "
+            f"{_NEAR_SHARE * size_mm:.3g} mm from {mesh.path}. Both must be in one frame and one unit: register "
+            "the scans with --control, see to --unit, or paint this mesh"
+        )
 
 
 def _by_colour(srgb: NDArray[np.uint8], table: dict[str, str], tolerance: float) -> tuple[NDArray[np.int64], str]:

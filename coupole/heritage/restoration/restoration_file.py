@@ -7,6 +7,7 @@ Lengths are mm, angles degrees; z is up in the scene, and the object's front loo
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -96,6 +97,13 @@ class Auto(Model):
 Views = Literal["auto"] | Annotated[Turntable | Cameras | Auto, Field(discriminator="kind")]
 
 
+class OtherLights(Model):
+    """Lights that may be taken in place of `lights`."""
+
+    name: Name
+    lights: Annotated[tuple[Light, ...], Field(min_length=1)]
+
+
 class RestorationFile(Model):
     schema_version: Literal[1]
     name: Name
@@ -107,6 +115,8 @@ class RestorationFile(Model):
     views: Views = "auto"
     """`auto` alone is its kind with nothing else."""
     lights: Annotated[tuple[Light, ...], Field(min_length=1)]
+    other_lights: tuple[OtherLights, ...] = ()
+    """The same hypotheses under other lights, each set by its name."""
     surroundings: tuple[Object, ...] = ()
     """Other things of the scene: a floor, a niche."""
     observer: Literal["10 deg", "2 deg"] = "10 deg"
@@ -124,6 +134,9 @@ class RestorationFile(Model):
         names = [hypothesis.name for hypothesis in self.hypotheses]
         if len(set(names)) < len(names):
             raise ValueError("two hypotheses have the same name; their pictures would overwrite each other")
+        set_names = [light_set.name for light_set in self.other_lights]
+        if len(set(set_names)) < len(set_names):
+            raise ValueError("two of `other_lights` have the same name; nobody could tell them apart")
         if not self.outputs.xyz:
             raise ValueError("`outputs: {xyz: false}`: pictures are shown and compared by X, Y, Z; leave it out")
         return self
@@ -149,20 +162,37 @@ def read_restoration(path: Path) -> tuple[Document, RestorationFile]:
     return document, restoration
 
 
-def reduced_file(
-    restoration_file: RestorationFile, samples: int | None, width_px: int | None, step_nm: int | None
-) -> RestorationFile:
-    """Return the file with fewer samples, narrower pictures or coarser bands, for a quick look. Raises InputError
-    for a step other than 5, 10, 20 or 40 nm."""
-    if step_nm not in {None, 5, 10, 20, 40}:
-        raise InputError(f"--step: expected 5, 10, 20 or 40, found {step_nm}; choose one of them")
-    changes: dict[str, Any] = {}
-    if samples:
-        changes["samples"] = samples
-    if step_nm:
-        changes["bands"] = Bands.model_validate({"step_nm": step_nm})
-    if width_px:
-        changes["views"] = _narrowed_views(_in_full(restoration_file.views), width_px)
+@dataclass(frozen=True)
+class Choice:
+    """Part of a restoration file that is rendered, and its fineness."""
+
+    hypotheses: tuple[str, ...] = ()
+    """Names; none: all."""
+    lights: str | None = None
+    """Name of a set of `other_lights`."""
+    samples: int | None = None
+    width_px: int | None = None
+    step_nm: int | None = None
+
+
+def chosen_file(document: Document, restoration_file: RestorationFile, choice: Choice) -> RestorationFile:
+    """Return the file with the chosen lights, and fewer samples, narrower pictures or coarser bands, for a quick
+    look. Raises InputError for unknown lights, and for a step other than 5, 10, 20 or 40 nm."""
+    if choice.step_nm not in {None, 5, 10, 20, 40}:
+        raise InputError(f"--step: expected 5, 10, 20 or 40, found {choice.step_nm}; choose one of them")
+    changes: dict[str, Any] = {"other_lights": ()}
+    if choice.lights:
+        by_name = {light_set.name: light_set.lights for light_set in restoration_file.other_lights}
+        if choice.lights not in by_name:
+            known_names = ", ".join(by_name) or "none; name some as `other_lights`"
+            raise InputError(f"--lights {choice.lights}: expected one of those of {document.path}: {known_names}")
+        changes["lights"] = by_name[choice.lights]
+    if choice.samples:
+        changes["samples"] = choice.samples
+    if choice.step_nm:
+        changes["bands"] = Bands.model_validate({"step_nm": choice.step_nm})
+    if choice.width_px:
+        changes["views"] = _narrowed_views(_in_full(restoration_file.views), choice.width_px)
     return restoration_file.model_copy(update=changes)
 
 

@@ -47,6 +47,8 @@ class Restoration:
     document: Document
     restoration_file: RestorationFile
     hypotheses: tuple[Hypothesis, ...]
+    lights_name: str | None = None
+    """Name of the set of the file's `other_lights` that is used, if any."""
 
     @property
     def folder(self) -> Path:

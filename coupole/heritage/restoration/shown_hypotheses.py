@@ -175,6 +175,7 @@ def _result(
         "parts": restoration.parts.counts(),
         "remarks": list(restoration.parts.remarks),
         "hypotheses": [hypothesis.model_dump(mode="json") for hypothesis in restoration.hypotheses],
+        "lights": restoration.lights_name,
         "observer": f"CIE {restoration.restoration_file.observer}",
         "bands": len(range(380, 781, restoration.restoration_file.bands.step_nm)),
         "white_cd_m2": round(white_cd_m2, 6),

@@ -124,8 +124,15 @@ def _parts(result: Mapping[str, Any]) -> Section:
     return Section("parts", "Parts", items=remarks, tables=[Table("Triangles", ("part", "triangles"), rows)])
 
 
+def _lights(result: Mapping[str, Any]) -> str:
+    return f"Lights: {result['lights']}. " if result["lights"] else ""
+
+
 def _files(result: Mapping[str, Any]) -> Section:
     rows: list[Sequence[Inline]] = [(Link("result.json"), "all figures")]
+    for hypothesis in result["hypotheses"]:
+        scene = f"{hypothesis['name']}/scene.yaml"
+        rows.append((Link(scene), f"hypothesis {hypothesis['name']} as a scene, for coupole show and render"))
     for view in result["views"]:
         if view["side_by_side"]:
             rows.append((Link(view["side_by_side"]), f"view {view['view']}, all hypotheses"))
@@ -133,7 +140,8 @@ def _files(result: Mapping[str, Any]) -> Section:
             words = f"hypothesis {name}, view {view['view']}: for the eye, and radiance by band"
             rows.append(([Link(paths["png"]), ", ", Link(paths["exr"])], words))
     note = (
-        f"{result['bands']} bands, {result['observer']}; white is {result['white_cd_m2']:.4g} cd/m2 in all "
+        f"{_lights(result)}{result['bands']} bands, {result['observer']}; "
+        f"white is {result['white_cd_m2']:.4g} cd/m2 in all "
         "pictures. "
         "Mean dE00 is over the pixels of a part, and includes the noise of the pictures; dE00 of mean colours "
         "does not include it."

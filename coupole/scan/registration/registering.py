@@ -32,6 +32,8 @@ _PARTNERS = 6
 """Largest number of pairs of each scan in a round, of more scans than `ALL_PAIRS`."""
 _ODD_SIZE = 200.0
 """A scan larger or smaller than most by this factor has another unit."""
+_ROUNDED_CELLS = 0.01
+"""Largest rounding of a coordinate of the merged mesh, in its cells."""
 _LEAST_JOINT_OVERLAP = 0.04
 """Share of the smaller scan, from which on a pair counts in the joint fit."""
 
@@ -67,6 +69,24 @@ class Registration:
     """Factor by which the loops enlarged all uncertainties."""
     fit: JointFit
     """The joint adjustment of all poses."""
+
+    def is_merged_on_site(self, cell_mm: float) -> bool:
+        """True if mesh and clouds are in the control points' frame: there is one, and 32 bits keep a hundredth of
+        a cell there."""
+        if self.site_from_first is None:
+            return False
+        farthest_mm = max(
+            float(np.abs((self.site_from_first @ pose)[:3, 3]).max() + self.scans[k].survey.size_mm)
+            for k, pose in self.first_from_scan.items()
+        )
+        return farthest_mm * float(np.finfo(np.float32).eps) < _ROUNDED_CELLS * cell_mm
+
+    def merged_from_scan(self, cell_mm: float) -> list[Floats]:
+        """4x4 mm of each placed scan to the frame of mesh and clouds."""
+        poses = [self.first_from_scan[k] for k in self.placed_numbers]
+        if self.site_from_first is None or not self.is_merged_on_site(cell_mm):
+            return poses
+        return [self.site_from_first @ pose for pose in poses]
 
 
 def register(

@@ -62,6 +62,7 @@ def about(registration: Registration, merged_mesh: Merged | None) -> dict[str, A
         summary["stated_poses_off_mm"] = off_mm
     if merged_mesh is not None:
         summary["mesh"] = {
+            "frame": frame_of_mesh(registration, merged_mesh),
             "vertices": merged_mesh.vertices,
             "triangles": merged_mesh.triangles,
             "points": merged_mesh.points,
@@ -70,6 +71,12 @@ def about(registration: Registration, merged_mesh: Merged | None) -> dict[str, A
         }
         summary["levels"] = merged_mesh.levels
     return summary
+
+
+def frame_of_mesh(registration: Registration, merged_mesh: Merged) -> str:
+    """`site` for that of the control points, else the first placed scan's name."""
+    is_on_site = registration.is_merged_on_site(merged_mesh.cell_mm)
+    return "site" if is_on_site else registration.names[registration.placed_numbers[0]]
 
 
 def _uncertainty(registration: Registration, number: int) -> dict[str, Any]:

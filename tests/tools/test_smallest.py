@@ -114,7 +114,6 @@ MAKE_PICTURES = {
     "make_pictures.py",
     "make_renderings.py",
     "make_statue_case.py",
-    "statue_spectra.py",
 }
 """They write what the docs show, in minutes, and measure nothing."""
 

@@ -206,7 +206,7 @@ def part_of(places_mm: Points) -> NDArray[np.int64]:
 
 
 def _write_painted(body: Callable[[Field], Field], path: Path) -> None:
-    """Write what the page of `coupole restore pick` saves after somebody has painted all parts."""
+    """Write what the page of `coupole restore pick` saves where all parts are painted."""
     vertices_mm, triangles = surface(PAINTED_MM, body)
     rows = part_of(vertices_mm[triangles].mean(axis=1))
     arrays = {"vertices_mm": (vertices_mm, "<f4"), "triangles": (triangles, "<u4"), "parts": (rows + 1, "u1")}

@@ -184,6 +184,8 @@ def _write_page(page: Any, result: dict[str, Any], out: Path) -> None:
 
 
 def _say(result: dict[str, Any], out: Path, console: Console) -> None:
+    from coupole.heritage.result_pages.restoration_page import scene_uses
+
     for remark in result["remarks"]:
         console.print(remark, markup=False)
     count = result["taken_as_they_were"]
@@ -195,6 +197,4 @@ def _say(result: dict[str, Any], out: Path, console: Console) -> None:
     )
     console.print(f"{out / 'report.html'}: {len(result['hypotheses'])} hypotheses", markup=False)
     for hypothesis in result["hypotheses"]:
-        console.print(
-            f"{out / hypothesis['name'] / 'scene.yaml'}: for coupole show and coupole render", markup=False
-        )
+        console.print(f"{out / hypothesis['name'] / 'scene.yaml'}: for {scene_uses(result)}", markup=False)

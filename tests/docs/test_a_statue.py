@@ -9,7 +9,6 @@ import json
 import re
 import shlex
 import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import cells
 import numpy as np
 import pytest
 import trimesh
+from nursery import NURSERY
 from places import REPO
 from scipy.spatial import cKDTree
 
@@ -32,6 +32,14 @@ def page_commands() -> list[list[str]]:
     """Words of the commands in the page's blocks of `sh`, in their order."""
     blocks = re.findall(r"^```sh\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     return [shlex.split(line) for block in blocks for line in block.splitlines()]
+
+
+def command_in(folder: Path, *words: str) -> cells.Ended:
+    """Run a command in a folder, forked where all modules are."""
+    pipes = dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
+    with NURSERY.command([*words], stdin=subprocess.DEVNULL, text=True, cwd=folder, **pipes) as process:
+        out, err = process.communicate(timeout=1500)
+    return cells.Ended(process.returncode, out, err)
 
 
 @dataclass(frozen=True)
@@ -60,10 +68,9 @@ def walked(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequ
             for found in (sorted(map(str, folder.glob(word))) if "*" in word else [word])
         ]
         more = SMALLEST if words[1:3] == ["restore", "registered/mesh.ply"] and not is_full else ()
-        command = [sys.executable, "-m", "coupole.commands.cli", *globbed, *more]
-        ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=1500)
-        assert ended.returncode == 0, (words, ended.stderr[-2000:])
-        printed[" ".join(words)] = ended.stdout + ended.stderr
+        ended = command_in(folder, *globbed, *more)
+        assert ended.code == 0, (words, ended.err[-2000:])
+        printed[" ".join(words)] = ended.out + ended.err
     return Walked(folder, printed)
 
 

@@ -128,11 +128,18 @@ def _lights(result: Mapping[str, Any]) -> str:
     return f"Lights: {result['lights']}. " if result["lights"] else ""
 
 
+def scene_uses(result: Mapping[str, Any]) -> str:
+    """Return the commands that take a hypothesis as a scene: a page has no near lights, such as candles."""
+    if result["lights"] is None:
+        return "coupole show and coupole render"
+    return "coupole render, and for coupole show if its lights are far away"
+
+
 def _files(result: Mapping[str, Any]) -> Section:
     rows: list[Sequence[Inline]] = [(Link("result.json"), "all figures")]
     for hypothesis in result["hypotheses"]:
         scene = f"{hypothesis['name']}/scene.yaml"
-        rows.append((Link(scene), f"hypothesis {hypothesis['name']} as a scene, for coupole show and render"))
+        rows.append((Link(scene), f"hypothesis {hypothesis['name']} as a scene, for {scene_uses(result)}"))
     for view in result["views"]:
         if view["side_by_side"]:
             rows.append((Link(view["side_by_side"]), f"view {view['view']}, all hypotheses"))

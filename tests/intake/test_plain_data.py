@@ -99,7 +99,8 @@ READERS = {
     "coupole/console/plans/plan_fields.py",
     "coupole/preflight/exposure_advice.py",
     "coupole/appearance/matter/paint_file.py",
-    # writes the YAML of a model
+    # write the YAML of a model
+    "coupole/heritage/restoration/scene_of_hypothesis.py",
     "coupole/scripting/plans.py",
 }
 

@@ -48,7 +48,7 @@ def test_help_imports_the_commands_alone(tmp_path: Path) -> None:
     assert ended.code == 0, ended.err
     names = modules(tmp_path / "seen", "end")
     assert heavy(names) == {"rich"}
-    assert ours(names) <= 77
+    assert ours(names) <= 78
 
 
 def test_each_command_is_found_where_the_table_has_it() -> None:
@@ -70,7 +70,7 @@ def test_an_acquisition_that_is_stopped_imports_nothing_while_its_devices_are_op
     opened, safe, end = (modules(tmp_path / "seen", when) for when in ("opened", "safe", "end"))
     assert safe - opened <= LATE
     assert {name.split(".")[0] for name in end - safe} <= REPORT
-    assert ours(opened) <= 281
+    assert ours(opened) <= 283
     assert heavy(opened) == {"embreex", "h5py", "numba", "numpy", "rich", "ruamel", "scipy"}
 
     asked = cells.finish(watched(tmp_path / "seen by status", "status", run))

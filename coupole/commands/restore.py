@@ -85,7 +85,7 @@ def restore(
     from coupole.heritage.restoration.restoration_file import Choice
     from coupole.heritage.restoration.restoring import render_all
     from coupole.heritage.restoration.scene_of_hypothesis import write_scenes
-    from coupole.heritage.restoration.shown_hypotheses import show_all
+    from coupole.heritage.restoration.shown_hypotheses import refuse_other_lights, show_all
     from coupole.heritage.result_pages import restoration_page
     from coupole.viewing.terminal import make_console, step_bars
 
@@ -96,6 +96,7 @@ def restore(
         with step_bars(console) as say:
             choice = Choice(tuple(hypothesis or ()), lights, samples, width, step)
             restoration = checked_restoration(mesh, parts, materials, choice, unit, say)
+            refuse_other_lights(out, lights)
             pictures = render_all(restoration, out, say)
             result = show_all(restoration, pictures, out, say)
             write_scenes(restoration, out)

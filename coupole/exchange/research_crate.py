@@ -3,6 +3,7 @@ them, which says in JSON-LD what they are, whose they are, from what and by what
 
 from __future__ import annotations
 
+import contextlib
 import json
 import mimetypes
 import os
@@ -35,6 +36,7 @@ _TOLD = {
     ".ply": "application/octet-stream",
     ".sha256": "text/plain",
 }
+_LINKED = ".h5"
 _ACTIONS = {
     "run": "acquisition",
     "result": "measurement of reflectance",
@@ -67,8 +69,8 @@ def write_crate(
     overwrite: bool,
     say: Callable[[str, int, int], None],
 ) -> list[Path]:
-    """Write the crate into `out`: its files below `data/`, hard links where the file system allows them, else
-    copies. With `in_place` only the metadata is written, into `source`.
+    """Write the crate into `out`: its files below `data/`, copies, but for frames and samples (HDF5): hard links
+    where the file system allows them. With `in_place` only the metadata is written, into `source`.
 
     With `overwrite` the files of a crate that is in `out` are removed first; what else is there is kept.
 
@@ -104,7 +106,7 @@ def write_crate(
             files.append(_file_entity(path, f"{inside}{inner}"))
             if not in_place:
                 links.append(root / DATA / inner)
-                _link(path, links[-1])
+                _take(path, links[-1])
             say("files", number + 1, len(paths))
         graph = [*_entities(source, origin, licence, facts, people, files)]
         document = {"@context": f"{_SPECIFICATION}/context", "@graph": graph}
@@ -303,10 +305,12 @@ def _to_all(entities: Sequence[Entity]) -> Entity | list[Entity]:
     return _to(entities[0]) if len(entities) == 1 else [_to(entity) for entity in entities]
 
 
-def _link(path: Path, to: Path) -> None:
+def _take(path: Path, to: Path) -> None:
+    """Link a file that is large and is not written anew; copy others, which their commands may write in place."""
     to.parent.mkdir(parents=True, exist_ok=True)
     to.unlink(missing_ok=True)
-    try:
-        os.link(path, to)
-    except OSError:
-        shutil.copy2(path, to)
+    if path.suffix == _LINKED:
+        with contextlib.suppress(OSError):
+            os.link(path, to)
+            return
+    shutil.copy2(path, to)

@@ -122,6 +122,16 @@ def test_page_and_crate_are_whole(walked: Walked) -> None:
     assert "computed, not measured" in (crate / "ro-crate-metadata.json").read_text()
 
 
+def test_pictures_by_day_are_not_written_over_by_those_by_candles(walked: Walked) -> None:
+    before = (walked.folder / "day/result.json").read_bytes()
+    words = "restore registered/mesh.ply --parts parts.json --materials hypotheses.yaml --lights candles --out day"
+    ended = command_in(walked.folder, *words.split(), *SMALLEST)
+    assert (ended.code, "has pictures under the file's own `lights`" in ended.err.replace("\n", " ")) == (2, True)
+    assert (walked.folder / "day/result.json").read_bytes() == before
+    kept = walked.folder / "statue-crate/data"
+    assert all(path.stat().st_nlink == 1 for path in kept.rglob("*") if path.is_file())
+
+
 @pytest.mark.full
 def test_the_flake_that_the_mantle_lost_is_the_largest_change(walked: Walked) -> None:
     region = json.loads((walked.folder / "since-1998/comparison.json").read_text())["shape"]["regions"][0]

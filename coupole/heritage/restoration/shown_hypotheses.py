@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import coupole
 from coupole.appearance.render import colour, pictures
 from coupole.appearance.render.denoising import DENOISED, denoised_xyz
-from coupole.errors import StorageError, reason
+from coupole.errors import InputError, StorageError, reason
 from coupole.heritage.restoration import hypotheses_compared, labelled_pictures
 from coupole.heritage.restoration.labelled_pictures import (
     Picture,
@@ -25,6 +25,7 @@ from coupole.heritage.restoration.labelled_pictures import (
     with_strip,
 )
 from coupole.heritage.restoration.restoring import Made, Restoration, Say, common_white
+from coupole.intake.plain_data import read_json
 
 RESULT = "result.json"
 _GAP_PX = 6
@@ -61,6 +62,15 @@ def show_all(restoration: Restoration, made_pictures: Sequence[Made], out: Path,
     except OSError as error:
         raise StorageError(f"{out}: {reason(error)}. Choose another folder, or free space.") from error
     return result
+
+
+def refuse_other_lights(out: Path, lights: str | None) -> None:
+    """Raise InputError if `out` has the pictures of a restoration under other lights: they would be lost."""
+    path = out / RESULT
+    earlier = read_json(path, allow_nan=True) if path.is_file() else None
+    if isinstance(earlier, dict) and "hypotheses" in earlier and earlier.get("lights") != lights:
+        under = f"the lights {earlier['lights']}" if earlier.get("lights") else "the file's own `lights`"
+        raise InputError(f"--out {out}: has pictures under {under}; name another folder for those under others")
 
 
 # -- helpers --------------------------------------------------------------------------------------------------

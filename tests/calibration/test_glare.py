@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 
 from coupole.calibration.light.frames import channel_mask, open_light_frames
 from coupole.calibration.light.glare_correction import read_glare
+from coupole.calibration.light.glare_fit import TrapLight, fit_glare, trap_view
 from coupole.calibration.light.glare_traps import find_traps
 from coupole.calibration.light.veil import (
     PARTS,
@@ -94,6 +96,17 @@ def test_black_beside_white_is_right_within_a_thousandth_of_white(tmp_path: Path
 def test_without_glare_none_is_found(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no more light than their own"):
         calibrate(tmp_path, card_run(tmp_path / "run", None), "--target", described(tmp_path, 0.002))
+
+
+def test_a_veil_that_one_view_alone_shows_is_refused_by_a_figure_that_is_a_number() -> None:
+    """Without that view none is predicted, of which nothing is a share."""
+    views = []
+    for number, light in enumerate(card_views()):
+        signal = light.astype(np.float32)
+        view = trap_view(f"v{number}", signal, MASKS["G"], find_traps(signal))
+        views.append(replace(view, dark=view.beside * (0.01 if number == 0 else 1e-4)))
+    fit = fit_glare(views, TrapLight(3e-4, 0.0), "G")
+    assert 0.2 < fit.u_form < np.inf
 
 
 def described(folder: Path, trap_share: float) -> Path:

@@ -126,12 +126,13 @@ class WatchedRecorder:
         firsts: dict[tuple[int, int], ShotId] = {}
         for shot in sentinels:
             firsts.setdefault((shot.label.exposure, cast("Sentinel", shot.light).led), shot)
-        for (exposure_index, led), shot in firsts.items():
-            try:
-                look = cast("LookGrid", self._grid).look(self._recorder.earlier_pixels(shot))
-            except StorageError as error:
-                self._observer.note(f"{view}: not compared with the session before: {error}")
-                return
+        grid = cast("LookGrid", self._grid)
+        try:
+            looks = {place: grid.look(self._recorder.earlier_pixels(shot)) for place, shot in firsts.items()}
+        except StorageError as error:
+            self._observer.note(f"{view}: not compared with the session before: {error}")
+            return
+        for (exposure_index, led), look in looks.items():
             self._first.note_earlier(self._job.plan.exposure.exposures_us[exposure_index], led, look)
 
     def store(self, frame: Frame, exposure_us: int) -> int:

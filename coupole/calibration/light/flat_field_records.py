@@ -139,12 +139,7 @@ def _brightest(frames: LightFrames) -> dict[tuple[str, Light], list[LightFrame]]
 
     Raises InputError if fewer than three views have such frames.
     """
-    groups: dict[tuple[str, Light], list[LightFrame]] = {}
-    for frame in sorted(frames.lit, key=lambda frame: -frame.exposure_us):
-        group = groups.setdefault((frame.view, frame.shot.light), [])
-        usable = not group and bool(np.mean(frame.read() >= frames.white_dn) < _MOST_SATURATED)
-        if usable or (group and group[0].exposure_us == frame.exposure_us):
-            group.append(frame)
+    groups = frames.brightest(_MOST_SATURATED)
     views = {key: group for key, group in groups.items() if group}
     if len(views) < 3:
         raise InputError(

@@ -18,7 +18,7 @@ from coupole.calibration.calibrated_arm import CalibratedArm, corrected_poses
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import About, about_of, frames_sha256
 from coupole.errors import InputError, StorageError
-from coupole.plan.shot_id import Led, PanelMark, Sentinel, ShotId
+from coupole.plan.shot_id import Led, Light, PanelMark, Sentinel, ShotId
 from coupole.storage.durable import sha256
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
@@ -93,6 +93,17 @@ class LightFrames:
             frames=tuple(frame for frame in self.frames if frame.view in kept_views),
             inputs=tuple((name, digest) for name, digest in self.inputs if name[name.index("/") :] in files),
         )
+
+    def brightest(self, most_saturated: float) -> dict[tuple[str, Light], list[LightFrame]]:
+        """Lit frames by view and light, of the longest exposure in which a smaller share of pixels than
+        `most_saturated` is saturated; an empty list where there is none."""
+        groups: dict[tuple[str, Light], list[LightFrame]] = {}
+        for frame in sorted(self.lit, key=lambda frame: -frame.exposure_us):
+            group = groups.setdefault((frame.view, frame.shot.light), [])
+            usable = not group and bool(np.mean(frame.read() >= self.white_dn) < most_saturated)
+            if usable or (group and group[0].exposure_us == frame.exposure_us):
+                group.append(frame)
+        return groups
 
     @cached_property
     def size_px(self) -> tuple[int, int]:

@@ -36,6 +36,8 @@ U_NEAR = 0.15
 a lobe with half its core there was found by 13 % too faint."""
 _LEAST_SPREAD = 0.35
 """Least distance of traps from each other, over the picture's width: traps in one place tell nothing of others."""
+_LEAST_VEIL = 1e-6
+"""Least veil over white of which a share is taken: a fit without a view may predict none, which is no figure."""
 _ROUNDS = 4
 
 
@@ -146,7 +148,7 @@ def fit_glare(views: Sequence[TrapView], trap_light: TrapLight, channel: str) ->
         shares,
         covariance,
         count - 1.0,
-        _worst_view(views, found_veil / predicted_veil - 1.0),
+        _worst_view(views, (found_veil - predicted_veil) / np.maximum(predicted_veil, _LEAST_VEIL)),
         predicted_veil,
         found_veil,
         pixels,

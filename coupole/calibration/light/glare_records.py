@@ -159,12 +159,7 @@ def _usable_frames(frames: LightFrames) -> dict[tuple[str, Light], list[LightFra
     there is none."""
     if not frames.lit:
         raise InputError("glare: no frame with light; acquire `coupole plan new glare`")
-    groups: dict[tuple[str, Light], list[LightFrame]] = {}
-    for frame in sorted(frames.lit, key=lambda frame: -frame.exposure_us):
-        group = groups.setdefault((frame.view, frame.shot.light), [])
-        usable = not group and bool(np.mean(frame.read() >= frames.white_dn) < _MOST_SATURATED)
-        if usable or (group and group[0].exposure_us == frame.exposure_us):
-            group.append(frame)
+    groups = frames.brightest(_MOST_SATURATED)
     bright = {key: group for key, group in groups.items() if group}
     if not bright:
         raise InputError(

@@ -46,7 +46,7 @@ class Format:
 
 
 RESTORATION_RESULT = "result.json"
-"""File that only folders of `coupole restore` have."""
+"""Figures of `coupole restore`. Results of reflectance have a file of this name too, and files of their own."""
 MAPS = ("texel-mm", "map-px", "uv")
 """Options of formats with maps."""
 _RUN, _PICTURES_TOO = (Source.RUN,), (Source.RUN, Source.PICTURES)
@@ -95,7 +95,7 @@ FORMATS = {one.name: one for one in _TABLE}
 
 
 def source_of(folder: Path) -> Source:
-    """Tell which kind of source a folder is, by the files that only one kind has."""
+    """Tell which kind of source a folder is, by its files."""
     if (folder / "object.h5").exists():
         return Source.RESULT
     if (folder / "normals.npy").exists():

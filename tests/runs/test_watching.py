@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import cells
 import pytest
@@ -11,7 +11,10 @@ from cells import CellFolder
 from real_cells import true_dose_lux_h
 
 from coupole.acquisition.watching import burst_judge
+from coupole.errors import ChecksumMismatch
 from coupole.preflight.job import read_job
+from coupole.storage.journal_events import FrameProven
+from coupole.storage.view_reader import View
 
 EVERY = {"kind": "every", "every": 20}
 
@@ -210,6 +213,20 @@ def test_a_frame_lost_in_one_view_is_not_judged_by_the_same_light_in_the_view_be
     assert _found(cell) == []
 
 
+def _begun_and_killed(cell: CellFolder) -> set[str]:
+    """Begin a run and kill it within its view. Shots that are proven."""
+    cell.write(lights={"kind": "every", "every": 6})
+    with cell.world() as world:
+        process = cell.start_acquire()
+        cells.wait_until(lambda: len(cells.events(cell.run_folder, "frame")) > 20, "frames")
+        process.kill()
+        cells.finish(process)
+        cells.wait_until(lambda: not world.ask("state")["shining"], "the dark")
+    shots = {str(event["shot"]) for event in cells.events(cell.run_folder, "frame")}
+    assert len(shots) < 160  # of 180, and sentinels
+    return shots
+
+
 BETWEEN = {
     "moved": {"kind": "bump", "what": "object", "mm": [0.3, 0.0, 0.0], "at_edge": 1},
     "drift": {"kind": "exposure_step", "factor": 1.05, "at_edge": 1},
@@ -221,21 +238,33 @@ def test_what_changed_between_two_sessions_of_a_view_is_found(tmp_path: Path, ki
     """The later session's sentinels are compared with the first ones of the earlier."""
     cell = _cell_of_its_own_world(tmp_path, True)
     cell.world_settings["camera"] = {"samples_per_side": 3}
-    cell.write(lights={"kind": "every", "every": 6})
-    with cell.world() as world:
-        process = cell.start_acquire()
-        cells.wait_until(lambda: len(cells.events(cell.run_folder, "frame")) > 20, "frames")
-        process.kill()
-        cells.finish(process)
-        cells.wait_until(lambda: not world.ask("state")["shining"], "the dark")
-    before = {event["shot"] for event in cells.events(cell.run_folder, "frame")}
-    assert len(before) < 160  # of 180, and sentinels
+    before = _begun_and_killed(cell)
     with cell.world(*([BETWEEN[kind]] if kind else [])):
         cell.confirm()
         resumed = cell.acquire("--resume", cell.run_folder)
     assert resumed.code == 0, resumed.err
     assert [finding["kind"] for finding in _found(cell)] == ([kind] if kind else [])
     assert all(not before & set(finding["shots"]) for finding in _found(cell))
+    cells.assert_each_shot_proven_once(cell.run_folder)
+
+
+def test_a_sentinel_of_the_session_before_that_cannot_be_read_ends_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = _cell_of_its_own_world(tmp_path, True)
+    _begun_and_killed(cell)
+
+    def unreadable(view: View, _: FrameProven) -> NoReturn:
+        raise ChecksumMismatch(f"{view.path}: not what was proven")
+
+    monkeypatch.setattr(View, "proven_pixels", unreadable)
+    with cell.world():
+        cell.confirm()
+        resumed = cell.acquire("--resume", cell.run_folder)
+    assert resumed.code == 0, resumed.err
+    (finding,) = _found(cell)
+    assert finding["kind"] == "not watched"
+    assert finding["message"].startswith("not compared with the session before: ")
     cells.assert_each_shot_proven_once(cell.run_folder)
 
 

@@ -20,7 +20,7 @@ TAKEN_AGAIN: tuple[Kind, ...] = ("ambient light", "LED", "thing in the field")
 """Findings whose shots may be good when they are taken again."""
 
 NOT_WATCHED = "not watched"
-"""Kind of the journal's line that says that watching itself has failed, and has ended."""
+"""Kind of the journal's line that says that watching itself has failed, wholly or in part."""
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,7 @@ class WatchedRecorder:
         try:
             looks = {place: grid.look(self._recorder.earlier_pixels(shot)) for place, shot in firsts.items()}
         except StorageError as error:
-            self._observer.note(f"{view}: not compared with the session before: {error}")
+            self._tell_not_watched(view, tuple(firsts.values()), f"not compared with the session before: {error}")
             return
         for (exposure_index, led), look in looks.items():
             self._first.note_earlier(self._job.plan.exposure.exposures_us[exposure_index], led, look)
@@ -220,11 +220,11 @@ class WatchedRecorder:
         self._watch = NOTHING
         shots = tuple(ShotId(burst.view, label) for label in burst.labels if label)
         defect = f"{type(error).__name__}: {error}. This is a defect of Coupole: please report it"
-        words = f"watching has ended, the run goes on: {defect}"
+        self._tell_not_watched(burst.view, shots, f"watching has ended, the run goes on: {defect}")
+
+    def _tell_not_watched(self, view: str, shots: tuple[ShotId, ...], words: str) -> None:
         self._tell(
-            FindingNoted(
-                kind=NOT_WATCHED, view=burst.view, shots=shots, figure=0.0, limit=0.0, unit="", message=words
-            )
+            FindingNoted(kind=NOT_WATCHED, view=view, shots=shots, figure=0.0, limit=0.0, unit="", message=words)
         )
 
     def _frames_of(self, burst: Burst) -> list[SeenFrame]:

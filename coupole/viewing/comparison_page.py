@@ -15,7 +15,13 @@ from coupole.pages.maps import shaded_map
 from coupole.pages.page_parts import Figure, Inline, Link, Page, Picture, Section, Table
 from coupole.pages.page_rendering import render
 from coupole.pages.palettes import ANCHORS, colours_of
-from coupole.viewing.registration_page import picture_of, sheet_of_sides, solid_drawn, values_from_sides
+from coupole.viewing.registration_page import (
+    picture_of,
+    sheet_of_sides,
+    sides_in_words,
+    solid_drawn,
+    values_from_sides,
+)
 from coupole.viewing.view_solids import Points, Solid
 
 REPORT, MAPS = "report.html", "maps.ply"
@@ -49,7 +55,8 @@ def write(comparison: Comparison, folder: Path) -> None:
                 "Shape",
                 figures=_drawing_of_changed(comparison, comparison.moved_points, "shape"),
                 figure_size="wide",
-                tables=[_regions("Regions that changed in shape", comparison.shape_regions)],
+                tables=[_regions("Regions that changed in shape", comparison, comparison.shape_regions)],
+                notes=[_frames(comparison)],
             ),
             _colour(comparison),
             Section("files", "Files", tables=[Table("Files", ("file", "holds"), _FILES)]),
@@ -71,7 +78,7 @@ def _quality(comparison: Comparison) -> str:
     return (
         f"A distance has a standard uncertainty of {u_mm:.2g} mm (median): "
         f"{int(comparison.moved_points.sum()):,} points "
-        f"changed significantly, in {regions}."
+        f"changed significantly; those that hang together form {regions}."
     )
 
 
@@ -88,16 +95,18 @@ def remarks(comparison: Comparison) -> Iterator[str]:
     is_finite = np.isfinite(comparison.distance_mm)
     yield (
         f"shape: {int(comparison.moved_points.sum()):,} of {int(is_finite.sum()):,} points changed significantly, "
-        f"in {len(comparison.shape_regions)} regions; standard uncertainty {np.nanmedian(comparison.u_mm):.2g} mm "
-        "in the median"
+        f"{_in_regions(comparison.shape_regions, comparison.moved_points)}; standard uncertainty "
+        f"{np.nanmedian(comparison.u_mm):.2g} mm in the median"
     )
+    if comparison.shape_regions:
+        yield _largest(comparison, comparison.shape_regions[0])
     if comparison.de00 is None or comparison.recoloured_points is None:
         yield "colour: not compared, as not both states have colours"
     else:
         yield (
-            f"colour: {int(comparison.recoloured_points.sum()):,} points changed significantly, in "
-            f"{len(comparison.colour_regions)} regions; dE00 {np.nanmedian(comparison.de00):.2f} in the median, "
-            "with noise"
+            f"colour: {int(comparison.recoloured_points.sum()):,} points changed significantly, "
+            f"{_in_regions(comparison.colour_regions, comparison.recoloured_points)}; dE00 "
+            f"{np.nanmedian(comparison.de00):.2f} in the median, with noise"
         )
     if (~is_finite).any():
         yield f"{int((~is_finite).sum()):,} points have no surface of the other state near them: not compared"
@@ -108,6 +117,36 @@ def remarks(comparison: Comparison) -> Iterator[str]:
         )
     if comparison.before.outward is None:
         yield "without triangles it is not known which side is outside: signs of distances have no meaning"
+
+
+def _in_regions(regions: Sequence[Region], is_changed: NDArray[np.bool_]) -> str:
+    """How many of the changed points hang together, and in how many regions; the others are single points."""
+    points_in_regions = sum(region.points for region in regions)
+    single = int(is_changed.sum()) - points_in_regions
+    if not regions:
+        return "none of them in a region" if single else "in no region"
+    named = "1 region" if len(regions) == 1 else f"{len(regions)} regions"
+    return f"{points_in_regions:,} of them in {named}" + (f", {single:,} scattered" if single else "")
+
+
+def _largest(comparison: Comparison, region: Region) -> str:
+    side = "lower" if region.distance_mm < 0 else "higher"
+    place = ", ".join(f"{value:.0f}" for value in region.middle_mm)
+    return (
+        f"the largest region, {region.across_mm:.3g} mm across, is {abs(region.distance_mm):.2g} mm {side} in "
+        f"{comparison.after.name}; its middle is at {place} mm in the frame of {comparison.before.name}"
+    )
+
+
+def _frames(comparison: Comparison) -> str:
+    """Which frame places and pictures have, in sentences."""
+    before, after = comparison.before, comparison.after
+    words = f"Places are in the frames of {before.name} and of {after.name}."
+    sides = sides_in_words(comparison.upright_axes)
+    if comparison.upright_axes is None:
+        return f"{words} Pictures, from left to right: {sides}; no file says which way is up."
+    upright = before if before.is_upright else after
+    return f"{words} Pictures, from left to right: {sides}, by the axes of {upright.name}, in which z is up."
 
 
 def _scale(distance_mm: Points, u_mm: Points) -> float:
@@ -143,7 +182,7 @@ def _colour(comparison: Comparison) -> Section:
             *_drawing_of_changed(comparison, comparison.recoloured_points, "colour"),
         ],
         figure_size="wide",
-        tables=[_regions("Regions that changed in colour", comparison.colour_regions)],
+        tables=[_regions("Regions that changed in colour", comparison, comparison.colour_regions)],
     )
 
 
@@ -157,7 +196,7 @@ def _map(
     if not len(state.triangles):
         return _image(comparison, colours, f"{title}: {low:.3g} to {high:.3g} {unit}")
     solid = Solid("state", state.points_mm, state.triangles)
-    value_sheet, shade = values_from_sides(solid, values[state.triangles].mean(axis=1))
+    value_sheet, shade = values_from_sides(solid, values[state.triangles].mean(axis=1), comparison.upright_axes)
     return shaded_map(title, value_sheet, shade, unit, high, low=low, palette=palette)
 
 
@@ -176,16 +215,22 @@ def _image(comparison: Comparison, colours: Points, title: str) -> Picture:
     state = comparison.before
     if len(state.triangles):
         of_faces = colours[state.triangles].mean(axis=1)
-        return picture_of(solid_drawn(Solid("state", state.points_mm, state.triangles), of_faces), title)
+        solid = Solid("state", state.points_mm, state.triangles)
+        return picture_of(solid_drawn(solid, of_faces, comparison.upright_axes), title)
     some = np.random.default_rng(0).permutation(len(state.points_mm))[:40_000]
-    sheet = sheet_of_sides(state.points_mm, lambda canvas: canvas.dots(state.points_mm[some], colours[some], 1.5))
+    sheet = sheet_of_sides(
+        state.points_mm,
+        lambda canvas: canvas.dots(state.points_mm[some], colours[some], 1.5),
+        comparison.upright_axes,
+    )
     return picture_of(sheet, title)
 
 
-def _regions(caption: str, regions: Sequence[Region]) -> Table:
+def _regions(caption: str, comparison: Comparison, regions: Sequence[Region]) -> Table:
     rows = [
         (
-            ", ".join(f"{value:.1f}" for value in region.middle_mm),
+            _place(region.middle_mm),
+            _place(region.middle_in_after_mm),
             f"{region.points:,}",
             f"{region.across_mm:.1f}",
             f"{region.distance_mm:+.3f}",
@@ -193,7 +238,12 @@ def _regions(caption: str, regions: Sequence[Region]) -> Table:
         )
         for region in regions[:_REGIONS_SHOWN]
     ]
-    return Table(caption, ("middle x, y, z, mm", "points", "across, mm", "mean distance, mm", "mean dE00"), rows)
+    places = (f"middle in {state.name}: x, y, z, mm" for state in (comparison.before, comparison.after))
+    return Table(caption, (*places, "points", "across, mm", "mean distance, mm", "mean dE00"), rows)
+
+
+def _place(point_mm: Points) -> str:
+    return ", ".join(f"{value:.1f}" for value in point_mm)
 
 
 def _write_maps(comparison: Comparison, colours: Points, path: Path) -> None:

@@ -23,7 +23,13 @@ from coupole.viewing.view_canvas import Canvas, Lookout, seen_faces
 from coupole.viewing.view_solids import Points, Solid, with_fewer_faces
 
 REPORT = "report.html"
-_SIDES = (("from the front", 15.0, -60.0), ("from the other side", 15.0, 120.0), ("from above", 75.0, -60.0))
+_SIDES = (("from -y", 15.0, -90.0), ("from +y", 15.0, 90.0), ("from above", 75.0, -90.0))
+_UNKNOWN_SIDES = (
+    ("from one side", 15.0, -60.0),
+    ("from the other side", 15.0, 120.0),
+    ("along its width", 75.0, -60.0),
+)
+"""Where nobody knows which way is up: the shortest extent is taken for depth."""
 _WIDTH_PX, _HEIGHT_PX = 560, 520
 _DRAWN_FACES, _DRAWN_POINTS = 300_000, 40_000
 _STONE = (0.75, 0.72, 0.66)
@@ -72,8 +78,10 @@ def _next_step(registration: Registration, merged_mesh: Merged | None, name: str
 
 def _pictures(registration: Registration, merged_mesh: Merged | None, folder: Path) -> list[Picture]:
     points, colours = _scan_points(registration, merged_mesh)
+    is_on_site = merged_mesh is not None and registration.is_merged_on_site(merged_mesh.cell_mm)
+    axes = np.eye(3) if is_on_site else None
     scans = picture_of(
-        sheet_of_sides(points, lambda canvas: canvas.dots(points, colours, 1.5)),
+        sheet_of_sides(points, lambda canvas: canvas.dots(points, colours, 1.5), axes),
         "Each scan in its place in a colour of its own, from three sides",
     )
     if merged_mesh is None:
@@ -81,7 +89,7 @@ def _pictures(registration: Registration, merged_mesh: Merged | None, folder: Pa
     mesh = read_ply(MeshFile(folder / "mesh.ply"))
     vertices = mesh.vertices.astype(np.float64)
     solid = with_fewer_faces(Solid("mesh", vertices, mesh.triangles.astype(np.int64)), _DRAWN_FACES)
-    sheet = sheet_of_sides(points, lambda canvas: canvas.fill([solid], [_STONE], has_outline=False))
+    sheet = sheet_of_sides(points, lambda canvas: canvas.fill([solid], [_STONE], has_outline=False), axes)
     return [picture_of(sheet, "The merged mesh, from the same three sides as the scans"), scans]
 
 
@@ -111,17 +119,21 @@ def _scan_points(registration: Registration, merged_mesh: Merged | None) -> tupl
     return points, colour
 
 
-def solid_drawn(solid: Solid, colours: Any) -> Any:
+def solid_drawn(solid: Solid, colours: Any, axes: Points | None) -> Any:
     """A solid with a colour for each face, from three sides."""
-    return sheet_of_sides(solid.vertices_mm, lambda canvas: canvas.fill([solid], [colours], has_outline=False))
+    return sheet_of_sides(
+        solid.vertices_mm, lambda canvas: canvas.fill([solid], [colours], has_outline=False), axes
+    )
 
 
-def sheet_of_sides(points: Points, draw: Callable[[Canvas], None]) -> Any:
-    """A PIL image from three sides, each of which shows all of the points; `draw` draws on a canvas."""
+def sheet_of_sides(points: Points, draw: Callable[[Canvas], None], axes: Points | None) -> Any:
+    """A PIL image from three sides, each of which shows all of the points; `draw` draws on a canvas.
+
+    `axes`: [3, 3] x, y and z of the frame in which z is up, as columns; None where nobody knows it."""
     from PIL import Image, ImageDraw
 
     sheet = Image.new("RGB", (len(_SIDES) * _WIDTH_PX, _HEIGHT_PX), "white")
-    for place, (name, lookout) in enumerate(_lookouts(points)):
+    for place, (name, lookout) in enumerate(_lookouts(points, axes)):
         canvas = Canvas(lookout)
         draw(canvas)
         sheet.paste(canvas.image(), (place * _WIDTH_PX, 0))
@@ -129,30 +141,37 @@ def sheet_of_sides(points: Points, draw: Callable[[Canvas], None]) -> Any:
     return sheet
 
 
-def values_from_sides(solid: Solid, values: Points) -> tuple[Points, Points]:
-    """Values [faces] of a solid as seen from three sides, and its brightness, both [h, w]; NaN beside it."""
+def values_from_sides(solid: Solid, values: Points, axes: Points | None) -> tuple[Points, Points]:
+    """Values [faces] of a solid as seen from three sides, and its brightness, both [h, w]; NaN beside it.
+
+    `axes` as for `sheet_of_sides`."""
     sheets, shades = [], []
-    for _, lookout in _lookouts(solid.vertices_mm):
+    for _, lookout in _lookouts(solid.vertices_mm, axes):
         face, brightness = seen_faces(lookout, solid)
         sheets.append(np.where(face >= 0, values[face], np.nan))
         shades.append(np.where(face >= 0, brightness[face].astype(np.float64), np.nan))
     return np.concatenate(sheets, axis=1), np.concatenate(shades, axis=1)
 
 
-def _lookouts(points: Points) -> Iterator[tuple[str, Lookout]]:
+def sides_in_words(axes: Points | None) -> str:
+    """The three sides, from left to right."""
+    return ", ".join(name for name, _, _ in (_UNKNOWN_SIDES if axes is None else _SIDES))
+
+
+def _lookouts(points: Points, axes: Points | None) -> Iterator[tuple[str, Lookout]]:
     """Three sides, and where from each is looked at all of the points."""
     low, high = points.min(axis=0), points.max(axis=0)
     size_mm = float(np.linalg.norm(high - low))
-    up = _upright(points)
-    for name, elevation_deg, azimuth_deg in _SIDES:
+    turn = _axes_by_extent(points) if axes is None else axes
+    for name, elevation_deg, azimuth_deg in _UNKNOWN_SIDES if axes is None else _SIDES:
         eye = look_at((0, 0, 0), 3 * size_mm, azimuth_deg, elevation_deg)
-        eye[:3] = up @ eye[:3]
+        eye[:3] = turn @ eye[:3]
         eye[:3, 3] += (low + high) / 2
         yield name, Lookout(eye, 1.1 * _HEIGHT_PX / size_mm, _WIDTH_PX, _HEIGHT_PX, perspective=False)
 
 
-def _upright(points: Points) -> NDArray[np.float64]:
-    """Axes to look along: scans know no upright, so the shortest extent is taken for depth."""
+def _axes_by_extent(points: Points) -> NDArray[np.float64]:
+    """[3, 3] axes as columns: the longest extent, the shortest, which is taken for depth, and the third."""
     _, _, axes = np.linalg.svd(points[:: max(1, len(points) // 5000)] - points.mean(axis=0), full_matrices=False)
     turn = axes[[0, 2, 1]].T
     return np.asarray(turn * np.sign(np.linalg.det(turn)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,9 @@ from coupole.commands.cli import app
 from coupole.errors import InputError
 from coupole.heritage.comparison.significance import discoveries
 from coupole.heritage.comparison.state_comparison import Comparison, compare, de00_of
-from coupole.heritage.comparison.state_files import lab_of
+from coupole.heritage.comparison.state_files import lab_of, read_state
+from coupole.viewing import comparison_page
+from coupole.viewing.comparison_page import remarks
 
 NOISE_MM, DENT_MM, DENT_ACROSS_MM = 0.03, 0.2, 10.0
 
@@ -81,6 +84,41 @@ def test_a_dent_of_a_fifth_of_a_millimetre_is_found(head: Head, changed: Compari
     region = changed.shape_regions[0]
     assert np.linalg.norm(region.middle_mm - np.array(head.mesh.vertices)[head.dent].mean(axis=0)) < 1.0
     assert region.distance_mm == pytest.approx(-DENT_MM, abs=0.06)  # inwards
+    turn = Rotation.from_rotvec([0.4, -1.1, 0.3]).as_matrix()
+    assert region.middle_in_after_mm == pytest.approx(turn @ region.middle_mm + [30, -90, 12], abs=0.02)
+
+
+def test_the_largest_region_and_single_points_are_told(changed: Comparison) -> None:
+    told = list(remarks(changed))
+    region = changed.shape_regions[0]
+    single = int(changed.moved_points.sum()) - region.points
+    of_shape = f"{region.points:,} of them in 1 region" + (f", {single:,} scattered" if single else "")
+    assert of_shape in told[0]
+    assert re.search(r"is 0\.\d+ mm lower in after\.ply; its middle is at .* in the frame of before\.ply", told[1])
+
+
+def test_pictures_stand_as_a_mesh_of_the_site_does(head: Head, before: Path, tmp_path: Path) -> None:
+    """A mesh that `register --control` merged has z up; the other state, turned, is drawn by these axes."""
+    changed = compare(
+        before, written_by_register(head, tmp_path, "site"), "mm", None, is_aligned=False, say=silent
+    )
+    turn = Rotation.from_rotvec([0.4, -1.1, 0.3]).as_matrix()
+    assert changed.upright_axes == pytest.approx(turn.T, abs=1e-3)
+    comparison_page.write(changed, tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    assert "from -y, from +y, from above, by the axes of mesh.ply, in which z is up" in page
+
+
+@pytest.mark.parametrize("record", ["", "{", '{"mesh": null}', '{"mesh": {"frame": "scan-1.ply"}}', "[]"])
+def test_otherwise_nobody_knows_what_is_up(head: Head, before: Path, tmp_path: Path, record: str) -> None:
+    after = written_by_register(head, tmp_path, "scan-1.ply")
+    (tmp_path / "registration.json").write_text(record)
+    assert read_state(after, "mm").is_upright is False
+
+
+def written_by_register(head: Head, folder: Path, frame: str) -> Path:
+    (folder / "registration.json").write_text(json.dumps({"mesh": {"frame": frame}}))
+    return head.write(folder / "mesh.ply", 2, dented=True, moved=True)
 
 
 def test_a_patch_of_another_colour_is_found(head: Head, changed: Comparison) -> None:

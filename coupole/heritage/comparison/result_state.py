@@ -48,6 +48,7 @@ def read_result_state(folder: Path) -> State:
         across[kept_triangles] / np.where(lengths[kept_triangles] > 0, lengths[kept_triangles], 1.0),
         Colours(lab, covariance),
         spacing(middles.astype(np.float32)),
+        is_upright=True,
     )
 
 

@@ -37,6 +37,9 @@ class Region:
 
     points: int
     middle_mm: Floats
+    """[3] in the frame of the first state."""
+    middle_in_after_mm: Floats
+    """[3] in the frame of the second state."""
     across_mm: float
     """Largest extent."""
     distance_mm: float
@@ -75,6 +78,14 @@ class Comparison:
     """Regions of `moved_points`, the largest first."""
     colour_regions: tuple[Region, ...]
     """Regions of `recoloured_points`, the largest first."""
+
+    @property
+    def upright_axes(self) -> Floats | None:
+        """[3, 3] x, y and z, as columns, of a state's frame in which z is up, seen in the frame of the first
+        state; None if no state has one."""
+        if self.before.is_upright:
+            return np.eye(3)
+        return self.alignment.before_from_after[:3, :3] if self.after.is_upright else None
 
 
 def compare(
@@ -203,10 +214,12 @@ def _regions(comparison: Comparison, point_mask: NDArray[np.bool_]) -> tuple[Reg
         if in_region.sum() < _LEAST_REGION:
             continue
         region_rows = numbers[in_region]
+        middle_mm = points[in_region].mean(axis=0)
         regions.append(
             Region(
                 len(region_rows),
-                points[in_region].mean(axis=0),
+                middle_mm,
+                moved_points(inverse_of(comparison.alignment.before_from_after), middle_mm[None])[0],
                 float(np.ptp(points[in_region], axis=0).max()),
                 float(np.nanmean(comparison.distance_mm[region_rows])),
                 float("nan") if comparison.de00 is None else float(np.nanmean(comparison.de00[region_rows])),
@@ -223,6 +236,7 @@ def about(comparison: Comparison) -> dict[str, Any]:
             {
                 "points": region.points,
                 "middle_mm": region.middle_mm.tolist(),
+                "middle_in_after_mm": region.middle_in_after_mm.tolist(),
                 "across_mm": region.across_mm,
                 "distance_mm": region.distance_mm,
                 "de00": None if np.isnan(region.de00) else region.de00,

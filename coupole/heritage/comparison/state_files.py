@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import ExtraMissing, InputError
+from coupole.intake.plain_data import read_json
 from coupole.scan.registration.prepared_scan import spacing, vertex_normals
 from coupole.scan.registration.scan_files import read_scan, sources_of
 
@@ -39,6 +40,8 @@ class State:
     """[n, 3] normals by the triangles."""
     colours: Colours | None
     spacing_mm: float
+    is_upright: bool = False
+    """True if z of its frame is known to point up."""
 
     @property
     def size_mm(self) -> float:
@@ -68,7 +71,20 @@ def read_state(path: Path, unit: str) -> State:
         vertex_normals(mesh),
         colours,
         spacing_mm,
+        _is_on_site(path),
     )
+
+
+def _is_on_site(path: Path) -> bool:
+    """True if `coupole register` merged the file in the frame of its control points, by the record beside it."""
+    record = path.with_name("registration.json")
+    if not record.is_file():
+        return False
+    try:
+        mesh = read_json(record)["mesh"]
+        return path.name == "mesh.ply" and bool(mesh["frame"] == "site")
+    except (InputError, KeyError, TypeError):
+        return False
 
 
 def lab_of(srgb: NDArray[np.uint8]) -> Floats:

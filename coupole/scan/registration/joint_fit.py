@@ -63,6 +63,8 @@ class JointFit:
     """4x4 mm; the common frame is that of the fixed scan, or of the control points."""
     covariance: Floats
     """[6 n, 6 n] of steps (mm, rad) about the pivots, in the common frame; zero for the fixed scan."""
+    overlap_covariance: Floats
+    """[6 n, 6 n] part of it by errors of overlaps; the rest is by targets, control points, sizes of scans."""
     pivots_mm: Floats
     """[n, 3] middle of each scan in the common frame."""
     noise_mm: float
@@ -98,9 +100,11 @@ def adjust(
         poses, state = _settled_poses(scans, pairs, poses, fixed_scan, sightings, inflation, say)
     every = np.concatenate([o.off_mm for o in state.overlaps] or [np.zeros(1)])
     nearest = np.concatenate([o.nearest_mm for o in state.overlaps] or [np.zeros(1)])
+    overlap_covariance, other_covariance = state.covariances()
     return JointFit(
         poses,
-        state.covariance(),
+        overlap_covariance + other_covariance,
+        overlap_covariance,
         state.pivots,
         state.noise_mm,
         float(np.sqrt(np.mean(every**2))),
@@ -144,12 +148,12 @@ class _State:
         honest = bread @ meat[np.ix_(self.free, self.free)] @ bread
         return max(1.0, float(np.sqrt(np.median(np.diag(honest) / np.diag(bread)))))
 
-    def covariance(self) -> Floats:
-        bread = np.linalg.inv(self.normal[np.ix_(self.free, self.free)])
-        meat = self._meat(self.inflation_used) + self.targets_normal + np.diag(self.prior)
-        whole = np.zeros_like(self.normal)
-        whole[np.ix_(self.free, self.free)] = bread @ meat[np.ix_(self.free, self.free)] @ bread
-        return whole
+    def covariances(self) -> tuple[Floats, Floats]:
+        """[6 n, 6 n] by errors of overlaps, and by those of targets and of what is known before."""
+        bread = np.zeros_like(self.normal)
+        bread[np.ix_(self.free, self.free)] = np.linalg.inv(self.normal[np.ix_(self.free, self.free)])
+        meat = self._meat(self.inflation_used)
+        return bread @ meat @ bread, bread @ (self.targets_normal + np.diag(self.prior)) @ bread
 
     def _meat(self, inflation: float) -> Floats:
         """[6 n, 6 n] sum over cells of space of the squared sums of weighted distances times derivatives."""

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.stats import chi2
 
 from coupole.scan.registration.control import Sightings
 from coupole.scan.registration.joint_fit import JointFit, Say, adjust
@@ -17,7 +18,7 @@ from coupole.scan.registration.prepared_scan import PreparedScan
 from coupole.scan.registration.small_motions import displacement_mm, inverse_of, step_between
 from coupole.scan.registration.viewpoint import Floats
 
-_MOST_SURPRISE = 50.0
+_CHANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,8 @@ class PairAlone:
     second: int
     first_from_second: Floats
     surprise: float
-    """Squared difference from the joint fit over its covariance; 6 are expected on average where loops are
-    many."""
+    """Squared difference from the joint fit over its covariance; where loops are many, chi-squared with 6 degrees
+    of freedom if noise explains it."""
 
 
 @dataclass(frozen=True)
@@ -54,19 +55,28 @@ def pairs_alone(
         alone = adjust(pair_scans, [(0, 1)], [np.eye(4), joint], 0, Sightings(), lambda *_: None)
         step = step_between(joint, alone.common_from_scan[1], alone.pivots_mm[1])
         surprise = float(step @ np.linalg.solve(alone.covariance[6:, 6:], step))
-        adjusted_pairs.append(
-            PairAlone(first, second, alone.common_from_scan[1], min(surprise, 6 * _MOST_SURPRISE))
-        )
+        adjusted_pairs.append(PairAlone(first, second, alone.common_from_scan[1], surprise))
     return adjusted_pairs
 
 
 def with_loops(fit: JointFit, pairs: Sequence[PairAlone], count: int) -> tuple[JointFit, float]:
-    """The fit with a covariance that is not smaller than the loops say, and the factor of its uncertainties."""
+    """The fit with a covariance that is not smaller than the loops say, and the factor for uncertainties by
+    overlaps.
+
+    The factor is of the median pair: a pair whose overlap does not hold it, so that by itself it slides away, says
+    nothing of the joint fit, which other pairs hold."""
     loops = len(pairs) - (count - 1)
     if loops < 1:
         return fit, 1.0
-    factor = max(1.0, float(np.sqrt(sum(pair.surprise for pair in pairs) / (6 * loops))))
-    return replace(fit, covariance=fit.covariance * factor**2), factor
+    expected = chi2.median(6) * loops / len(pairs)
+    factor = max(1.0, float(np.sqrt(np.median([pair.surprise for pair in pairs]) / expected)))
+    more = (factor**2 - 1.0) * fit.overlap_covariance
+    return replace(fit, covariance=fit.covariance + more, overlap_covariance=fit.overlap_covariance + more), factor
+
+
+def sliding_pairs(pairs: Sequence[PairAlone], factor: float) -> list[PairAlone]:
+    """Pairs that by themselves end elsewhere than all together: farther than one in a million would by chance."""
+    return [pair for pair in pairs if pair.surprise > factor**2 * chi2.isf(_CHANCE, 6)]
 
 
 def find_loops(scans: Sequence[PreparedScan], pairs: Sequence[PairAlone]) -> list[Loop]:

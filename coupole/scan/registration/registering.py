@@ -14,7 +14,7 @@ from coupole.errors import InputError
 from coupole.scan.registration.control import Sightings, motions_by_targets, read_sightings
 from coupole.scan.registration.joining import Groups, join, spheres_meet
 from coupole.scan.registration.joint_fit import JointFit, adjust
-from coupole.scan.registration.loop_errors import Loop, find_loops, pairs_alone, with_loops
+from coupole.scan.registration.loop_errors import Loop, find_loops, pairs_alone, sliding_pairs, with_loops
 from coupole.scan.registration.pair_matching import LEAST_OVERLAP, PairMotion, fit_of
 from coupole.scan.registration.pair_search import Search, Task, search_of
 from coupole.scan.registration.prepared_scan import PLACE_SPACINGS, PreparedScan, Survey, prepare, survey
@@ -66,7 +66,9 @@ class Registration:
     loops: tuple[Loop, ...]
     """Closed chains of pairs, with the error of each."""
     loop_factor: float
-    """Factor by which the loops enlarged all uncertainties."""
+    """Factor by which the loops enlarged the uncertainties by overlaps."""
+    sliding_pairs: tuple[tuple[int, int], ...]
+    """Pairs of scans that by themselves, without the others, would lie elsewhere."""
     fit: JointFit
     """The joint adjustment of all poses."""
 
@@ -301,5 +303,6 @@ def _adjusted_registration(
         len(overlapping),
         tuple(loops),
         factor,
+        tuple((placed_numbers[pair.first], placed_numbers[pair.second]) for pair in sliding_pairs(alone, factor)),
         fit,
     )

@@ -39,6 +39,7 @@ def about(registration: Registration, merged_mesh: Merged | None) -> dict[str, A
             for loop in registration.loops
         ],
         "loop_factor": registration.loop_factor,
+        "sliding_pairs": [[registration.names[k] for k in pair] for pair in registration.sliding_pairs],
         "rejected": [
             [registration.names[m.first], registration.names[m.second]] for m in registration.rejected_motions
         ],
@@ -122,6 +123,14 @@ def worst_loop_mm(registration: Registration) -> float:
     return registration.loops[0].error_mm if registration.loops else 0.0
 
 
+def _sliding(registration: Registration) -> str:
+    count, names = len(registration.sliding_pairs), registration.names
+    some = ", ".join(f"{names[a]} on {names[b]}" for a, b in registration.sliding_pairs[:3])
+    pairs_do = "1 pair does" if count == 1 else f"{count} pairs do"
+    more = ", ..." if count > 3 else ""
+    return f"{pairs_do} not hold by overlap alone ({some}{more}): the other pairs place these scans"
+
+
 def remarks(registration: Registration) -> Iterator[str]:
     """Yield remarks that the reader must know, one sentence each."""
     names = registration.names
@@ -144,9 +153,11 @@ def remarks(registration: Registration) -> Iterator[str]:
         yield "no loop closes: a wrong pair would not be noticed, and uncertainties are from noise alone"
     if registration.loop_factor > 1.05:
         yield (
-            f"loops close {registration.loop_factor:.1f} times worse than noise explains; all uncertainties are "
-            "multiplied by this factor"
+            f"pairs by themselves differ {registration.loop_factor:.1f} times more than noise explains; all "
+            "uncertainties by overlaps are multiplied by this factor"
         )
+    if registration.sliding_pairs:
+        yield _sliding(registration)
     if registration.unplaced_numbers:
         yield "not placed, because they overlap no other scan enough: " + ", ".join(
             names[k] for k in registration.unplaced_numbers

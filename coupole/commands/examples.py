@@ -148,7 +148,7 @@ EXAMPLES: dict[str, tuple[str, str]] = {
         "restore bust.ply --parts parts.yaml --materials bust.yaml --out restored",
         "restore bust.ply --parts parts.yaml --materials bust.yaml --width 400 --out restored",
     ),
-    "restore pick": ("restore pick bust.ply", "restore pick bust.ply --unit m --out parts.html"),
+    "restore pick": ("restore pick bust.ply", "restore pick bust.ply --materials bust.yaml --out parts.html"),
     # runs
     "status": ("status", "status RUN --follow"),
     "pause": ("pause", "pause RUN"),

@@ -140,6 +140,12 @@ def checked_restoration(
 def pick(
     mesh: MeshArgument,
     out: Annotated[Path, typer.Option("--out", help="Write this page (HTML).")] = Path("pick.html"),
+    materials: Annotated[
+        Path | None,
+        typer.Option(
+            "--materials", help="Hypotheses (YAML) whose parts the page offers by name.", show_default=False
+        ),
+    ] = None,
     unit: UnitOption = "mm",
     as_json: JsonOption = False,
 ) -> None:
@@ -148,13 +154,15 @@ def pick(
     """
     from coupole.exchange.pick.pick_page import write_pick_page
     from coupole.heritage.restoration.painted_mesh import read_painted
+    from coupole.heritage.restoration.restoration_file import names_of_parts, read_restoration
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     try:
+        names = [] if materials is None else names_of_parts(read_restoration(materials)[1])
         with console.status("reading the mesh"):
             painted_mesh = read_painted(mesh, unit)
-            triangles = write_pick_page(painted_mesh.vertices_mm, painted_mesh.triangles, mesh.name, out)
+            triangles = write_pick_page(painted_mesh.vertices_mm, painted_mesh.triangles, mesh.name, out, names)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -162,6 +170,7 @@ def pick(
         "page": str(out),
         "triangles_of_the_mesh": len(painted_mesh.triangles),
         "triangles_of_the_page": triangles,
+        "parts": names,
     }
     if as_json:
         print(json.dumps(document))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+from collections.abc import Sequence
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -28,11 +29,12 @@ def write_pick_page(
     triangles: NDArray[np.int64],
     title: str,
     path: Path,
+    names: Sequence[str] = (),
     most_triangles: int = MOST_TRIANGLES,
 ) -> int:
     """Write the page of a mesh, vertices [n, 3] and triangles [m, 3]; how many triangles it has.
 
-    Raises InputError for a name that does not end in .html, StorageError if it cannot be written.
+    `names` are parts that the page begins with; without any it begins with one to be named. Raises InputError for a name that does not end in .html, StorageError if it cannot be written.
     """
     if path.suffix.lower() != ".html":
         raise InputError(f"--out {path}: expected a name that ends in .html")
@@ -43,16 +45,19 @@ def write_pick_page(
         )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(page_text(points, faces, title), encoding="utf-8")
+        path.write_text(page_text(points, faces, title, names), encoding="utf-8")
     except OSError as error:
         raise StorageError(f"{path}: {reason(error)}. Choose another place, or free space.") from error
     return len(faces)
 
 
-def page_text(points_mm: NDArray[np.float64], triangles: NDArray[np.int64], title: str) -> str:
+def page_text(
+    points_mm: NDArray[np.float64], triangles: NDArray[np.int64], title: str, names: Sequence[str] = ()
+) -> str:
     """The HTML."""
     mesh = {
         "title": title,
+        "names": list(names),
         "vertices_mm": base64.b64encode(points_mm.astype("<f4").tobytes()).decode(),
         "triangles": base64.b64encode(triangles.astype("<u4").tobytes()).decode(),
     }

@@ -212,6 +212,11 @@ def chosen_hypotheses(
     return tuple(candidate for candidate in restoration_file.hypotheses if not names or candidate.name in names)
 
 
+def names_of_parts(restoration_file: RestorationFile) -> list[str]:
+    """Names of the parts to which hypotheses give materials, in the file's order."""
+    return list(dict.fromkeys(name for hypothesis in restoration_file.hypotheses for name in hypothesis.materials))
+
+
 def expect_parts(document: Document, restoration_file: RestorationFile, names: Sequence[str], parts: Path) -> None:
     """Raise InputError unless every hypothesis has a material for each part, and for no other."""
     problems: list[Problem] = []

@@ -12,7 +12,10 @@ from browser import needs_chromium
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 from shown_page import FIELD_DEG, Page
+from typer.testing import CliRunner, Result
 
+from coupole.commands.cli import app
+from coupole.errors import InputError
 from coupole.exchange.pick.pick_page import write_pick_page
 from coupole.heritage.restoration.painted_mesh import read_painted
 from coupole.heritage.restoration.part_labels import parts_of
@@ -20,6 +23,23 @@ from coupole.heritage.restoration.parts_file import read_parts
 
 pytestmark = needs_chromium
 BRUSH_MM = 9.0
+HYPOTHESES = """
+schema_version: 1
+name: wall
+hypotheses:
+  - name: bare
+    title: Bare
+    sources: &drawn [{says: Nothing is known., reference: Assumption}]
+    materials:
+      stone: &grey {kind: diffuse, reflectance: {kind: constant, value: 0.5}}
+      gilt rim: *grey
+  - name: later
+    title: Later
+    sources: *drawn
+    materials: {gilt rim: *grey, base: *grey}
+lights:
+  - {kind: candle, position_mm: [0, -500, 0], wax_height_mm: 250, flame_height_mm: 35}
+"""
 WALL: trimesh.Trimesh = trimesh.creation.box((40.0, 1.0, 40.0)).subdivide().subdivide().subdivide()
 """Thinner than the brush."""
 
@@ -85,6 +105,38 @@ def test_a_stroke_paints_what_is_under_the_brush_and_the_file_gives_it_back(pick
         assert np.array_equal(got[~edge], wanted[~edge]), "the pointer is true to a pixel"
         assert got.sum() > 12
     assert pick.browser.troubles() == []
+
+
+def test_parts_of_the_hypotheses_are_offered_by_name(page: Page, tmp_path: Path) -> None:
+    """Names are those of the file, in its order, once each; the page begins with the first."""
+    WALL.export(tmp_path / "wall.ply")
+    (tmp_path / "hypotheses.yaml").write_text(HYPOTHESES)
+    ended = picked(tmp_path, "--json")
+    assert ended.exit_code == 0, ended.output
+    assert json.loads(ended.stdout)["parts"] == ["stone", "gilt rim", "base"]
+    page.opened = None
+    page.browser.open((tmp_path / "pick.html").as_uri())
+    page.run(f"document.getElementById('brush').value = {BRUSH_MM}")
+    page.browser.at("[data-tool=paint]").click()
+    strike(page, (-8.0, 6.0))
+    page.browser.at("[aria-label='Paint as gilt rim']").click()
+    strike(page, (11.0, -7.0))
+    assert json.loads(page.run("coupolePick.parts.file()"))["names"] == ["stone", "gilt rim"]
+    assert page.browser.troubles() == []
+
+
+def picked(folder: Path, *more: str) -> Result:
+    words = [str(folder / "wall.ply"), "--materials", str(folder / "hypotheses.yaml")]
+    return CliRunner().invoke(app, ["restore", "pick", *words, "--out", str(folder / "pick.html"), *more])
+
+
+def test_hypotheses_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
+    WALL.export(tmp_path / "wall.ply")
+    (tmp_path / "hypotheses.yaml").write_text(HYPOTHESES.replace("materials:", "material:"))
+    ended = picked(tmp_path)
+    assert isinstance(ended.exception, InputError)
+    assert "hypotheses.yaml:8:" in str(ended.exception)
+    assert not (tmp_path / "pick.html").exists()
 
 
 def test_a_whole_stroke_is_undone_at_once_and_a_saved_file_is_taken_up_again(pick: Page, tmp_path: Path) -> None:

@@ -14,7 +14,9 @@ class Pick {
     byId("brush").value = (this.surface.radius * 0.03).toPrecision(2);
     this.resize();
     this.showAll();
-    this.add();
+    this.parts.names = [...mesh.names];
+    if (mesh.names.length) this.list();
+    else this.add();
     this.listen();
     new ResizeObserver(() => this.resize()).observe(byId("stage"));
     byId("status").textContent = "";

@@ -99,7 +99,7 @@ def restore(
             refuse_other_lights(out, lights)
             pictures = render_all(restoration, out, say)
             result = show_all(restoration, pictures, out, say)
-            write_scenes(restoration, out)
+            write_scenes(restoration, result["white_cd_m2"], out)
             _write_page(restoration_page, result, out)
     except CoupoleError as error:
         fail(error, as_json=as_json)

@@ -136,6 +136,8 @@ def test_each_hypothesis_is_a_scene_that_can_be_moved_rendered_and_shown(
         names = sorted(name for name in file.channels() if name.startswith("S0."))
         radiance = np.stack([np.array(file.channels()[name].pixels) for name in names], axis=-1)
     assert np.allclose(radiance[:, : PX // 2], restored.exr("light")[1][:, : PX // 2], rtol=0.02)
+    white = json.loads((restored.out / "result.json").read_text())["white_cd_m2"]
+    assert [camera["white_cd_m2"] for camera in json.loads(rendered.out)["cameras"].values()] == [white]
     shown = cells.here("show", scene, "--out", tmp_path / "page.html", "--json")
     assert shown.code == 0, shown.err
     assert "diffuse" in " ".join(json.loads(shown.out)["about"]["materials"])

@@ -26,14 +26,14 @@ SCENE = "scene.yaml"
 PARTS, FILES = "parts", "files"
 
 
-def write_scenes(restoration: Restoration, out: Path) -> None:
-    """Write all of it into `out`. Raises StorageError."""
+def write_scenes(restoration: Restoration, white_cd_m2: float, out: Path) -> None:
+    """Write all of it into `out`; scenes have the white of the restoration's pictures. Raises StorageError."""
     try:
         for name, triangles in _triangles_of_parts(restoration):
             (out / PARTS).mkdir(exist_ok=True)
             _write_part(out / PARTS / f"{name}.ply", restoration.mesh.vertices_mm, triangles)
         for hypothesis in restoration.hypotheses:
-            text = _scene_text(restoration, hypothesis, _Copies(restoration.folder, out))
+            text = _scene_text(restoration, hypothesis, white_cd_m2, _Copies(restoration.folder, out))
             (out / hypothesis.name / SCENE).write_text(text, encoding="utf-8")
     except OSError as error:
         raise StorageError(f"{out}: {reason(error)}. Choose another folder, or free space.") from error
@@ -80,7 +80,7 @@ def _write_part(path: Path, vertices_mm: NDArray[np.float64], triangles: NDArray
     path.write_bytes(head.encode() + vertices_mm[used_rows].astype("<f4").tobytes() + faces.tobytes())
 
 
-def _scene_text(restoration: Restoration, hypothesis: Hypothesis, copies: _Copies) -> str:
+def _scene_text(restoration: Restoration, hypothesis: Hypothesis, white_cd_m2: float, copies: _Copies) -> str:
     """The scene as YAML, with the hypothesis and its sources as comments."""
     pose = restoration.restoration_file.object.model_dump(mode="json", exclude_defaults=True)
     stage = _named_anew(restoration.stage, copies) | {
@@ -98,6 +98,7 @@ def _scene_text(restoration: Restoration, hypothesis: Hypothesis, copies: _Copie
         for name in restoration.parts.names
     ]
     stage["objects"] = [*parts, *stage.get("objects", [])]
+    stage["display"] = stage.get("display", {}) | {"white_cd_m2": white_cd_m2}
     yaml, stream = YAML(), io.StringIO()
     yaml.width = 1000
     yaml.dump(stage, stream)

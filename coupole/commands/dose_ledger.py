@@ -48,7 +48,7 @@ def dose(
     """
     from coupole.plan.cell import read_cell, users_ledger_folder
     from coupole.storage.ledger import Ledger, ledger_of, similar_ids
-    from coupole.viewing.dose_table import document, show_dose
+    from coupole.viewing.dose_table import document, show_dose, show_that_it_is_new
     from coupole.viewing.terminal import make_console
 
     if (add is not None) != bool(note.strip()):
@@ -59,6 +59,7 @@ def dose(
         )
     cell = read_cell(rig) if rig else None
     ledger = ledger_of(cell, object_id) if cell else Ledger(users_ledger_folder(), object_id)
+    is_new = ledger.read_history().is_empty
     if add is not None and not _entered_by_console(
         cell, object_id, "light", {"dose_lux_h": add, "note": note.strip()}
     ):
@@ -70,7 +71,10 @@ def dose(
     if budget is not None and not _entered_by_console(cell, object_id, "budget", request):
         ledger.set_budget(budget, person, reason)
     history, similar_objects = ledger.read_history(), similar_ids(ledger.folder, object_id)
-    show_dose(make_console(quiet=as_json), ledger, history, similar_objects)
+    console = make_console(quiet=as_json)
+    show_dose(console, ledger, history, similar_objects)
+    if is_new:
+        show_that_it_is_new(console, history)
     if as_json:
         print(json.dumps(document(ledger, history, similar_objects)))
 

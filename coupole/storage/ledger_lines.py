@@ -113,6 +113,11 @@ class History:
         return self.without_plan > self.unreadable
 
     @property
+    def is_empty(self) -> bool:
+        """True if nothing was ever entered, as of an object that is new, or whose file was moved away."""
+        return not self.entries and not self.budgets and self.warn_above_lux_h is None and not self.unreadable
+
+    @property
     def total_lux_h(self) -> float:
         return sum(entry.dose_lux_h for entry in self.entries)
 

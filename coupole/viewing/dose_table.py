@@ -50,6 +50,16 @@ def show_dose(console: Console, ledger: Ledger, history: History, similar_ids: l
     console.print(f"  {escape(str(ledger.path))}", soft_wrap=True)
 
 
+def show_that_it_is_new(console: Console, history: History) -> None:
+    """Nothing was known of the object before: a person must know it, as a file may have been moved away."""
+    begun = "there is none yet" if history.is_empty else "it was begun now"
+    console.print(
+        f"[yellow]note:[/] no earlier ledger is in this folder: {begun}. If the object ever received light, "
+        "find its file before you go on: that light is not counted here",
+        soft_wrap=True,
+    )
+
+
 def document(ledger: Ledger, history: History, similar_ids: list[str]) -> dict[str, Any]:
     """Return the document for `--json`."""
     return {

@@ -70,3 +70,13 @@ def test_light_without_end_is_no_figure(tmp_path: Path, words: list[str]) -> Non
     assert ended.code == 2
     assert "of 0 lux.h or more, found inf" in ended.err
     assert not list(tmp_path.rglob("*.jsonl"))
+
+
+def test_a_ledger_that_begins_now_says_so(tmp_path: Path) -> None:
+    """Also one whose file was moved away: its light would be forgotten without a word."""
+    assert "there is none yet. If the object ever received light" in dose(tmp_path, "vase").err
+    assert "it was begun now" in dose(tmp_path, "vase", "--add", "1", "--note", "a").err
+    assert "ledger is in this folder" not in dose(tmp_path, "vase", "--add", "1", "--note", "b").err
+    (tmp_path / "coupole/ledger/vase.jsonl").rename(tmp_path / "elsewhere.jsonl")
+    ended = dose(tmp_path, "vase", "--add", "1", "--note", "c")
+    assert (ended.code, "it was begun now" in ended.err) == (0, True)

@@ -47,7 +47,7 @@ def test_a_full_standard_output_is_told_in_one_sentence(
     ("words", "why"),
     [
         ([], "cannot read the dose ledger: a pipe or a device, expected a file"),
-        (["--add", "1", "--note", "a"], "cannot write the dose ledger: a pipe or a device, expected a file"),
+        (["--add", "1", "--note", "a"], "cannot read the dose ledger: a pipe or a device, expected a file"),
     ],
     ids=["read", "written"],
 )

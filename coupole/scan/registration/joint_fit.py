@@ -3,7 +3,7 @@
 Points of one scan are compared with the surface of another along its normals (Chen, Medioni, 1992), for all
 pairs that overlap at once, so that errors do not add up along chains (Bergevin et al., PAMI 18(5), 1996).
 Neighbouring points have errors in common, and a point counts in every pair of its scan; so the covariance is
-that of sums over cells of space, not over points (a sandwich, clustered: Liang, Zeger, Biometrika 73(1), 1986).
+that of sums over cells of space, not over points (`cell_errors`).
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
 from coupole.errors import InputError
+from coupole.scan.registration.cell_errors import Overlap, gradient_covariance
 from coupole.scan.registration.control import Sighting, Sightings
 from coupole.scan.registration.prepared_scan import Cloud, PreparedScan
 from coupole.scan.registration.small_motions import inverse_of, moved_points, stepped_motion
@@ -36,23 +36,6 @@ _HUBER = 2.0
 _CELLS_ACROSS = 12
 """Cells of space along the size of a scan, over each of which errors may have something in common."""
 _LEAST_PAIRS = 30
-_LEAST_CELLS = 8.0
-
-
-@dataclass(frozen=True)
-class Overlap:
-    """Points of the second scan that lie on the first, in the common frame."""
-
-    first: int
-    second: int
-    derivatives: Floats
-    """[n, 12] of the distances, by steps of the first and of the second scan."""
-    off_mm: Floats
-    """[n] distances along the normals of the first."""
-    points_mm: Floats
-    """[n, 3]"""
-    nearest_mm: Floats
-    """[n] from point to point."""
 
 
 @dataclass(frozen=True)
@@ -143,44 +126,27 @@ class _State:
         if not self.overlaps:
             return 1.0
         points = self.normal - self.targets_normal
-        bread = np.linalg.inv(points[np.ix_(self.free, self.free)] * self.inflation_used**2)
-        meat = self._meat(1.0) + np.diag(self.prior)
-        honest = bread @ meat[np.ix_(self.free, self.free)] @ bread
-        return max(1.0, float(np.sqrt(np.median(np.diag(honest) / np.diag(bread)))))
+        bread = self._inverse(points * self.inflation_used**2)
+        honest = bread @ (self._meat(bread, 1.0) + np.diag(self.prior)) @ bread
+        return max(1.0, float(np.sqrt(np.median(np.diag(honest)[self.free] / np.diag(bread)[self.free]))))
 
     def covariances(self) -> tuple[Floats, Floats]:
         """[6 n, 6 n] by errors of overlaps, and by those of targets and of what is known before."""
-        bread = np.zeros_like(self.normal)
-        bread[np.ix_(self.free, self.free)] = np.linalg.inv(self.normal[np.ix_(self.free, self.free)])
-        meat = self._meat(self.inflation_used)
+        bread = self._inverse(self.normal)
+        meat = self._meat(bread, self.inflation_used)
         return bread @ meat @ bread, bread @ (self.targets_normal + np.diag(self.prior)) @ bread
 
-    def _meat(self, inflation: float) -> Floats:
-        """[6 n, 6 n] sum over cells of space of the squared sums of weighted distances times derivatives."""
-        if not self.overlaps:
-            return np.zeros_like(self.normal)
+    def _inverse(self, normal: Floats) -> Floats:
+        """The inverse of a normal matrix [6 n, 6 n], with zeros for the fixed scan."""
+        inverse = np.zeros_like(normal)
+        inverse[np.ix_(self.free, self.free)] = np.linalg.inv(normal[np.ix_(self.free, self.free)])
+        return inverse
+
+    def _meat(self, bread: Floats, inflation: float) -> Floats:
+        """[6 n, 6 n] covariance of the gradient, by cells of space."""
         size_mm = float(np.median([scan.survey.size_mm for scan in self.scans])) / _CELLS_ACROSS
-        keys = [np.floor(o.points_mm / size_mm).astype(np.int64) for o in self.overlaps]
-        low = np.min([k.min(axis=0) for k in keys], axis=0)
-        span = np.max([k.max(axis=0) for k in keys], axis=0) - low + 1
-        flat = [((k - low) @ np.array([span[1] * span[2], span[2], 1])) for k in keys]
-        cells, number = np.unique(np.concatenate(flat), return_inverse=True)
-        rows, columns, values, at = [], [], [], 0
-        for overlap in self.overlaps:
-            point_numbers = number[at : at + len(overlap.off_mm)]
-            at += len(overlap.off_mm)
-            pulls = overlap.derivatives * (_weights(overlap.off_mm, self.noise_mm) * overlap.off_mm)[:, None]
-            distinct, place = np.unique(point_numbers, return_inverse=True)
-            sums = np.stack([np.bincount(place, column, len(distinct)) for column in pulls.T], axis=1)
-            rows.append(np.repeat(distinct, 12))
-            columns.append(np.tile(_columns(overlap), len(distinct)))
-            values.append(sums.reshape(-1))
-        shape = (len(cells), len(self.gradient))
-        pull = sparse.coo_matrix(
-            (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape
-        ).tocsr()
-        few = len(cells) / max(len(cells) - _LEAST_CELLS, 1.0)  # sums of few cells are too small by chance
-        return np.asarray((pull.T @ pull).toarray() * few / inflation**4)
+        weights = [_weights(overlap.off_mm, self.noise_mm) / inflation**2 for overlap in self.overlaps]
+        return gradient_covariance(self.overlaps, weights, bread, size_mm)
 
 
 def _settled_poses(
@@ -229,7 +195,7 @@ def _state(
     noise_mm = max(noise_mm, 1e-4 * pitch_mm)
     normal, gradient = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
     for overlap in overlaps:
-        columns = _columns(overlap)
+        columns = overlap.columns
         weighted_derivatives = overlap.derivatives * (_weights(overlap.off_mm, noise_mm) / inflation**2)[:, None]
         normal[np.ix_(columns, columns)] += weighted_derivatives.T @ overlap.derivatives
         gradient[columns] += weighted_derivatives.T @ overlap.off_mm
@@ -250,10 +216,6 @@ def _state(
         np.flatnonzero(free),
         inflation,
     )
-
-
-def _columns(overlap: Overlap) -> Columns:
-    return np.concatenate([6 * scan + np.arange(6) for scan in (overlap.first, overlap.second)])
 
 
 def _overlaps(

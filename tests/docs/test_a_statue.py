@@ -83,7 +83,10 @@ def test_the_scans_come_to_their_true_places_in_the_frame_of_the_site(walked: Wa
     for name, pose in found["poses"].items():
         points = np.asarray(trimesh.load(walked.folder / "scans" / name).vertices)
         off = np.array(found["site_from_first"]) @ np.array(pose) - np.array(true_poses[name])
-        assert np.sqrt(np.mean(np.sum((points @ off[:3, :3].T + off[:3, 3]) ** 2, axis=1))) < 0.35
+        off_mm = np.sqrt(np.mean(np.sum((points @ off[:3, :3].T + off[:3, 3]) ** 2, axis=1)))
+        stated_mm = found["uncertainties"][name]["of_a_point_mm"]
+        assert off_mm < 0.35
+        assert off_mm / 2 < stated_mm < 4 * off_mm
     surface = np.asarray(trimesh.load(walked.folder / "truth/surface.ply").vertices)
     nearest = cKDTree(trimesh.load(walked.folder / "registered/mesh.ply").vertices).query(surface)[0]
     assert np.median(nearest) < 1.6  # cells of 3 mm

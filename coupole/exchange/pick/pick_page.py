@@ -34,7 +34,8 @@ def write_pick_page(
 ) -> int:
     """Write the page of a mesh, vertices [n, 3] and triangles [m, 3]; how many triangles it has.
 
-    `names` are parts that the page begins with; without any it begins with one to be named. Raises InputError for a name that does not end in .html, StorageError if it cannot be written.
+    `names` are parts that the page begins with; without any it begins with one to be named. Raises InputError for
+    a name that does not end in .html, StorageError if it cannot be written.
     """
     if path.suffix.lower() != ".html":
         raise InputError(f"--out {path}: expected a name that ends in .html")

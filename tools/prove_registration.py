@@ -60,12 +60,12 @@ def main() -> int:
         for process_kind in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     )
     coverage = float(np.mean([outcome.coverage for outcome in outcomes]))
-    squared = float(np.mean([outcome.squared_ratio for outcome in outcomes]))
+    squared_ratio = float(np.mean([outcome.squared_ratio for outcome in outcomes]))
     off_mm, minutes = max(outcome.off_mm for outcome in outcomes), max(outcome.minutes for outcome in outcomes)
     gb = memory / 1e6
     print(
-        f"in 95 % regions {100 * coverage:.1f} % of the poses; mean squared error {squared:.2f} times the stated "
-        f"one; {off_mm:.3f} mm at worst; {minutes:.1f} minutes at most; {gb:.2f} GB in the largest process"
+        f"in 95 % regions {100 * coverage:.1f} % of the poses; mean squared error {squared_ratio:.2f} times the "
+        f"stated one; {off_mm:.3f} mm at worst; {minutes:.1f} minutes at most; {gb:.2f} GB in the largest process"
     )
     wrong = any(outcome.unplaced for outcome in outcomes) or off_mm > MOST_OFF_MM or coverage < LEAST_COVERED
     return int(wrong or minutes > MOST_MINUTES or gb > MOST_GB)
@@ -73,11 +73,11 @@ def main() -> int:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one registration."""
+    """Errors of one registration."""
 
     unplaced: int
     off_mm: float
-    """Of the worst scan's points, root mean square."""
+    """Root mean square displacement of the worst scan's points."""
     coverage: float
     """Share of the poses in their 95 % regions."""
     squared_ratio: float
@@ -151,12 +151,12 @@ def compare_with_truth(
         )
         for n, true in zip(registration.placed_numbers, world_from, strict=True)
     ]
-    squared = np.concatenate([_squared_errors(registration, world_from, r) for r in range(len(world_from))])
-    return np.array(off_mm), float(np.mean(squared < chi2.ppf(0.95, 6))), float(np.mean(squared) / 6)
+    squared_errors = np.concatenate([_squared_errors(registration, world_from, r) for r in range(len(world_from))])
+    return np.array(off_mm), float(np.mean(squared_errors < chi2.ppf(0.95, 6))), float(np.mean(squared_errors) / 6)
 
 
 def _squared_errors(registration: Registration, world_from: list[np.ndarray], reference: int) -> list[float]:
-    """Of the poses, seen from one scan, over their covariances."""
+    """Squared errors of the poses, seen from one scan, over their covariances."""
     fit, squared_errors = registration.fit, []
     true_from_world = fit.common_from_scan[reference] @ inverse_of(world_from[reference])
     for k, pose in enumerate(fit.common_from_scan):

@@ -48,7 +48,7 @@ def dose(
     """
     from coupole.plan.cell import read_cell, users_ledger_folder
     from coupole.storage.ledger import Ledger, ledger_of, similar_ids
-    from coupole.viewing.dose_table import document, show_dose, show_that_it_is_new
+    from coupole.viewing.dose_table import document, show_dose
     from coupole.viewing.terminal import make_console
 
     if (add is not None) != bool(note.strip()):
@@ -71,10 +71,7 @@ def dose(
     if budget is not None and not _entered_by_console(cell, object_id, "budget", request):
         ledger.set_budget(budget, person, reason)
     history, similar_objects = ledger.read_history(), similar_ids(ledger.folder, object_id)
-    console = make_console(quiet=as_json)
-    show_dose(console, ledger, history, similar_objects)
-    if is_new:
-        show_that_it_is_new(console, history)
+    show_dose(make_console(quiet=as_json), ledger, history, similar_objects, is_new=is_new)
     if as_json:
         print(json.dumps(document(ledger, history, similar_objects)))
 

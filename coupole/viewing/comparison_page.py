@@ -120,13 +120,13 @@ def remarks(comparison: Comparison) -> Iterator[str]:
 
 
 def _in_regions(regions: Sequence[Region], is_changed: NDArray[np.bool_]) -> str:
-    """How many of the changed points hang together, and in how many regions; the others are single points."""
+    """Say how many of the changed points hang together, and in how many regions; the others are single points."""
     points_in_regions = sum(region.points for region in regions)
     single = int(is_changed.sum()) - points_in_regions
     if not regions:
         return "none of them in a region" if single else "in no region"
-    named = "1 region" if len(regions) == 1 else f"{len(regions)} regions"
-    return f"{points_in_regions:,} of them in {named}" + (f", {single:,} scattered" if single else "")
+    count = "1 region" if len(regions) == 1 else f"{len(regions)} regions"
+    return f"{points_in_regions:,} of them in {count}" + (f", {single:,} scattered" if single else "")
 
 
 def _largest(comparison: Comparison, region: Region) -> str:
@@ -139,7 +139,7 @@ def _largest(comparison: Comparison, region: Region) -> str:
 
 
 def _frames(comparison: Comparison) -> str:
-    """Which frame places and pictures have, in sentences."""
+    """Say in sentences which frames places and pictures have."""
     before, after = comparison.before, comparison.after
     words = f"Places are in the frames of {before.name} and of {after.name}."
     sides = sides_in_words(comparison.upright_axes)

@@ -16,8 +16,9 @@ NOT_KNOWN = "not known"
 NO_BUDGET = "  it has no light budget: `coupole dose {} --budget LUX_H --name NAME` gives it one"
 
 
-def show_dose(console: Console, ledger: Ledger, history: History, similar_ids: list[str]) -> None:
-    """Light of each run, the total, and remarks. `similar_ids`: objects with nearly the same id."""
+def show_dose(console: Console, ledger: Ledger, history: History, similar_ids: list[str], *, is_new: bool) -> None:
+    """Light of each run, the total, and remarks. `similar_ids`: objects with nearly the same id; `is_new`: nothing
+    was entered before this command."""
     title = f"{ledger.object_id}: light received"
     table = Table("run", "first", "lux.h", "damage, mW.h/m2", "", box=None, title=title, title_justify="left")
     for run in history.runs:
@@ -48,16 +49,13 @@ def show_dose(console: Console, ledger: Ledger, history: History, similar_ids: l
     if history.unreadable:
         console.print(f"[yellow]note:[/] {history.unreadable} lines of the ledger cannot be read")
     console.print(f"  {escape(str(ledger.path))}", soft_wrap=True)
-
-
-def show_that_it_is_new(console: Console, history: History) -> None:
-    """Nothing was known of the object before: a person must know it, as a file may have been moved away."""
-    begun = "there is none yet" if history.is_empty else "it was begun now"
-    console.print(
-        f"[yellow]note:[/] no earlier ledger is in this folder: {begun}. If the object ever received light, "
-        "find its file before you go on: that light is not counted here",
-        soft_wrap=True,
-    )
+    if is_new:  # a person must know it, as a file may have been moved away
+        state = "there is none yet" if history.is_empty else "it was begun now"
+        console.print(
+            f"[yellow]note:[/] no earlier ledger is in this folder: {state}. If the object ever received light, "
+            "find its file before you go on: that light is not counted here",
+            soft_wrap=True,
+        )
 
 
 def document(ledger: Ledger, history: History, similar_ids: list[str]) -> dict[str, Any]:

@@ -29,7 +29,7 @@ _UNKNOWN_SIDES = (
     ("from the other side", 15.0, 120.0),
     ("along its width", 75.0, -60.0),
 )
-"""Where nobody knows which way is up: the shortest extent is taken for depth."""
+"""Sides of an object of which nobody knows what is up: the shortest extent is taken for depth."""
 _WIDTH_PX, _HEIGHT_PX = 560, 520
 _DRAWN_FACES, _DRAWN_POINTS = 300_000, 40_000
 _STONE = (0.75, 0.72, 0.66)

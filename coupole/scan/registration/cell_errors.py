@@ -40,7 +40,7 @@ class Overlap:
 
 @dataclass(frozen=True)
 class _CellPart:
-    """What one overlap adds to one cell."""
+    """Sums of one overlap over one cell."""
 
     columns: NDArray[np.intp]
     gradient: Floats
@@ -84,9 +84,9 @@ def _cells(overlaps: Sequence[Overlap], weights: Sequence[Floats], cell_mm: floa
         order = np.argsort(cell_of_point, kind="stable")
         distinct, starts = np.unique(cell_of_point[order], return_index=True)
         derivatives, columns = overlap.derivatives[order], overlap.columns
-        weighted = derivatives * weight[order][:, None]
+        weighted_derivatives = derivatives * weight[order][:, None]
         off_mm, ends = overlap.off_mm[order], [*starts[1:], len(order)]
         for cell, start, end in zip(distinct.tolist(), starts, ends, strict=True):
-            part, at = weighted[start:end].T, slice(start, end)
+            part, at = weighted_derivatives[start:end].T, slice(start, end)
             cells.setdefault(cell, []).append(_CellPart(columns, part @ off_mm[at], part @ derivatives[at]))
     return list(cells.values())

@@ -68,8 +68,8 @@ def with_loops(fit: JointFit, pairs: Sequence[PairAlone], count: int) -> tuple[J
     loops = len(pairs) - (count - 1)
     if loops < 1:
         return fit, 1.0
-    expected = chi2.median(6) * loops / len(pairs)
-    factor = max(1.0, float(np.sqrt(np.median([pair.surprise for pair in pairs]) / expected)))
+    usual_surprise = chi2.median(6) * loops / len(pairs)
+    factor = max(1.0, float(np.sqrt(np.median([pair.surprise for pair in pairs]) / usual_surprise)))
     more = (factor**2 - 1.0) * fit.overlap_covariance
     return replace(fit, covariance=fit.covariance + more, overlap_covariance=fit.overlap_covariance + more), factor
 

@@ -1,7 +1,8 @@
 """Runs a command and tells what it imported until when: `python tests/watched_imports.py FILE ARGUMENT ...`.
 
 FILE gets a JSON object: the names in `sys.modules` when the devices were open (`opened`), when they were safe
-(`safe`), when a running acquisition was asked for something (`asked`), and at the end (`end`).
+(`safe`), when a running acquisition was asked for something (`asked`), and at the end (`end`). `kernels` has our
+compiled functions, with the types of their arguments, at the same times.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ sys.path[:0] = [str(Path(__file__).resolve().parent.parent)]
 
 from coupole.commands import cli  # noqa: E402  # found by the path above
 
-seen: dict[str, list[str]] = {}
+seen: dict[str, Any] = {"kernels": {}}
 leave = cli.leave
 
 
@@ -28,17 +29,37 @@ def noted(name: str, function: Callable[..., Any], *, before: bool) -> Callable[
     @functools.wraps(function)
     def called(*args: Any, **kwargs: Any) -> Any:
         if before:
-            seen.setdefault(name, sorted(sys.modules))
-        found = function(*args, **kwargs)
+            look(name)
+        result = function(*args, **kwargs)
         if not before:
-            seen.setdefault(name, sorted(sys.modules))
-        return found
+            look(name)
+        return result
 
     return called
 
 
+def look(name: str) -> None:
+    if name not in seen:
+        seen[name], seen["kernels"][name] = sorted(sys.modules), sorted(kernels())
+
+
+def kernels() -> set[str]:
+    """Our functions that numba has compiled or loaded, with the types that they take."""
+    if "numba" not in sys.modules:
+        return set()
+    dispatcher = sys.modules["numba.core.dispatcher"].Dispatcher
+    return {
+        f"{module}.{name}{signature}"
+        for module, content in list(sys.modules.items())
+        if module.startswith(("coupole.", "drivers."))
+        for name, kernel in list(vars(content).items())
+        if isinstance(kernel, dispatcher)
+        for signature in kernel.signatures
+    }
+
+
 def left(code: int) -> NoReturn:
-    seen["end"] = sorted(sys.modules)
+    look("end")
     Path(FILE).write_text(json.dumps(seen))
     leave(code)
 

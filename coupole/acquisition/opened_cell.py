@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 _LONGEST_WATCHDOG_S = 60.0
 _WORLD_STARTS_S, _OPENS_S = 900.0, 30.0
 _SLOW_START_S = 15.0
+_WORLD_COMPILES = (
+    "the simulated cell compiles its code, once on a machine: a minute or two, longer on a busy one ..."
+)
 
 
 ARM_STOPPED = "arm stopped"
@@ -196,15 +199,14 @@ def _get_world(cell: Cell, job: Job | None, sensor: Sensor, *, dry_run: bool, sp
     with (
         frozen(world_config(cell, job, sensor, dry_run=dry_run, speed=speed), cell.files) as config,
         under_way("world", "start", _WORLD_STARTS_S),
-        _told_if_slow(),
+        told_if_slow(_WORLD_COMPILES),
     ):
         return world_class.start(config)
 
 
 @contextmanager
-def _told_if_slow() -> Iterator[None]:
-    """A user who waits for a simulated cell is told the reason."""
-    words = "the simulated cell compiles its code, once on a machine: a minute or two, longer on a busy one ..."
+def told_if_slow(words: str) -> Iterator[None]:
+    """Tell a user who waits the reason."""
     timer = threading.Timer(_SLOW_START_S, alarm, (words,))
     timer.daemon = True
     timer.start()

@@ -16,6 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from coupole.acquisition.changed_inputs import tell_changes
+from coupole.acquisition.compiled_ahead import compile_ahead
 from coupole.acquisition.conclusion import close_complete, conclude, note_unread, open_for_session
 from coupole.acquisition.memory_recorder import DryRecorder
 from coupole.acquisition.observer import Control
@@ -143,6 +144,7 @@ def _acquire_into(
         return
     faults_of(job.cell).refuse(job.cell.document.path)
     ask_to_begin(job.cell, confirm=confirm)
+    compile_ahead()
     console.print("opening the devices ...")
     with open_cell(job.cell, job=job, on_opened=identity_printer(console)) as cell:
         faults = faults_of(job.cell, cell.identities["robot"])  # by its serial number too

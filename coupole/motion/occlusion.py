@@ -261,6 +261,12 @@ def hidden_by(
     return capsule_numbers
 
 
+def compile_now() -> None:
+    """Compile the kernel of `hidden_by`."""
+    point_mm, asked = np.zeros((1, 3)), np.ones((1, 1), np.bool_)
+    hidden_by(point_mm, point_mm + 1.0, np.zeros((1, 2, 3)), np.ones(1), asked)
+
+
 def sight_of(rig: Rig, support_from_camera: Transform) -> Sight:
     """The rig's camera at a pose, with the image distance from the lens equation for the focus distance."""
     image_mm = 1 / (1 / rig.lens.focal_length_mm - 1 / rig.lens.focus_distance_mm)

@@ -1,0 +1,19 @@
+"""What a run calls is compiled before its devices are open: on a fresh machine this takes seconds to a minute, in
+which the arm and the lamps would wait, and frames with them."""
+
+from __future__ import annotations
+
+from coupole.acquisition import frame_matching
+from coupole.acquisition.opened_cell import told_if_slow
+from coupole.acquisition.watching import frame_look
+from coupole.motion import occlusion
+
+_WORDS = "compiling what the run will call, once on a machine: a minute or less, longer on a busy one ..."
+
+
+def compile_ahead() -> None:
+    """Compile all kernels of an acquisition, or load them from numba's cache."""
+    with told_if_slow(_WORDS):
+        frame_matching.compile_now()
+        frame_look.compile_now()
+        occlusion.compile_now()

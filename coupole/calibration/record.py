@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AwareDatetime, Field
 
+from coupole.calibration.artefact import UsedArtefact
 from coupole.calibration.optics import NAMES, Intrinsics
 from coupole.errors import InputError, StorageError, reason
 from coupole.geometry import abc_from_rotation
@@ -179,6 +180,9 @@ class Record(Model):
     """Remarks for the operator: methods that disagree, corners that were left out."""
     faults: tuple[LedFault, ...] = Field(default=(), exclude_if=_none_found)
     """Faults of LEDs; their texts are among the remarks."""
+    artefacts: tuple[UsedArtefact, ...] = Field(default=(), exclude_if=_none_found)
+    """Boards, tiles, charts that it was made from, with their certificates; none in a record that is not
+    traceable, or that rests on other records."""
     inputs: Annotated[tuple[Input, ...], Field(min_length=1)]
     sha256: Sha256
 

@@ -134,6 +134,8 @@ class _Result:
     """Our records, then those of `--beside`."""
     table: tuple[Accuracy, ...]
     doubts: tuple[str, ...]
+    traces: tuple[str, ...]
+    """The certificates that our records rest on."""
     document: dict[str, Any]
     """Document as `--json` prints it."""
 
@@ -149,7 +151,7 @@ def _propagate(
     """The budget by our records, and the table that compares them with those of `beside`."""
     from coupole.calibration.budget.accuracy import Case, accuracies
     from coupole.calibration.budget.budget import budget_of
-    from coupole.calibration.budget.records import doubts, known_from, read_records
+    from coupole.calibration.budget.records import doubts, known_from, read_records, traces
     from coupole.calibration.budget.report import as_json as figures_of
 
     figures = known_from(own_records, start)
@@ -163,8 +165,9 @@ def _propagate(
         )
     table = accuracies(cases)
     doubts_of_records = doubts([item for case in cases for item in case.records], datetime.now(UTC))
-    document = figures_of(our_budget, our_spread, cases, table) | {"doubts": doubts_of_records}
-    return _Result(our_budget, our_spread, cases, table, doubts_of_records, document)
+    document = figures_of(our_budget, our_spread, cases, table)
+    document |= {"doubts": doubts_of_records, "traceability": traces(own_records)}
+    return _Result(our_budget, our_spread, cases, table, doubts_of_records, traces(own_records), document)
 
 
 def _write_report(out: Path, result: _Result) -> None:
@@ -173,7 +176,9 @@ def _write_report(out: Path, result: _Result) -> None:
     from coupole.calibration.budget.report import draw_budget
 
     picture = draw_budget(result.budget, result.dome_spread)
-    text = page(result.budget, result.dome_spread, result.cases, result.table, picture, result.doubts)
+    text = page(
+        result.budget, result.dome_spread, result.cases, result.table, picture, result.doubts, result.traces
+    )
     _write(
         {
             out: picture,
@@ -275,5 +280,7 @@ def _show_accuracies(console: Console, result: _Result) -> None:
     console.print()
     console.print(table)
     console.print("standard uncertainties, all directions together; samples over a dome: their 68 % intervals")
+    for trace in result.traces:
+        console.print(f"traceability: {trace}")
     for doubt in result.doubts:
         console.print(f"[yellow]{doubt}[/]")

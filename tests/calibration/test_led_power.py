@@ -176,7 +176,7 @@ def test_what_channels_share_of_one_tile_is_known_to_be_shared(scale: Callable[[
             )
             for channel in "RGB"
         }
-        covariance = covariance_of(found, prior_of(TILE))
+        covariance = covariance_of(found, dict.fromkeys(found, prior_of(TILE)))
         means = np.array([one.power.mean() for one in found.values()])
         at = np.arange(3) * len(covariance) // 3
         u = np.sqrt(covariance[at, at])

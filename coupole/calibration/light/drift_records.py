@@ -135,6 +135,7 @@ def drift_outcome(
             *remarks,
         ),
         more_inputs=(*record_input(led_power), *setting.inputs),
+        artefacts=setting.artefacts([CHANNEL]),
     )
 
 
@@ -159,11 +160,12 @@ def _readings(
             "description, "
             "or add a view of the tile to the plan"
         )
+    tile = setting.tile_of(CHANNEL)
     readings: list[Reading] = []
     frame_done = counter(progress, sum(map(len, frames_of_views)))
     for view_frames in frames_of_views:
         view = tile_reader.view(view_frames, frame_done)[CHANNEL]
-        rows, _ = rows_of(0, view, setting.positions, setting.tile, setting.emission, remarks=remarks)
+        rows, _ = rows_of(0, view, setting.positions, tile, setting.emission, remarks=remarks)
         frame_of = {frame.led: frame for frame in view_frames if frame.led is not None}
         readings += [
             _reading(frame_of[row.led], row.value, row.u, row.design, powers)

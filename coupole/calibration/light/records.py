@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.acceptance import against_limits
+from coupole.calibration.artefact import UsedArtefact
 from coupole.calibration.earlier import read_accepted, read_earlier
 from coupole.calibration.light import drawing as pictures
 from coupole.calibration.light.acceptance import DARK, RESPONSE
@@ -68,6 +69,7 @@ def sealed_outcome(
     fixed_figures: Mapping[str, float] | None = None,
     remarks: Sequence[str] = (),
     more_inputs: Sequence[tuple[str, str]] = (),
+    artefacts: Sequence[UsedArtefact] = (),
 ) -> Outcome:
     """A record of a radiometric calibration, with its files; `draw` gets the record and an empty figure."""
     about, contents = frames.about, files or {}
@@ -85,6 +87,7 @@ def sealed_outcome(
         images=(),
         limits=tuple(limits),
         remarks=tuple(remarks),
+        artefacts=tuple(artefacts),
         inputs=tuple(Input(name=name, sha256=digest) for name, digest in (*frames.inputs, *more_inputs)),
     )
     return Outcome(record, partial(draw, record), contents)

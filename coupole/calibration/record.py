@@ -44,6 +44,7 @@ Kind = Literal[
     "drift",
     "colour",
     "glare",
+    "artefact-check",
 ]
 SEAL = "# A calibration of Coupole"
 """First words of a record's file."""
@@ -127,6 +128,35 @@ class Limit(Model):
         return self.found <= self.limit
 
 
+class Comparison(Model):
+    """A value that a calibrated cell measured on an artefact, beside the certified one."""
+
+    position: str
+    """Place of the artefact: the name of its run or folder."""
+    name: str
+    """Name of the length, or of the channel."""
+    unit: str
+    certified: float
+    expanded_u_certified: NotNegative
+    """U of the certified value at the temperature of the measurement, k = 2."""
+    measured: float
+    expanded_u_measured: NotNegative
+    """U of the measured value by the records in force, k = 2."""
+    permissible: Positive | None = Field(default=None, exclude_if=_not_said)
+    """Largest permissible error that the user stated (MPE), in the unit."""
+
+    @property
+    def error(self) -> float:
+        """Measured minus certified, in the unit."""
+        return self.measured - self.certified
+
+    @property
+    def en(self) -> float:
+        """E_n of ISO 13528, 9.7: the error over both expanded uncertainties together."""
+        together = float(np.hypot(self.expanded_u_certified, self.expanded_u_measured))
+        return abs(self.error) / max(together, 1e-300)
+
+
 class Input(Model):
     """A file that the calibration was made from."""
 
@@ -183,6 +213,8 @@ class Record(Model):
     artefacts: tuple[UsedArtefact, ...] = Field(default=(), exclude_if=_none_found)
     """Boards, tiles, charts that it was made from, with their certificates; none in a record that is not
     traceable, or that rests on other records."""
+    comparisons: tuple[Comparison, ...] = Field(default=(), exclude_if=_none_found)
+    """Values of a check by an independent artefact."""
     inputs: Annotated[tuple[Input, ...], Field(min_length=1)]
     sha256: Sha256
 

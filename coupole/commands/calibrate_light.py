@@ -155,7 +155,7 @@ def led_power(
 
     def work(console: Console, request: Request) -> Outcome:
         frames = frames_with_poses(open_light_frames(runs), known.hand_eye, known.rig, runs)
-        setting = _setting(frames, tile, known.rig or rig_of(runs[0]), known)
+        setting = setting_of(frames, tile, known.rig or rig_of(runs[0]), known)
         with bar(console, "frames of the tile") as progress:
             return led_power_outcome(frames, setting, request, progress)
 
@@ -180,7 +180,7 @@ def drift(
 
     def work(console: Console, request: Request) -> Outcome:
         frames = frames_with_poses(open_light_frames(runs), known.hand_eye, known.rig, runs)
-        setting = _setting(frames, tile, known.rig or rig_of(runs[0]), known)
+        setting = setting_of(frames, tile, known.rig or rig_of(runs[0]), known)
         with bar(console, "frames with the tile") as progress:
             return drift_outcome(frames, setting, led_power_record, request, progress)
 
@@ -204,7 +204,7 @@ def frames_with_poses(
     return frames.seen_through(prior.flange_from_camera, arm_of(read_cell(rig or rig_of(runs[0])), hand_eye))
 
 
-def _setting(frames: LightFrames, tile: Path, rig: Path, calibrations: TargetCalibrations) -> Setting:
+def setting_of(frames: LightFrames, tile: Path, rig: Path, calibrations: TargetCalibrations) -> Setting:
     """Descriptions and calibrations that frames of a tile are read with. Raises InputError for invalid files."""
     from coupole.calibration.light.led_power_tile import Setting, calibrated_positions
     from coupole.calibration.light.spectralon import read_tile

@@ -265,6 +265,7 @@ def _figures(record: Record) -> dict[str, Any]:
         "limits": [{**limit.model_dump(), "passed": limit.is_met} for limit in record.limits],
         "artefacts": [item.model_dump(mode="json") for item in record.artefacts],
         "traceability": list(trace_of(record)),
+        "comparisons": [{**v.model_dump(), "error": v.error, "en": v.en} for v in record.comparisons],
         "faults": [asdict(fault) for fault in record.faults],
         "remarks": list(record.remarks),
     }

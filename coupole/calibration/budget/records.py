@@ -216,7 +216,7 @@ def reader_of(kind: Kind) -> Callable[[Record, Path], Said] | None:
             return _of_drift
         case "glare":
             return _of_glare
-        case "chromatic" | "dark" | "colour":
+        case "chromatic" | "dark" | "colour" | "artefact-check":
             return None
         case _:
             assert_never(kind)

@@ -81,6 +81,10 @@ EXAMPLES: dict[str, tuple[str, str]] = {
         "calibrate check-artefact RUN --tile second-tile.yaml --records records",
     ),
     "calibrate all": ("calibrate all --rig sim", "calibrate all --rig my-cell.yaml --only charuco --yes"),
+    "certificate": (
+        "certificate calibrations --about certificate.yaml",
+        "certificate calibrations --about certificate.yaml --earlier last-year --out cell.html",
+    ),
     "budget": ("budget camera.yaml hand-eye.yaml leds.yaml", "budget --plan first.yaml --out budget.png"),
     # results and bench
     "reflectance": (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -75,6 +75,10 @@ def budget(
         list[Path] | None,
         typer.Option("--beside", help="Records of another cell, for a separate column in the table."),
     ] = None,
+    earlier: Annotated[
+        list[Path] | None,
+        typer.Option("--earlier", help="Records of earlier calibrations: which figures have drifted since."),
+    ] = None,
     *,
     spot: SpotOfObject,
     coverage: CoverageOption = None,
@@ -105,7 +109,7 @@ def budget(
         with console.status("propagating distributions"):
             result = _propagate(
                 all_records, beside or [], start, Geometry(spot.incidence_deg), emission, coverage or COVERAGES
-            )
+            ).with_doubts(_drifted(all_records, earlier or []))
         if out is not None:
             _write_report(out, result)
     except CoupoleError as error:
@@ -138,6 +142,20 @@ class _Result:
     """The certificates that our records rest on."""
     document: dict[str, Any]
     """Document as `--json` prints it."""
+
+    def with_doubts(self, more: tuple[str, ...]) -> _Result:
+        """The same with more reasons not to rely on the records."""
+        all_doubts = (*self.doubts, *more)
+        return replace(self, doubts=all_doubts, document=self.document | {"doubts": all_doubts})
+
+
+def _drifted(our_records: tuple[InForce, ...], earlier: list[Path]) -> tuple[str, ...]:
+    """Records whose drift exceeds their uncertainty."""
+    from coupole.calibration.in_force import read_in_force
+    from coupole.calibration.record import records_named
+    from coupole.calibration.validity import expired_by_drift
+
+    return expired_by_drift(our_records, read_in_force(records_named(earlier)), datetime.now(UTC))
 
 
 def _propagate(

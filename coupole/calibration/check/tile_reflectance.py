@@ -106,11 +106,10 @@ def _solved(
     deltas = len(places) * len(channels)
     priors = [prior_of(place.tile[channels[0]]) for place in places]
     sigmas = np.maximum([*(s for prior in priors for s in prior[:OF_PLACE]), priors[0][-1]], LEAST_PRIOR)
-    weight = np.zeros((design.shape[1],) * 2)
     end = deltas + len(sigmas)
-    weight[range(deltas, end), range(deltas, end)] = sigmas**-2.0
-    floor = np.diag(np.full(len(shared), LEAST_PRIOR**2))
-    weight[end:, end:] = np.linalg.inv(shared + floor)
+    # Channels share the first tile's errors, so the covariance has no inverse: its root's figures are independent.
+    design = np.hstack([design[:, :end], design[:, end:] @ _root(shared)])
+    weight = np.diag(np.concatenate([np.zeros(deltas), sigmas**-2.0, np.ones(design.shape[1] - end)]))
     scaled = design / u[:, None] ** 2
     covariance = np.asarray(np.linalg.inv(design.T @ scaled + weight), np.float64)
     found = covariance @ (scaled.T @ y)
@@ -126,6 +125,14 @@ def _solved(
         u_certified,
         float(np.sqrt(np.mean(residuals**2))),
     )
+
+
+def _root(covariance: Floats) -> Floats:
+    """R [n, r] with R R' = a covariance [n, n]; units of its figures differ, so it is scaled first."""
+    u = np.sqrt(np.maximum(np.diag(covariance), LEAST_PRIOR**2))
+    values, vectors = np.linalg.eigh(covariance / np.outer(u, u))
+    root: Floats = u[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return root
 
 
 def _usable(rows: Sequence[Row], powers: Powers) -> list[Row]:

@@ -224,7 +224,7 @@ def check_outcome(
         covariance=rows_of(checked.covariance),
         noise=(),
         images=(),
-        limits=_limits(checked, request),
+        limits=limits_of(checked, request.limits),
         remarks=(*checked.remarks, *_against(records)),
         artefacts=(artefact,),
         comparisons=checked.comparisons,
@@ -234,14 +234,15 @@ def check_outcome(
     return Outcome(record, draw, sections=(comparison_section(record),))
 
 
-def _limits(checked: Checked, request: Request) -> tuple[Limit, ...]:
+def limits_of(checked: Checked, operator_limits: Mapping[str, float]) -> tuple[Limit, ...]:
+    """Acceptance limits of a check; `operator_limits` are those that the operator set."""
     values = np.array([value.en for value in checked.comparisons])
     figures = {
         "mean_en": checked.mean_en,
         "worst_en": float(values.max()),
         "share": float(np.mean(values > 1.0)),
     }
-    limits = against_limits(CHECK, request.limits, figures)
+    limits = against_limits(CHECK, operator_limits, figures)
     shares = [abs(v.error) / v.permissible for v in checked.comparisons if v.permissible is not None]
     return (*limits, limit_of("largest error of a length over its MPE", max(shares), 1.0)) if shares else limits
 

@@ -62,23 +62,27 @@ def main() -> int:
     options = parser.parse_args()
     seeds = range(options.first, options.first + options.cells)
     with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
-        cells = list(pool.map(checks_of, seeds))
+        cells = []
+        for seed, cell in zip(seeds, pool.map(checks_of, seeds), strict=True):
+            cells.append(cell)
+            largest = ", ".join(f"{name} {max(figures[0]):.2f}" for name, figures in cell.items())
+            print(f"cell {seed}: largest E_n: {largest}", flush=True)
     is_good = True
     for name in ("board", "tile"):
         en = np.array([value for cell in cells for value in cell[name][0]])
         ratios = np.array([value for cell in cells for value in cell[name][1]])
         share = float(np.mean(en <= 1.0))
-        accepted = sum(cell[name][2] for cell in cells)
+        accepted_count = sum(cell[name][2] for cell in cells)
         rms = float(np.sqrt(np.mean(ratios**2)))
         print(
             f"{name}: E_n at most 1 in {share:.1%} of {len(en)} values, largest {en.max():.2f}; rms(error/u) of "
-            f"positions {rms:.2f}; accepted in {accepted} of {len(cells)} cells"
+            f"positions {rms:.2f}; accepted in {accepted_count} of {len(cells)} cells"
         )
         is_good &= LOW <= share <= HIGH
     for name, words in (("wrong board", f"{BOARD_PPM:g} ppm"), ("wrong tile", f"{TILE:.0%}")):
-        found = sum(not cell[name][2] for cell in cells)
-        print(f"{name}, {words}: found in {found} of {len(cells)} cells")
-        is_good &= found >= LEAST_FOUND * len(cells)
+        found_count = sum(not cell[name][2] for cell in cells)
+        print(f"{name}, {words}: found in {found_count} of {len(cells)} cells")
+        is_good &= found_count >= LEAST_FOUND * len(cells)
     return 0 if is_good or options.smallest else 1
 
 

@@ -126,14 +126,16 @@ class CertifiedReflectance(Model):
                 f"artefact.reflectance: its values from {wavelengths[0]:g} to {wavelengths[-1]:g} nm "
                 f"do not cover the band of {channel}, {first:g} to {last:g} nm"
             )
-        found = self._mean_of_band(first, last, light)
-        if found is None:
+        mean_and_u = self._mean_of_band(first, last, light)
+        if mean_and_u is None:
             raise InputError(
                 f"the LEDs' spectrum has no light from {first:g} to {last:g} nm, the band of {channel}"
             )
-        value, u = found
-        shifted = [self._mean_of_band(first + by, last + by, light) for by in (-_BAND_SHIFT_NM, _BAND_SHIFT_NM)]
-        u_band = max((abs(other[0] - value) for other in shifted if other), default=0.0) / np.sqrt(3.0)
+        value, u = mean_and_u
+        shifted_means = [
+            self._mean_of_band(first + by, last + by, light) for by in (-_BAND_SHIFT_NM, _BAND_SHIFT_NM)
+        ]
+        u_band = max((abs(mean[0] - value) for mean in shifted_means if mean), default=0.0) / np.sqrt(3.0)
         return value, float(np.hypot(u, u_band))
 
     def _mean_of_band(self, first: float, last: float, light: LightSpectrum | None) -> tuple[float, float] | None:
@@ -205,7 +207,7 @@ class Temperature:
 
 
 class UsedArtefact(Model):
-    """What a record keeps of an artefact that it was made from."""
+    """Part of a record: an artefact that it was made from."""
 
     role: Literal["board", "tile", "chart", "glare target"]
     artefact: Artefact
@@ -219,7 +221,7 @@ class UsedArtefact(Model):
     u_scale_ppm: Annotated[float, Field(ge=0)] | None = None
     """Standard uncertainty of its lengths at that temperature."""
     figures: dict[str, float] = Field(default_factory=dict)
-    """What was taken from the certificate: `reflectance.G`, `u_reflectance.G`."""
+    """Figures that were taken from the certificate: `reflectance.G`, `u_reflectance.G`."""
 
     @property
     def is_traceable(self) -> bool:
@@ -231,7 +233,7 @@ def used_as(
     artefact: Artefact | None,
     figures: dict[str, float] | None = None,
 ) -> tuple[UsedArtefact, ...]:
-    """What a record keeps of an artefact whose lengths do not matter; nothing without one."""
+    """Part of a record for an artefact whose lengths do not matter; nothing without one."""
     return () if artefact is None else (UsedArtefact(role=role, artefact=artefact, figures=figures or {}),)
 
 
@@ -276,8 +278,8 @@ def read_described(path: Path, model: type[D]) -> D:
     if artefact.certificate.sha256 not in (None, digest):
         message = f"has the checksum {digest}, another than its `sha256`: it is not that certificate"
         raise InputError([document.problem(place, message)])
-    kept = {"file": Path(artefact.certificate.file.name), "sha256": digest}
-    certificate = artefact.certificate.model_copy(update=kept)
+    hashed_file = {"file": Path(artefact.certificate.file.name), "sha256": digest}
+    certificate = artefact.certificate.model_copy(update=hashed_file)
     return description.model_copy(update={"artefact": artefact.model_copy(update={"certificate": certificate})})
 
 
@@ -285,7 +287,7 @@ def read_described(path: Path, model: type[D]) -> D:
 
 
 def facts_of(used_artefact: UsedArtefact) -> dict[str, str]:
-    """What is known of an artefact, by the names that pages show."""
+    """Facts of an artefact, by the names that pages show."""
     artefact, certificate = used_artefact.artefact, used_artefact.artefact.certificate
     facts = {used_artefact.role: artefact.title, "certificate": NOT_TRACEABLE}
     if certificate is not None:
@@ -319,9 +321,9 @@ def facts_of(used_artefact: UsedArtefact) -> dict[str, str]:
 def sentence_of(used_artefact: UsedArtefact) -> str:
     """One line: thing, certificate, or that there is none."""
     certificate = used_artefact.artefact.certificate
-    said = (
+    certificate_words = (
         NOT_TRACEABLE
         if certificate is None
         else f"certificate {certificate.number} of {certificate.laboratory}, {certificate.date}"
     )
-    return f"{used_artefact.role} {used_artefact.artefact.title}: {said}"
+    return f"{used_artefact.role} {used_artefact.artefact.title}: {certificate_words}"

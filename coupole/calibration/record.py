@@ -136,10 +136,10 @@ class Comparison(Model):
     name: str
     """Name of the length, or of the channel."""
     unit: str
-    certified: float
+    certified_value: float
     expanded_u_certified: NotNegative
     """U of the certified value at the temperature of the measurement, k = 2."""
-    measured: float
+    measured_value: float
     expanded_u_measured: NotNegative
     """U of the measured value by the records in force, k = 2."""
     permissible: Positive | None = Field(default=None, exclude_if=_not_said)
@@ -148,7 +148,7 @@ class Comparison(Model):
     @property
     def error(self) -> float:
         """Measured minus certified, in the unit."""
-        return self.measured - self.certified
+        return self.measured_value - self.certified_value
 
     @property
     def en(self) -> float:

@@ -1,4 +1,4 @@
-"""What records say of the certificates that they rest on."""
+"""Words of records about the certificates that they rest on."""
 
 from __future__ import annotations
 

@@ -35,9 +35,9 @@ def _by_drift_records(items: Sequence[InForce]) -> Iterator[str]:
         if item.record.kind != "led-power":
             continue
         digest = hashlib.sha256(item.path.read_bytes()).hexdigest()
-        for other in items:
-            if other.record.kind == "drift" and digest in {line.sha256 for line in other.record.inputs}:
-                yield from _by_drift_record(item, other.record)
+        for candidate in items:
+            if candidate.record.kind == "drift" and digest in {line.sha256 for line in candidate.record.inputs}:
+                yield from _by_drift_record(item, candidate.record)
 
 
 def _by_drift_record(item: InForce, drift: Record) -> Iterator[str]:
@@ -76,11 +76,11 @@ def _by_rate(item: InForce, before: Record, now: datetime) -> Iterator[str]:
         change = parameter.value - old.value
         if abs(change) <= _SIGNIFICANT * np.hypot(parameter.u, old.u):
             continue
-        drifted = change / between_s * age_s
+        drifted_by = change / between_s * age_s
         words = (
             f"{item.path}: expired by drift: {parameter.name} changed by {change:.3g} since {before.name}; at "
-            f"that rate it is {drifted:+.3g} off by now, more than its u of {parameter.u:.2g}. Calibrate anew"
+            f"that rate it is {drifted_by:+.3g} off by now, more than its u of {parameter.u:.2g}. Calibrate anew"
         )
-        worst = max(worst, (abs(drifted) / parameter.u, words))
+        worst = max(worst, (abs(drifted_by) / parameter.u, words))
     if worst[1]:
         yield worst[1]

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from coupole.commands.common import JsonOption, fail
 from coupole.errors import CalibrationRefused, CoupoleError, InputError, StorageError
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 def certificate(
@@ -45,34 +48,38 @@ def certificate(
     """
     from coupole.calibration.budget.records import doubts
     from coupole.calibration.certificate.chain import chain_of
-    from coupole.calibration.certificate.description import read_description
     from coupole.calibration.certificate.page import CellCertificate, certificate_page, document_of
+    from coupole.calibration.certificate.statements import read_description
     from coupole.calibration.in_force import read_in_force
     from coupole.calibration.record import records_named
     from coupole.calibration.validity import expired_by_drift
     from coupole.pages.page_rendering import write_page
     from coupole.viewing.terminal import make_console
 
-    console = make_console(quiet=as_json)
-    now = datetime.now(UTC)
+    console, now = make_console(quiet=as_json), datetime.now(UTC)
     try:
         _refuse_out(out)
         chain = chain_of(records)
         if not chain:
             raise InputError(f"{', '.join(map(str, records))}: expected records of calibrations, found none")
         items = [link.item for link in chain]
-        drifted = expired_by_drift(items, read_in_force(records_named(earlier or [])), now)
+        drift_doubts = expired_by_drift(items, read_in_force(records_named(earlier or [])), now)
         gaps = [gap for link in chain for gap in link.gaps]
-        all_doubts = tuple(dict.fromkeys([*doubts(items, now), *drifted, *gaps]))
-        made = CellCertificate(read_description(about), chain, now.replace(microsecond=0), all_doubts)
-        write_page(out, certificate_page(made))
-        _write_json(out.with_suffix(".json"), document_of(made))
+        all_doubts = tuple(dict.fromkeys([*doubts(items, now), *drift_doubts, *gaps]))
+        cell_certificate = CellCertificate(read_description(about), chain, now.replace(microsecond=0), all_doubts)
+        write_page(out, certificate_page(cell_certificate))
+        _write_json(out.with_suffix(".json"), document_of(cell_certificate))
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
     if as_json:
-        print(json.dumps(document_of(made)))
+        print(json.dumps(document_of(cell_certificate)))
     console.print(f"certificate {out}, {len(chain)} records")
+    _refuse_doubtful(out, all_doubts, console)
+
+
+def _refuse_doubtful(out: Path, all_doubts: tuple[str, ...], console: Console) -> None:
+    """Print the reasons for doubt. Raises CalibrationRefused if there is one."""
     for doubt in all_doubts:
         console.print(f"[yellow]{doubt}[/]")
     if all_doubts:

@@ -110,29 +110,31 @@ def _check_board(
         Pictures,
         check_outcome,
         compare_lengths,
-        needed,
+        needed_record,
         parse_permissible,
         refuse_dependent,
+        refuse_used_images,
         used_records,
     )
     from coupole.calibration.lens.board import read_board
 
     assert independent.board is not None  # as `check_artefact` has refused
     permissible = None if independent.mpe is None else parse_permissible(independent.mpe)
-    needed(records, "hand-eye")
-    used = used_records(records, OF_BOARD)
+    needed_record(records, "hand-eye")
+    used_kinds = used_records(records, OF_BOARD)
     refuse_dependent(read_board(independent.board).artefact, independent.board, records)
-    found, inputs, sources, target = [], [], None, None
+    lengths, inputs, sources, target = [], [], None, None
     for path in paths:
-        position, sources, target = _position(path, independent, warmth, used["hand-eye"], console)
+        position, sources, target = _position(path, independent, warmth, used_kinds["hand-eye"], console)
+        refuse_used_images(used_kinds, sources.inputs)
         inputs += list(sources.inputs)
-        found.append(lengths_of(position, target, Noise.of(used["hand-eye"].record)))
+        lengths.append(lengths_of(position, target, Noise.of(used_kinds["hand-eye"].record)))
     assert sources is not None  # `paths` has at least one
     assert target is not None
-    checked = compare_lengths(found, position.camera.covariance, 1e-6 * target.scale_u_ppm, permissible)
-    size_px = used["hand-eye"].record.validity.size_px or (1, 1)
+    check = compare_lengths(lengths, position.camera.covariance, 1e-6 * target.scale_u_ppm, permissible)
+    size_px = used_kinds["hand-eye"].record.validity.size_px or (1, 1)
     pictures = Pictures(sources.about, size_px, tuple(dict.fromkeys(inputs)))
-    return check_outcome(checked, sources.artefacts[0], pictures, used, request)
+    return check_outcome(check, sources.artefacts[0], pictures, used_kinds, request)
 
 
 def _position(
@@ -143,24 +145,22 @@ def _position(
 
     from coupole.calibration.calibrated_arm import calibrated_poses
     from coupole.calibration.check.board_lengths import Position
-    from coupole.calibration.earlier import refuse_same_images
     from coupole.calibration.posed_camera import read_posed_camera
     from coupole.plan.cell import read_cell
 
-    sources, target, seen = look_for_board([path], independent.board, independent.poses, console, warmth)
+    sources, target, sightings = look_for_board([path], independent.board, independent.poses, console, warmth)
     if sources.poses is None:
         raise InputError(f"{path}: the pictures have no poses; give a pose file with --poses")
-    refuse_same_images(hand_eye.path, hand_eye.record, sources.inputs)
-    camera = read_posed_camera(hand_eye.path, None, sources.about, seen.size_px)
-    base_from_flange = sources.poses.base_from_flange[seen.image_numbers]
+    camera = read_posed_camera(hand_eye.path, None, sources.about, sightings.size_px)
+    base_from_flange = sources.poses.base_from_flange[sightings.image_numbers]
     if any(parameter.name.startswith("axis_zero.") for parameter in hand_eye.record.parameters):
-        joints = [sources.images[number].joints_deg for number in seen.image_numbers]
+        joints = [sources.images[number].joints_deg for number in sightings.image_numbers]
         if None in joints:
             raise InputError(f"{hand_eye.path}: has axis zeros of the arm, but {path} has no joints; give runs")
         arm = arm_of(read_cell(independent.rig or rig_of(path)), hand_eye.path)
         assert arm is not None  # the record has zeros
         base_from_flange, camera = calibrated_poses(base_from_flange, np.array(joints), arm, camera)
-    return Position(path.resolve().name, seen.sightings, base_from_flange, camera), sources, target
+    return Position(path.resolve().name, sightings.sightings, base_from_flange, camera), sources, target
 
 
 # -- a tile -----------------------------------------------------------------------------------------------------
@@ -182,8 +182,9 @@ def _check_tile(
         Pictures,
         check_outcome,
         compare_reflectances,
-        needed,
+        needed_record,
         refuse_dependent,
+        refuse_used_images,
         used_records,
     )
     from coupole.calibration.earlier import refuse_read_otherwise
@@ -196,36 +197,37 @@ def _check_tile(
         raise InputError(
             f"--tile: expected one description, or one for each of {len(runs)} runs; got {len(tiles)}"
         )
-    record = needed(records, "led-power")
-    used = used_records(records, OF_TILE)
+    record = needed_record(records, "led-power")
+    used_kinds = used_records(records, OF_TILE)
     artefacts = [refuse_dependent(read_tile(tile).artefact, tile, records) for tile in tiles]
     if len({artefact.serial for artefact in artefacts}) > 1:
         raise InputError(
             f"--tile: expected one tile in all places, found {', '.join(a.serial for a in artefacts)}"
         )
-    refuse_read_otherwise(used["led-power"].path, record, list(used))
+    refuse_read_otherwise(used_kinds["led-power"].path, record, list(used_kinds))
     places, inputs = [], []
     for number, run in enumerate(runs):
         tile = tiles[number % len(tiles)]
         place, frames, run_inputs = _place(
-            run, tile, independent.rig, _known(used, independent.rig, emission), console
+            run, tile, independent.rig, _calibrations_of(used_kinds, independent.rig, emission), console
         )
+        refuse_used_images(used_kinds, frames.inputs)
         places.append(place)
         inputs += run_inputs
     channels = channels_of(frames.pattern)
-    powers = {channel: read_powers(used["led-power"].path, channel) for channel in channels}
+    powers = {channel: read_powers(used_kinds["led-power"].path, channel) for channel in channels}
     names = [parameter.name for parameter in record.parameters]
     at = [names.index(f"{name}.{channel}") for channel in channels for name in powers[channel].names]
-    measured = reflectance_of(places, powers, record.covariance_matrix[np.ix_(at, at)])
+    tile_values = reflectance_of(places, powers, record.covariance_matrix[np.ix_(at, at)])
     figures = {f"reflectance.{channel}": places[0].tile[channel].reflectance for channel in channels}
     pictures = Pictures(frames.about, frames.size_px, tuple(dict.fromkeys(inputs)))
     artefact = used_as("tile", artefacts[0], figures)[0]
-    return check_outcome(compare_reflectances(measured), artefact, pictures, used, request)
+    return check_outcome(compare_reflectances(tile_values), artefact, pictures, used_kinds, request)
 
 
-def _known(used: Mapping[Kind, InForce], rig: Path | None, emission: str) -> TargetCalibrations:
+def _calibrations_of(used_kinds: Mapping[Kind, InForce], rig: Path | None, emission: str) -> TargetCalibrations:
     """The records by which frames of the tile are read."""
-    paths = {kind: item.path for kind, item in used.items()}
+    paths = {kind: item.path for kind, item in used_kinds.items()}
     return TargetCalibrations(
         rig=rig,
         leds=paths.get("leds"),
@@ -240,14 +242,14 @@ def _known(used: Mapping[Kind, InForce], rig: Path | None, emission: str) -> Tar
 
 
 def _place(
-    run: Path, tile: Path, rig: Path | None, known: TargetCalibrations, console: Console
+    run: Path, tile: Path, rig: Path | None, calibrations: TargetCalibrations, console: Console
 ) -> tuple[Place, LightFrames, list[tuple[str, str]]]:
     """The tile in one run, the run's frames, and all files that were read."""
     from coupole.calibration.check.tile_reflectance import place_of
     from coupole.calibration.light.frames import open_light_frames
 
-    frames = frames_with_poses(open_light_frames([run]), known.hand_eye, known.rig, [run])
-    setting = setting_of(frames, tile, rig or rig_of(run), known)
+    frames = frames_with_poses(open_light_frames([run]), calibrations.hand_eye, calibrations.rig, [run])
+    setting = setting_of(frames, tile, rig or rig_of(run), calibrations)
     with bar(console, f"frames of the tile in {run.name}") as progress:
         place = place_of(run.resolve().name, frames, setting, progress)
     return place, frames, [*frames.inputs, *setting.inputs]

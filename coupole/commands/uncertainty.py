@@ -109,7 +109,7 @@ def budget(
         with console.status("propagating distributions"):
             result = _propagate(
                 all_records, beside or [], start, Geometry(spot.incidence_deg), emission, coverage or COVERAGES
-            ).with_doubts(_drifted(all_records, earlier or []))
+            ).with_doubts(_doubts_by_drift(all_records, earlier or []))
         if out is not None:
             _write_report(out, result)
     except CoupoleError as error:
@@ -149,7 +149,7 @@ class _Result:
         return replace(self, doubts=all_doubts, document=self.document | {"doubts": all_doubts})
 
 
-def _drifted(our_records: tuple[InForce, ...], earlier: list[Path]) -> tuple[str, ...]:
+def _doubts_by_drift(our_records: tuple[InForce, ...], earlier: list[Path]) -> tuple[str, ...]:
     """Records whose drift exceeds their uncertainty."""
     from coupole.calibration.in_force import read_in_force
     from coupole.calibration.record import records_named

@@ -25,7 +25,7 @@ CERTIFIED = """\
 artefact:
   name: board
   serial: CB-7
-  certificate: {number: L-26-104, laboratory: City Metrology, date: 2026-02-11, due: 2028-02-11, file: c.pdf}
+  certificate: {number: L-26-104, laboratory: Laboratory A, date: 2026-02-11, due: 2028-02-11, file: c.pdf}
   temperature_c: 20.0
   expansion_ppm_per_k: {value: 10.0, expanded_u: 1.0, k: 2}
   square_mm: {value: 16.0016, expanded_u: 0.0008, k: 2}
@@ -35,7 +35,7 @@ TILE = """\
 artefact:
   name: white tile
   serial: T-3
-  certificate: {number: R-26-9, laboratory: City Optics, date: 2026-01-20}
+  certificate: {number: R-26-9, laboratory: Laboratory B, date: 2026-01-20}
   reflectance:
     geometry: 8/h
     k: 2
@@ -91,7 +91,7 @@ def test_a_temperature_that_nobody_measured_is_the_runs_or_allowed_for(tmp_path:
     [
         (
             ("file: c.pdf", "file: d.pdf"),
-            "board.yaml:8:104: artefact.certificate.file: expected the certificate's file",
+            "board.yaml:8:102: artefact.certificate.file: expected the certificate's file",
         ),
         (("file: c.pdf", f"file: c.pdf, sha256: '{'0' * 64}'"), "another than its `sha256`"),
         (("k: 2}\n  flatness", "k: 0}\n  flatness"), "board.yaml:11:"),
@@ -113,14 +113,14 @@ def test_a_record_keeps_the_certificate_and_a_budget_names_it(tmp_path: Path) ->
     )
     document = json.loads(result.stdout)
     assert document["traceability"] == [
-        "board board, serial CB-7: certificate L-26-104 of City Metrology, 2026-02-11"
+        "board board, serial CB-7: certificate L-26-104 of Laboratory A, 2026-02-11"
     ]
     (kept,) = read_record(tmp_path / "he.yaml").artefacts
     assert kept.correction_ppm == pytest.approx(100.0)
     scale = document["parameters"]["board_scale"]
     assert scale["u"] <= 1.01e-6 * (kept.u_scale_ppm or 0.0)
     page = (tmp_path / "he.html").read_text()
-    assert "L-26-104, City Metrology, 2026-02-11, due 2028-02-11" in page
+    assert "L-26-104, Laboratory A, 2026-02-11, due 2028-02-11" in page
     assert "12 um, U 4 um (k = 2, 95%)" in page
     (folder / "board.yaml").write_text(BOARD_YAML)
     CliRunner().invoke(calibrate_app, ["hand-eye", str(folder), *words, "--name", "plain"])
@@ -132,7 +132,7 @@ def test_a_record_keeps_the_certificate_and_a_budget_names_it(tmp_path: Path) ->
     app.command()(budget)
     told = json.loads(CliRunner().invoke(app, [str(tmp_path / "he.yaml"), "--json"]).stdout)
     assert told["traceability"] == [
-        "hand-eye he: board board, serial CB-7: certificate L-26-104 of City Metrology, 2026-02-11"
+        "hand-eye he: board board, serial CB-7: certificate L-26-104 of Laboratory A, 2026-02-11"
     ]
 
 

@@ -2,7 +2,7 @@
 
 ::
 
-    description.py  what a laboratory states itself: names, place, item, climate, who authorises (YAML)
+    statements.py   what a laboratory states itself: names, place, item, climate, who authorises (YAML)
     chain.py        records, those that they were made from, artefacts: the chain to certificates
     page.py         the printable page, and the same as JSON
 """

@@ -32,7 +32,7 @@ class ChainLink:
 
 def chain_of(paths: Sequence[Path]) -> tuple[ChainLink, ...]:
     """Records, with those that they were made from and that lie beside them. Raises InputError."""
-    found: dict[str, InForce] = {}
+    records_by_digest: dict[str, InForce] = {}
     waiting = [*read_in_force(records_named(list(paths)))]
     beside: dict[str, InForce] = {}
     for folder in dict.fromkeys(item.path.parent for item in waiting):
@@ -40,34 +40,36 @@ def chain_of(paths: Sequence[Path]) -> tuple[ChainLink, ...]:
     while waiting:
         item = waiting.pop(0)
         digest = _digest(item.path)
-        if digest not in found:
-            found[digest] = item
+        if digest not in records_by_digest:
+            records_by_digest[digest] = item
             waiting += [beside[line.sha256] for line in item.record.inputs if line.sha256 in beside]
-    return tuple(_link(digest, item, found) for digest, item in found.items())
+    return tuple(_link(digest, item, records_by_digest) for digest, item in records_by_digest.items())
 
 
-def _link(digest: str, item: InForce, found: dict[str, InForce]) -> ChainLink:
+def _link(digest: str, item: InForce, records_by_digest: dict[str, InForce]) -> ChainLink:
     record = item.record
-    made_from = [found[line.sha256] for line in record.inputs if line.sha256 in found]
+    made_from = [records_by_digest[line.sha256] for line in record.inputs if line.sha256 in records_by_digest]
     return ChainLink(
         item,
         digest,
-        tuple(f"{other.record.kind} {other.record.name}" for other in made_from),
+        tuple(f"{source_record.record.kind} {source_record.record.name}" for source_record in made_from),
         trace_of(record),
-        tuple(dict.fromkeys(_gaps(item, found))),
+        tuple(dict.fromkeys(_gaps(item, records_by_digest))),
     )
 
 
-def _gaps(item: InForce, found: dict[str, InForce]) -> list[str]:
-    """What is missing in a record's chain, its own and that of all records that it was made from."""
+def _gaps(item: InForce, records_by_digest: dict[str, InForce]) -> list[str]:
+    """Gaps in a record's chain, its own and that of all records that it was made from."""
     record = item.record
     name = f"{record.kind} {record.name}"
-    made_from = [found[line.sha256] for line in record.inputs if line.sha256 in found]
+    made_from = [records_by_digest[line.sha256] for line in record.inputs if line.sha256 in records_by_digest]
     gaps = [] if is_traceable(record) else [f"{name}: {NOT_TRACEABLE}"]
-    lost = set(NEEDS.get(record.kind, ())) - {other.record.kind for other in made_from}
-    gaps += [f"{name}: its {kind} record is not among the given ones, nor beside them" for kind in sorted(lost)]
-    for other in made_from:
-        gaps += _gaps(other, found)
+    lost_kinds = set(NEEDS.get(record.kind, ())) - {source_record.record.kind for source_record in made_from}
+    gaps += [
+        f"{name}: its {kind} record is not among the given ones, nor beside them" for kind in sorted(lost_kinds)
+    ]
+    for source_record in made_from:
+        gaps += _gaps(source_record, records_by_digest)
     return gaps
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from coupole.calibration.adjustment import coverage_factor
 from coupole.calibration.certificate.chain import ChainLink
-from coupole.calibration.certificate.description import Description
+from coupole.calibration.certificate.statements import Description
 from coupole.calibration.record import Parameter, Record
 from coupole.pages.page_parts import Code, Inline, Page, Section, Table, Verdict
 
@@ -44,7 +44,7 @@ class CellCertificate:
 
     description: Description
     chain: tuple[ChainLink, ...]
-    issued: datetime
+    issue_time: datetime
     doubts: tuple[str, ...]
     """Reasons not to issue it: records not accepted, expired by date or by drift, broken chains."""
 
@@ -63,7 +63,7 @@ def document_of(certificate: CellCertificate) -> dict[str, Any]:
         "title": "Certificate of calibration",
         "simulated": certificate.is_simulated,
         **certificate.description.model_dump(mode="json"),
-        "issued": certificate.issued.isoformat(),
+        "issued": certificate.issue_time.isoformat(),
         "calibrated": _dates(certificate),
         "methods": _methods(certificate),
         "results": [
@@ -156,7 +156,7 @@ def _facts(certificate: CellCertificate) -> dict[str, Inline]:
         "condition of the item": item.condition,
         "date of receipt": str(item.received) if item.received else "does not apply: the cell stays in its place",
         "dates of calibration": f"{start} to {end}",
-        "date of issue": f"{certificate.issued:%Y-%m-%d}",
+        "date of issue": f"{certificate.issue_time:%Y-%m-%d}",
     }
     return facts
 
@@ -205,8 +205,8 @@ def _checks(records: Sequence[Record]) -> list[Table]:
             (
                 value.position,
                 value.name,
-                f"{value.certified:.5f}",
-                f"{value.measured:.5f}",
+                f"{value.certified_value:.5f}",
+                f"{value.measured_value:.5f}",
                 f"{value.expanded_u_certified:.5f}",
                 f"{value.expanded_u_measured:.5f}",
                 f"{value.en:.2f}",

@@ -88,7 +88,7 @@ def lengths_of(position: Position, board: Board, noise: Noise) -> Lengths:
             "or more, tilted to several sides"
         )
     corners = _Seen.of(position.sightings)
-    points, errors, solved = _adjusted(position, corners, noise)
+    points, errors, solution = _adjust(position, corners, noise)
     pairs = _pairs(board, corners.ids)
     if len(pairs) < _LEAST_LENGTHS:
         raise InputError(
@@ -97,21 +97,21 @@ def lengths_of(position: Position, board: Board, noise: Noise) -> Lengths:
         )
     first, second = (np.array([pair[i] for pair in pairs]) for i in (0, 1))
     way = points[first] - points[second]
-    measured = np.linalg.norm(way, axis=1)
-    slopes = np.zeros((len(pairs), solved.by_noise.shape[0]))
+    lengths_mm = np.linalg.norm(way, axis=1)
+    slopes = np.zeros((len(pairs), solution.by_noise.shape[0]))
     rows = np.arange(len(pairs))[:, None]
-    slopes[rows, 3 * first[:, None] + np.arange(3)] = way / measured[:, None]
-    slopes[rows, 3 * second[:, None] + np.arange(3)] = -way / measured[:, None]
+    slopes[rows, 3 * first[:, None] + np.arange(3)] = way / lengths_mm[:, None]
+    slopes[rows, 3 * second[:, None] + np.arange(3)] = -way / lengths_mm[:, None]
     flat = board.points_mm[corners.ids]
-    certified = np.linalg.norm(flat[first] - flat[second], axis=1)
+    certified_mm = np.linalg.norm(flat[first] - flat[second], axis=1)
     return Lengths(
         position.name,
         tuple(pair[2] for pair in pairs),
-        measured,
-        certified,
-        slopes @ solved.by_noise @ slopes.T,
-        slopes @ solved.by_record,
-        _own_u_mm(board, certified),
+        lengths_mm,
+        certified_mm,
+        slopes @ solution.by_noise @ slopes.T,
+        slopes @ solution.by_record,
+        _own_u_mm(board, certified_mm),
         _residual_ratio(position, corners, points, errors, noise),
     )
 
@@ -135,12 +135,12 @@ def _pairs(board: Board, ids: NDArray[np.intp]) -> list[tuple[int, int, str]]:
     across, down = board.corners
     place = {int(corner): n for n, corner in enumerate(ids)}
     square = min(across, down) - 1
-    left, top = (across - 1 - square) // 2, (down - 1 - square) // 2
+    first_column, top = (across - 1 - square) // 2, (down - 1 - square) // 2
     lines = {
         "row": ((0, down // 2), (1, 0), across - 1),
         "column": ((across // 2, 0), (0, 1), down - 1),
-        "diagonal": ((left, top), (1, 1), square),
-        "other diagonal": ((left + square, top), (-1, 1), square),
+        "diagonal": ((first_column, top), (1, 1), square),
+        "other diagonal": ((first_column + square, top), (-1, 1), square),
     }
     pairs = []
     for name, ((x, y), (dx, dy), most) in lines.items():
@@ -180,14 +180,14 @@ class _Seen:
 
 
 @dataclass(frozen=True)
-class _Solved:
+class _Solution:
     by_noise: Floats
     """[3 m, 3 m] covariance of the points by noise, mm^2."""
     by_record: Floats
     """[3 m, parameters] points by the record's figures."""
 
 
-def _adjusted(position: Position, corners: _Seen, noise: Noise) -> tuple[Floats, Floats, _Solved]:
+def _adjust(position: Position, corners: _Seen, noise: Noise) -> tuple[Floats, Floats, _Solution]:
     """Points [m, 3] in the base, the arm's errors [views, 4, 4], and how the points depend on everything else."""
     points = _start(position, corners)
     views, size = len(position.sightings), 3 * len(corners.ids)
@@ -195,17 +195,21 @@ def _adjusted(position: Position, corners: _Seen, noise: Noise) -> tuple[Floats,
     prior = np.r_[[noise.position_mm] * 3, [noise.orientation_rad] * 3] ** -2.0
     for _ in range(_STEPS):
         residuals, jacobian, by_record = _equations(position, corners, points, errors)
-        weighted = jacobian / noise.corner_px**2
-        normal = jacobian.T @ weighted
+        weighted_jacobian = jacobian / noise.corner_px**2
+        normal = jacobian.T @ weighted_jacobian
         normal[range(size, len(normal)), range(size, len(normal))] += np.tile(prior, views)
         off = np.concatenate([errors[:, :3, 3], rotation_vector(errors[:, :3, :3])], axis=1)
-        right_side = weighted.T @ residuals
+        right_side = weighted_jacobian.T @ residuals
         right_side[size:] -= (prior * off).ravel()
         step = np.asarray(np.linalg.solve(normal, right_side), np.float64)
         points = points + step[:size].reshape(-1, 3)
         errors = moved_transforms(errors, step[size:].reshape(-1, 6))
     covariance = np.asarray(np.linalg.inv(normal), np.float64)
-    return points, errors, _Solved(covariance[:size, :size], -(covariance @ (weighted.T @ by_record))[:size])
+    return (
+        points,
+        errors,
+        _Solution(covariance[:size, :size], -(covariance @ (weighted_jacobian.T @ by_record))[:size]),
+    )
 
 
 def _start(position: Position, corners: _Seen) -> Floats:

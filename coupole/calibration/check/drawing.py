@@ -39,13 +39,13 @@ def _draw_errors(ax: Axes, values: tuple[Comparison, ...], is_length: bool) -> N
     positions = list(dict.fromkeys(value.position for value in values))
     factor = 1e3 if is_length else 1.0
     for number, position in enumerate(positions):
-        mine = [value for value in values if value.position == position]
+        position_values = [value for value in values if value.position == position]
         shift = 0.6 * (number / max(1, len(positions) - 1) - 0.5)
-        x = [v.certified + 2.0 * shift if is_length else _channel(v.name) + shift for v in mine]
-        expanded = [factor * np.hypot(v.expanded_u_certified, v.expanded_u_measured) for v in mine]
-        errors = [factor * v.error for v in mine]
-        ax.errorbar(x, errors, expanded, fmt="o", ms=4, lw=1, capsize=2, label=position)
-    limits = sorted((v.certified, factor * v.permissible) for v in values if v.permissible is not None)
+        x = [v.certified_value + 2.0 * shift if is_length else _channel(v.name) + shift for v in position_values]
+        expanded_u = [factor * np.hypot(v.expanded_u_certified, v.expanded_u_measured) for v in position_values]
+        errors = [factor * v.error for v in position_values]
+        ax.errorbar(x, errors, expanded_u, fmt="o", ms=4, lw=1, capsize=2, label=position)
+    limits = sorted((v.certified_value, factor * v.permissible) for v in values if v.permissible is not None)
     for sign in (-1.0, 1.0) if limits else ():
         ax.plot([at for at, _ in limits], [sign * limit for _, limit in limits], color=RED, lw=1.2)
     ax.axhline(0.0, color=DARK, lw=0.8)
@@ -66,7 +66,7 @@ def _channel(name: str) -> float:
 def _draw_en(ax: Axes, values: tuple[Comparison, ...]) -> None:
     at = np.arange(len(values))
     en = np.array([value.en for value in values])
-    ax.bar(at, en, color=[BLUE if one <= 1.0 else RED for one in en])
+    ax.bar(at, en, color=[BLUE if value <= 1.0 else RED for value in en])
     ax.axhline(1.0, color=RED, lw=1.2)
     starts = [n for n in at if n == 0 or values[n].position != values[n - 1].position]
     for start in starts[1:]:
@@ -83,9 +83,9 @@ def comparison_section(record: Record) -> Section:
         (
             value.position,
             value.name,
-            f"{value.certified:.5f}",
+            f"{value.certified_value:.5f}",
             f"{value.expanded_u_certified:.5f}",
-            f"{value.measured:.5f}",
+            f"{value.measured_value:.5f}",
             f"{value.expanded_u_measured:.5f}",
             f"{value.error:+.5f}",
             "" if value.permissible is None else f"{value.permissible:.5f}",

@@ -54,7 +54,7 @@ class MeasuredTile:
     """[places, channels]."""
     covariance: Floats
     """[places channels] squared, relative: of their logarithms."""
-    certified: Floats
+    certified_reflectance: Floats
     """[places, channels]."""
     u_certified: Floats
     """[places, channels]."""
@@ -71,8 +71,8 @@ def reflectance_of(
     `powers`. Raises InputError if too few LEDs can be used at a place.
     """
     channels = tuple(powers)
-    deltas, shared = len(places) * len(channels), len(shared_covariance)
-    size = deltas + OF_PLACE * len(places) + 1 + shared
+    deltas, shared_count = len(places) * len(channels), len(shared_covariance)
+    size = deltas + OF_PLACE * len(places) + 1 + shared_count
     blocks, y, u = [], [], []
     for p, place in enumerate(places):
         for c, channel in enumerate(channels):
@@ -88,40 +88,45 @@ def reflectance_of(
             design[:, deltas + OF_PLACE * p : deltas + OF_PLACE * (p + 1)] = slopes[:, :OF_PLACE]
             design[:, deltas + OF_PLACE * len(places)] = slopes[:, -1]
             at = [powers[channel].row[row.led] for row in usable]
-            first = size - shared + c * len(powers[channel].names)
+            first = size - shared_count + c * len(powers[channel].names)
             design[:, first : first + len(powers[channel].names)] = powers[channel].common[at]
             values = np.array([row.value for row in usable])
             blocks.append(design)
             y.append(np.log(values / powers[channel].power[at]))
-            own = np.array([row.u for row in usable]) / values
-            u.append(np.sqrt(own**2 + powers[channel].u_own[at] ** 2 + _FLASH**2))
-    return _solved(
+            u_noise = np.array([row.u for row in usable]) / values
+            u.append(np.sqrt(u_noise**2 + powers[channel].u_own[at] ** 2 + _FLASH**2))
+    return _solve(
         places, channels, np.concatenate(blocks), np.concatenate(y), np.concatenate(u), shared_covariance
     )
 
 
-def _solved(
-    places: Sequence[Place], channels: tuple[str, ...], design: Floats, y: Floats, u: Floats, shared: Floats
+def _solve(
+    places: Sequence[Place],
+    channels: tuple[str, ...],
+    design: Floats,
+    y: Floats,
+    u: Floats,
+    shared_covariance: Floats,
 ) -> MeasuredTile:
     deltas = len(places) * len(channels)
     priors = [prior_of(place.tile[channels[0]]) for place in places]
     sigmas = np.maximum([*(s for prior in priors for s in prior[:OF_PLACE]), priors[0][-1]], LEAST_PRIOR)
     end = deltas + len(sigmas)
     # Channels share the first tile's errors, so the covariance has no inverse: its root's figures are independent.
-    design = np.hstack([design[:, :end], design[:, end:] @ _root(shared)])
+    design = np.hstack([design[:, :end], design[:, end:] @ _root(shared_covariance)])
     weight = np.diag(np.concatenate([np.zeros(deltas), sigmas**-2.0, np.ones(design.shape[1] - end)]))
-    scaled = design / u[:, None] ** 2
-    covariance = np.asarray(np.linalg.inv(design.T @ scaled + weight), np.float64)
-    found = covariance @ (scaled.T @ y)
-    residuals = (y - design @ found) / u
-    certified = np.array([[place.tile[channel].reflectance for channel in channels] for place in places])
+    weighted_design = design / u[:, None] ** 2
+    covariance = np.asarray(np.linalg.inv(design.T @ weighted_design + weight), np.float64)
+    solution = covariance @ (weighted_design.T @ y)
+    residuals = (y - design @ solution) / u
+    certified_values = np.array([[place.tile[channel].reflectance for channel in channels] for place in places])
     u_certified = np.array([[place.tile[channel].u_reflectance for channel in channels] for place in places])
     return MeasuredTile(
         tuple(place.name for place in places),
         channels,
-        certified * np.exp(found[:deltas]).reshape(certified.shape),
+        certified_values * np.exp(solution[:deltas]).reshape(certified_values.shape),
         covariance[:deltas, :deltas],
-        certified,
+        certified_values,
         u_certified,
         float(np.sqrt(np.mean(residuals**2))),
     )

@@ -56,7 +56,7 @@ class Checked:
 
 @dataclass(frozen=True)
 class Pictures:
-    """What the check's pictures are of, and the files that it read."""
+    """Camera of the check's pictures, and the files that it read."""
 
     about: About
     size_px: tuple[int, int]
@@ -69,8 +69,10 @@ def records_by_kind(paths: Sequence[Path]) -> dict[Kind, InForce]:
     for item in read_in_force(paths):
         if item.record.kind == "artefact-check":
             continue
-        if other := records.get(item.record.kind):
-            raise InputError(f"{item.path}: a second record of the kind `{item.record.kind}`, beside {other.path}")
+        if earlier := records.get(item.record.kind):
+            raise InputError(
+                f"{item.path}: a second record of the kind `{item.record.kind}`, beside {earlier.path}"
+            )
         records[item.record.kind] = item
     return records
 
@@ -84,13 +86,23 @@ def refuse_dependent(artefact: Artefact | None, path: Path, records: Mapping[Kin
             "name, serial and certificate"
         )
     for item in records.values():
-        for other in item.record.artefacts:
-            if other.artefact.serial.strip().casefold() == artefact.serial.strip().casefold():
+        for used_artefact in item.record.artefacts:
+            if used_artefact.artefact.serial.strip().casefold() == artefact.serial.strip().casefold():
                 raise InputError(
                     f"{path}: {artefact.title} took part in the {item.record.kind} record {item.path}, so it is "
                     "not independent of it. Take another artefact"
                 )
     return artefact
+
+
+def refuse_used_images(records: Mapping[Kind, InForce], inputs: Sequence[tuple[str, str]]) -> None:
+    """Raise InputError if a record was made from some of these images: then they check nothing."""
+    for item in records.values():
+        image_hashes = {line.sha256 for line in item.record.inputs if "/" in line.name}
+        if common := [name for name, sha256 in inputs if "/" in name and sha256 in image_hashes]:
+            raise InputError(
+                f"{item.path}: was made from the same images ({common[0]}), which check nothing. Acquire others"
+            )
 
 
 def parse_permissible(words: str) -> Permissible:
@@ -109,7 +121,7 @@ def parse_permissible(words: str) -> Permissible:
 
 
 def compare_lengths(
-    found: Sequence[Lengths], covariance: Floats, u_scale: float, permissible: Permissible | None
+    position_lengths: Sequence[Lengths], covariance: Floats, u_scale: float, permissible: Permissible | None
 ) -> Checked:
     """Lengths of all positions beside the certified ones.
 
@@ -117,7 +129,7 @@ def compare_lengths(
     uncertainty of the board's certified lengths at the temperature of the measurement.
     """
     comparisons, slopes, noises, certified_own = [], [], [], []
-    for part in found:
+    for part in position_lengths:
         u_measured = np.sqrt(
             np.diag(part.noise_covariance) + np.einsum("ni,ij,nj->n", part.by_record, covariance, part.by_record)
         )
@@ -127,9 +139,9 @@ def compare_lengths(
                 position=part.position,
                 name=name,
                 unit="mm",
-                certified=float(part.certified_mm[n]),
+                certified_value=float(part.certified_mm[n]),
                 expanded_u_certified=float(K * u_certified[n]),
-                measured=float(part.measured_mm[n]),
+                measured_value=float(part.measured_mm[n]),
                 expanded_u_measured=float(K * u_measured[n]),
                 permissible=None if permissible is None else permissible.at(float(part.certified_mm[n])),
             )
@@ -142,47 +154,47 @@ def compare_lengths(
     errors = np.array(
         [
             part.certified_mm @ (part.measured_mm - part.certified_mm) / np.sum(part.certified_mm**2)
-            for part in found
+            for part in position_lengths
         ]
     )
     together = np.array(slopes) @ covariance @ np.array(slopes).T + np.diag(noises)
     together = together + u_scale**2 + np.diag(certified_own)
-    names = [f"length_error_ppm.{part.position}" for part in found]
-    ratios = ", ".join(f"{part.position} {part.residual_ratio:.2f}" for part in found)
+    names = [f"length_error_ppm.{part.position}" for part in position_lengths]
+    ratios = ", ".join(f"{part.position} {part.residual_ratio:.2f}" for part in position_lengths)
     remark = f"residuals of corners over the record's noise: {ratios}"
-    return _checked(comparisons, names, 1e6 * errors, 1e12 * together, (remark,))
+    return _check_of(comparisons, names, 1e6 * errors, 1e12 * together, (remark,))
 
 
 # -- a tile -----------------------------------------------------------------------------------------------------
 
 
-def compare_reflectances(found: MeasuredTile) -> Checked:
+def compare_reflectances(tile: MeasuredTile) -> Checked:
     """Reflectances of all places and channels beside the certified ones, whose errors are fully correlated."""
-    u = np.sqrt(np.diag(found.covariance)).reshape(found.reflectance.shape) * found.reflectance
+    u = np.sqrt(np.diag(tile.covariance)).reshape(tile.reflectance.shape) * tile.reflectance
     comparisons = [
         Comparison(
             position=place,
             name=channel,
             unit="1",
-            certified=float(found.certified[p, c]),
-            expanded_u_certified=float(K * found.u_certified[p, c]),
-            measured=float(found.reflectance[p, c]),
+            certified_value=float(tile.certified_reflectance[p, c]),
+            expanded_u_certified=float(K * tile.u_certified[p, c]),
+            measured_value=float(tile.reflectance[p, c]),
             expanded_u_measured=float(K * u[p, c]),
         )
-        for p, place in enumerate(found.places)
-        for c, channel in enumerate(found.channels)
+        for p, place in enumerate(tile.places)
+        for c, channel in enumerate(tile.channels)
     ]
-    errors = np.log(found.reflectance / found.certified).ravel()
-    u_certified = (found.u_certified / found.certified).ravel()
-    names = [f"ln_reflectance_error.{place}.{channel}" for place in found.places for channel in found.channels]
-    remark = f"residuals of readings over their noise: {found.residual_ratio:.2f}"
-    return _checked(comparisons, names, errors, found.covariance + np.outer(u_certified, u_certified), (remark,))
+    errors = np.log(tile.reflectance / tile.certified_reflectance).ravel()
+    u_certified = (tile.u_certified / tile.certified_reflectance).ravel()
+    names = [f"ln_reflectance_error.{place}.{channel}" for place in tile.places for channel in tile.channels]
+    remark = f"residuals of readings over their noise: {tile.residual_ratio:.2f}"
+    return _check_of(comparisons, names, errors, tile.covariance + np.outer(u_certified, u_certified), (remark,))
 
 
 # -- the record -------------------------------------------------------------------------------------------------
 
 
-def _checked(
+def _check_of(
     comparisons: Sequence[Comparison],
     names: Sequence[str],
     errors: Floats,
@@ -205,7 +217,7 @@ def _checked(
 
 
 def check_outcome(
-    checked: Checked,
+    check: Checked,
     artefact: UsedArtefact,
     pictures: Pictures,
     records: Mapping[Kind, InForce],
@@ -219,31 +231,31 @@ def check_outcome(
         simulated=pictures.about.is_simulated or any(item.record.simulated for item in records.values()),
         validity=request.validity(pictures.about, pictures.size_px, pictures.about.temperature_c),
         transforms={},
-        parameters=checked.parameters,
+        parameters=check.parameters,
         fixed={"coverage_factor": K},
-        covariance=rows_of(checked.covariance),
+        covariance=rows_of(check.covariance),
         noise=(),
         images=(),
-        limits=limits_of(checked, request.limits),
-        remarks=(*checked.remarks, *_against(records)),
+        limits=limits_of(check, request.limits),
+        remarks=(*check.remarks, *_against(records)),
         artefacts=(artefact,),
-        comparisons=checked.comparisons,
+        comparisons=check.comparisons,
         inputs=tuple(Input(name=name, sha256=digest) for name, digest in inputs),
     )
     draw: Callable[..., None] = partial(draw_comparisons, record)
     return Outcome(record, draw, sections=(comparison_section(record),))
 
 
-def limits_of(checked: Checked, operator_limits: Mapping[str, float]) -> tuple[Limit, ...]:
+def limits_of(check: Checked, operator_limits: Mapping[str, float]) -> tuple[Limit, ...]:
     """Acceptance limits of a check; `operator_limits` are those that the operator set."""
-    values = np.array([value.en for value in checked.comparisons])
+    values = np.array([value.en for value in check.comparisons])
     figures = {
-        "mean_en": checked.mean_en,
+        "mean_en": check.mean_en,
         "worst_en": float(values.max()),
         "share": float(np.mean(values > 1.0)),
     }
     limits = against_limits(CHECK, operator_limits, figures)
-    shares = [abs(v.error) / v.permissible for v in checked.comparisons if v.permissible is not None]
+    shares = [abs(v.error) / v.permissible for v in check.comparisons if v.permissible is not None]
     return (*limits, limit_of("largest error of a length over its MPE", max(shares), 1.0)) if shares else limits
 
 
@@ -252,11 +264,11 @@ def _against(records: Mapping[Kind, InForce]) -> list[str]:
 
 
 def used_records(records: Mapping[Kind, InForce], kinds: Sequence[Kind]) -> dict[Kind, InForce]:
-    """Those of some kinds."""
+    """Records of some kinds."""
     return {kind: item for kind, item in records.items() if kind in kinds}
 
 
-def needed(records: Mapping[Kind, InForce], kind: Kind) -> Record:
+def needed_record(records: Mapping[Kind, InForce], kind: Kind) -> Record:
     """The record of a kind. Raises InputError if there is none."""
     if kind not in records:
         raise InputError(

@@ -81,9 +81,9 @@ class Board(Described):
         artefact = self.artefact
         if artefact is None:
             return self, ()
-        certified = artefact.square_mm
-        side_mm = self.square_mm if certified is None else certified.value
-        u_side = 1e-6 * self.scale_u_ppm if certified is None else certified.u / certified.value
+        certified_side = artefact.square_mm
+        side_mm = self.square_mm if certified_side is None else certified_side.value
+        u_side = 1e-6 * self.scale_u_ppm if certified_side is None else certified_side.u / certified_side.value
         expansion, u_expansion = expansion_of(artefact, temperature)
         u_ppm = 1e6 * float(np.hypot(u_side, u_expansion))
         used_artefact = UsedArtefact(

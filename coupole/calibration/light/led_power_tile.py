@@ -55,7 +55,7 @@ class Setting:
         return self.tile.of_channel(channel, self.light)
 
     def artefacts(self, channels: Sequence[str]) -> tuple[UsedArtefact, ...]:
-        """What a record keeps of the tile's certificate."""
+        """Part of a record: the tile's certificate."""
         figures: dict[str, float] = {}
         for channel in channels:
             tile = self.tile_of(channel)

@@ -72,12 +72,12 @@ def sealed_outcome(
     artefacts: Sequence[UsedArtefact] = (),
 ) -> Outcome:
     """A record of a radiometric calibration, with its files; `draw` gets the record and an empty figure."""
-    about, contents = frames.about, files or {}
+    contents = files or {}
     record = seal_record(
         kind=kind,
         **request.head(),
-        simulated=about.is_simulated,
-        validity=request.validity(about, size_px, temperatures_of(frames.frames)),
+        simulated=frames.about.is_simulated,
+        validity=request.validity(frames.about, size_px, temperatures_of(frames.frames)),
         transforms={},
         parameters=tuple(parameters),
         fixed=dict(fixed_figures or {}),
@@ -103,7 +103,6 @@ def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> O
     dark_frames = [DarkFrame(str(f.shot), f.exposure_us * 1e-6, f.temperature_c, f.read) for f in frames.dark]
     dark = calibrate_dark(dark_frames, white_dn=frames.white_dn, progress=progress)
     height, width = dark.offset_dn.shape
-    pixels = height * width
     values = {
         "read_noise_dn": (dark.read_noise_dn, dark.read_noise_u_dn),
         "row_noise_dn": (dark.row_noise_dn, dark.row_noise_u_dn),
@@ -138,10 +137,10 @@ def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> O
         parameters,
         _of_means(dark, np.array([p.u for p in parameters])),
         partial(pictures.draw_dark, dark),
-        limits=against_limits(DARK, request.limits, {"hot": len(dark.hot) / pixels}),
+        limits=against_limits(DARK, request.limits, {"hot": len(dark.hot) / dark.offset_dn.size}),
         files={f"{request.name}.h5": content},
         fixed_figures=fixed_figures,
-        remarks=(f"{len(dark.hot)} hot pixels of {pixels}; the list is in {request.name}.h5",),
+        remarks=(f"{len(dark.hot)} hot pixels of {height * width}; the list is in {request.name}.h5",),
     )
 
 

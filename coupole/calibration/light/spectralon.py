@@ -31,7 +31,7 @@ class Tile(Described):
     schema_version: Literal[1] = 1
     name: str = "Spectralon SRS-99"
     reflectance: Annotated[float, Field(gt=0, le=1.05)] = 0.99
-    """In `geometry`. Left out, as its uncertainty is, where `artefact` has a certified `reflectance`."""
+    """Reflectance in `geometry`. Both are left out where `artefact` has a certified `reflectance`."""
     u_reflectance: Annotated[float, Field(ge=0)] = 0.005
     geometry: Geometry = "0/h"
     """Light and view of `reflectance`: 0/h is hemispherical, for light along the normal."""
@@ -51,8 +51,8 @@ class Tile(Described):
     def _certificate_alone(self) -> Self:
         if self.artefact is None or self.artefact.reflectance is None:
             return self
-        if doubled := sorted({"reflectance", "u_reflectance", "geometry"} & self.model_fields_set):
-            raise ValueError(f"no {', '.join(doubled)} beside a certified artefact.reflectance")
+        if doubled_keys := sorted({"reflectance", "u_reflectance", "geometry"} & self.model_fields_set):
+            raise ValueError(f"no {', '.join(doubled_keys)} beside a certified artefact.reflectance")
         return self
 
     def of_channel(self, channel: str, light: LightSpectrum | None = None) -> Tile:

@@ -1,4 +1,4 @@
-"""What a laboratory states itself for the certificate of a cell (YAML)."""
+"""A laboratory's own statements for the certificate of a cell (YAML)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Item(Model):
 
 
 class Person(Model):
-    """Who authorises the certificate."""
+    """Person who authorises the certificate."""
 
     name: Words
     function: Words

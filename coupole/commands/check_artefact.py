@@ -15,7 +15,7 @@ from coupole.commands.calibrating import EmissionOption, Paths, Work, arm_of, ba
 from coupole.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from rich.console import Console
 
@@ -80,13 +80,13 @@ def check_artefact(
 
     Each run, or folder of pictures with poses, is one position of the artefact.
     """
-    from coupole.calibration.check.workflow import records_by_kind
+    from coupole.calibration.check.workflow import records_in_force
     from coupole.calibration.record import records_named
 
     def work(console: Console, request: Request) -> Outcome:
         if (independent.board is None) == (independent.tile is None):
             raise InputError("check-artefact: give one of --board and --tile, the artefact's description")
-        records = records_by_kind(records_named(independent.records or []))
+        records = records_in_force(records_named(independent.records or []))
         if independent.board is not None:
             return _check_board(paths, independent, warmth, records, request, console)
         return _check_tile(paths, independent, emission, records, request, console)
@@ -101,7 +101,7 @@ def _check_board(
     paths: list[Path],
     independent: IndependentArtefact,
     warmth: Warmth,
-    records: Mapping[Kind, InForce],
+    records: Sequence[InForce],
     request: Request,
     console: Console,
 ) -> Outcome:
@@ -112,29 +112,29 @@ def _check_board(
         compare_lengths,
         needed_record,
         parse_permissible,
+        records_by_kind,
         refuse_dependent,
         refuse_used_images,
-        used_records,
     )
     from coupole.calibration.lens.board import read_board
 
     assert independent.board is not None  # as `check_artefact` has refused
     permissible = None if independent.mpe is None else parse_permissible(independent.mpe)
-    needed_record(records, "hand-eye")
-    used_kinds = used_records(records, OF_BOARD)
+    record_of_kind = records_by_kind(records, OF_BOARD)
+    needed_record(record_of_kind, "hand-eye")
     refuse_dependent(read_board(independent.board).artefact, independent.board, records)
     lengths, inputs, sources, target = [], [], None, None
     for path in paths:
-        position, sources, target = _position(path, independent, warmth, used_kinds["hand-eye"], console)
-        refuse_used_images(used_kinds, sources.inputs)
+        position, sources, target = _position(path, independent, warmth, record_of_kind["hand-eye"], console)
+        refuse_used_images(records, sources.inputs)
         inputs += list(sources.inputs)
-        lengths.append(lengths_of(position, target, Noise.of(used_kinds["hand-eye"].record)))
+        lengths.append(lengths_of(position, target, Noise.of(record_of_kind["hand-eye"].record)))
     assert sources is not None  # `paths` has at least one
     assert target is not None
     check = compare_lengths(lengths, position.camera.covariance, 1e-6 * target.scale_u_ppm, permissible)
-    size_px = used_kinds["hand-eye"].record.validity.size_px or (1, 1)
+    size_px = record_of_kind["hand-eye"].record.validity.size_px or (1, 1)
     pictures = Pictures(sources.about, size_px, tuple(dict.fromkeys(inputs)))
-    return check_outcome(check, sources.artefacts[0], pictures, used_kinds, request)
+    return check_outcome(check, sources.artefacts[0], pictures, record_of_kind, request)
 
 
 def _position(
@@ -170,7 +170,7 @@ def _check_tile(
     runs: list[Path],
     independent: IndependentArtefact,
     emission: str,
-    records: Mapping[Kind, InForce],
+    records: Sequence[InForce],
     request: Request,
     console: Console,
 ) -> Outcome:
@@ -183,9 +183,9 @@ def _check_tile(
         check_outcome,
         compare_reflectances,
         needed_record,
+        records_by_kind,
         refuse_dependent,
         refuse_used_images,
-        used_records,
     )
     from coupole.calibration.earlier import refuse_read_otherwise
     from coupole.calibration.light.drift_records import read_powers
@@ -197,37 +197,39 @@ def _check_tile(
         raise InputError(
             f"--tile: expected one description, or one for each of {len(runs)} runs; got {len(tiles)}"
         )
-    record = needed_record(records, "led-power")
-    used_kinds = used_records(records, OF_TILE)
+    record_of_kind = records_by_kind(records, OF_TILE)
+    record = needed_record(record_of_kind, "led-power")
     artefacts = [refuse_dependent(read_tile(tile).artefact, tile, records) for tile in tiles]
     if len({artefact.serial for artefact in artefacts}) > 1:
         raise InputError(
             f"--tile: expected one tile in all places, found {', '.join(a.serial for a in artefacts)}"
         )
-    refuse_read_otherwise(used_kinds["led-power"].path, record, list(used_kinds))
+    refuse_read_otherwise(record_of_kind["led-power"].path, record, list(record_of_kind))
     places, inputs = [], []
     for number, run in enumerate(runs):
         tile = tiles[number % len(tiles)]
         place, frames, run_inputs = _place(
-            run, tile, independent.rig, _calibrations_of(used_kinds, independent.rig, emission), console
+            run, tile, independent.rig, _calibrations_of(record_of_kind, independent.rig, emission), console
         )
-        refuse_used_images(used_kinds, frames.inputs)
+        refuse_used_images(records, frames.inputs)
         places.append(place)
         inputs += run_inputs
     channels = channels_of(frames.pattern)
-    powers = {channel: read_powers(used_kinds["led-power"].path, channel) for channel in channels}
+    powers = {channel: read_powers(record_of_kind["led-power"].path, channel) for channel in channels}
     names = [parameter.name for parameter in record.parameters]
     at = [names.index(f"{name}.{channel}") for channel in channels for name in powers[channel].names]
     tile_values = reflectance_of(places, powers, record.covariance_matrix[np.ix_(at, at)])
     figures = {f"reflectance.{channel}": places[0].tile[channel].reflectance for channel in channels}
     pictures = Pictures(frames.about, frames.size_px, tuple(dict.fromkeys(inputs)))
     artefact = used_as("tile", artefacts[0], figures)[0]
-    return check_outcome(compare_reflectances(tile_values), artefact, pictures, used_kinds, request)
+    return check_outcome(compare_reflectances(tile_values), artefact, pictures, record_of_kind, request)
 
 
-def _calibrations_of(used_kinds: Mapping[Kind, InForce], rig: Path | None, emission: str) -> TargetCalibrations:
+def _calibrations_of(
+    record_of_kind: Mapping[Kind, InForce], rig: Path | None, emission: str
+) -> TargetCalibrations:
     """The records by which frames of the tile are read."""
-    paths = {kind: item.path for kind, item in used_kinds.items()}
+    paths = {kind: item.path for kind, item in record_of_kind.items()}
     return TargetCalibrations(
         rig=rig,
         leds=paths.get("leds"),

@@ -62,7 +62,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
     result = CliRunner().invoke(calibrate_app, ["hand-eye", str(pictures), *map(str, words)])
     assert result.exception is None, result.output
     for seed in (4, 5):
-        write_folder(folder / f"place{seed}", shoot(seed=seed))
+        write_folder(folder / f"place{seed}", shoot(count=5, seed=seed))
     return folder
 
 

@@ -63,11 +63,16 @@ class Pictures:
     inputs: tuple[tuple[str, str], ...]
 
 
-def records_by_kind(paths: Sequence[Path]) -> dict[Kind, InForce]:
-    """Records by their kind. Raises InputError for two of one kind."""
+def records_in_force(paths: Sequence[Path]) -> tuple[InForce, ...]:
+    """All records but those of other checks."""
+    return tuple(item for item in read_in_force(paths) if item.record.kind != "artefact-check")
+
+
+def records_by_kind(items: Sequence[InForce], kinds: Sequence[Kind]) -> dict[Kind, InForce]:
+    """Records of some kinds. Raises InputError for two of one of them."""
     records: dict[Kind, InForce] = {}
-    for item in read_in_force(paths):
-        if item.record.kind == "artefact-check":
+    for item in items:
+        if item.record.kind not in kinds:
             continue
         if earlier := records.get(item.record.kind):
             raise InputError(
@@ -77,7 +82,7 @@ def records_by_kind(paths: Sequence[Path]) -> dict[Kind, InForce]:
     return records
 
 
-def refuse_dependent(artefact: Artefact | None, path: Path, records: Mapping[Kind, InForce]) -> Artefact:
+def refuse_dependent(artefact: Artefact | None, path: Path, items: Sequence[InForce]) -> Artefact:
     """The artefact of a description. Raises InputError unless it has a certificate, and for one that took part
     in a fit of the records."""
     if artefact is None or artefact.certificate is None:
@@ -85,7 +90,7 @@ def refuse_dependent(artefact: Artefact | None, path: Path, records: Mapping[Kin
             f"{path}: a check needs the artefact's identity and certificate: expected a block `artefact` with "
             "name, serial and certificate"
         )
-    for item in records.values():
+    for item in items:
         for used_artefact in item.record.artefacts:
             if used_artefact.artefact.serial.strip().casefold() == artefact.serial.strip().casefold():
                 raise InputError(
@@ -95,9 +100,9 @@ def refuse_dependent(artefact: Artefact | None, path: Path, records: Mapping[Kin
     return artefact
 
 
-def refuse_used_images(records: Mapping[Kind, InForce], inputs: Sequence[tuple[str, str]]) -> None:
+def refuse_used_images(items: Sequence[InForce], inputs: Sequence[tuple[str, str]]) -> None:
     """Raise InputError if a record was made from some of these images: then they check nothing."""
-    for item in records.values():
+    for item in items:
         image_hashes = {line.sha256 for line in item.record.inputs if "/" in line.name}
         if common := [name for name, sha256 in inputs if "/" in name and sha256 in image_hashes]:
             raise InputError(
@@ -261,11 +266,6 @@ def limits_of(check: Checked, operator_limits: Mapping[str, float]) -> tuple[Lim
 
 def _against(records: Mapping[Kind, InForce]) -> list[str]:
     return [f"checked: {kind} record {item.record.name}, {item.record.sha256}" for kind, item in records.items()]
-
-
-def used_records(records: Mapping[Kind, InForce], kinds: Sequence[Kind]) -> dict[Kind, InForce]:
-    """Records of some kinds."""
-    return {kind: item for kind, item in records.items() if kind in kinds}
 
 
 def needed_record(records: Mapping[Kind, InForce], kind: Kind) -> Record:

@@ -75,6 +75,11 @@ PROOFS = (
     Proof("cells", "intervals of 100 random cells hold", "tools/prove_calibrations.py --cells 100"),
     Proof("cells-absolute", "the same with the arm's absolute errors", "tools/prove_calibrations.py --absolute"),
     Proof(
+        "artefacts",
+        "E_n of independent boards and tiles holds as stated; wrong ones are found",
+        "tools/prove_artefacts.py",
+    ),
+    Proof(
         "reflectance",
         "45 cells of materials that the fit does not know: intervals, normals, fits, new views",
         "tools/prove_reflectance.py",

@@ -7,6 +7,8 @@
     stickers/       pose of a scanned object, by its stickers
     light/          radiometry of sensor, lens and LEDs, and its drift
     colour/         colour profile from a chart, and figures of image quality
+    check/          the calibrated cell measures a board or tile that took part in no fit
+    certificate/    a certificate of the whole cell
     budget/         uncertainty of a reflectance, from the records of all calibrations
 
     sources.py      runs and folders of pictures; grey_image.py: an image, one colour at a time
@@ -17,6 +19,8 @@
     multi_view.py point_sets.py rotations.py arm_errors.py  geometry that several of them use
 
     request.py      what the operator asks for; acceptance.py: acceptance limits
+    artefact.py     certificates of boards, tiles, charts; traceability.py: what records say of them
+    validity.py     records that have expired by drift
     record.py       the result on disk, sealed by its checksum
     report.py       the result as a page and a picture
     in_force.py     whether a plan may be acquired with the records that it names

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AwareDatetime, Field
 
+from coupole.calibration.artefact import UsedArtefact
 from coupole.calibration.optics import NAMES, Intrinsics
 from coupole.errors import InputError, StorageError, reason
 from coupole.geometry import abc_from_rotation
@@ -43,6 +44,7 @@ Kind = Literal[
     "drift",
     "colour",
     "glare",
+    "artefact-check",
 ]
 SEAL = "# A calibration of Coupole"
 """First words of a record's file."""
@@ -126,6 +128,35 @@ class Limit(Model):
         return self.found <= self.limit
 
 
+class Comparison(Model):
+    """A value that a calibrated cell measured on an artefact, beside the certified one."""
+
+    position: str
+    """Place of the artefact: the name of its run or folder."""
+    name: str
+    """Name of the length, or of the channel."""
+    unit: str
+    certified_value: float
+    expanded_u_certified: NotNegative
+    """U of the certified value at the temperature of the measurement, k = 2."""
+    measured_value: float
+    expanded_u_measured: NotNegative
+    """U of the measured value by the records in force, k = 2."""
+    permissible: Positive | None = Field(default=None, exclude_if=_not_said)
+    """Largest permissible error that the user stated (MPE), in the unit."""
+
+    @property
+    def error(self) -> float:
+        """Measured minus certified, in the unit."""
+        return self.measured_value - self.certified_value
+
+    @property
+    def en(self) -> float:
+        """E_n of ISO 13528, 9.7: the error over both expanded uncertainties together."""
+        together = float(np.hypot(self.expanded_u_certified, self.expanded_u_measured))
+        return abs(self.error) / max(together, 1e-300)
+
+
 class Input(Model):
     """A file that the calibration was made from."""
 
@@ -179,6 +210,11 @@ class Record(Model):
     """Remarks for the operator: methods that disagree, corners that were left out."""
     faults: tuple[LedFault, ...] = Field(default=(), exclude_if=_none_found)
     """Faults of LEDs; their texts are among the remarks."""
+    artefacts: tuple[UsedArtefact, ...] = Field(default=(), exclude_if=_none_found)
+    """Boards, tiles, charts that it was made from, with their certificates; none in a record that is not
+    traceable, or that rests on other records."""
+    comparisons: tuple[Comparison, ...] = Field(default=(), exclude_if=_none_found)
+    """Values of a check by an independent artefact."""
     inputs: Annotated[tuple[Input, ...], Field(min_length=1)]
     sha256: Sha256
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from coupole.calibration.adjustment import coverage_factor
 from coupole.calibration.record import Parameter, Record, write_record
+from coupole.calibration.traceability import traceability_section
 from coupole.errors import StorageError
 from coupole.pages.page_parts import Code, Inline, Link, Page, Picture, Section, Table, Verdict
 from coupole.pages.page_rendering import render
@@ -31,6 +32,8 @@ class Outcome:
     """Fills an empty figure of 1600 x 1200 pixels."""
     files: Mapping[str, bytes] = field(default_factory=dict)
     """Files by name, as `record.files` lists them: tables and maps that are too large for YAML."""
+    sections: Sequence[Section] = ()
+    """Parts of the page beside those that all records have."""
 
 
 def write_outcome(record_path: Path, outcome: Outcome) -> tuple[Path, Path]:
@@ -46,7 +49,7 @@ def write_outcome(record_path: Path, outcome: Outcome) -> tuple[Path, Path]:
         for file, content in outcome.files.items():
             (folder / file).write_bytes(content)
         png.write_bytes(picture)
-        page.write_text(render(_page(outcome.record, picture)), encoding="utf-8")
+        page.write_text(render(_page(outcome, picture)), encoding="utf-8")
     except OSError as error:
         raise StorageError(f"{folder}: cannot write the report: {error.strerror}. Free its disk.") from error
     write_record(record_path, outcome.record)
@@ -78,7 +81,8 @@ def draw(outcome: Outcome) -> bytes:
 # -- the page ---------------------------------------------------------------------------------------------
 
 
-def _page(record: Record, picture: bytes) -> Page:
+def _page(outcome: Outcome, picture: bytes) -> Page:
+    record = outcome.record
     return Page(
         title=f"{record.name}: {record.kind} calibration, {'accepted' if record.is_accepted else 'not accepted'}",
         pictures=[Picture("Residuals and what was found", picture, is_broad=True)],
@@ -89,7 +93,9 @@ def _page(record: Record, picture: bytes) -> Page:
         sections=[
             Section("limits", "Limits", tables=[_limits(record)]),
             Section("result", "Result", tables=[_transforms(record), _parameters(record), _noise(record)]),
+            *outcome.sections,
             Section("remarks", "Remarks", items=record.remarks),
+            traceability_section(record),
             _validity(record),
         ],
     )

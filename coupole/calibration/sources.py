@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.calibration.artefact import UsedArtefact
 from coupole.calibration.grey_image import COLOUR, Picture
 from coupole.calibration.poses import PoseFile, ReportedPoses, kuka_poses, read_poses
 from coupole.calibration.rotations import Floats
@@ -69,6 +70,8 @@ class Sources:
     about: About
     inputs: tuple[tuple[str, str], ...]
     """Name and SHA-256 of every file that was or will be read."""
+    artefacts: tuple[UsedArtefact, ...] = ()
+    """The board that the images show, with its certificate; none without a certificate."""
 
     def with_file(self, path: Path | None) -> Sources:
         """The same with one more input file."""

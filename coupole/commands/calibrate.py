@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from coupole.commands import calibrate_colour, calibrate_geometry, calibrate_lens, calibrate_light
+from coupole.commands import calibrate_colour, calibrate_geometry, calibrate_lens, calibrate_light, check_artefact
 from coupole.commands.calibrate_all import calibrate_all
 
 calibrate_app = typer.Typer(
@@ -22,4 +22,5 @@ calibrate_app.command("glare")(calibrate_light.glare)
 calibrate_app.command("led-power")(calibrate_light.led_power)
 calibrate_app.command("drift")(calibrate_light.drift)
 calibrate_app.command("colour")(calibrate_colour.colour)
+calibrate_app.command("check-artefact")(check_artefact.check_artefact)
 calibrate_app.command("all")(calibrate_all)

@@ -50,12 +50,38 @@ PosesOption = Annotated[
 ModelOption = Annotated[str, typer.Option("--model", help="pinhole, radial (k1), brown4 or brown5 (with k3).")]
 
 
+@dataclass(frozen=True)
+class Warmth:
+    """Temperature of a certified board while it was photographed."""
+
+    celsius: Annotated[
+        float | None,
+        typer.Option(
+            "--board-c",
+            min=-50.0,
+            max=100.0,
+            help="Temperature of a board with a certificate, C; that of the run's coolest LED board if not given.",
+            show_default=False,
+        ),
+    ] = None
+    u_k: Annotated[
+        float, typer.Option("--u-board-k", min=0.0, max=50.0, help="Standard uncertainty of --board-c, K.")
+    ] = 0.5
+
+    @property
+    def pair(self) -> tuple[float | None, float]:
+        """Both, as `sight_board` takes them."""
+        return self.celsius, self.u_k
+
+
 @calibration("camera", limits=CAMERA)
 def camera(
     paths: Paths,
     board: PlainBoardOption = None,
     square: SquareOption = None,
     model: ModelOption = "brown5",
+    *,
+    warmth: Warmth,
 ) -> Work:
     """Lens and distortion from 8 to 60 images of a board, tilted to all sides, corners over the whole field."""
     from coupole.calibration.lens.workflow import camera_from
@@ -64,7 +90,7 @@ def camera(
         _refuse_unknown_model(model)
         plain_board = _plain_board(board, square)
         path = Path(board) if board is not None and plain_board is None else None
-        sources, _, sightings = _look(paths, path, None, console, plain_board)
+        sources, _, sightings = look_for_board(paths, path, None, console, warmth, plain_board)
         return _outcome_with_drawing(camera_from(sightings, sources, model, request)[1])
 
     return work
@@ -75,6 +101,8 @@ def chromatic(
     paths: Paths,
     board: BoardOption = None,
     model: ModelOption = "brown5",
+    *,
+    warmth: Warmth,
 ) -> Work:
     """Lateral shift of red and blue against green, from the images of a lens calibration."""
     from coupole.calibration.lens.chromatic_workflow import chromatic_from, draw_chromatic
@@ -82,7 +110,7 @@ def chromatic(
 
     def work(console: Console, request: Request) -> Outcome:
         _refuse_unknown_model(model)
-        sources, target, sightings = _look(paths, board, None, console)
+        sources, target, sightings = look_for_board(paths, board, None, console, warmth)
         with console.status("adjusting a lens for each colour"):
             calibration = chromatic_from(sightings, sources, target, model, request)
         return Outcome(calibration.record, partial(draw_chromatic, calibration))
@@ -125,6 +153,7 @@ def hand_eye(
     ] = None,
     *,
     robot: StatedRobot,
+    warmth: Warmth,
     model: ModelOption = "brown5",
 ) -> Work:
     """Pose of the camera on the flange, from 10 to 60 images of a board that is not moved."""
@@ -134,7 +163,7 @@ def hand_eye(
     def work(console: Console, request: Request) -> Outcome:
         _refuse_unknown_model(model)
         arm = _arm(rig)
-        sources, target, sightings = _look(paths, board, poses, console)
+        sources, target, sightings = look_for_board(paths, board, poses, console, warmth)
         earlier = _earlier_lens(camera_record, sources, sightings)
         sources = sources.with_file(camera_record).with_file(rig)
         noise = RobotNoise(robot.repeatability_mm, robot.repeatability_deg, robot.absolute_mm, robot.absolute_deg)
@@ -174,14 +203,19 @@ def _plain_board(text: str | None, square_mm: float | None) -> Board | None:
     return plain_chessboard((int(match[1]), int(match[2])), square_mm)
 
 
-def _look(
-    paths: list[Path], board: Path | None, poses: Path | None, console: Console, plain_board: Board | None = None
+def look_for_board(
+    paths: list[Path],
+    board: Path | None,
+    poses: Path | None,
+    console: Console,
+    warmth: Warmth,
+    plain_board: Board | None = None,
 ) -> tuple[Sources, Board, Found]:
     """Open the images and find the board in them."""
     from coupole.scripting.analyses import sight_board
 
     with bar(console, "looking for the board") as progress:
-        sources, target, sightings = sight_board(paths, board, poses, plain_board, progress)
+        sources, target, sightings = sight_board(paths, board, poses, plain_board, progress, warmth.pair)
     for line in sightings.left_out:
         console.print(f"[yellow]left out:[/] {line}")
     corners = sum(len(sighting.ids) for sighting in sightings.sightings)

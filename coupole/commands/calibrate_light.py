@@ -14,11 +14,13 @@ from coupole.commands.calibrating import EmissionOption, Work, arm_of, bar, cali
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from coupole.calibration.artefact import LightSpectrum
     from coupole.calibration.light.frames import LightFrames
     from coupole.calibration.light.led_power_tile import Setting
     from coupole.calibration.optics import Intrinsics
     from coupole.calibration.report import Outcome
     from coupole.calibration.request import Request
+    from coupole.plan.cell import Cell
 
 Runs = Annotated[list[Path], typer.Argument(help="Runs.", show_default=False, metavar="RUN...")]
 DarkOption = Annotated[
@@ -153,7 +155,7 @@ def led_power(
 
     def work(console: Console, request: Request) -> Outcome:
         frames = frames_with_poses(open_light_frames(runs), known.hand_eye, known.rig, runs)
-        setting = _setting(frames, tile, known.rig or rig_of(runs[0]), known)
+        setting = setting_of(frames, tile, known.rig or rig_of(runs[0]), known)
         with bar(console, "frames of the tile") as progress:
             return led_power_outcome(frames, setting, request, progress)
 
@@ -178,7 +180,7 @@ def drift(
 
     def work(console: Console, request: Request) -> Outcome:
         frames = frames_with_poses(open_light_frames(runs), known.hand_eye, known.rig, runs)
-        setting = _setting(frames, tile, known.rig or rig_of(runs[0]), known)
+        setting = setting_of(frames, tile, known.rig or rig_of(runs[0]), known)
         with bar(console, "frames with the tile") as progress:
             return drift_outcome(frames, setting, led_power_record, request, progress)
 
@@ -202,7 +204,7 @@ def frames_with_poses(
     return frames.seen_through(prior.flange_from_camera, arm_of(read_cell(rig or rig_of(runs[0])), hand_eye))
 
 
-def _setting(frames: LightFrames, tile: Path, rig: Path, calibrations: TargetCalibrations) -> Setting:
+def setting_of(frames: LightFrames, tile: Path, rig: Path, calibrations: TargetCalibrations) -> Setting:
     """Descriptions and calibrations that frames of a tile are read with. Raises InputError for invalid files."""
     from coupole.calibration.light.led_power_tile import Setting, calibrated_positions
     from coupole.calibration.light.spectralon import read_tile
@@ -211,7 +213,8 @@ def _setting(frames: LightFrames, tile: Path, rig: Path, calibrations: TargetCal
 
     cell = read_cell(rig)
     by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)
-    files = (tile, rig, calibrations.leds or cell.leds_path, calibrations.hand_eye, calibrations.camera)
+    spectrum = None if cell.rig.dome.spectrum is None else cell.document.resolve(cell.rig.dome.spectrum)
+    files = (tile, rig, calibrations.leds or cell.leds_path, spectrum, calibrations.hand_eye, calibrations.camera)
     return Setting(
         read_tile(tile),
         cell.rig.support.base_from_support.matrix(),
@@ -223,7 +226,20 @@ def _setting(frames: LightFrames, tile: Path, rig: Path, calibrations: TargetCal
         calibrations.glare,
         emission_of(calibrations.emission),
         tuple(path for path in files if path is not None),
+        light_of(cell),
     )
+
+
+def light_of(cell: Cell) -> LightSpectrum | None:
+    """The LEDs' spectrum that a rig names (`dome.spectrum`); None if it names none. Raises InputError."""
+    from coupole.appearance.spectra.measured import read_spectrum
+    from coupole.calibration.artefact import LightSpectrum
+
+    if cell.rig.dome.spectrum is None:
+        return None
+    path = cell.document.resolve(cell.rig.dome.spectrum)
+    measured = read_spectrum(path, unit="power")
+    return LightSpectrum(measured.wavelengths_nm, measured.values, path.name)
 
 
 def lens_of(record_path: Path | None, frames: LightFrames) -> Intrinsics:

@@ -225,6 +225,8 @@ def _show(console: Console, record: Record) -> None:
     """Print the figures as text."""
     from rich.table import Table
 
+    from coupole.calibration.traceability import trace_of
+
     for name, pose in record.transforms.items():
         shift = " ".join(f"{v:.4f}" for v in pose.translation_mm)
         console.print(f"{name}: {shift} mm, A B C {' '.join(f'{v:.5f}' for v in pose.abc_deg)} deg")
@@ -234,6 +236,8 @@ def _show(console: Console, record: Record) -> None:
     console.print(table)
     for remark in record.remarks:
         console.print(f"[yellow]{remark}[/]")
+    for line in trace_of(record):
+        console.print(f"traceability: {line}")
     for limit in record.limits:
         colour, how = ("green", "met") if limit.is_met else ("red", "missed")
         usual = "" if limit.usual is None else f", usually {limit.usual:.3g}"
@@ -246,6 +250,8 @@ def _show(console: Console, record: Record) -> None:
 
 def _figures(record: Record) -> dict[str, Any]:
     """The figures, for JSON."""
+    from coupole.calibration.traceability import trace_of
+
     return {
         "kind": record.kind,
         "accepted": record.is_accepted,
@@ -257,6 +263,9 @@ def _figures(record: Record) -> dict[str, Any]:
         "transforms": {name: pose.model_dump() for name, pose in record.transforms.items()},
         "noise": {n.name: {"found": n.found, "stated": n.stated, "unit": n.unit} for n in record.noise},
         "limits": [{**limit.model_dump(), "passed": limit.is_met} for limit in record.limits],
+        "artefacts": [item.model_dump(mode="json") for item in record.artefacts],
+        "traceability": list(trace_of(record)),
+        "comparisons": [{**v.model_dump(), "error": v.error, "en": v.en} for v in record.comparisons],
         "faults": [asdict(fault) for fault in record.faults],
         "remarks": list(record.remarks),
     }

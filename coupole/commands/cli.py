@@ -71,6 +71,7 @@ GROUPS = {
     "Calibrate": {
         "calibrate": "calibrate.calibrate_app",
         "budget": "uncertainty.budget",
+        "certificate": "certificate.certificate",
     },
     "Results": {
         "reflectance": "reflectance.reflectance_app",

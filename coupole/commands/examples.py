@@ -76,7 +76,15 @@ EXAMPLES: dict[str, tuple[str, str]] = {
         "calibrate colour RUN --chart chart.yaml",
         "calibrate colour RUN --chart chart.yaml --white WHITE",
     ),
+    "calibrate check-artefact": (
+        "calibrate check-artefact PLACE1 PLACE2 --board second-board.yaml --records records --mpe-um 50+L/20",
+        "calibrate check-artefact RUN --tile second-tile.yaml --records records",
+    ),
     "calibrate all": ("calibrate all --rig sim", "calibrate all --rig my-cell.yaml --only charuco --yes"),
+    "certificate": (
+        "certificate calibrations --about certificate.yaml",
+        "certificate calibrations --about certificate.yaml --earlier last-year --out cell.html",
+    ),
     "budget": ("budget camera.yaml hand-eye.yaml leds.yaml", "budget --plan first.yaml --out budget.png"),
     # results and bench
     "reflectance": (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -75,6 +75,10 @@ def budget(
         list[Path] | None,
         typer.Option("--beside", help="Records of another cell, for a separate column in the table."),
     ] = None,
+    earlier: Annotated[
+        list[Path] | None,
+        typer.Option("--earlier", help="Records of earlier calibrations: which figures have drifted since."),
+    ] = None,
     *,
     spot: SpotOfObject,
     coverage: CoverageOption = None,
@@ -105,7 +109,7 @@ def budget(
         with console.status("propagating distributions"):
             result = _propagate(
                 all_records, beside or [], start, Geometry(spot.incidence_deg), emission, coverage or COVERAGES
-            )
+            ).with_doubts(_doubts_by_drift(all_records, earlier or []))
         if out is not None:
             _write_report(out, result)
     except CoupoleError as error:
@@ -134,8 +138,24 @@ class _Result:
     """Our records, then those of `--beside`."""
     table: tuple[Accuracy, ...]
     doubts: tuple[str, ...]
+    traces: tuple[str, ...]
+    """The certificates that our records rest on."""
     document: dict[str, Any]
     """Document as `--json` prints it."""
+
+    def with_doubts(self, more: tuple[str, ...]) -> _Result:
+        """The same with more reasons not to rely on the records."""
+        all_doubts = (*self.doubts, *more)
+        return replace(self, doubts=all_doubts, document=self.document | {"doubts": all_doubts})
+
+
+def _doubts_by_drift(our_records: tuple[InForce, ...], earlier: list[Path]) -> tuple[str, ...]:
+    """Records whose drift exceeds their uncertainty."""
+    from coupole.calibration.in_force import read_in_force
+    from coupole.calibration.record import records_named
+    from coupole.calibration.validity import expired_by_drift
+
+    return expired_by_drift(our_records, read_in_force(records_named(earlier)), datetime.now(UTC))
 
 
 def _propagate(
@@ -149,7 +169,7 @@ def _propagate(
     """The budget by our records, and the table that compares them with those of `beside`."""
     from coupole.calibration.budget.accuracy import Case, accuracies
     from coupole.calibration.budget.budget import budget_of
-    from coupole.calibration.budget.records import doubts, known_from, read_records
+    from coupole.calibration.budget.records import doubts, known_from, read_records, traces
     from coupole.calibration.budget.report import as_json as figures_of
 
     figures = known_from(own_records, start)
@@ -163,8 +183,9 @@ def _propagate(
         )
     table = accuracies(cases)
     doubts_of_records = doubts([item for case in cases for item in case.records], datetime.now(UTC))
-    document = figures_of(our_budget, our_spread, cases, table) | {"doubts": doubts_of_records}
-    return _Result(our_budget, our_spread, cases, table, doubts_of_records, document)
+    document = figures_of(our_budget, our_spread, cases, table)
+    document |= {"doubts": doubts_of_records, "traceability": traces(own_records)}
+    return _Result(our_budget, our_spread, cases, table, doubts_of_records, traces(own_records), document)
 
 
 def _write_report(out: Path, result: _Result) -> None:
@@ -173,7 +194,9 @@ def _write_report(out: Path, result: _Result) -> None:
     from coupole.calibration.budget.report import draw_budget
 
     picture = draw_budget(result.budget, result.dome_spread)
-    text = page(result.budget, result.dome_spread, result.cases, result.table, picture, result.doubts)
+    text = page(
+        result.budget, result.dome_spread, result.cases, result.table, picture, result.doubts, result.traces
+    )
     _write(
         {
             out: picture,
@@ -275,5 +298,7 @@ def _show_accuracies(console: Console, result: _Result) -> None:
     console.print()
     console.print(table)
     console.print("standard uncertainties, all directions together; samples over a dome: their 68 % intervals")
+    for trace in result.traces:
+        console.print(f"traceability: {trace}")
     for doubt in result.doubts:
         console.print(f"[yellow]{doubt}[/]")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -261,8 +262,14 @@ def sight_board(
     poses: Path | None,
     plain_board: Board | None,
     progress: Callable[[int, int], None],
+    warmth: tuple[float | None, float] = (None, 0.5),
 ) -> tuple[Sources, Board, Found]:
-    """Open the images, and find the board in them: a plain one, that of a file, or of `board.yaml` beside them."""
+    """Open the images, and find the board in them: a plain one, that of a file, or of `board.yaml` beside them.
+
+    `warmth` is the board's temperature when it was photographed (C, None if nobody measured it) and its standard
+    uncertainty (K); a board with a certificate has the lengths of that temperature.
+    """
+    from coupole.calibration.artefact import temperature_of
     from coupole.calibration.lens.board import read_board
     from coupole.calibration.lens.images import find_board
     from coupole.calibration.sources import BOARD_NAME, open_sources
@@ -278,7 +285,8 @@ def sight_board(
     if description is None:
         across, down = target.corners
         sources = sources.with_words(f"--board {across}x{down} --square {target.square_mm:g}")
-    return sources, target, find_board(target, sources, progress)
+    target, artefacts = target.measured_at(temperature_of(*warmth, sources.about.temperature_c))
+    return replace(sources, artefacts=artefacts), target, find_board(target, sources, progress)
 
 
 def _silent(step: str, count: int, total: int) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from light_synthesis import Array, coverage
+from tile_synthesis import TILE, dome, powers, summed_irradiance, turned, views_of
 
 from coupole.calibration.light.irradiance import Emission, irradiance_per_flux, lambert_vector, led_corners_mm
 from coupole.calibration.light.led_power import LedPower, calibrate_led_power, prior_of
@@ -16,86 +17,13 @@ from coupole.calibration.light.spectralon import Tile
 from coupole.calibration.light.tile_views import Positions, TileView
 from coupole.errors import InputError
 
-TILE = Tile(reflectance=0.99, u_reflectance=0.005, minnaert=1.1, u_minnaert=0.03, u_tilt_deg=0.2)
 EXPOSURE_S = 0.01
-
-
-def turned(x_deg: float, y_deg: float, z_deg: float = 0.0) -> Array:
-    a, b, c = np.radians([x_deg, y_deg, z_deg])
-    x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-    y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
-    z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
-    return np.asarray(z @ y @ x)
-
-
-def dome(count: int, random: np.random.Generator) -> Positions:
-    """LEDs over the upper half of a sphere of 1 m, looking to its middle."""
-    up = random.uniform(0.25, 0.98, count)
-    turn = random.uniform(0, 2 * np.pi, count)
-    out = np.sqrt(1 - up**2)
-    centres = 1000 * np.stack([out * np.cos(turn), out * np.sin(turn), up], axis=1)
-    return Positions(np.arange(count), centres, -centres / 1000)
 
 
 def u_scale(found: LedPower) -> float:
     """Relative standard uncertainty of all powers together."""
     mean = np.nanmean(found.common[found.power > 0], axis=0)
     return float(np.sqrt(mean @ found.common_covariance @ mean))
-
-
-def summed_irradiance(point: Array, normal: Array, centres: Array, normals: Array) -> Array:
-    """E/Phi in m^-2 by 8 x 8 small Lambertian emitters on each LED."""
-    total = np.zeros(len(centres))
-    for k, (centre, axis) in enumerate(zip(centres, normals, strict=True)):
-        u = np.linalg.svd(axis[None])[2][1:]
-        a, b = np.meshgrid(*[(np.arange(8) + 0.5) / 8 * 7 - 3.5] * 2)
-        away = point - (centre + a.ravel()[:, None] * u[0] + b.ravel()[:, None] * u[1])
-        far = np.linalg.norm(away, axis=1)
-        total[k] = np.mean((away @ axis) * -(away @ normal) / far**4) / np.pi * 1e6
-    return total
-
-
-def views_of(
-    positions: Positions,
-    power: Array,
-    random: np.random.Generator,
-    *,
-    tilts_deg: tuple[tuple[float, float], ...] = ((0.0, 0.0),),
-    height_mm: float = 0.0,
-    truth: Tile = TILE,
-    noise: float = 1e-3,
-    cameras: int = 2,
-) -> list[TileView]:
-    """What cameras see of the tile in each of its places; `tilts_deg` and `height_mm` tell how it lies otherwise
-    than described."""
-    found = []
-    for place, tilt in enumerate(tilts_deg):
-        pose = np.eye(4)
-        pose[:3, :3] = turned(0, 0, 90 * place)
-        normal = pose[:3, :3] @ turned(*tilt) @ (0, 0, 1)
-        a, b = np.meshgrid(*[np.array([-15.0, 0.0, 15.0])] * 2)
-        points = np.stack([a.ravel(), b.ravel(), np.zeros(9)], axis=1)
-        for camera in range(cameras):
-            eye = np.array([120.0 * (camera - 0.5), 40.0, 320.0])
-            there = points + (points - eye) * (height_mm / (points - eye)[:, 2:])
-            leds = positions.centres_mm, positions.normals
-            lit = np.stack([summed_irradiance(point, normal, *leds) for point in there], 1)
-            towards = positions.centres_mm[:, None] - there
-            cos_in = towards @ normal / np.linalg.norm(towards, axis=2)
-            cos_out = (eye - there) @ normal / np.linalg.norm(eye - there, axis=1)
-            k = truth.minnaert
-            f = truth.reflectance * (k + 1) / 2 / np.pi * (cos_in * cos_out) ** (k - 1)
-            signal = f * lit * power[:, None]
-            u = noise * signal
-            seen = signal + u * random.standard_normal(signal.shape)
-            saturated = np.zeros(len(power), bool)
-            name = f"p{place}c{camera}"
-            found.append(TileView(name, place, pose, points, eye, positions.ids, seen, u, saturated))
-    return found
-
-
-def powers(count: int, random: np.random.Generator) -> Array:
-    return np.asarray(1e4 * np.exp(0.04 * random.standard_normal(count)))
 
 
 def small_dome(seed: int = 1, count: int = 60) -> tuple[Positions, Array, np.random.Generator]:
@@ -176,7 +104,7 @@ def test_what_channels_share_of_one_tile_is_known_to_be_shared(scale: Callable[[
             )
             for channel in "RGB"
         }
-        covariance = covariance_of(found, prior_of(TILE))
+        covariance = covariance_of(found, dict.fromkeys(found, prior_of(TILE)))
         means = np.array([one.power.mean() for one in found.values()])
         at = np.arange(3) * len(covariance) // 3
         u = np.sqrt(covariance[at, at])

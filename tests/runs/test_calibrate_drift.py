@@ -180,3 +180,57 @@ def test_a_run_without_the_tile_is_refused(calibrated: Path, later: Path, tmp_pa
     ended = drift(calibrated, later, tmp_path, 400.0, 300.0)
     assert ended.code == 2
     assert "no view shows the whole reference tile" in ended.err
+
+
+SECOND = {
+    "name": "second tile",
+    "serial": "T-2",
+    "certificate": {"number": "R-2", "laboratory": "Laboratory B", "date": "2026-01-20"},
+    "reflectance": {"geometry": "8/h", "k": 2, "values": [[400, 0.99, 0.008], [700, 0.99, 0.008]]},
+}
+
+
+def check(calibrated: Path, run: Path, folder: Path, place_mm: tuple[float, float], serial: str = "T-2") -> Ended:
+    """`check-artefact` of a run with a tile of a certificate."""
+    place = {"translation_mm": [*place_mm, 10.0]}
+    described = {"minnaert": 1.0, "support_from_tile": place, "artefact": SECOND | {"serial": serial}}
+    folder.mkdir(exist_ok=True)
+    path = folder / "second.yaml"
+    path.write_text(json.dumps(described))
+    words = ["--tile", path, "--records", calibrated / "led-power.yaml", "--out", folder, "--name", "check"]
+    return cells.here("calibrate", "check-artefact", run, *words, "--json")
+
+
+@pytest.mark.timeout(600)
+def test_a_second_tile_agrees_with_its_certificate(calibrated: Path, tmp_path: Path) -> None:
+    things = [{"kind": "spectralon_tile", "translation_mm": [30.0, 20.0, 0.0]}]
+    rig(tmp_path, things, hours_shone=0.0, ambient_c=24.0)
+    ended = check(calibrated, acquire(tmp_path, 30.0, 20.0), tmp_path, (30.0, 20.0))
+    assert ended.code == 0, ended.err
+    record = read_record(tmp_path / "check.yaml")
+    assert [value.name for value in record.comparisons] == ["R", "G", "B"]
+    for value in record.comparisons:
+        assert value.measured_value == pytest.approx(0.99, abs=value.expanded_u_measured)
+        assert value.en < 1.0
+    assert record.artefacts[0].figures["reflectance.G"] == pytest.approx(0.99)
+    used_images = check(calibrated, next((calibrated / "runs").glob("*-tile")), tmp_path / "x", (0.0, 0.0))
+    assert used_images.code == 2
+    assert "was made from the same images" in used_images.err
+
+
+@pytest.mark.timeout(600)
+def test_a_second_tile_and_a_drift_record_tell_that_the_leds_have_faded(
+    calibrated: Path, later: Path, tmp_path: Path
+) -> None:
+    ended = check(calibrated, later / "run", tmp_path, BESIDE_MM)
+    assert ended.code == 3
+    assert "largest E_n of one value" in ended.err
+    faded = [
+        value.measured_value / value.certified_value for value in read_record(tmp_path / "check.yaml").comparisons
+    ]
+    assert max(faded) < 0.97
+    assert drift(calibrated, later, tmp_path, *BESIDE_MM).code == 0
+    told = cells.here("budget", calibrated / "led-power.yaml", tmp_path / "drift.yaml", "--json")
+    doubts = [doubt for doubt in told.document["doubts"] if "expired by drift" in doubt]
+    assert len(doubts) == 1
+    assert "the LEDs' power has changed by -" in doubts[0]

@@ -18,8 +18,10 @@ def page(
     accuracies: Sequence[Accuracy],
     picture: bytes,
     doubts: Sequence[str] = (),
+    traces: Sequence[str] = (),
 ) -> str:
-    """The whole page as HTML; `picture` is the PNG, `doubts` are reasons not to rely on the records."""
+    """The whole page as HTML; `picture` is the PNG, `doubts` are reasons not to rely on the records, `traces`
+    their certificates."""
     names = ", ".join(dict.fromkeys(case.name for case in cases))
     return render(
         Page(
@@ -44,6 +46,7 @@ def page(
                         "intervals."
                     ],
                 ),
+                Section("traceability", "Traceability", items=traces),
                 Section("inputs", "All inputs", tables=[_inputs(budget)]),
             ],
         )

@@ -15,6 +15,7 @@ from coupole.calibration.budget.budget import Known
 from coupole.calibration.in_force import InForce, read_in_force
 from coupole.calibration.record import SEAL, Kind, Record, intrinsics_of, step_names
 from coupole.calibration.rotations import Floats, skew
+from coupole.calibration.traceability import overdue_of, trace_of
 from coupole.errors import InputError
 
 WORKING_MM = 334.0
@@ -63,7 +64,7 @@ def of_use(items: Sequence[InForce]) -> tuple[InForce, ...]:
 
 
 def doubts(items: Sequence[InForce], now: datetime) -> tuple[str, ...]:
-    """Reasons not to rely on records: limits that were exceeded, an expired validity."""
+    """Reasons not to rely on records: limits that were exceeded, an expired validity, a certificate too old."""
     missed_limits = [
         f"{item.path}: not accepted: {limit.what} is {limit.found:.3g} {limit.unit}, at most {limit.limit:.3g}"
         for item in items
@@ -75,7 +76,13 @@ def doubts(items: Sequence[InForce], now: datetime) -> tuple[str, ...]:
         for item in items
         if now >= item.record.validity.expires
     ]
-    return (*missed_limits, *expired_records)
+    overdue = [line for item in items for line in overdue_of(item.record, now.date())]
+    return (*missed_limits, *expired_records, *overdue)
+
+
+def traces(items: Sequence[InForce]) -> tuple[str, ...]:
+    """The certificates that each record rests on, one line each."""
+    return tuple(f"{_display_name(item.record)}: {line}" for item in items for line in trace_of(item.record))
 
 
 def known_from(items: Sequence[InForce], start: Known) -> Known:
@@ -209,7 +216,7 @@ def reader_of(kind: Kind) -> Callable[[Record, Path], Said] | None:
             return _of_drift
         case "glare":
             return _of_glare
-        case "chromatic" | "dark" | "colour":
+        case "chromatic" | "dark" | "colour" | "artefact-check":
             return None
         case _:
             assert_never(kind)

@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from coupole.calibration.artefact import Described, read_described
 from coupole.calibration.colour.chart_values import Unit, read_chart_values
 from coupole.calibration.colour.colorimetry import lab_of
 from coupole.calibration.rotations import Floats
@@ -37,7 +38,7 @@ class Edge(Model):
     size_mm: tuple[_Length, _Length]
 
 
-class Chart(Model):
+class Chart(Described):
     """A flat chart of patches in rows and columns."""
 
     schema_version: Literal[1] = 1
@@ -151,7 +152,7 @@ def read_chart(path: Path, without: Sequence[str] = ()) -> KnownChart:
     """A chart's description and values, `without` some patches more. Raises InputError with all problems: wrong
     keys, patches without values, too few patches, no grey one."""
     document = yamlfile.read_document(path)
-    whole = document.validate(Chart)
+    whole = read_described(path, Chart)
     if strange := sorted({*whole.without, *without} - set(whole.model_copy(update={"without": ()}).patch_names)):
         raise InputError(f"{path}: the chart has no patch {', '.join(strange)} to leave out")
     chart = whole.model_copy(update={"without": (*whole.without, *without)})

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from coupole.calibration.acceptance import against_limits
+from coupole.calibration.artefact import used_as
 from coupole.calibration.colour.acceptance import COLOUR
 from coupole.calibration.colour.chart import KnownChart
 from coupole.calibration.colour.chart_signals import ChartPicture, Reading, Signals, combined_signals, read_patches
@@ -145,6 +146,7 @@ def colour_outcome(
             *measurements.signals.remarks,
         ),
         more_inputs=setting.inputs,
+        artefacts=used_as("chart", known_chart.chart.artefact),
     )
 
 

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
+from coupole.calibration.artefact import Described, Temperature, UsedArtefact, expansion_of, read_described
 from coupole.calibration.grey_image import Channel, Picture
 from coupole.calibration.lens.corner_fit import enough_pixels, fit_corners
 from coupole.calibration.rotations import Floats
-from coupole.plan import yamlfile
-from coupole.plan.base_model import Model
 
 Count = Annotated[int, Field(ge=3, le=200)]
 Millimetres = Annotated[float, Field(gt=0, le=1000)]
@@ -27,12 +26,14 @@ Millimetres = Annotated[float, Field(gt=0, le=1000)]
 LEAST_CORNERS = 8
 _HALVED_FROM_PX = 1500
 """Least side of an image whose board is searched at half its size."""
+_SAME_SIDE = 0.01
+"""Largest difference of a certified side of squares from that of the description."""
 CLIPPED_SHARE = 0.02
 """An image with a larger share of white pixels about the corners is left out: clipping shifts edges."""
 
 
-class Board(Model):
-    """A board as its owner measured it (YAML)."""
+class Board(Described):
+    """A board as its owner or its certificate has it (YAML)."""
 
     schema_version: Literal[1] = 1
     kind: Literal["charuco", "chessboard"]
@@ -40,7 +41,8 @@ class Board(Model):
     """Inner corners along x and y: one less than squares."""
     square_mm: Millimetres
     scale_u_ppm: Annotated[float, Field(ge=0, le=20_000)] = 50.0
-    """Standard uncertainty of its scale: print, measurement, temperature."""
+    """Standard uncertainty of its scale: print, measurement, temperature. Left out where `artefact` has a
+    certified `square_mm`."""
     marker_mm: Millimetres | None = None
     dictionary: str = "DICT_5X5_250"
     """OpenCV's name of the markers' dictionary."""
@@ -61,6 +63,40 @@ class Board(Model):
         if self.kind == "charuco" and not 0 < (self.marker_mm or 0) < self.square_mm:
             raise ValueError("a ChArUco board with `marker_mm`, smaller than `square_mm`")
         return self
+
+    @model_validator(mode="after")
+    def _certificate_fits(self) -> Board:
+        square_mm = None if self.artefact is None else self.artefact.square_mm
+        if square_mm is None:
+            return self
+        if abs(square_mm.value - self.square_mm) > _SAME_SIDE * self.square_mm:
+            raise ValueError(f"artefact.square_mm of this board, {self.square_mm:g} mm within 1 %")
+        if "scale_u_ppm" in self.model_fields_set:
+            raise ValueError("no `scale_u_ppm` beside a certified artefact.square_mm, which has an uncertainty")
+        return self
+
+    def measured_at(self, temperature: Temperature) -> tuple[Board, tuple[UsedArtefact, ...]]:
+        """The board with the lengths that it has at a temperature, by its certificate, and what a record keeps of
+        that; the same board if it has no certificate."""
+        artefact = self.artefact
+        if artefact is None:
+            return self, ()
+        certified_side = artefact.square_mm
+        side_mm = self.square_mm if certified_side is None else certified_side.value
+        u_side = 1e-6 * self.scale_u_ppm if certified_side is None else certified_side.u / certified_side.value
+        expansion, u_expansion = expansion_of(artefact, temperature)
+        u_ppm = 1e6 * float(np.hypot(u_side, u_expansion))
+        used_artefact = UsedArtefact(
+            role="board",
+            artefact=artefact,
+            measured_c=temperature.celsius,
+            u_measured_k=temperature.u_k,
+            measured_by=temperature.source,
+            correction_ppm=1e6 * expansion,
+            u_scale_ppm=u_ppm,
+        )
+        changes = {"square_mm": side_mm * (1.0 + expansion), "scale_u_ppm": u_ppm}
+        return self.model_copy(update=changes), (used_artefact,)
 
     @property
     def points_mm(self) -> Floats:
@@ -94,7 +130,7 @@ class Sighting:
 
 def read_board(path: Path) -> Board:
     """A board's description. Raises InputError with every problem of the file."""
-    return yamlfile.read_document(path).validate(Board)
+    return read_described(path, Board)
 
 
 def detect(board: Board, picture: Picture) -> Sighting | str:

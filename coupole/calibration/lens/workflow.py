@@ -242,6 +242,7 @@ def content_of(board_images: Found, sources: Sources, request: Request) -> dict[
         **request.head(),
         "simulated": about.is_simulated,
         "validity": request.validity(about, board_images.size_px, about.temperature_c),
+        "artefacts": sources.artefacts,
         "inputs": tuple(Input(name=name, sha256=digest) for name, digest in sources.inputs),
     }
 

@@ -54,31 +54,32 @@ class Powers:
     """Departure of the shared figures from their description, by the calibration."""
 
 
-def read_powers(path: Path) -> Powers:
-    """The table beside a record of the kind `led-power`. Raises InputError for another or an older record."""
+def read_powers(path: Path, channel: str = CHANNEL) -> Powers:
+    """The table beside a record of the kind `led-power`, in one channel. Raises InputError for another, or for
+    an older record."""
     record = read_accepted(path, "led-power")
     table = path.parent / record.files[0].name
     lines = [line for line in table.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
     columns = list(csv.DictReader(lines))
     if "board_c" not in columns[0]:
         raise InputError(f"{table}: has no temperatures of boards; calibrate the LEDs' power anew")
-    start, end = "d_", f"_{CHANNEL}"
+    start, end = "d_", f"_{channel}"
     names = tuple(key[len(start) : -len(end)] for key in columns[0] if key.startswith(start) and key.endswith(end))
 
     def numbers(key: str) -> Floats:
         return np.array([float(line[key]) for line in columns])
 
     record_names = [parameter.name for parameter in record.parameters]
-    at = [record_names.index(f"{name}.{CHANNEL}") for name in names]
+    at = [record_names.index(f"{name}.{channel}") for name in names]
     return Powers(
         {int(line["id"]): row for row, line in enumerate(columns)},
-        numbers(f"power_{CHANNEL}"),
-        numbers(f"u_own_{CHANNEL}"),
+        numbers(f"power_{channel}"),
+        numbers(f"u_own_{channel}"),
         numbers("board_c"),
-        np.column_stack([numbers(f"d_{name}_{CHANNEL}") for name in names]),
+        np.column_stack([numbers(f"d_{name}_{channel}") for name in names]),
         names,
         record.covariance_matrix[np.ix_(at, at)],
-        {name: record.value(f"{name}.{CHANNEL}") for name in names},
+        {name: record.value(f"{name}.{channel}") for name in names},
     )
 
 
@@ -135,6 +136,7 @@ def drift_outcome(
             *remarks,
         ),
         more_inputs=(*record_input(led_power), *setting.inputs),
+        artefacts=setting.artefacts([CHANNEL]),
     )
 
 
@@ -159,11 +161,12 @@ def _readings(
             "description, "
             "or add a view of the tile to the plan"
         )
+    tile = setting.tile_of(CHANNEL)
     readings: list[Reading] = []
     frame_done = counter(progress, sum(map(len, frames_of_views)))
     for view_frames in frames_of_views:
         view = tile_reader.view(view_frames, frame_done)[CHANNEL]
-        rows, _ = rows_of(0, view, setting.positions, setting.tile, setting.emission, remarks=remarks)
+        rows, _ = rows_of(0, view, setting.positions, tile, setting.emission, remarks=remarks)
         frame_of = {frame.led: frame for frame in view_frames if frame.led is not None}
         readings += [
             _reading(frame_of[row.led], row.value, row.u, row.design, powers)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from coupole.calibration.acceptance import against_limits
+from coupole.calibration.artefact import Described, read_described, used_as
 from coupole.calibration.light.acceptance import GLARE
 from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask, channels_of
 from coupole.calibration.light.glare_drawing import draw_glare
@@ -32,8 +33,6 @@ from coupole.calibration.report import Outcome
 from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
-from coupole.plan import yamlfile
-from coupole.plan.base_model import Model
 from coupole.plan.shot_id import Light
 
 SHARE = "share"
@@ -44,7 +43,7 @@ _MOST_SATURATED = 1e-4
 """Greatest share of saturated pixels of a frame: their light is not known, and makes glare."""
 
 
-class GlareTarget(Model):
+class GlareTarget(Described):
     """A white target with black traps, as its description says."""
 
     schema_version: int = 1
@@ -58,7 +57,7 @@ class GlareTarget(Model):
 
 def read_target(path: Path | None) -> GlareTarget:
     """The description of a target (YAML); usual figures without one. Raises InputError with all problems."""
-    return GlareTarget() if path is None else yamlfile.read_document(path).validate(GlareTarget)
+    return GlareTarget() if path is None else read_described(path, GlareTarget)
 
 
 def glare_outcome(
@@ -121,7 +120,7 @@ def _outcome_of(
         f"white, at a side {index[2]:.2%}, in a corner {index[1]:.2%}"
         for channel, (index, u) in indices.items()
     ]
-    artefact = f"target: {target.name}" + (f", {target.certificate}" if target.certificate else "")
+    words = f"target: {target.name}" + (f", {target.certificate}" if target.certificate else "")
     light = f"its traps have {target.trap_share:.2%} (u {target.u_trap_share:.2%}) of the white beside them"
     return sealed_outcome(
         "glare",
@@ -132,8 +131,9 @@ def _outcome_of(
         partial(draw_glare, fits),
         limits=against_limits(GLARE, request.limits, figures),
         fixed_figures=fixed_figures,
-        remarks=(*by_words, f"{artefact}; {light}", *remarks),
+        remarks=(*by_words, f"{words}; {light}", *remarks),
         more_inputs=tuple(pair for path in files for pair in record_input(path)),
+        artefacts=used_as("glare target", target.artefact),
     )
 
 

@@ -40,11 +40,13 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
         for channel, view in reader.view(view_frames, tell).items():
             views[channel].append(view)
     powers = {
-        channel: calibrate_led_power(views[channel], setting.positions, setting.tile, emission=setting.emission)
+        channel: calibrate_led_power(
+            views[channel], setting.positions, setting.tile_of(channel), emission=setting.emission
+        )
         for channel in channels
     }
     warm = board_temperatures(lit)
-    covariance = covariance_of(powers, prior_of(setting.tile))
+    covariance = covariance_of(powers, {channel: prior_of(setting.tile_of(channel)) for channel in channels})
     parameters = _parameters(powers, covariance)
     height, width = reader.shape
     green = powers["G"]
@@ -65,7 +67,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
         limits=against_limits(LED_POWER, request.limits, {"power": typical, "unusable": unusable}),
         files={f"{request.name}.csv": power_table(powers, warm).encode()},
         fixed_figures={
-            "tile.reflectance": setting.tile.reflectance,
+            "tile.reflectance": setting.tile_of("G").reflectance,
             "tile.minnaert": setting.tile.minnaert,
             "gain_db": frames.gain_db,
             READ_WITH + "response": float(setting.response is not None),
@@ -74,6 +76,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
         },
         remarks=(f"emission profile `{setting.emission}`", *remarks),
         more_inputs=setting.inputs,
+        artefacts=setting.artefacts(channels),
     )
 
 
@@ -135,21 +138,23 @@ def _mean_and_slopes(power: LedPower) -> tuple[float, Floats]:
     return float(power.power[good].mean()), np.asarray((power.power[good, None] * power.common[good]).mean(axis=0))
 
 
-def covariance_of(powers: Mapping[str, LedPower], prior: Floats) -> Floats:
+def covariance_of(powers: Mapping[str, LedPower], priors: Mapping[str, Floats]) -> Floats:
     """Return the covariance of `_parameters`, [channels (1 + c)] squared.
 
-    All channels see the same tile. With the prior S and posteriors C_a, C_b the errors of channels a and b have
-    the covariance C_a S^-1 C_b, the remaining part of the prior's error; their noise is independent.
+    All channels see the same tile, so errors of their priors are fully correlated, also where a certificate's
+    spectrum gives each its own. With priors of standard uncertainties s_a, s_b and posteriors C_a, C_b the errors
+    of channels a and b have the covariance C_a diag(1 / (s_a s_b)) C_b, the remaining part of the priors' error;
+    their noise is independent.
     """
-    size = 1 + len(prior)
+    size = 1 + len(next(iter(priors.values())))
     whole = np.zeros((size * len(powers), size * len(powers)))
-    prior_weights = np.diag(np.maximum(prior, LEAST_PRIOR) ** -2.0)
-    by_common = [np.vstack([_mean_and_slopes(power)[1], np.eye(len(prior))]) for power in powers.values()]
+    sigmas = [np.maximum(priors[channel], LEAST_PRIOR) for channel in powers]
+    by_common = [np.vstack([_mean_and_slopes(power)[1], np.eye(size - 1)]) for power in powers.values()]
     for i, first in enumerate(powers.values()):
         for j, second in enumerate(powers.values()):
             between = first.common_covariance
             if i != j:
-                between = between @ prior_weights @ second.common_covariance
+                between = between @ np.diag(1.0 / (sigmas[i] * sigmas[j])) @ second.common_covariance
             block = by_common[i] @ between @ by_common[j].T
             if i == j:
                 good = np.isfinite(first.power) & (first.power > 0)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration import optics
+from coupole.calibration.artefact import LightSpectrum, UsedArtefact, used_as
 from coupole.calibration.earlier import read_accepted
 from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask, channels_of
 from coupole.calibration.light.glare_correction import read_glare
@@ -42,10 +43,24 @@ class Setting:
     emission: Emission = "lambertian"
     files: tuple[Path, ...] = ()
     """Files of tile, support and LEDs: inputs of the record."""
+    light: LightSpectrum | None = None
+    """Spectrum of the LEDs, if the rig names one: weighs a certificate's wavelengths."""
 
     @property
     def base_from_tile(self) -> Floats:
         return self.base_from_support @ self.tile.support_from_tile.matrix()
+
+    def tile_of(self, channel: str) -> Tile:
+        """The tile as a channel sees it."""
+        return self.tile.of_channel(channel, self.light)
+
+    def artefacts(self, channels: Sequence[str]) -> tuple[UsedArtefact, ...]:
+        """Part of a record: the tile's certificate."""
+        figures: dict[str, float] = {}
+        for channel in channels:
+            tile = self.tile_of(channel)
+            figures |= {f"reflectance.{channel}": tile.reflectance, f"u_reflectance.{channel}": tile.u_reflectance}
+        return used_as("tile", self.tile.artefact, figures)
 
     @property
     def inputs(self) -> tuple[tuple[str, str], ...]:

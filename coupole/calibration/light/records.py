@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.acceptance import against_limits
+from coupole.calibration.artefact import UsedArtefact
 from coupole.calibration.earlier import read_accepted, read_earlier
 from coupole.calibration.light import drawing as pictures
 from coupole.calibration.light.acceptance import DARK, RESPONSE
@@ -68,14 +69,15 @@ def sealed_outcome(
     fixed_figures: Mapping[str, float] | None = None,
     remarks: Sequence[str] = (),
     more_inputs: Sequence[tuple[str, str]] = (),
+    artefacts: Sequence[UsedArtefact] = (),
 ) -> Outcome:
     """A record of a radiometric calibration, with its files; `draw` gets the record and an empty figure."""
-    about, contents = frames.about, files or {}
+    contents = files or {}
     record = seal_record(
         kind=kind,
         **request.head(),
-        simulated=about.is_simulated,
-        validity=request.validity(about, size_px, temperatures_of(frames.frames)),
+        simulated=frames.about.is_simulated,
+        validity=request.validity(frames.about, size_px, temperatures_of(frames.frames)),
         transforms={},
         parameters=tuple(parameters),
         fixed=dict(fixed_figures or {}),
@@ -85,6 +87,7 @@ def sealed_outcome(
         images=(),
         limits=tuple(limits),
         remarks=tuple(remarks),
+        artefacts=tuple(artefacts),
         inputs=tuple(Input(name=name, sha256=digest) for name, digest in (*frames.inputs, *more_inputs)),
     )
     return Outcome(record, partial(draw, record), contents)
@@ -100,7 +103,6 @@ def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> O
     dark_frames = [DarkFrame(str(f.shot), f.exposure_us * 1e-6, f.temperature_c, f.read) for f in frames.dark]
     dark = calibrate_dark(dark_frames, white_dn=frames.white_dn, progress=progress)
     height, width = dark.offset_dn.shape
-    pixels = height * width
     values = {
         "read_noise_dn": (dark.read_noise_dn, dark.read_noise_u_dn),
         "row_noise_dn": (dark.row_noise_dn, dark.row_noise_u_dn),
@@ -135,10 +137,10 @@ def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> O
         parameters,
         _of_means(dark, np.array([p.u for p in parameters])),
         partial(pictures.draw_dark, dark),
-        limits=against_limits(DARK, request.limits, {"hot": len(dark.hot) / pixels}),
+        limits=against_limits(DARK, request.limits, {"hot": len(dark.hot) / dark.offset_dn.size}),
         files={f"{request.name}.h5": content},
         fixed_figures=fixed_figures,
-        remarks=(f"{len(dark.hot)} hot pixels of {pixels}; the list is in {request.name}.h5",),
+        remarks=(f"{len(dark.hot)} hot pixels of {height * width}; the list is in {request.name}.h5",),
     )
 
 

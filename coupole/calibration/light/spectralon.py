@@ -6,29 +6,35 @@ is above 1: a comprehensive model from goniometer data (IEEE TGRS 2024, doi 10.1
 diffuse part that falls with the zenith angle z in radians by 0.091 z^1.85, which k = 1.15 follows within 1 % to 60
 degrees; `u_minnaert` has to cover its lobes, forward and back. Figures of a goniometer's certificate for the tile
 belong into the description.
+
+A certificate states a reflectance in some geometry. rho follows from it by the law itself: light at the angle i
+gives rho cos_i^(k - 1) over the hemisphere, so 8/h is rho cos(8 deg)^(k - 1); 0/45 over a perfect diffuser is
+rho (k + 1) / 2 cos(45 deg)^(k - 1). So k changes rho where the certificate's figure is held.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from coupole.calibration.artefact import Described, Geometry, LightSpectrum, read_described
 from coupole.calibration.rotations import Floats
-from coupole.plan import yamlfile
-from coupole.plan.base_model import Model, Pose
+from coupole.plan.base_model import Pose
 
 
-class Tile(Model):
+class Tile(Described):
     """A white tile and its pose; its white face is z = 0 of its frame, with the origin in the centre."""
 
     schema_version: Literal[1] = 1
     name: str = "Spectralon SRS-99"
     reflectance: Annotated[float, Field(gt=0, le=1.05)] = 0.99
-    """Hemispherical, for light along the normal."""
+    """Reflectance in `geometry`. Both are left out where `artefact` has a certified `reflectance`."""
     u_reflectance: Annotated[float, Field(ge=0)] = 0.005
+    geometry: Geometry = "0/h"
+    """Light and view of `reflectance`: 0/h is hemispherical, for light along the normal."""
     minnaert: Annotated[float, Field(ge=0.5, le=1.5)] = 1.15
     u_minnaert: Annotated[float, Field(ge=0)] = 0.05
     side_mm: Annotated[float, Field(gt=0)] = 50.0
@@ -41,14 +47,41 @@ class Tile(Model):
     """Standard uncertainty of the white face's place along its normal; shifts within the face do not change the
     image."""
 
+    @model_validator(mode="after")
+    def _certificate_alone(self) -> Self:
+        if self.artefact is None or self.artefact.reflectance is None:
+            return self
+        if doubled_keys := sorted({"reflectance", "u_reflectance", "geometry"} & self.model_fields_set):
+            raise ValueError(f"no {', '.join(doubled_keys)} beside a certified artefact.reflectance")
+        return self
+
+    def of_channel(self, channel: str, light: LightSpectrum | None = None) -> Tile:
+        """The tile as a channel of the camera sees it under this light, with its certificate's mean there;
+        the same tile without a certified reflectance. Raises InputError for a band without certified values."""
+        if self.artefact is None or self.artefact.reflectance is None:
+            return self
+        value, u = self.artefact.reflectance.in_channel(channel, light)
+        changes = {"reflectance": value, "u_reflectance": u, "geometry": self.artefact.reflectance.geometry}
+        return self.model_copy(update=changes)
+
+    def hemispherical(self, minnaert: float) -> float:
+        """rho for light along the normal, if this is Minnaert's k."""
+        match self.geometry:
+            case "0/h":
+                return self.reflectance
+            case "8/h":
+                return float(self.reflectance / np.cos(np.radians(8.0)) ** (minnaert - 1.0))
+            case "0/45":
+                return float(self.reflectance / (0.5 * (minnaert + 1.0) * np.sqrt(0.5) ** (minnaert - 1.0)))
+
     def brdf(self, cos_in: Floats, cos_out: Floats, *, minnaert: float | None = None) -> Floats:
         """f in 1/sr, for cosines of incidence and observation above 0."""
         k = self.minnaert if minnaert is None else minnaert
         cos_product = np.maximum(cos_in * cos_out, 1e-12)
-        value: Floats = self.reflectance * (k + 1.0) / (2.0 * np.pi) * cos_product ** (k - 1.0)
+        value: Floats = self.hemispherical(k) * (k + 1.0) / (2.0 * np.pi) * cos_product ** (k - 1.0)
         return value
 
 
 def read_tile(path: Path) -> Tile:
     """A tile's description (YAML). Raises InputError with all problems."""
-    return yamlfile.read_document(path).validate(Tile)
+    return read_described(path, Tile)

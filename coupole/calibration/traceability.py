@@ -1,0 +1,57 @@
+"""Words of records about the certificates that they rest on."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+
+from coupole.calibration.artefact import NOT_TRACEABLE, facts_of, sentence_of
+from coupole.calibration.record import Kind, Record
+from coupole.pages.page_parts import Inline, Section
+
+WITHOUT_ARTEFACT: dict[Kind, str] = {
+    "dark": "no artefact is needed: figures of the camera in its own unit, DN",
+    "response": "no artefact is needed: ratios of the camera's own signals",
+    "flat-field": "no artefact is needed: ratios of the camera's own signals",
+    "leds": "through the records that it was made from",
+    "mesh": "through the records that it was made from, and the scanner",
+}
+"""Kinds of records that are made from no artefact of their own."""
+
+
+def trace_of(record: Record) -> tuple[str, ...]:
+    """One line for each artefact of a record; one line that says why there is none."""
+    if record.artefacts:
+        return tuple(sentence_of(item) for item in record.artefacts)
+    return (WITHOUT_ARTEFACT.get(record.kind, NOT_TRACEABLE),)
+
+
+def is_traceable(record: Record) -> bool:
+    """True if all artefacts of a record have a certificate, or if it needs none of its own."""
+    if record.artefacts:
+        return all(item.is_traceable for item in record.artefacts)
+    return record.kind in WITHOUT_ARTEFACT
+
+
+def overdue_of(record: Record, day: datetime.date) -> tuple[str, ...]:
+    """Certificates of a record that were due for calibration before a day."""
+    certificates = [(item.artefact, item.artefact.certificate) for item in record.artefacts]
+    return tuple(
+        f"{record.kind} {record.name}: the certificate {certificate.number} of {artefact.title} was due on "
+        f"{certificate.due}"
+        for artefact, certificate in certificates
+        if certificate is not None and certificate.due is not None and certificate.due < day
+    )
+
+
+def traceability_section(record: Record) -> Section:
+    """The part of a record's page that says which certificates it rests on."""
+    facts: dict[str, Inline] = {}
+    sections: list[Section] = []
+    for number, item in enumerate(record.artefacts):
+        facts = dict(facts_of(item))
+        sections.append(Section(f"artefact-{number + 1}", f"The {item.role}", facts=facts))
+    words: Sequence[Inline] = () if sections else trace_of(record)
+    if sections and overdue_of(record, record.created.date()):
+        words = overdue_of(record, record.created.date())
+    return Section("traceability", "Traceability", words=words, sections=sections)

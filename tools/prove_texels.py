@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import resource
+import re
 import shutil
 import sys
 import tempfile
@@ -28,8 +28,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests/runs")]
@@ -78,8 +76,8 @@ def main() -> int:
     add_smallest(parser, sizes=["1.6"], every=48)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="coupole-texels-") as folder:
-        acquired = acquire(Path(folder), arguments.every)
-        rows = [judge(acquired, size) for size in arguments.sizes]
+        relief_run = acquire(Path(folder), arguments.every)
+        rows = [judge(relief_run, size) for size in arguments.sizes]
     faults = [fault for row in rows for fault in _faults(row)]
     if arguments.json:
         print(json.dumps({"sizes": rows, "faults": faults}))
@@ -96,33 +94,33 @@ def acquire(folder: Path, every: int) -> Acquired:
     if outcome.code:
         raise RuntimeError(outcome.err)
     draw_records(folder / "records", None)
-    acquired = Acquired(cell.run_folder, folder / "records", folder / "result")
-    reflectance_of(acquired.request, acquired.result)
-    return acquired
+    relief_run = Acquired(cell.run_folder, folder / "records", folder / "result")
+    reflectance_of(relief_run.request, relief_run.result)
+    return relief_run
 
 
-def judge(acquired: Acquired, size: str) -> dict[str, Any]:
+def judge(relief_run: Acquired, size: str) -> dict[str, Any]:
     """Make the texels of a size, and compare them with the truth."""
-    out = acquired.result.with_name(f"result-{size}")
-    shutil.copytree(acquired.result, out)
+    out = relief_run.result.with_name(f"result-{size}")
+    shutil.copytree(relief_run.result, out)
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        row = pool.apply(_make, (acquired, out, size))
+        row = pool.apply(_make, (relief_run, out, size))
     result = RunResult(out)
-    held, errors = [], []
+    held_shares, errors = [], []
     for view in result.views:
         kd_off, kd_held, tilts_off_deg, tilts_held = _against_truth(result, view)
         errors.append((np.median(kd_off), np.median(tilts_off_deg)))
-        held.append((kd_held.mean(), tilts_held.mean()))
+        held_shares.append((kd_held.mean(), tilts_held.mean()))
     row["kd_off_percent"], row["normals_off_deg"] = map(float, np.mean(errors, axis=0) * (100.0, 1.0))
-    row["kd_held"], row["tilts_held"] = map(float, np.mean(held, axis=0))
+    row["kd_held"], row["tilts_held"] = map(float, np.mean(held_shares, axis=0))
     row["pictures_held"], row["half_width"] = _pictures_held(result)
     shutil.rmtree(out)
     return row
 
 
-def _make(acquired: Acquired, out: Path, size: str) -> dict[str, Any]:
+def _make(relief_run: Acquired, out: Path, size: str) -> dict[str, Any]:
     """Make texels twice, since the first time compiles, in a process whose memory is theirs alone."""
-    request, texel_size = acquired.request, read_size(size)
+    request, texel_size = relief_run.request, read_size(size)
     add_texels(request, out, texel_size)
     shutil.rmtree(out / FOLDER)
     forecast = foresee_texels(request, out, texel_size)
@@ -130,16 +128,16 @@ def _make(acquired: Acquired, out: Path, size: str) -> dict[str, Any]:
     begun_s = time.monotonic()
     about = add_texels(request, out, texel_size)
     taken_s = time.monotonic() - begun_s
-    (other,) = set(about["mae"]) - {TEXELS}
+    (triangle_fit,) = set(about["mae"]) - {TEXELS}
     return {
         "size": size,
         "texels": sum(about["pixels"].values()),
         "side_px": sorted({view.side_px for view in forecast.views}),
         "psnr_db": about["held_out_psnr_db"][TEXELS],
-        "triangles_psnr_db": about["held_out_psnr_db"][other],
+        "triangles_psnr_db": about["held_out_psnr_db"][triangle_fit],
         "mae_percent": 100 * about["mae"][TEXELS],
         "time_s": taken_s,
-        "memory_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        "memory_bytes": _peak_bytes(),
         "disk_bytes": sum(path.stat().st_size for path in (out / FOLDER).iterdir()),
         "foreseen": {
             "texels": forecast.texels,
@@ -150,22 +148,29 @@ def _make(acquired: Acquired, out: Path, size: str) -> dict[str, Any]:
     }
 
 
+def _peak_bytes() -> int:
+    """Most memory that this process has had, by Linux; unlike the usage of resources, without its parent's."""
+    line = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(encoding="ascii"))
+    assert line is not None
+    return 1024 * int(line[1])
+
+
 def _against_truth(result: RunResult, view: ViewSamples) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Relative errors of kd, of the channels that a texel has measured itself, and which lie in their intervals;
     the angles by which normals are off, and which of their tilts lie in theirs."""
     texels = read_view_texels(result, view)
-    seen = seen_by_texels(result, view, texels)
+    truth = seen_by_texels(result, view, texels)
     row, column = np.divmod(texels.pixels, 512)
-    own = np.array([[1, 2], [0, 1]])[row % 2, column % 2]
-    channels = np.arange(3)[None] if texels.side_px > 1 else own[:, None]
-    kd = np.take_along_axis(texels.kd, np.broadcast_to(channels, (len(own), channels.shape[1])), 1)
-    off = np.log(kd * np.pi / np.array(DIFFUSE)[channels]) - np.log(seen.paint)[:, None]
+    own_channel = np.array([[1, 2], [0, 1]])[row % 2, column % 2]
+    channels = np.arange(3)[None] if texels.side_px > 1 else own_channel[:, None]
+    kd = np.take_along_axis(texels.kd, np.broadcast_to(channels, (len(own_channel), channels.shape[1])), 1)
+    off = np.log(kd * np.pi / np.array(DIFFUSE)[channels]) - np.log(truth.paint)[:, None]
     variances = texels.covariance[:, VARIANCES]
     u_kd = np.sqrt(variances[:, 2] + np.sum(np.square(texel_uncertainty(result, view))))
     steps = np.array([tangents(*normal) for normal in texels.normals.astype(float)])
-    tilts = np.einsum("nki,ni->nk", steps, seen.bumpy - texels.normals)
+    tilts = np.einsum("nki,ni->nk", steps, truth.bumpy - texels.normals)
     tilts_held = np.abs(tilts) < _QUANTILE * np.sqrt(variances[:, :2])
-    cosines = np.clip(np.sum(texels.normals * seen.bumpy, axis=1), -1, 1)
+    cosines = np.clip(np.sum(texels.normals * truth.bumpy, axis=1), -1, 1)
     return np.abs(off), np.abs(off) < _QUANTILE * u_kd[:, None], np.degrees(np.arccos(cosines)), tilts_held
 
 
@@ -179,9 +184,9 @@ def _pictures_held(result: RunResult) -> tuple[float, float]:
             "picture": lambda led, scene=scene: scene.picture([LedLight(number=led)]),
             "half": lambda led, scene=scene: half_width_of_picture(scene, [LedLight(number=led)]),
         }
-        for measured, made in held_out_pictures(result, view, makers):
-            known = np.isfinite(measured) & (made["picture"] > 0.0) & np.isfinite(made["half"])
-            off, half = np.abs(made["picture"] - measured)[known], made["half"][known]
+        for frame, made in held_out_pictures(result, view, makers):
+            known = np.isfinite(frame) & (made["picture"] > 0.0) & np.isfinite(made["half"])
+            off, half = np.abs(made["picture"] - frame)[known], made["half"][known]
             held_count, count = held_count + int((off < half).sum()), count + off.size
             widths.append(half / made["picture"][known])
     return held_count / count, float(np.median(np.concatenate(widths)))
@@ -198,26 +203,26 @@ def _faults(row: dict[str, Any]) -> list[str]:
 
 
 def _print(rows: list[dict[str, Any]], faults: list[str]) -> None:
-    console = Console(soft_wrap=True)
-    titles = (
-        "--texels", "texels", "kd off", "in", "normals", "tilts in", "left out", "triangles", "in", "half width",
-        "time", "memory", "disk",
-    )  # fmt: skip
-    table = Table(*titles, box=None)
+    """The rows of docs/how-to/reflectance-of-a-run.md."""
+    print("| `--texels` | texels | kd off, intervals hold | normals off, intervals hold | left-out LEDs, triangles | "
+          "their intervals hold, half width | time | memory | disk |")  # fmt: skip
+    print("|---|---|---|---|---|---|---|---|---|")
     for row in rows:
         foreseen = row["foreseen"]
-        table.add_row(
-            row["size"], f"{row['texels']} ({foreseen['texels']})", f"{row['kd_off_percent']:.1f} %",
-            f"{row['kd_held']:.1%}", f"{row['normals_off_deg']:.2f} deg", f"{row['tilts_held']:.1%}",
-            f"{row['psnr_db']:.1f} dB", f"{row['triangles_psnr_db']:.1f} dB", f"{row['pictures_held']:.1%}",
-            f"{row['half_width']:.0%}", f"{row['time_s']:.1f} ({foreseen['time_s']:.1f}) s",
+        cells = (
+            row["size"], f"{row['texels']} ({foreseen['texels']})",
+            f"{row['kd_off_percent']:.1f} %, {row['kd_held']:.1%}",
+            f"{row['normals_off_deg']:.2f} degrees, {row['tilts_held']:.1%}",
+            f"{row['psnr_db']:.1f} dB, {row['triangles_psnr_db']:.1f} dB",
+            f"{row['pictures_held']:.1%}, {row['half_width']:.0%}",
+            f"{row['time_s']:.1f} ({foreseen['time_s']:.1f}) s",
             f"{row['memory_bytes'] / 1e9:.2f} ({foreseen['memory_bytes'] / 1e9:.2f}) GB",
             f"{row['disk_bytes'] / 1e6:.2f} ({foreseen['disk_bytes'] / 1e6:.2f}) MB",
         )  # fmt: skip
-    console.print(table)
-    console.print(f"{len(rows)} sizes; in brackets what was foreseen; {len(faults)} faults")
+        print(f"| {' | '.join(cells)} |")
+    print(f"{len(rows)} sizes; in brackets what was foreseen; {len(faults)} faults")
     for fault in faults:
-        console.print(fault)
+        print(fault)
 
 
 if __name__ == "__main__":

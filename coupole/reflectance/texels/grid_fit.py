@@ -1,8 +1,8 @@
 """Materials of texels of several pixels: one fit for each, to the means of its channels, as triangles are fitted.
 
-All channels of a texel are measured, so that its colours are its own. Normal, lightness, ks and roughness are
-fitted to the mean of the channels, about the material of the triangle that most of its pixels see, and neighbours
-have their word on them as on single pixels.
+Normal, lightness, ks and roughness are fitted to the mean of the channels, about the material of the triangle that
+most of a texel's pixels see, and neighbours have their word on them as on single pixels. All channels of a texel
+are measured, and give its colour together with those of the texels beside it.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from coupole.reflectance.ggx import lobe
 from coupole.reflectance.normal_fit import colour_weight
@@ -32,6 +33,10 @@ Singles = NDArray[np.float32]
 _TOGETHER = 1 << 16
 """Texels that are fitted together."""
 _PART = 1 << 12
+_MOST_WIDER = 4.0
+"""Largest factor of kd's variance."""
+_SPREAD_PX, _LEAST_SPREAD = 2.5, 1.0
+"""Standard deviation of the weights with which texels around count for a colour, px, and its least, texels."""
 
 
 def texels_of_grid(
@@ -48,7 +53,7 @@ def texels_of_grid(
     grid, channels = reader.grid, result.channels
     centres = centres_of(result, view, grid.triangle, reader.mesh_normals)
     lights = lights_of(result, view, left_out)
-    fitted, count = Fitted.empty(grid.triangle.shape), 0
+    fits, count = Fitted.empty(grid.triangle.shape), 0
     colours = np.zeros((grid.triangle.size, channels), np.float32)
     u_colours = np.zeros(grid.triangle.size, np.float32)
     for rows in reader.bands(memory_bytes):
@@ -59,28 +64,68 @@ def texels_of_grid(
             prior, shine = centres.grey_prior(part.texels)
             values = part.values.astype(np.float32)
             fit = fit_pixels(values.mean(axis=1), part.places_mm, lights, prior, threads)
-            fitted.put(part.texels, prior, fit)
+            fits.add(part.texels, prior, fit)
             of_fits = colours_of(values, part.places_mm, lights, fit, shine, threads)
             colours[part.texels], u_colours[part.texels] = of_fits
         count += len(block.texels)
         say(count, reader.count)
-    fitted.is_fitted[...] &= np.isfinite(colours).all(axis=1).reshape(grid.triangle.shape)
-    is_fitted = fitted.is_fitted
-    normals = fitted.settle(view, centres, grid.triangle)
-    texels = np.flatnonzero(is_fitted)
-    fitted.covariance[is_fitted, VARIANCES[KD]] += u_colours[texels] ** 2
+    colours, u_colours = colours.reshape(*grid.triangle.shape, channels), u_colours.reshape(grid.triangle.shape)
+    fits.is_fitted[...] &= np.isfinite(colours).all(axis=-1)
+    is_fitted = fits.is_fitted
+    colours, u_colours = colours_around(colours, u_colours, centres.colours, is_fitted, grid.side_px)
+    normals = fits.settle(view, centres, grid.triangle)
+    fits.covariance[is_fitted, VARIANCES[KD]] *= _wider(colours[is_fitted])
+    fits.covariance[is_fitted, VARIANCES[KD]] += u_colours[is_fitted] ** 2
     logs = centres.logs[is_fitted].astype(np.float64)
-    deviation = fitted.deviation[is_fitted]
+    deviation = fits.deviation[is_fitted]
     grey = np.log(np.exp(logs[:, :channels]).mean(axis=1)) + deviation[:, KD]
-    logs[:, :channels] = grey[:, None] + colours[texels]
+    logs[:, :channels] = grey[:, None] + colours[is_fitted]
     logs[:, channels:-1] += deviation[:, KS, None]
     logs[:, -1] += deviation[:, ALPHA]
-    first_pixels, number_of_pixel = _pixels_of(grid.texel_of_pixel, texels)
+    first_pixels, number_of_pixel = _pixels_of(grid.texel_of_pixel, np.flatnonzero(is_fitted))
     return replace(
-        view_texels(first_pixels, normals, logs, fitted.covariance[is_fitted]),
+        view_texels(first_pixels, normals, logs, fits.covariance[is_fitted]),
         texel_of_pixel=number_of_pixel,
         side_px=grid.side_px,
     )
+
+
+def _wider(colours: Singles) -> Singles:
+    """[n] mean over the channels of the factors of kd's variance, where colours [n, channels] differ: what a lobe
+    of another form makes of kd is as large in a dark channel as in a light one."""
+    factors: Singles = np.clip(np.exp(-2.0 * colours).mean(axis=1), 1.0, _MOST_WIDER)
+    return factors
+
+
+def colours_around(
+    colours: Singles, u_colours: Singles, of_triangles: Singles, is_fitted: NDArray[np.bool_], side_px: int
+) -> tuple[Singles, Singles]:
+    """Colours of texels [h, w, channels], logarithms of kd over the channels' mean, with those around, and their
+    standard uncertainty [h, w].
+
+    A texel's red and blue pixels are not in the same places, and paint that changes between them looks like a
+    colour. So what a texel's colour has beyond its triangle's is taken from the texels around, too, within some
+    pixels; the spread that this takes away says how uncertain the rest is. Logarithms' means are those of no
+    colour: kd's mean over the channels stays as it was fitted.
+    """
+    width = max(_SPREAD_PX / side_px, _LEAST_SPREAD)
+    weight = is_fitted.astype(np.float32)
+    around = np.maximum(gaussian_filter(weight, width, mode="mirror"), 1e-6)
+    triangle_colours = of_triangles - np.log(np.exp(of_triangles).mean(axis=-1, keepdims=True))
+    more = np.where(is_fitted[..., None], colours - triangle_colours, np.float32(0.0))
+    smooth = np.stack(
+        [gaussian_filter(plane, width, mode="mirror") / around for plane in np.moveaxis(more, -1, 0)], axis=-1
+    )
+    lost_variance = np.where(is_fitted, np.square(more - smooth).mean(axis=-1), np.float32(0.0))
+    lost_variance = gaussian_filter(lost_variance, 2.0 * width, mode="mirror") / np.maximum(
+        gaussian_filter(weight, 2.0 * width, mode="mirror"), 1e-6
+    )
+    kept_share = 1.0 / (4.0 * np.pi * width**2)  # of the variance of what is different from texel to texel
+    whole = triangle_colours + smooth
+    whole -= np.log(np.exp(whole).mean(axis=-1, keepdims=True))
+    own_variance = np.square(np.where(is_fitted, u_colours, np.float32(0.0)))
+    u_whole = np.sqrt(kept_share * (own_variance + lost_variance / (1.0 - kept_share)))
+    return whole.astype(np.float32), u_whole.astype(np.float32)
 
 
 def _pixels_of(
@@ -123,11 +168,10 @@ def colours_of(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _colours(values, places_mm, led_mm, camera_mm, normals, grey, shine, kd, u_kd):  # type: ignore[no-untyped-def]
-    """Each channel's kd by least squares, with the normal, ks and roughness of the fit to their mean, and its
-    uncertainty by how its residuals differ from those of the mean."""
+    """Each channel's kd by least squares, and its uncertainty by the residuals. What is fitted is how a channel's
+    values differ from their mean over the channels: there the error of a lobe of another form is gone."""
     channels, leds = values.shape[1:]
     cosines, lobes, weights = np.empty(leds), np.empty(leds), np.empty(leds)
-    off = np.empty(channels)
     for texel in range(len(values)):
         if not grey[texel, 2] > 0.0:
             continue
@@ -137,17 +181,14 @@ def _colours(values, places_mm, led_mm, camera_mm, normals, grey, shine, kd, u_k
         if not total > 0.0:
             continue
         for channel in range(channels):
-            diffuse = 0.0
+            more, square, more_shine = 0.0, 0.0, shine[texel, channel] - 1.0
             for led in np.flatnonzero(weights):
-                off_lobe = sample[channel, led] - lobes[led] * shine[texel, channel]
-                diffuse += weights[led] * cosines[led] * off_lobe
-            kd[texel, channel], u_kd[texel, channel] = diffuse / total, 0.0
-        for led in np.flatnonzero(weights):
-            for channel in range(channels):
-                modelled = cosines[led] * kd[texel, channel] + lobes[led] * shine[texel, channel]
-                off[channel] = weights[led] * cosines[led] * (sample[channel, led] - modelled) / total
-            u_kd[texel] += (off - off.mean()) ** 2
-        u_kd[texel] = np.sqrt(u_kd[texel])
+                difference = sample[channel, led] - sample[:, led].mean() - lobes[led] * more_shine
+                more += weights[led] * cosines[led] * difference / total
+            for led in np.flatnonzero(weights):
+                difference = sample[channel, led] - sample[:, led].mean() - lobes[led] * more_shine
+                square += (weights[led] * cosines[led] * (difference - cosines[led] * more) / total) ** 2
+            kd[texel, channel], u_kd[texel, channel] = grey[texel, 0] + more, np.sqrt(square)
         if not kd[texel].min() > 0.0:
             kd[texel] = np.nan
 

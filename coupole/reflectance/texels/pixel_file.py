@@ -70,19 +70,19 @@ class ViewTexels:
 
 @dataclass(frozen=True)
 class TexelFileHead:
-    """What a file says beside the texels."""
+    """Head of a file of texels: all that it says beside them."""
 
     view: str
     size_px: tuple[int, int]
-    """Of its pictures: width, height."""
-    asked: TexelSize
+    """Width and height of its pictures."""
+    asked_size: TexelSize
     pixel_mm: float
     """Width of a pixel on the surface."""
     u_pixel: NDArray[np.float64]
     """[channels] relative standard uncertainty of kd and ks, of the responses of a texel's pixels."""
     u_shared: float
     """The same, of the power of all LEDs."""
-    simulated: bool
+    is_simulated: bool
 
 
 def texels_path(result: RunResult, view: ViewSamples) -> Path:
@@ -94,9 +94,9 @@ def write_view_texels(path: Path, texels: ViewTexels, head: TexelFileHead) -> No
     is_of_several = texels.texel_of_pixel is not None
     with h5py.File(path, "w") as file:
         file.attrs["view"], file.attrs["size_px"] = head.view, head.size_px
-        file.attrs["frame"], file.attrs["simulated"] = "base of the robot", head.simulated
-        if head.asked.mm is not None:
-            file.attrs[_ASKED], file.attrs[_SIDE] = head.asked.mm, texels.side_px
+        file.attrs["frame"], file.attrs["simulated"] = "base of the robot", head.is_simulated
+        if head.asked_size.mm is not None:
+            file.attrs[_ASKED], file.attrs[_SIDE] = head.asked_size.mm, texels.side_px
             file.attrs[_PIXEL] = head.pixel_mm
         for name, description in (_TOLD_OF_SEVERAL if is_of_several else _TOLD).items():
             _dataset(file, name, getattr(texels, name), description)
@@ -158,9 +158,9 @@ def refuse_other_size(folder: Path, size: TexelSize) -> None:
     there = size_of_texels(folder)
     if there is not None and there != size:
         raise InputError(
-            f"--texels {size.text}: {folder} has texels of {there.told} already. `--texels {there.text}` goes on "
-            f"with them. To have the others instead, move the folder {folder / FOLDER} away: nothing else is made "
-            "again"
+            f"--texels {size.text}: {folder} has texels of {there.in_words} already. `--texels {there.text}` goes "
+            f"on with them. To have the others instead, move the folder {folder / FOLDER} away: nothing else is "
+            "made again"
         )
 
 

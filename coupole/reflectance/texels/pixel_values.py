@@ -116,11 +116,11 @@ def fill_rows(
     places_mm: NDArray[np.float32],
     light: tuple[NDArray[np.uint8], NDArray[np.float32]],
     values: NDArray[np.uint16],
-    raised: np.float32,
+    root_share: np.float32,
 ) -> None:
     """Fill `values` [pixels, leds] of the pixels of some rows, which see `places_mm` [pixels, 3], from the frames
-    of some LEDs, whose `light` has reached the rows (`light_of`). `raised` is the share of what noise takes from
-    square roots that is given back: 1 if each pixel is fitted by itself."""
+    of some LEDs, whose `light` has reached the rows (`light_of`). `root_share` is the share of what noise takes
+    from square roots that is given back: 1 if each pixel is fitted by itself."""
     lists, (codes, direct) = reader.lists, light
     channels = reader.pixels.shape[1]
     first = int(lists.starts[rows.start * channels])
@@ -132,7 +132,7 @@ def fill_rows(
         of_pixels = slice(begin - first, int(ends[-1]) - first)
         fill_pixels(
             begin, ends.reshape(-1, channels), lists, response, reader.darks, *batch, places_mm[of_pixels],
-            codes[of_rows], direct[of_rows], values[of_pixels], raised,
+            codes[of_rows], direct[of_rows], values[of_pixels], root_share,
         )  # fmt: skip
 
     starts = range(rows.start, rows.stop, _TRIANGLES)

@@ -1,4 +1,4 @@
-"""What texels of a size will be, told before the work begins: how many, how wide, how much memory and disk they
+"""Forecast of texels of a size, before the work begins: how many, how wide, how much memory and disk they
 take, and how long they take on this machine.
 
 Views are traced coarsely for how many pixels see the object, and how wide these are on it. Time follows from small
@@ -60,7 +60,7 @@ class ViewForecast:
     picture_px: int
     """Pixels of its pictures."""
     pixels: int
-    """Those that see the object."""
+    """Number of pixels that see the object."""
     pixel_mm: float
     """Width of one on the surface, median."""
     side_px: int
@@ -82,7 +82,7 @@ class TexelForecast:
     size: TexelSize
     views: tuple[ViewForecast, ...]
     edge_mm: float
-    """Of the triangles that are seen, median."""
+    """Edge of the triangles that are seen, median."""
     memory_bytes: int
     disk_bytes: int
     time_s: float
@@ -92,7 +92,7 @@ class TexelForecast:
         return sum(view.texels for view in self.views)
 
     def document(self) -> dict[str, Any]:
-        """As `--json` has it."""
+        """Document of `--json`."""
         views = [{**asdict(view), "texels": view.texels, "texel_mm": view.texel_mm} for view in self.views]
         figures = ("edge_mm", "memory_bytes", "disk_bytes", "time_s")
         return {"texels": self.texels, **{name: getattr(self, name) for name in figures}, "views": views}
@@ -199,11 +199,11 @@ class _Rates:
 
     channels: int
     pixel_s: float
-    """Of a pixel that sees the object, under one LED, read and made a value."""
+    """Time in which a pixel that sees the object, under one LED, is read and made a value."""
     sample_s: float
-    """Of a value, fitted."""
+    """Time of a value in a fit."""
     place_s: float
-    """Of a place of a view's texels, seen or not: all that is done with neighbours."""
+    """Time of a place of a view's texels, seen or not, in all that is done with neighbours."""
 
     def time_s(self, view: ViewForecast, left_out: list[int], budget_bytes: int) -> float:
         """Time of a view's texels."""

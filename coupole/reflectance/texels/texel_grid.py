@@ -24,16 +24,16 @@ class TexelSize:
     """Width of texels that was asked for."""
 
     mm: float | None = None
-    """On the surface; None for single pixels of each view, `auto`."""
+    """Width on the surface; None for single pixels of each view, `auto`."""
 
     @property
     def text(self) -> str:
-        """As the command line has it."""
+        """Text of the command line."""
         return "auto" if self.mm is None else f"{self.mm:g}"
 
     @property
-    def told(self) -> str:
-        """For people."""
+    def in_words(self) -> str:
+        """Name for people."""
         return "single pixels (auto)" if self.mm is None else f"{self.mm:g} mm"
 
     def side_px(self, of_pixel_mm: float) -> int:
@@ -80,7 +80,7 @@ def texel_grid(surface: Surface, side_px: int) -> TexelGrid:
     most_mm = side_px * pixel_mm(surface)
     in_strips(
         rows,
-        lambda some: _cut(
+        lambda some: _cut_rows(
             some.start, some.stop, side_px, most_mm, surface.triangle_of_pixel, surface.places_mm,
             surface.centres_mm, surface.normals, triangle, places_mm, texel_of_pixel,
         ),
@@ -89,7 +89,7 @@ def texel_grid(surface: Surface, side_px: int) -> TexelGrid:
 
 
 @numba.njit(cache=True, nogil=True)
-def _cut(  # type: ignore[no-untyped-def]
+def _cut_rows(  # type: ignore[no-untyped-def]
     first, end, side_px, most_mm, triangle_of_pixel, seen_mm, centres_mm, normals, triangle, places_mm,
     texel_of_pixel
 ):  # fmt: skip

@@ -127,11 +127,11 @@ def _texels_of_one(token: str, sources: Sources, threads: int | None, say: Said,
         task.left_out, task.memory_bytes, threads or len(os.sched_getaffinity(0)),
         lambda count, of: say(f"texels of {task.view}", count, of),
     )  # fmt: skip
-    given, u_pixel = (measured_run, geometry, radiometry, view), radiometry.u_pixel
+    of_run, u_pixel = (measured_run, geometry, radiometry, view), radiometry.u_pixel
     if side_px == 1:
-        texels = texels_of_view(result, samples, PixelReader(*given, surface, samples), *fit_with)
+        texels = texels_of_view(result, samples, PixelReader(*of_run, surface, samples), *fit_with)
     else:
-        reader = TexelReader(*given, surface, samples, texel_grid(surface, side_px))
+        reader = TexelReader(*of_run, surface, samples, texel_grid(surface, side_px))
         texels = texels_of_grid(result, samples, reader, *fit_with)
         u_pixel = u_pixel / np.sqrt(reader.pixels_of_channels)
     head = TexelFileHead(

@@ -98,14 +98,16 @@ class TexelReader:
         values = np.full((len(band.texels), channels, len(self._samples.leds)), np.nan, np.float16)
         of_pixels = np.full((len(reader.lists.places), LANES), NO_VALUE, np.uint16)
         seen_mm = self._seen_mm[reader.lists.places]
-        raised = np.float32(np.sum(1.0 / self.pixels_of_channels) / channels**2)
+        root_share = np.float32(np.sum(1.0 / self.pixels_of_channels) / channels**2)
         batches = view_pass.batches()
         with closing(batches), ThreadPoolExecutor(threads) as pool, h5py.File(self._samples.path, "r") as file:
             for part, batch in zip(view_pass.parts, batches, strict=True):
                 codes, direct = light_of(file, entries.rows, part, channels)
                 of_pixels[:] = NO_VALUE
                 of_leds = of_pixels[:, : part.stop - part.start]
-                fill_rows(pool, entries.rows, reader, response, batch, seen_mm, (codes, direct), of_leds, raised)
+                fill_rows(
+                    pool, entries.rows, reader, response, batch, seen_mm, (codes, direct), of_leds, root_share
+                )
                 is_reached = codes[:, : part.stop - part.start] == REACHED
 
                 def mean(first: int, part: slice = part, is_reached: NDArray[np.bool_] = is_reached,
@@ -166,8 +168,8 @@ class _Entries:
     def of(cls, reader: SignalReader, texel_of_pixel: NDArray[np.int32], texels: NDArray[np.int64]) -> _Entries:
         count, channels = reader.pixels.shape
         of_triangles = reader.pixels.sum(axis=1)
-        occupied = np.flatnonzero(of_triangles)
-        rows = slice(int(occupied[0]), int(occupied[-1]) + 1)
+        used_rows = np.flatnonzero(of_triangles)
+        rows = slice(int(used_rows[0]), int(used_rows[-1]) + 1)
         texel = np.searchsorted(texels, texel_of_pixel[reader.lists.places])
         return cls(
             rows,

@@ -58,7 +58,7 @@ class Fitted:
         deviation = np.full((*shape, UNKNOWNS), np.nan, np.float32)
         return cls(normals, deviation, np.empty((*shape, 15), np.float32), np.zeros(shape, np.bool_))
 
-    def put(self, places: NDArray[np.integer], prior: Prior, fit: PixelMaterials) -> None:
+    def add(self, places: NDArray[np.integer], prior: Prior, fit: PixelMaterials) -> None:
         """Take the fits at places [n], row by row, which began at `prior`; those that ran off do not count."""
         off = np.empty((len(places), UNKNOWNS))
         tilts_from(fit.normals, prior.normals, off[:, :2])
@@ -100,25 +100,25 @@ def texels_of_view(
     lights = lights_of(result, view, left_out)
     shape = reader.triangle_of_pixel.shape
     channel = np.zeros(shape, np.int8)
-    fitted, count = Fitted.empty(shape), 0
+    fits, count = Fitted.empty(shape), 0
     for rows in reader.blocks(memory_bytes):
         block = reader.read_block(rows, threads)
         prior = centres.prior(block)
-        fitted.put(block.pixels, prior, fit_pixels(block.values, block.places_mm, lights, prior, threads))
+        fits.add(block.pixels, prior, fit_pixels(block.values, block.places_mm, lights, prior, threads))
         channel[np.unravel_index(block.pixels, shape)] = block.channel
         count += len(block.pixels)
         say(count, reader.count)
-    is_fitted, channels = fitted.is_fitted, result.channels
-    texel_normals = fitted.settle(view, centres, reader.triangle_of_pixel)
+    is_fitted, channels = fits.is_fitted, result.channels
+    texel_normals = fits.settle(view, centres, reader.triangle_of_pixel)
     logs = centres.logs[is_fitted].astype(np.float64)
     logs[:, :channels] = _with_colours(logs[:, :channels], centres.colours[is_fitted], channel[is_fitted])
     for first, unknown in ((0, KD), (channels, KS)):
-        variance = fitted.covariance[..., VARIANCES[unknown]]
+        variance = fits.covariance[..., VARIANCES[unknown]]
         certainty = np.where(is_fitted, 1.0 / (variance + _ALIKE), 0.0).astype(np.float32)
-        plane = all_channels(fitted.deviation[..., unknown], certainty, channel, channels)
+        plane = all_channels(fits.deviation[..., unknown], certainty, channel, channels)
         logs[:, first : first + channels] += plane[is_fitted]
-    logs[:, -1] += fitted.deviation[is_fitted][:, ALPHA]
-    return view_texels(np.flatnonzero(is_fitted), texel_normals, logs, fitted.covariance[is_fitted])
+    logs[:, -1] += fits.deviation[is_fitted][:, ALPHA]
+    return view_texels(np.flatnonzero(is_fitted), texel_normals, logs, fits.covariance[is_fitted])
 
 
 def view_texels(places: NDArray[np.integer], normals: Singles, logs: Floats, covariance: Singles) -> ViewTexels:

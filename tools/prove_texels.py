@@ -204,8 +204,11 @@ def _faults(row: dict[str, Any]) -> list[str]:
 
 def _print(rows: list[dict[str, Any]], faults: list[str]) -> None:
     """The rows of docs/how-to/reflectance-of-a-run.md."""
-    print("| `--texels` | texels | kd off, intervals hold | normals off, intervals hold | left-out LEDs, triangles | "
-          "their intervals hold, half width | time | memory | disk |")  # fmt: skip
+    titles = (
+        "`--texels`", "texels", "kd off, intervals hold", "normals off, intervals hold",
+        "left-out LEDs, triangles", "their intervals hold, half width", "time", "memory", "disk",
+    )  # fmt: skip
+    print(f"| {' | '.join(titles)} |")
     print("|---|---|---|---|---|---|---|---|---|")
     for row in rows:
         foreseen = row["foreseen"]

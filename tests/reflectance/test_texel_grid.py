@@ -60,7 +60,9 @@ def test_a_pixel_is_as_wide_as_the_square_of_what_it_sees() -> None:
     assert pixel_mm(surface) == pytest.approx(STEP_MM * np.sqrt(2.0), rel=1e-4)
 
 
-@pytest.mark.parametrize(("mm", "side_px"), [(None, 1), (0.1, 1), (0.14, 1), (0.2, 2), (0.44, 4), (1.0, 10)])
+@pytest.mark.parametrize(
+    ("mm", "side_px"), [(None, 1), (0.1, 1), (0.14, 1), (0.17, 2), (0.2, 2), (0.44, 4), (1.0, 10)]
+)
 def test_texels_are_the_nearest_whole_number_of_pixels_wide(mm: float | None, side_px: int) -> None:
     assert TexelSize(mm).side_px(0.1) == side_px
 

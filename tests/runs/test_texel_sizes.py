@@ -68,7 +68,8 @@ def test_they_take_a_quarter_of_the_disk(detailed: Made, coarse: Made) -> None:
 def test_pictures_of_leds_that_no_fit_has_seen_are_better_than_by_triangles(coarse: Made) -> None:
     texels = coarse[2]["texels"]
     (other,) = set(texels["mae"]) - {TEXELS}
-    assert texels["held_out_psnr_db"][TEXELS] > texels["held_out_psnr_db"][other] + 2.0
+    assert texels["held_out_psnr_db"][TEXELS] > texels["held_out_psnr_db"][other] + 0.7
+    assert texels["mae"][TEXELS] < 0.95 * texels["mae"][other]
     assert texels["asked_mm"] == SIZE_MM
 
 

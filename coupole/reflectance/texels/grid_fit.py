@@ -69,17 +69,17 @@ def texels_of_grid(
             colours[part.texels], u_colours[part.texels] = of_fits
         count += len(block.texels)
         say(count, reader.count)
-    colours, u_colours = colours.reshape(*grid.triangle.shape, channels), u_colours.reshape(grid.triangle.shape)
-    fits.is_fitted[...] &= np.isfinite(colours).all(axis=-1)
+    of_grid = colours.reshape(*grid.triangle.shape, channels), u_colours.reshape(grid.triangle.shape)
+    fits.is_fitted[...] &= np.isfinite(of_grid[0]).all(axis=-1)
     is_fitted = fits.is_fitted
-    colours, u_colours = colours_around(colours, u_colours, centres.colours, is_fitted, grid.side_px)
+    whole_colours, u_whole = colours_around(*of_grid, centres.colours, is_fitted, grid.side_px)
     normals = fits.settle(view, centres, grid.triangle)
-    fits.covariance[is_fitted, VARIANCES[KD]] *= _wider(colours[is_fitted])
-    fits.covariance[is_fitted, VARIANCES[KD]] += u_colours[is_fitted] ** 2
+    fits.covariance[is_fitted, VARIANCES[KD]] *= _wider(whole_colours[is_fitted])
+    fits.covariance[is_fitted, VARIANCES[KD]] += u_whole[is_fitted] ** 2
     logs = centres.logs[is_fitted].astype(np.float64)
     deviation = fits.deviation[is_fitted]
     grey = np.log(np.exp(logs[:, :channels]).mean(axis=1)) + deviation[:, KD]
-    logs[:, :channels] = grey[:, None] + colours[is_fitted]
+    logs[:, :channels] = grey[:, None] + whole_colours[is_fitted]
     logs[:, channels:-1] += deviation[:, KS, None]
     logs[:, -1] += deviation[:, ALPHA]
     first_pixels, number_of_pixel = _pixels_of(grid.texel_of_pixel, np.flatnonzero(is_fitted))

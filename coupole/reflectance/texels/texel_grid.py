@@ -67,7 +67,7 @@ def pixel_mm(surface: Surface) -> float:
         return math.sqrt(median_mm2)
     seen_mm = surface.centres_mm
     extent_mm2 = float(np.prod(np.sort(np.ptp(seen_mm, axis=0))[1:]))
-    return math.sqrt(extent_mm2 / max(1, np.count_nonzero(surface.triangle_of_pixel >= 0)))
+    return math.sqrt(extent_mm2 / max(1, int(np.count_nonzero(surface.triangle_of_pixel >= 0))))
 
 
 def texel_grid(surface: Surface, side_px: int) -> TexelGrid:

@@ -45,7 +45,7 @@ from coupole.reflectance.run_job import RunRequest, reflectance_of  # noqa: E402
 from coupole.reflectance.run_relighting import scene_of_view  # noqa: E402
 from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples  # noqa: E402
 from coupole.reflectance.texels.pixel_file import FOLDER, read_view_texels, texel_uncertainty  # noqa: E402
-from coupole.reflectance.texels.texel_check import held_out_pictures  # noqa: E402
+from coupole.reflectance.texels.texel_check import WIDENED_BY_EVERY, held_out_pictures  # noqa: E402
 from coupole.reflectance.texels.texel_forecast import foresee_texels  # noqa: E402
 from coupole.reflectance.texels.texel_job import add_texels  # noqa: E402
 from drawn_records import draw_records  # noqa: E402
@@ -176,7 +176,7 @@ def _against_truth(result: RunResult, view: ViewSamples) -> tuple[np.ndarray, np
 
 def _pictures_held(result: RunResult) -> tuple[float, float]:
     """Share of the 95 % intervals of pictures under LEDs left out that hold the frames, and their median half
-    width over the picture."""
+    width over the picture; of LEDs by which the widths were not found."""
     held_count, count, widths = 0, 0, []
     for view in result.views:
         scene = scene_of_view(result, view.view, TEXELS)
@@ -184,7 +184,8 @@ def _pictures_held(result: RunResult) -> tuple[float, float]:
             "picture": lambda led, scene=scene: scene.picture([LedLight(number=led)]),
             "half": lambda led, scene=scene: half_width_of_picture(scene, [LedLight(number=led)]),
         }
-        for frame, made in held_out_pictures(result, view, makers):
+        pictures = list(held_out_pictures(result, view, makers))
+        for frame, made in [pair for number, pair in enumerate(pictures) if number % WIDENED_BY_EVERY]:
             known = np.isfinite(frame) & (made["picture"] > 0.0) & np.isfinite(made["half"])
             off, half = np.abs(made["picture"] - frame)[known], made["half"][known]
             held_count, count = held_count + int((off < half).sum()), count + off.size

@@ -80,9 +80,9 @@ def test_paint_is_the_mean_of_what_their_pixels_see_in_all_channels(coarse: Made
         seen = seen_by_texels(result, view, texels)
         error = np.log(texels.kd * np.pi / np.array(DIFFUSE)) - np.log(seen.paint)[:, None]
         u_kd = np.sqrt(texels.covariance[:, 5] + np.sum(np.square(texel_uncertainty(result, view))))
-        assert (np.median(np.abs(error), axis=0) < 0.03).all()
+        assert (np.median(np.abs(error), axis=0) < 0.06).all()
         held = (np.abs(error) < 1.96 * u_kd[:, None]).mean(axis=0)
-        assert (held > 0.8).all()
+        assert (held > 0.7).all()
         assert (held < 0.995).all()
 
 

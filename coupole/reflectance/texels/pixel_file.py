@@ -173,6 +173,13 @@ def read_texel_errors(folder: Path) -> dict[str, float | None]:
     return mae
 
 
+def read_texel_widening(folder: Path) -> dict[str, Any] | None:
+    """Widths of texels' intervals that the check found, as `result.json` has them of fits; None without."""
+    path = folder / FOLDER / ABOUT
+    widening: dict[str, Any] | None = read_json(path, allow_nan=True).get("widening") if path.exists() else None
+    return widening
+
+
 def texel_uncertainty(result: RunResult, view: ViewSamples) -> tuple[float, float]:
     """Relative standard uncertainties of kd and ks, means of channels: of a pixel's own response, and of all."""
     with h5py.File(texels_path(result, view), "r") as file:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.reflectance.extraction.extraction import MOST_BLUR_PX, Geometry, view_pass
+from coupole.reflectance.extraction.frames_for_check import MOST_FRAMES
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import Radiometry
 from coupole.reflectance.extraction.sample_codes import REACHED
@@ -41,9 +42,9 @@ _TRACED = 200_000
 """Pixels of a view, about, that are traced."""
 _FITTED, _SIDE_PX = 2048, 192
 """Texels of the trial of fits, and width of that of neighbours."""
-_ALL_OVER_SETTLE, _CHECK_OVER_FIT = 3.0, 4.5
-"""Times that were seen: all that is done with neighbours over the part that is tried; a pixel of a picture for the
-check over a fit's sample."""
+_ALL_OVER_SETTLE, _CHECK_OVER_FIT = 3.0, 17.0
+"""Times that were seen: all that is done with neighbours over the part that is tried; a pixel under an LED of
+the check, with the uncertainties of every second, over a fit's sample."""
 _PLACE_BYTES, _PIXEL_BYTES, _SHOWN_BYTES, _BEFORE_BYTES = 650, 60, 900, 400_000_000
 """Memory of a texel's place in a view, of a pixel of the picture, of a pixel that sees the object while pictures
 are compared, and of the program before it begins (measured)."""
@@ -125,7 +126,8 @@ def foresee_texels(request: RunRequest, out: Path, size: TexelSize) -> TexelFore
             return None
         rates = _Rates.of(*trial[0], trial[1].pixels)
         time_s = sum(rates.time_s(view, left_out, request.memory_bytes) for view in lacking)
-        time_s += sum(rates.check_s(view, len(left_out)) for view in views)
+        leds = min(len(left_out), MOST_FRAMES)
+        time_s += sum(rates.check_s(view, leds) for view in views)
         memory = _BEFORE_BYTES + max(_memory_bytes(view, rates.channels, request.memory_bytes) for view in views)
         disk = sum(_disk_bytes(view, rates.channels) for view in lacking)
         edge_mm = float(np.median(np.concatenate(edges_mm)))

@@ -111,7 +111,7 @@ def test_a_job_that_was_stopped_goes_on_and_ends_alike(detailed: Made, coarse: M
     shutil.copytree(coarse[1], copy)
     (copy / "texels/top.h5").unlink()
     request = RunRequest((detailed[0].run_folder,), None, records_named([detailed[0].folder / "records"]))
-    add_texels(replace(request, memory_bytes=300_000), copy, TexelSize(SIZE_MM))
+    add_texels(replace(request, memory_bytes=1_500_000), copy, TexelSize(SIZE_MM))
     assert (copy / "texels/top.h5").read_bytes() == (coarse[1] / "texels/top.h5").read_bytes()
     shutil.rmtree(copy / "texels")
     with cluster(tmp_path, 2) as (address, _):

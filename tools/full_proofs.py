@@ -84,6 +84,7 @@ PROOFS = (
         "45 cells of materials that the fit does not know: intervals, normals, fits, new views",
         "tools/prove_reflectance.py",
     ),
+    Proof("texels", "texels of pixels and of sizes: kd, normals, left-out LEDs, memory", "tools/prove_texels.py"),
     Proof("paper-table", "intervals with the paper's uncertainties hold the truth", "tools/prove_paper_table.py"),
     Proof("clusters", "1,000 materials for an object that varies everywhere", "tools/prove_clusters.py"),
     Proof("clusters-400k", "the same for 400,000 triangles", "tools/prove_clusters.py --triangles 400000"),

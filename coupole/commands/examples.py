@@ -92,7 +92,7 @@ EXAMPLES: dict[str, tuple[str, str]] = {
         "reflectance --pictures PICTURES --lights lights.lp --out result",
     ),
     "reflectance from": (
-        "reflectance RUN --out result",
+        "reflectance RUN --out result --texels 0.2",
         "reflectance --pictures PICTURES --lights lights.lp --out result",
     ),
     "reflectance extract": ("reflectance extract RUN --out result", "reflectance extract RUN RUN2 --out result"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -31,6 +31,8 @@ from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
     from coupole.reflectance.run_job import RunRequest
+    from coupole.reflectance.texels.texel_forecast import TexelForecast
+    from coupole.reflectance.texels.texel_grid import TexelSize
 
 Said = Callable[[str, int, int], None]
 Made = tuple[dict[str, Any], list[str], Path]
@@ -84,7 +86,7 @@ def from_runs_or_pictures(
         if out is None:
             raise InputError("--out: expected the folder of the result")
         _refuse_mixed(runs or [], samples, without)
-        _refuse_texels(texels, runs or [], without)
+        size = _texel_size(texels, runs or [], without)
         left_out = _numbers(leave_out)
         with step_bars(console) as say:
             if without.is_uncalibrated and runs:
@@ -93,7 +95,7 @@ def from_runs_or_pictures(
                 outcome = _of_pictures(without.pictures, without, left_out, out, say)
             else:
                 request = replace(samples.request(runs or [], left_out), memory_bytes=workers.memory_bytes)
-                outcome = _of_runs(request, out, workers.scheduler, say, with_texels=texels is not None)
+                outcome = _of_runs(request, out, workers.scheduler, say, Texels(size, console.print))
     except CoupoleError as error:
         fail_with(error, as_json=as_json)
         raise
@@ -134,13 +136,16 @@ def _refuse_mixed(runs: list[Path], samples: SamplesOfRuns, without: PicturesWit
         raise InputError("--lights, --srgb, --intensities, --mask: need --pictures, not runs")
 
 
-def _refuse_texels(texels: str | None, runs: list[Path], without: PicturesWithoutRecords) -> None:
-    if texels is None:
-        return
-    if texels != "auto":
-        raise InputError(f"--texels: expected auto, each view's own pixels; got {texels!r}")
+def _texel_size(text: str | None, runs: list[Path], without: PicturesWithoutRecords) -> TexelSize | None:
+    """Return the size that `--texels` names. Raises InputError."""
+    if text is None:
+        return None
+    from coupole.commands.texels_told import read_size
+
+    size = read_size(text)
     if not runs or without.is_uncalibrated:
         raise InputError("--texels: is for calibrated runs; pixels of pictures are fitted one by one anyway")
+    return size
 
 
 def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path, say: Said) -> Made:
@@ -160,11 +165,25 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 
 
-def _of_runs(request: RunRequest, out: Path, scheduler: str | None, say: Said, *, with_texels: bool) -> Made:
+@dataclass(frozen=True)
+class Texels:
+    """Texels that are asked for, and where is told what they will take."""
+
+    size: TexelSize | None
+    print_line: Callable[[str], None]
+
+    def tell(self, forecast: TexelForecast) -> None:
+        from coupole.commands.texels_told import lines_of
+
+        for line in lines_of(forecast):
+            self.print_line(line)
+
+
+def _of_runs(request: RunRequest, out: Path, scheduler: str | None, say: Said, texels: Texels) -> Made:
     from coupole.reflectance.result_pages import run_reflectance_page
     from coupole.scripting.analyses import fit_runs
 
-    about = fit_runs(request, out, scheduler, say, with_texels=with_texels)
+    about = fit_runs(request, out, scheduler, say, texels=texels.size, tell=texels.tell)
     return about, list(run_reflectance_page.remarks(about)), run_reflectance_page.write(out)
 
 

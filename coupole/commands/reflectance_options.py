@@ -113,9 +113,10 @@ TexelsOption = Annotated[
     str | None,
     typer.Option(
         "--texels",
-        metavar="auto",
-        help="Add materials of single pixels of each view, for detail that is finer than the mesh's triangles: "
-        "normal, kd, ks and roughness of each, with uncertainty.",
+        metavar="auto|MM",
+        help="Add materials of texels, for detail that is finer than the mesh's triangles: normal, kd, ks and "
+        "roughness of each, with uncertainty. auto: of single pixels of each view; a number: of texels of that "
+        "width on the surface, in mm, such as 0.2. Memory, disk and time are told before the work begins.",
         show_default=False,
     ),
 ]

@@ -22,6 +22,7 @@ from coupole.reflectance.run_pictures import HeldOut
 from coupole.reflectance.run_relighting import SAMPLES, RelitScene, Say
 from coupole.reflectance.run_result import RunResult, read_about
 from coupole.reflectance.strata import MOST_STRATA, StratumFactors, fit_strata
+from coupole.reflectance.texels.pixel_file import read_texel_widening
 
 Floats = NDArray[np.float64]
 
@@ -86,10 +87,12 @@ def _stratum_count(name: str) -> int:
 
 
 def read_widening(result: RunResult, fit: str) -> StratumFactors:
-    """Read the quantiles of a fit; of texels, those of the fit that they start from. Raises InputError if the
-    result has none."""
+    """Read the quantiles of a fit; of texels their own, or, if an earlier version made them, those of the fit that
+    they start from. Raises InputError if the result has none."""
     name = GGX_NORMAL.name if fit == TEXELS else fit
-    widening = read_about(result.folder).get("widening", {}).get(name)
+    widening = read_texel_widening(result.folder) if fit == TEXELS else None
+    if widening is None:
+        widening = read_about(result.folder).get("widening", {}).get(name)
     if widening is None:
         raise InputError(
             f"--interval: {result.folder} has none for {fit}: no LEDs were kept for its check, or it is of an "
@@ -112,12 +115,12 @@ def half_width_of_picture(
     picture = scene.picture(lights, samples)
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = np.where(picture > 0.0, uncertainty / picture, np.nan)
-    residual = np.broadcast_to(_residuals(scene)[..., None], relative.shape)
+    residual = np.broadcast_to(residuals_of(scene)[..., None], relative.shape)
     quantiles = widening.quantiles(strata_of(relative, residual))
     return (quantiles * relative * picture).astype(np.float32)
 
 
-def _residuals(scene: RelitScene) -> Floats:
+def residuals_of(scene: RelitScene) -> Floats:
     """[h, w] residual of the material of the triangle that each pixel sees."""
     name = GGX_NORMAL.name if scene.fit == TEXELS else scene.fit
     places = np.searchsorted(scene.result.triangles, scene.surface.triangles)

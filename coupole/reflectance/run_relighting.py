@@ -270,8 +270,8 @@ def best_with_texels(result: RunResult, among: Collection[str] = FITS) -> str:
 
 def _texels_of(result: RunResult, view: ViewSamples, surface: Surface) -> Texels:
     texels = read_view_texels(result, view)
-    of_pixel = np.where(surface.triangle_of_pixel < 0, np.int32(-1), np.int32(0))
-    of_pixel.reshape(-1)[texels.pixels] = np.arange(1, len(texels.pixels) + 1)
+    is_seen = surface.triangle_of_pixel >= 0
+    of_pixel = np.where(is_seen, texels.in_picture(is_seen.shape) + np.int32(1), np.int32(-1))
     values = (texels.normals, texels.kd, texels.ks, texels.alpha, texels.covariance)
     normals, kd, ks, alpha, covariance = (
         np.concatenate([np.zeros_like(rows[:1]), rows]).astype(np.float64) for rows in values

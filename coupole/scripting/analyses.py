@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from coupole.calibration.sources import Sources
     from coupole.heritage.analysis.references import References
     from coupole.reflectance.run_job import RunRequest
+    from coupole.reflectance.texels.texel_forecast import TexelForecast
+    from coupole.reflectance.texels.texel_grid import TexelSize
 
 CalibrationRecord = Record
 AnyPath = str | os.PathLike[str]
@@ -40,21 +42,22 @@ def fit_reflectance(
     mesh: AnyPath | None = None,
     calibrations: Sequence[AnyPath] = (),
     left_out: Sequence[int] = (),
-    texels: bool = False,
+    texels: bool | float = False,
     memory_bytes: int = 2_000_000_000,
     progress: Progress | None = None,
 ) -> Result:
     """Materials of an object from proven frames of its runs, as `coupole reflectance RUN --out OUT` finds them.
 
     `mesh` and `calibrations` (records, or folders of them) replace those of the runs' plans. `left_out` are LEDs
-    that are kept for the check (by default every twelfth). `texels` adds materials of single pixels. A job that
-    was stopped goes on where it was when it is called again.
+    that are kept for the check (by default every twelfth). `texels` adds materials of single pixels, or of texels
+    of a width in mm on the surface. A job that was stopped goes on where it was when it is called again.
 
     Raises InputError: no runs, or records that do not belong to them; StorageError, ChecksumMismatch.
     """
     from coupole.calibration.record import records_named
     from coupole.reflectance.result_pages import run_reflectance_page
     from coupole.reflectance.run_job import RunRequest
+    from coupole.reflectance.texels.texel_grid import TexelSize
     from coupole.scripting.opened_result import open_result
 
     request = RunRequest(
@@ -64,7 +67,8 @@ def fit_reflectance(
         tuple(map(int, left_out)),
         memory_bytes=memory_bytes,
     )
-    fit_runs(request, Path(out), None, progress or _silent, with_texels=texels)
+    size = None if texels is False else TexelSize(None if texels is True else float(texels))
+    fit_runs(request, Path(out), None, progress or _silent, texels=size)
     run_reflectance_page.write(Path(out))
     result = open_result(out)
     assert isinstance(result, Result)
@@ -200,16 +204,31 @@ def compare(
 
 
 def fit_runs(
-    request: RunRequest, out: Path, scheduler: str | None, progress: Progress, *, with_texels: bool
+    request: RunRequest,
+    out: Path,
+    scheduler: str | None,
+    progress: Progress,
+    *,
+    texels: TexelSize | None,
+    tell: Callable[[TexelForecast], None] | None = None,
 ) -> dict[str, Any]:
-    """Make a result, or what of it is missing; return what `result.json` says. Raises as `fit_reflectance`."""
+    """Make a result, or what of it is missing; return what `result.json` says. What texels will take is given to
+    `tell` before the work begins. Raises as `fit_reflectance`."""
     from coupole.reflectance.run_job import reflectance_of
 
+    forecast = None
+    if texels is not None:
+        from coupole.reflectance.texels.texel_forecast import foresee_texels
+
+        forecast = foresee_texels(request, out, texels)
+        if forecast is not None and tell is not None:
+            tell(forecast)
     about = reflectance_of(request, out, scheduler=scheduler, say=progress)
-    if with_texels:
+    if texels is not None:
         from coupole.reflectance.texels.texel_job import add_texels
 
-        about |= {"texels": add_texels(request, out, scheduler=scheduler, say=progress)}
+        about |= {"texels": add_texels(request, out, texels, scheduler=scheduler, say=progress)}
+        about["texels"]["foreseen"] = forecast and forecast.document()
     return about
 
 

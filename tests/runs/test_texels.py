@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,32 +13,26 @@ import numpy as np
 import pytest
 from dask_cluster import cluster
 from lazily import lazily
-from relief_cells import DETAIL, DIFFUSE, RECORDS, Made, glossy_result
+from relief_cells import DIFFUSE, RECORDS, Made, glossy_result
 from scipy.ndimage import gaussian_filter
+from texel_truth import seen_by
 
 from coupole.calibration.record import records_named
 from coupole.reflectance.fits import TEXELS
 from coupole.reflectance.new_light.light_kinds import DistantLight, LedLight
-from coupole.reflectance.new_light.pictured_surface import FreeCamera, pixels_of_places, surface_of_view
+from coupole.reflectance.new_light.pictured_surface import FreeCamera, pixels_of_places
 from coupole.reflectance.relit_uncertainty import uncertainty_of_picture
 from coupole.reflectance.run_job import RunRequest
 from coupole.reflectance.run_pictures import read_check_frames
 from coupole.reflectance.run_relighting import scene_from, scene_of_view
-from coupole.reflectance.run_result import RunResult, ViewSamples
-from coupole.reflectance.texels.pixel_file import ViewTexels, read_view_texels, texel_uncertainty
+from coupole.reflectance.run_result import RunResult
+from coupole.reflectance.texels.pixel_file import read_view_texels, texel_uncertainty
 from coupole.reflectance.texels.texel_job import add_texels
-from sim.scene.surface import Layer
 
 MaterialX: Any = lazily("MaterialX")
 Usd: Any = lazily("pxr.Usd")
 UsdGeom: Any = lazily("pxr.UsdGeom")
 UsdValidation: Any = lazily("pxr.UsdValidation")
-
-FOCUS_MM = 335.0
-FOCAL_PX = 35.0 * FOCUS_MM / (FOCUS_MM - 35.0) / 0.044
-"""Of a lens of 35 mm, focused there, with pixels of 44 um."""
-BLUR_PX = 35.0 / 8.0 * 35.0 / (FOCUS_MM - 35.0) / 0.044
-"""Diameter of the circle of confusion at f/8, for a departure of all of the distance."""
 
 
 @pytest.fixture
@@ -48,63 +42,6 @@ def made(detailed: Made) -> Made:
 
 def request_of(made: Made) -> RunRequest:
     return RunRequest((made[0].run_folder,), None, records_named([made[0].folder / "records"]))
-
-
-def truth_at(result: RunResult, places_mm: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Factor of the paint [n], and normals [n, 3] of the bumps, at places of the base frame: the rig's waves."""
-    waves = np.concatenate([Layer(**layer).waves() for layer in DETAIL])
-    vectors, phase, paint, height = waves[:, :3], *waves[:, 3:].T
-    base_from_support = result.base_from_support
-    local = (places_mm - base_from_support[:3, 3]) @ base_from_support[:3, :3]
-    angle = local @ vectors.T + phase
-    slope = -(np.sin(angle) * height) @ vectors @ base_from_support[:3, :3].T
-    bumpy = normals - slope + np.einsum("nk,nk->n", slope, normals)[:, None] * normals
-    return 1 + np.cos(angle) @ paint, bumpy / np.linalg.norm(bumpy, axis=1, keepdims=True)
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What the texels of a view see: places and normals [n, 3] of the mesh, triangles, paint and normals that are
-    there, means over a pixel and the circle of confusion; and pixels whose neighbours see the same triangle."""
-
-    places_mm: np.ndarray
-    normals: np.ndarray
-    triangle: np.ndarray
-    paint: np.ndarray
-    bumpy: np.ndarray
-    inner: np.ndarray
-
-
-def seen_by(result: RunResult, view: ViewSamples, texels: ViewTexels) -> Seen:
-    surface = surface_of_view(result, view)
-    row, column = np.divmod(texels.pixels, surface.triangle_of_pixel.shape[1])
-    place, triangle = (image[row, column] for image in (surface.places_mm, surface.triangle_of_pixel))
-    normals = surface.normals[triangle]
-    inner = np.ones(len(row), bool)
-    for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-        inner &= surface.triangle_of_pixel[row + down, column + right] == triangle
-    away = place - view.camera_mm
-    distance = np.linalg.norm(away, axis=1)
-    pixel_mm = distance / FOCAL_PX
-    steps = []
-    for axis in range(2):  # along the surface, one pixel to the right and one down
-        beside = surface.places_mm[row + axis, column + 1 - axis] - place
-        across = beside - np.einsum("nk,nk->n", beside, normals)[:, None] * normals
-        steps.append(
-            np.nan_to_num(across * (pixel_mm / np.maximum(np.linalg.norm(across, axis=1), 1e-9))[:, None])
-        )
-    blur_px = np.abs(distance - FOCUS_MM) / distance * BLUR_PX
-    random, paint, bumpy = np.random.default_rng(1), np.zeros(len(row)), np.zeros((len(row), 3))
-    for _ in range(32):
-        angle, radius = (
-            random.uniform(0, 2 * np.pi, len(row)),
-            np.sqrt(random.uniform(size=len(row))) * blur_px / 2,
-        )
-        x, y = random.uniform(-0.5, 0.5, (2, len(row))) + radius * np.stack([np.cos(angle), np.sin(angle)])
-        some = truth_at(result, place + x[:, None] * steps[0] + y[:, None] * steps[1], normals)
-        paint, bumpy = paint + some[0] / 32, bumpy + some[1] / 32
-    bumpy /= np.linalg.norm(bumpy, axis=1, keepdims=True)
-    return Seen(place.astype(float), normals, triangle, paint, bumpy, inner)
 
 
 def test_pictures_of_leds_that_no_fit_has_seen_are_better_than_by_triangles(made: Made) -> None:
@@ -120,7 +57,7 @@ def test_paint_is_found_pixel_by_pixel_and_intervals_hold_most_of_it(made: Made)
     result = RunResult(made[1])
     for view in result.views:
         texels = read_view_texels(result, view)
-        seen = seen_by(result, view, texels)
+        seen = seen_by(result, view, texels.pixels)
         row, column = np.divmod(texels.pixels, 512)
         channel = np.array([[1, 2], [0, 1]])[row % 2, column % 2]
         kd = texels.kd[np.arange(len(row)), channel] * np.pi / np.array(DIFFUSE)[channel]
@@ -138,7 +75,7 @@ def test_normals_show_bumps_that_the_mesh_does_not_have(made: Made) -> None:
     result = RunResult(made[1])
     view = result.views[1]
     texels = read_view_texels(result, view)
-    seen = seen_by(result, view, texels)
+    seen = seen_by(result, view, texels.pixels)
 
     def off_deg(normals: np.ndarray) -> float:
         cosines = np.sum(normals * seen.bumpy, axis=1)[seen.inner]

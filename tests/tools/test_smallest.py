@@ -87,6 +87,7 @@ RUNS = (
     Run("prove_reflectance.py --smallest", r"3 cells: ", full=True),
     Run("prove_registration.py --smallest", r"12 placed, 0 not", full=True),
     Run("prove_suggested_plans.py --smallest", r"relief +glossy.* = \d\.\d", full=True),
+    Run("prove_texels.py --smallest", r"\| 1\.6 \| \d{4} \(\d{4}\) \| \d\.\d %, ", full=True),
     Run("replay_plans.py --smallest", r'"plans": 1, ', full=True),
     Run("soak.py --smallest --keep {keep}", r"mislabelled +0", full=True),
     Run("where_seconds_go.py tests/acquisition/test_attention.py", r"accounted for\n", full=True),

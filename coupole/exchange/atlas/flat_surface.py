@@ -97,8 +97,8 @@ class FlatSurface:
 
 
 def flatten(surface: MeasuredSurface) -> FlatSurface:
-    """Lay a surface out in maps. Texels are as wide as its options say; or as what neighbouring pixels of the
-    finest view see, or as a map of the width that they allow.
+    """Lay a surface out in maps. Texels are as wide as its options say; or as those that were made in
+    the finest view, or as a map of the width that they allow.
 
     Raises InputError if the maps would be wider than the options say, or than `MOST_SIDE_PX`, or if nothing has a
     material.
@@ -169,9 +169,9 @@ def _seen_there(
 
 
 def _finest_mm(views: list[TexelView], corners_mm: Floats) -> float:
-    """Distance of places that neighbouring pixels see, in the finest view; of triangles, half their edge."""
+    """Width of texels in the finest view, as they were made; of triangles, half their edge."""
     if views:
-        return min(view.step_mm for view in views)
+        return min(view.texel_mm for view in views)
     return float(np.median(np.linalg.norm(corners_mm[:, 1] - corners_mm[:, 0], axis=1))) / 2.0
 
 

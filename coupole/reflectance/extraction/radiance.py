@@ -101,7 +101,7 @@ class SignalReader:
         """[triangles, channels] relative standard uncertainty that all means share, of pixels' responses."""
         starts = np.concatenate([[0], np.cumsum(self.pixels.ravel(), dtype=np.int64)])
         places = np.empty(starts[-1], np.int32)
-        _list(surface.places, radiometry.channel, starts[:-1].copy(), places)
+        _list(surface.places, radiometry.channel, channels, starts[:-1].copy(), places)
         self.lists = PixelLists(starts, places, np.float32(1.0) / radiometry.flat.ravel()[places])
         scale = radiometry.curve[:, 2:]
         curve = radiometry.curve[:, :2] / np.hstack([scale, scale**2])
@@ -174,9 +174,8 @@ def _count(triangle, channel, pixels):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _list(triangle, channel, next_place, places):  # type: ignore[no-untyped-def]
+def _list(triangle, channel, channels, next_place, places):  # type: ignore[no-untyped-def]
     """Fill `places` with the numbers of pixels; `next_place` [triangles channels] is where a list goes on."""
-    channels = len(next_place) // (triangle.max() + 1) if len(places) else 1
     width = triangle.shape[1]
     for row in range(triangle.shape[0]):
         for column in range(width):

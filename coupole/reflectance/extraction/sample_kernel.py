@@ -97,9 +97,12 @@ def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normal
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def fill_pixels(first_entry, entry_ends, lists, response, darks, shots, lamps, places_mm, codes, direct, values):  # type: ignore[no-untyped-def]
+def fill_pixels(  # type: ignore[no-untyped-def]
+    first_entry, entry_ends, lists, response, darks, shots, lamps, places_mm, codes, direct, values, root_share
+):
     """Fill `values` [pixels, leds], bits of float16, with S / (P E/Phi) of single pixels, 1/sr: f times the cosine
-    of incidence, whatever the normal is; higher by what the mean of their square roots loses by noise.
+    of incidence, whatever the normal is; higher by the share `root_share` (float32) of what the mean of their
+    square roots loses by noise.
 
     The pixels are those of the lists from the `first_entry` on, up to `entry_ends` [b, channels] of each of b
     triangles; `places_mm` [pixels, 3] is what they see, `codes` [b, 8] says where light has reached the triangle,
@@ -120,7 +123,7 @@ def fill_pixels(first_entry, entry_ends, lists, response, darks, shots, lamps, p
             share = if_less(off, np.float32(0.5), load_row(straight, 0), _NAN) / load_row(lamps.powers, channel)
             while pixel < end:
                 signal, u_signal, _ = _signal(pixel, pixel + 1, channel, lists, response, darks, shots)
-                signal = signal + absolute(signal) * _lost_by_root(u_signal)
+                signal = signal + absolute(signal) * _lost_by_root(u_signal) * root_share
                 value = signal * share * _per_normal_irradiance(places_mm[pixel - first_entry], lamps)
                 store_halves(if_less(absolute(value), np.float32(MOST_F), value, _NAN), bits)
                 for led in range(values.shape[1]):

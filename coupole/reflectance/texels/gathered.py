@@ -54,6 +54,8 @@ class TexelView:
     """[h, w] -1 for none."""
     step_mm: float
     """Median distance of what neighbouring pixels see."""
+    texel_mm: float
+    """Width of its texels on the surface."""
     u_common: float
     """Relative standard uncertainty of kd and ks that covariances do not have: of responses, and of the LEDs'
     power."""
@@ -88,11 +90,11 @@ def gather(views: Sequence[TexelView], places_mm: NDArray[np.floating]) -> Gathe
 
 def _open_view(result: RunResult, view: ViewSamples) -> TexelView:
     texels, surface = read_view_texels(result, view), surface_of_view(result, view)
-    texel_of_pixel = np.full(surface.triangle_of_pixel.shape, -1, np.int32)
-    texel_of_pixel.reshape(-1)[texels.pixels] = np.arange(len(texels.pixels))
+    texel_of_pixel = texels.in_picture(surface.triangle_of_pixel.shape)
     steps = np.linalg.norm(surface.places_mm[:, 1:] - surface.places_mm[:, :-1], axis=2)
     u_common = math.hypot(*texel_uncertainty(result, view))
-    return TexelView(texels, surface, texel_of_pixel, float(np.nanmedian(steps)), u_common)
+    step_mm = float(np.nanmedian(steps))
+    return TexelView(texels, surface, texel_of_pixel, step_mm, step_mm * texels.side_px, u_common)
 
 
 def _by_columns(of_unknowns: Floats, channels: int) -> Floats:

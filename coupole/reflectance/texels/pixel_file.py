@@ -1,8 +1,9 @@
-"""Files `texels/VIEW.h5` of a result folder: materials of a view's pixels; docs/reference/result-folder.md."""
+"""Files `texels/VIEW.h5` of a result folder: materials of a view's pixels, or of texels of several pixels;
+docs/reference/result-folder.md."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.intake.plain_data import read_json
 from coupole.reflectance.run_result import RunResult, ViewSamples
+from coupole.reflectance.texels.texel_grid import TexelSize
 
 FOLDER, ABOUT = "texels", "texels.json"
 Singles = NDArray[np.float32]
@@ -26,14 +28,24 @@ _TOLD = {
     "covariance": "lower half, row by row, of tilts (rad) along two tangents of the normal and of the logarithms "
     "of kd, ks (of the pixel's own channel) and alpha; without u_pixel and u_shared",
 }
+_TOLD_OF_SEVERAL = _TOLD | {
+    "pixels": "places in the picture, row by row, of each texel's first pixel",
+    "kd": "1/sr, by channel; all were measured",
+    "covariance": "lower half, row by row, of tilts (rad) along two tangents of the normal and of the logarithms "
+    "of kd, ks (the channels' mean) and alpha; without u_pixel and u_shared",
+}
+_ASKED, _SIDE, _PIXEL = "texel_mm", "side_px", "pixel_mm"
+"""Attributes of files of texels of a size that was asked for."""
+_OF_PIXEL = "texel_of_pixel"
 
 
 @dataclass(frozen=True)
 class ViewTexels:
-    """Materials of n pixels of a view."""
+    """Materials of n texels of a view: of single pixels, or of squares of them."""
 
     pixels: NDArray[np.int32]
-    """[n] places in the picture, row by row, rising."""
+    """[n] places in the picture, row by row, rising; of squares the first pixel of each, in the order of the
+    squares."""
     normals: Singles
     """[n, 3] unit, base frame."""
     kd: Singles
@@ -42,31 +54,61 @@ class ViewTexels:
     alpha: Singles
     covariance: Singles
     """[n, 15] as `fits/*.h5` have it."""
+    texel_of_pixel: NDArray[np.int32] | None = None
+    """[h, w] which of them a pixel belongs to, -1 for none; None for single pixels."""
+    side_px: int = 1
+    """Pixels across a texel."""
+
+    def in_picture(self, shape: tuple[int, ...]) -> NDArray[np.int32]:
+        """[h, w] which of the texels a pixel belongs to; -1 for none."""
+        if self.texel_of_pixel is not None:
+            return self.texel_of_pixel
+        number = np.full(shape, -1, np.int32)
+        number.reshape(-1)[self.pixels] = np.arange(len(self.pixels))
+        return number
+
+
+@dataclass(frozen=True)
+class TexelFileHead:
+    """Head of a file of texels: all that it says beside them."""
+
+    view: str
+    size_px: tuple[int, int]
+    """Width and height of its pictures."""
+    asked_size: TexelSize
+    pixel_mm: float
+    """Width of a pixel on the surface."""
+    u_pixel: NDArray[np.float64]
+    """[channels] relative standard uncertainty of kd and ks, of the responses of a texel's pixels."""
+    u_shared: float
+    """The same, of the power of all LEDs."""
+    is_simulated: bool
 
 
 def texels_path(result: RunResult, view: ViewSamples) -> Path:
     return result.folder / FOLDER / view.path.name
 
 
-def write_view_texels(
-    path: Path,
-    texels: ViewTexels,
-    view: str,
-    size_px: tuple[int, int],
-    u_pixel: NDArray[np.float64],
-    u_shared: float,
-    *,
-    simulated: bool,
-) -> None:
-    """Write the pixels of a view whose pictures are `size_px` wide and high. `u_pixel` [channels] and `u_shared`
-    are relative standard uncertainties of kd and ks: of single pixels' responses, and of the power of all LEDs."""
+def write_view_texels(path: Path, texels: ViewTexels, head: TexelFileHead) -> None:
+    """Write the texels of a view."""
+    is_of_several = texels.texel_of_pixel is not None
     with h5py.File(path, "w") as file:
-        file.attrs["view"], file.attrs["size_px"], file.attrs["frame"] = view, size_px, "base of the robot"
-        file.attrs["simulated"] = simulated
-        for name, description in _TOLD.items():
+        file.attrs["view"], file.attrs["size_px"] = head.view, head.size_px
+        file.attrs["frame"], file.attrs["simulated"] = "base of the robot", head.is_simulated
+        if head.asked_size.mm is not None:
+            file.attrs[_ASKED], file.attrs[_SIDE] = head.asked_size.mm, texels.side_px
+            file.attrs[_PIXEL] = head.pixel_mm
+        for name, description in (_TOLD_OF_SEVERAL if is_of_several else _TOLD).items():
             _dataset(file, name, getattr(texels, name), description)
-        _dataset(file, "u_pixel", u_pixel, "relative standard uncertainty of kd and ks, of a pixel's own response")
-        _dataset(file, "u_shared", u_shared, "the same, of the power of all LEDs")
+        if is_of_several:
+            numbers = file.create_dataset(
+                _OF_PIXEL, data=texels.texel_of_pixel, compression="gzip", shuffle=True, track_times=False
+            )
+            numbers.attrs["told"] = "[h, w] which of the texels a pixel belongs to, -1 for none"
+        of_pixel = "relative standard uncertainty of kd and ks, of a pixel's own response"
+        of_several = "relative standard uncertainty of kd and ks, of the responses of a texel's pixels"
+        _dataset(file, "u_pixel", head.u_pixel, of_several if is_of_several else of_pixel)
+        _dataset(file, "u_shared", head.u_shared, "the same, of the power of all LEDs")
 
 
 def _dataset(file: h5py.File, name: str, values: Any, description: str) -> None:
@@ -97,7 +139,29 @@ def read_view_texels(result: RunResult, view: ViewSamples) -> ViewTexels:
     if not path.exists():
         raise _none_of(result, f" of the view {view.view}")
     with h5py.File(path, "r") as file:
-        return ViewTexels(*(file[name][()] for name in _TOLD))
+        numbers = file[_OF_PIXEL][()] if _OF_PIXEL in file else None
+        texels = ViewTexels(*(file[name][()] for name in _TOLD))
+        return replace(texels, texel_of_pixel=numbers, side_px=int(file.attrs.get(_SIDE, 1)))
+
+
+def size_of_texels(folder: Path) -> TexelSize | None:
+    """Return the size that the texels of a result folder were asked for with; None without texels."""
+    path = next(iter(sorted((folder / FOLDER).glob("*.h5"))), None)
+    if path is None:
+        return None
+    with h5py.File(path, "r") as file:
+        return TexelSize(float(file.attrs[_ASKED]) if _ASKED in file.attrs else None)
+
+
+def refuse_other_size(folder: Path, size: TexelSize) -> None:
+    """Raise InputError if a result folder has texels that were asked for with another size."""
+    there = size_of_texels(folder)
+    if there is not None and there != size:
+        raise InputError(
+            f"--texels {size.text}: {folder} has texels of {there.in_words} already. `--texels {there.text}` goes "
+            f"on with them. To have the others instead, move the folder {folder / FOLDER} away: nothing else is "
+            "made again"
+        )
 
 
 def read_texel_errors(folder: Path) -> dict[str, float | None]:
@@ -107,6 +171,13 @@ def read_texel_errors(folder: Path) -> dict[str, float | None]:
         return {}
     mae: dict[str, float | None] = read_json(path, allow_nan=True)["mae"]
     return mae
+
+
+def read_texel_widening(folder: Path) -> dict[str, Any] | None:
+    """Widths of texels' intervals that the check found, as `result.json` has them of fits; None without."""
+    path = folder / FOLDER / ABOUT
+    widening: dict[str, Any] | None = read_json(path, allow_nan=True).get("widening") if path.exists() else None
+    return widening
 
 
 def texel_uncertainty(result: RunResult, view: ViewSamples) -> tuple[float, float]:

@@ -6,11 +6,9 @@ larger memory means fewer readings, not another result.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any
 
 import h5py
 import numpy as np
@@ -18,14 +16,14 @@ from numpy.typing import NDArray
 
 from coupole.reflectance.extraction.extraction import Geometry
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
-from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
+from coupole.reflectance.extraction.radiance import Radiometry, Response, SignalReader
 from coupole.reflectance.extraction.sample_codes import AWAY
-from coupole.reflectance.extraction.sample_kernel import NO_VALUE, fill_pixels
+from coupole.reflectance.extraction.sample_kernel import NO_VALUE, Lamps, Shots, fill_pixels
 from coupole.reflectance.extraction.seen_surface import SeenSurface
 from coupole.reflectance.extraction.view_samples import ViewPass
 from coupole.reflectance.lanes import LANES
-from coupole.reflectance.new_light.pictured_surface import surface_of_view
-from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples
+from coupole.reflectance.new_light.pictured_surface import Surface
+from coupole.reflectance.run_result import INTER_REFLECTION, ViewSamples
 
 _TRIANGLES = 512
 """Triangles whose pixels a thread fills in one go."""
@@ -57,10 +55,9 @@ class PixelReader:
         geometry: Geometry,
         radiometry: Radiometry,
         view: MeasuredView,
-        result: RunResult,
+        surface: Surface,
         samples: ViewSamples,
     ) -> None:
-        surface = surface_of_view(result, samples)
         self._samples = samples
         self.triangle_of_pixel = surface.triangle_of_pixel
         """[h, w] row of the view's file of what a pixel sees; -1 for none."""
@@ -102,35 +99,47 @@ class PixelReader:
         batches = self._pass.batches()
         with closing(batches), ThreadPoolExecutor(threads) as pool, h5py.File(self._samples.path, "r") as file:
             for part, batch in zip(self._pass.parts, batches, strict=True):
-                codes, direct = _light_of(file, rows, part, channels)
-                blocks = _parts_of(rows)
-
-                def fill(
-                    some: slice,
-                    part: slice = part,
-                    batch: tuple[Any, Any] = batch,
-                    codes: NDArray[np.uint8] = codes,
-                    direct: NDArray[np.float32] = direct,
-                ) -> None:
-                    begin = int(lists.starts[some.start * channels])
-                    ends = lists.starts[some.start * channels + 1 : some.stop * channels + 1]
-                    of_rows = slice(some.start - rows.start, some.stop - rows.start)
-                    of_pixels = slice(begin - first, int(ends[-1]) - first)
-                    fill_pixels(
-                        begin, ends.reshape(-1, channels), lists, self._response, self._reader.darks, *batch,
-                        places_mm[of_pixels], codes[of_rows], direct[of_rows], values[of_pixels, part],
-                    )  # fmt: skip
-
-                list(pool.map(fill, blocks))
+                light = light_of(file, rows, part, channels)
+                fill_rows(
+                    pool, rows, self._reader, self._response, batch, places_mm, light, values[:, part],
+                    np.float32(1.0),
+                )  # fmt: skip
         return PixelBlock(pixels, triangle, channel, places_mm, values.view(np.float16))
 
 
-def _parts_of(rows: slice) -> Iterator[slice]:
-    for first in range(rows.start, rows.stop, _TRIANGLES):
-        yield slice(first, min(first + _TRIANGLES, rows.stop))
+def fill_rows(
+    pool: ThreadPoolExecutor,
+    rows: slice,
+    reader: SignalReader,
+    response: Response,
+    batch: tuple[Shots, Lamps],
+    places_mm: NDArray[np.float32],
+    light: tuple[NDArray[np.uint8], NDArray[np.float32]],
+    values: NDArray[np.uint16],
+    root_share: np.float32,
+) -> None:
+    """Fill `values` [pixels, leds] of the pixels of some rows, which see `places_mm` [pixels, 3], from the frames
+    of some LEDs, whose `light` has reached the rows (`light_of`). `root_share` is the share of what noise takes
+    from square roots that is given back: 1 if each pixel is fitted by itself."""
+    lists, (codes, direct) = reader.lists, light
+    channels = reader.pixels.shape[1]
+    first = int(lists.starts[rows.start * channels])
+
+    def fill(some: slice) -> None:
+        begin = int(lists.starts[some.start * channels])
+        ends = lists.starts[some.start * channels + 1 : some.stop * channels + 1]
+        of_rows = slice(some.start - rows.start, some.stop - rows.start)
+        of_pixels = slice(begin - first, int(ends[-1]) - first)
+        fill_pixels(
+            begin, ends.reshape(-1, channels), lists, response, reader.darks, *batch, places_mm[of_pixels],
+            codes[of_rows], direct[of_rows], values[of_pixels], root_share,
+        )  # fmt: skip
+
+    starts = range(rows.start, rows.stop, _TRIANGLES)
+    list(pool.map(fill, [slice(first_row, min(first_row + _TRIANGLES, rows.stop)) for first_row in starts]))
 
 
-def _light_of(
+def light_of(
     file: h5py.File, rows: slice, part: slice, channels: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Codes [b, 8] of some triangles and LEDs, and the share [b, leds, channels] of light that came straight."""

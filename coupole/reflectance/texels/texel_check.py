@@ -7,7 +7,7 @@ where both have a value: light from surface to surface is taken off the frames, 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import h5py
@@ -17,15 +17,21 @@ from numpy.typing import NDArray
 from coupole.reflectance.block_work import Said, silent
 from coupole.reflectance.fits import FITS, TEXELS
 from coupole.reflectance.new_light.light_kinds import LedLight
+from coupole.reflectance.relit_uncertainty import uncertainty_of_picture
 from coupole.reflectance.result_folder import read_settings
 from coupole.reflectance.run_check import PEAK_QUANTILE
+from coupole.reflectance.run_intervals import WideningSamples, residuals_of
 from coupole.reflectance.run_pictures import read_check_frames
 from coupole.reflectance.run_relighting import best_fit, scene_of_view
 from coupole.reflectance.run_result import FRAMES, RunResult, ViewSamples
-from coupole.reflectance.texels.pixel_file import ABOUT, FOLDER, read_view_texels
+from coupole.reflectance.texels.pixel_file import ABOUT, FOLDER, read_view_texels, size_of_texels
 from coupole.storage.durable import write_synced
 
 SCHEMA = "coupole-texels/1"
+WIDENED_BY_EVERY = 2
+"""LEDs in whose pictures the widths of intervals are found: one in so many of those that were left out."""
+_MOST_SAMPLES = 200_000
+"""Pixels and channels of a picture that are used for them."""
 _BLOCK_BYTES = 500_000_000
 """Memory for shares of light that are read together."""
 Singles = NDArray[np.float32]
@@ -38,7 +44,8 @@ def check_texels(result: RunResult, say: Said = silent) -> dict[str, Any]:
     misses: dict[str, list[NDArray[np.float64]]] = {TEXELS: [], triangle_fit: []}
     measured_parts: list[Singles] = []
     for number, view in enumerate(result.views, start=1):
-        for measured_picture, pictures in _pictures(result, view, (TEXELS, triangle_fit)):
+        makers = {name: picture_maker(result, view, name) for name in (TEXELS, triangle_fit)}
+        for measured_picture, pictures in held_out_pictures(result, view, makers):
             has_both = np.isfinite(measured_picture) & np.logical_and.reduce(
                 [picture > 0.0 for picture in pictures.values()]
             )
@@ -56,6 +63,11 @@ def check_texels(result: RunResult, say: Said = silent) -> dict[str, Any]:
         "mae": {name: _mean(parts, 0) for name, parts in misses.items()},
         "held_out_psnr_db": {name: _psnr_db(parts, peak) for name, parts in misses.items()},
     }
+    about["widening"] = texel_widening(result, say)
+    size = size_of_texels(result.folder)
+    if size is not None and size.mm is not None:
+        about["asked_mm"] = size.mm
+        about["side_px"] = {view.view: read_view_texels(result, view).side_px for view in result.views}
     write_synced(result.folder / FOLDER / ABOUT, json.dumps(about, indent=1) + "\n")
     return about
 
@@ -70,25 +82,65 @@ def _psnr_db(parts: list[NDArray[np.float64]], peak: float) -> float | None:
     return None if not square else float(10.0 * np.log10(peak**2 / square))
 
 
-def _pictures(
-    result: RunResult, view: ViewSamples, names: tuple[str, ...]
+def texel_widening(result: RunResult, say: Said = silent) -> dict[str, Any] | None:
+    """Quantiles of the errors of pictures over their stated uncertainty, as `result.json` has them of fits, from
+    every second LED that was left out; None from too few pixels."""
+    samples = WideningSamples()
+    for number, view in enumerate(result.views, start=1):
+        _add_errors(samples, result, view)
+        say("widths of intervals", number, len(result.views))
+    return samples.widening()
+
+
+def _add_errors(samples: WideningSamples, result: RunResult, view: ViewSamples) -> None:
+    """Add the errors of a view's pictures."""
+    scene = scene_of_view(result, view.view, TEXELS)
+    residuals = np.nan_to_num(residuals_of(scene))[..., None].repeat(result.channels, axis=2).astype(np.float32)
+    makers: dict[str, Callable[[int], Singles]] = {
+        "picture": lambda led: scene.picture([LedLight(number=led)]),
+        "uncertainty": lambda led: uncertainty_of_picture(scene, [LedLight(number=led)]),
+        "residual": lambda _: residuals,
+        "led": lambda led: np.full(residuals.shape, led, np.float32),
+    }
+    for measured_picture, pictures in held_out_pictures(result, view, makers, every=WIDENED_BY_EVERY):
+        has_all = np.isfinite(measured_picture) & (pictures["picture"] > 0.0) & (pictures["uncertainty"] > 0.0)
+        places = np.flatnonzero(has_all)
+        places = places[:: 1 + len(places) // _MOST_SAMPLES]
+        measured_values = measured_picture.ravel()[places].astype(np.float64)
+        values, u_values, residual, leds = (
+            image.ravel()[places].astype(np.float64) for image in pictures.values()
+        )
+        samples.ratios.append(np.abs(measured_values - values) / u_values)
+        samples.relative.append(u_values / values)
+        samples.residual.append(residual)
+        samples.leds.append(leds.astype(np.int64))
+
+
+def held_out_pictures(
+    result: RunResult, view: ViewSamples, makers: Mapping[str, Callable[[int], Singles]], *, every: int = 1
 ) -> Iterator[tuple[Singles, dict[str, Singles]]]:
-    """Pictures of each LED that was kept for the check: the measured one [h / 2, w / 2, channels] in shares of the
-    camera's range, and those that fits make."""
+    """Pictures of each LED that was kept for the check, or of one in so many: the measured one [h / 2, w / 2,
+    channels] in shares of the camera's range, and those that `makers` make [h, w, channels] of an LED, by their
+    names."""
     frames = read_check_frames(result, view)
-    scenes = {name: scene_of_view(result, view.view, name) for name in names}
     with h5py.File(result.folder / FRAMES / view.path.name, "r") as file:
         offsets = file["offsets"][()]
     is_checked = np.isin(view.leds, frames.leds)
     blocks = [result.direct_shares(view, rows, is_checked) for rows in result.view_blocks(view, _BLOCK_BYTES)]
     direct = dict(zip(view.leds[is_checked], np.concatenate(blocks).swapaxes(0, 1), strict=True))
-    for number, led in enumerate(frames.leds):
+    for number, led in list(enumerate(frames.leds))[::every]:
         measured_picture = frames.share[number].astype(np.float32) * frames.picture(direct[led])
-        pictures = {name: scene.picture([LedLight(number=int(led))]) for name, scene in scenes.items()}
+        pictures = {name: make(int(led)) for name, make in makers.items()}
         yield (
             measured_picture,
             {name: _of_blocks(picture, offsets, measured_picture.shape) for name, picture in pictures.items()},
         )
+
+
+def picture_maker(result: RunResult, view: ViewSamples, fit: str) -> Callable[[int], Singles]:
+    """Return a function that makes a view's picture by a fit under an LED."""
+    scene = scene_of_view(result, view.view, fit)
+    return lambda led: scene.picture([LedLight(number=led)])
 
 
 def _of_blocks(picture: Singles, offsets: NDArray[np.int64], shape: tuple[int, ...]) -> Singles:

@@ -1,5 +1,5 @@
-"""Job that adds materials of single pixels to a result of runs, view by view, and compares them with pictures of
-LEDs that were kept for the check.
+"""Job that adds materials of texels (single pixels, or squares of them) to a result of runs, view by view, and
+compares them with pictures of LEDs that were kept for the check.
 
 Each view's texels are a file of their own, whole or not there; a job that was killed goes on with the first that
 is missing.
@@ -15,8 +15,11 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import numpy as np
+
 from coupole.errors import InputError
 from coupole.reflectance.block_work import Said, Workshop, silent, workshop
+from coupole.reflectance.new_light.pictured_surface import surface_of_view
 from coupole.reflectance.result_folder import SETTINGS, clear_remains, complete, read_settings
 from coupole.reflectance.run_job import (
     RunRequest,
@@ -28,9 +31,17 @@ from coupole.reflectance.run_job import (
     view_file_name,
 )
 from coupole.reflectance.run_result import RunResult
-from coupole.reflectance.texels.pixel_file import texels_path, write_view_texels
+from coupole.reflectance.texels.grid_fit import texels_of_grid
+from coupole.reflectance.texels.pixel_file import (
+    TexelFileHead,
+    refuse_other_size,
+    texels_path,
+    write_view_texels,
+)
 from coupole.reflectance.texels.pixel_values import PixelReader
 from coupole.reflectance.texels.texel_check import check_texels
+from coupole.reflectance.texels.texel_grid import TexelSize, pixel_mm, texel_grid
+from coupole.reflectance.texels.texel_values import TexelReader
 from coupole.reflectance.texels.view_texels import texels_of_view
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import make_folder
@@ -48,18 +59,25 @@ class _View:
     out: Path
     left_out: tuple[int, ...]
     memory_bytes: int
+    size: TexelSize
 
 
 def add_texels(
-    request: RunRequest, out: Path, *, scheduler: str | None = None, say: Said = silent
+    request: RunRequest,
+    out: Path,
+    size: TexelSize | None = None,
+    *,
+    scheduler: str | None = None,
+    say: Said = silent,
 ) -> dict[str, Any]:
-    """Make the texels that a whole result lacks, in the workers of a `scheduler` if one is named; returns what
-    `texels/texels.json` says.
+    """Make the texels of a `size` (without one: single pixels) that a whole result lacks, in the workers of a
+    `scheduler` if one is named; returns what `texels/texels.json` says.
 
-    Raises InputError: a result that is not whole or is that of another request, a scheduler that does not answer;
-    StorageError if a frame is damaged or the disk takes nothing.
+    Raises InputError: a result that is not whole or is that of another request, or has texels of another size, a
+    scheduler that does not answer; StorageError if a frame is damaged or the disk takes nothing.
     """
-    token = uuid4().hex
+    token, size = uuid4().hex, size or TexelSize()
+    refuse_other_size(out, size)
     measured_runs = read_runs(request, token)
     settings = read_settings(out)
     try:
@@ -70,7 +88,7 @@ def add_texels(
         tasks = [
             _View(
                 run.resolve(), view.name, view_file_name(measured_runs, measured_run, view), out.resolve(),
-                tuple(settings["left_out"]), request.memory_bytes,
+                tuple(settings["left_out"]), request.memory_bytes, size,
             )
             for run, measured_run in zip(request.runs, measured_runs, strict=True)
             for view in measured_run.views
@@ -102,16 +120,22 @@ def _texels_of_one(token: str, sources: Sources, threads: int | None, say: Said,
     view = next(view for view in measured_run.views if view.name == task.view)
     result = RunResult(task.out)
     samples = next(samples for samples in result.views if samples.path.stem == task.name)
-    reader = PixelReader(measured_run, geometry, radiometry, view, result, samples)
-    texels = texels_of_view(
-        result, samples, reader, task.left_out, task.memory_bytes,
-        threads or len(os.sched_getaffinity(0)), lambda count, of: say(f"texels of {task.view}", count, of),
+    surface = surface_of_view(result, samples)
+    width_mm = pixel_mm(surface)
+    side_px = task.size.side_px(width_mm)
+    fit_with = (
+        task.left_out, task.memory_bytes, threads or len(os.sched_getaffinity(0)),
+        lambda count, of: say(f"texels of {task.view}", count, of),
     )  # fmt: skip
-
-    def write(path: Path) -> None:
-        write_view_texels(
-            path, texels, samples.view, measured_run.frames.size_px, radiometry.u_pixel, result.u_shared,
-            simulated=measured_run.run.is_simulated,
-        )  # fmt: skip
-
-    complete(texels_path(result, samples), write)
+    of_run, u_pixel = (measured_run, geometry, radiometry, view), radiometry.u_pixel
+    if side_px == 1:
+        texels = texels_of_view(result, samples, PixelReader(*of_run, surface, samples), *fit_with)
+    else:
+        reader = TexelReader(*of_run, surface, samples, texel_grid(surface, side_px))
+        texels = texels_of_grid(result, samples, reader, *fit_with)
+        u_pixel = u_pixel / np.sqrt(reader.pixels_of_channels)
+    head = TexelFileHead(
+        samples.view, measured_run.frames.size_px, task.size, width_mm, u_pixel, result.u_shared,
+        measured_run.run.is_simulated,
+    )  # fmt: skip
+    complete(texels_path(result, samples), lambda path: write_view_texels(path, texels, head))

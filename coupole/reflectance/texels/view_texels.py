@@ -7,51 +7,82 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.fits import GGX_NORMAL
 from coupole.reflectance.ggx import UNKNOWNS
-from coupole.reflectance.material_uncertainty import groups_of_leds
 from coupole.reflectance.normal_fit import LEAST_ALPHA
-from coupole.reflectance.run_result import (
-    INTER_REFLECTION,
-    VARIANCES,
-    RunResult,
-    ViewSamples,
-    u_inter_reflection,
-)
+from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples
 from coupole.reflectance.texels.mosaic import all_channels
-from coupole.reflectance.texels.neighbours import (
-    TRIANGLES_AROUND,
-    WINDOW_PX,
-    lower_half,
-    mean_around,
-    settle,
-    settle_colours,
-    settle_triangles,
-    tilts_from,
-)
+from coupole.reflectance.texels.neighbours import lower_half, settle, tilts_from
 from coupole.reflectance.texels.pixel_file import ViewTexels
-from coupole.reflectance.texels.pixel_fit import LEAST_KS, LOG_ALPHA, LOG_KS, TILT, Lights, Prior, fit_pixels
-from coupole.reflectance.texels.pixel_values import PixelBlock, PixelReader
-from coupole.reflectance.triangle_fit import LEAST_KD, MOST_KS, turned_normals
+from coupole.reflectance.texels.pixel_fit import PixelMaterials, Prior, fit_pixels
+from coupole.reflectance.texels.pixel_values import PixelReader
+from coupole.reflectance.texels.view_centres import (
+    ALPHA,
+    KD,
+    KS,
+    MOST_KD,
+    MOST_VARIANCE,
+    Centres,
+    centres_of,
+    lights_of,
+    u_of_inter_reflection,
+)
+from coupole.reflectance.triangle_fit import MOST_KS, turned_normals
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Say = Callable[[int, int], None]
-_KD, _KS, _ALPHA = 2, 3, 4
 MOST_OFF = 5.0
 """Largest deviation from a triangle, of logarithms: farther away are fits that ran off."""
-MOST_KD = 1.0
-"""1/sr: three times that of white, for strong light from other surfaces. A fit with more ran off."""
-MOST_VARIANCE = np.square([TILT, TILT, 1.0, LOG_KS, LOG_ALPHA]) * 4.0
-"""Largest variances of a fit that says anything: beyond the prior's."""
 _ALIKE = 1e-3
 """Variance of logarithms below which pixels are equally certain of colours."""
-_ROWS = 1 << 12
-"""Triangles whose inter-reflection is read together."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Fits of a view's texels [h, w], as they come block by block."""
+
+    normals: Singles
+    """[h, w, 3]"""
+    deviation: Singles
+    """[h, w, 5] from the centres: tilts, logarithms."""
+    covariance: Singles
+    """[h, w, 15]"""
+    is_fitted: NDArray[np.bool_]
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...]) -> Fitted:
+        normals = np.full((*shape, 3), np.nan, np.float32)
+        deviation = np.full((*shape, UNKNOWNS), np.nan, np.float32)
+        return cls(normals, deviation, np.empty((*shape, 15), np.float32), np.zeros(shape, np.bool_))
+
+    def add(self, places: NDArray[np.integer], prior: Prior, fit: PixelMaterials) -> None:
+        """Take the fits at places [n], row by row, which began at `prior`; those that ran off do not count."""
+        off = np.empty((len(places), UNKNOWNS))
+        tilts_from(fit.normals, prior.normals, off[:, :2])
+        off[:, 2:] = fit.logs - np.log(np.stack([prior.kd, prior.ks, prior.alpha], axis=1))
+        at = np.unravel_index(places, self.is_fitted.shape)
+        self.normals[at], self.deviation[at] = fit.normals, off
+        self.covariance[at] = lower_half(fit.covariance)
+        self.is_fitted[at] = (
+            (np.abs(off) < MOST_OFF).all(axis=1)
+            & (fit.logs[:, 0] < math.log(MOST_KD))
+            & (self.covariance[at][:, VARIANCES] < MOST_VARIANCE).all(axis=1)
+        )
+
+    def settle(self, view: ViewSamples, centres: Centres, triangle: NDArray[np.int32]) -> Singles:
+        """Let the neighbours have their word, and add what inter-reflection makes uncertain by the `triangle`
+        [h, w] of each; return the normals [fitted, 3] of those that are fitted."""
+        is_fitted = self.is_fitted
+        before = self.deviation[is_fitted][:, :2]
+        settle(self.deviation, self.covariance, is_fitted, centres.covariance)
+        self.covariance[is_fitted, VARIANCES[KD]] += u_of_inter_reflection(view)[triangle[is_fitted]] ** 2
+        normals = turned_normals(
+            self.normals[is_fitted].astype(np.float64), self.deviation[is_fitted][:, :2] - before
+        )
+        return np.asarray(normals, np.float32)
 
 
 def texels_of_view(
@@ -65,113 +96,43 @@ def texels_of_view(
 ) -> ViewTexels:
     """Fit all pixels of a view, under its LEDs but those `left_out`; frames are read once for each part of the
     pixels whose values fit into the memory. Raises StorageError for a damaged frame."""
-    centres = _centres_of(result, view, reader.triangle_of_pixel, reader.mesh_normals)
-    lights = _lights(result, view, left_out)
+    centres = centres_of(result, view, reader.triangle_of_pixel, reader.mesh_normals)
+    lights = lights_of(result, view, left_out)
     shape = reader.triangle_of_pixel.shape
     channel = np.zeros(shape, np.int8)
-    normals = np.full((*shape, 3), np.nan, np.float32)
-    deviation, covariance = np.full((*shape, UNKNOWNS), np.nan, np.float32), np.empty_like(centres.covariance)
-    is_fitted, count = np.zeros(shape, np.bool_), 0
+    fits, count = Fitted.empty(shape), 0
     for rows in reader.blocks(memory_bytes):
         block = reader.read_block(rows, threads)
         prior = centres.prior(block)
-        fit = fit_pixels(block.values, block.places_mm, lights, prior, threads)
-        off = np.empty((len(block.pixels), UNKNOWNS))
-        tilts_from(fit.normals, prior.normals, off[:, :2])
-        off[:, 2:] = fit.logs - np.log(np.stack([prior.kd, prior.ks, prior.alpha], axis=1))
-        at = np.unravel_index(block.pixels, shape)
-        channel[at], normals[at], deviation[at] = block.channel, fit.normals, off
-        covariance[at] = lower_half(fit.covariance)
-        is_fitted[at] = (
-            (np.abs(off) < MOST_OFF).all(axis=1)
-            & (fit.logs[:, 0] < math.log(MOST_KD))
-            & (covariance[at][:, VARIANCES] < MOST_VARIANCE).all(axis=1)
-        )
+        fits.add(block.pixels, prior, fit_pixels(block.values, block.places_mm, lights, prior, threads))
+        channel[np.unravel_index(block.pixels, shape)] = block.channel
         count += len(block.pixels)
         say(count, reader.count)
-    before = deviation[is_fitted][:, :2]
-    settle(deviation, covariance, is_fitted, centres.covariance)
-    of_triangle = reader.triangle_of_pixel[is_fitted]
-    covariance[is_fitted, VARIANCES[_KD]] += _u_inter_reflection(view)[of_triangle] ** 2
-    texel_normals = turned_normals(normals[is_fitted].astype(np.float64), deviation[is_fitted][:, :2] - before)
-    logs, channels = centres.logs[is_fitted].astype(np.float64), result.channels
+    is_fitted, channels = fits.is_fitted, result.channels
+    texel_normals = fits.settle(view, centres, reader.triangle_of_pixel)
+    logs = centres.logs[is_fitted].astype(np.float64)
     logs[:, :channels] = _with_colours(logs[:, :channels], centres.colours[is_fitted], channel[is_fitted])
-    for first, unknown in ((0, _KD), (channels, _KS)):
-        variance = covariance[..., VARIANCES[unknown]]
+    for first, unknown in ((0, KD), (channels, KS)):
+        variance = fits.covariance[..., VARIANCES[unknown]]
         certainty = np.where(is_fitted, 1.0 / (variance + _ALIKE), 0.0).astype(np.float32)
-        plane = all_channels(deviation[..., unknown], certainty, channel, channels)
+        plane = all_channels(fits.deviation[..., unknown], certainty, channel, channels)
         logs[:, first : first + channels] += plane[is_fitted]
-    alpha = np.exp(logs[:, -1] + deviation[is_fitted][:, _ALPHA])
+    logs[:, -1] += fits.deviation[is_fitted][:, ALPHA]
+    return view_texels(np.flatnonzero(is_fitted), texel_normals, logs, fits.covariance[is_fitted])
+
+
+def view_texels(places: NDArray[np.integer], normals: Singles, logs: Floats, covariance: Singles) -> ViewTexels:
+    """Return texels at places [n] of a picture, from the logarithms [n, 2 channels + 1] of kd, ks and alpha, which
+    are kept within what is possible."""
+    channels = logs.shape[1] // 2
     return ViewTexels(
-        np.flatnonzero(is_fitted).astype(np.int32),
-        texel_normals.astype(np.float32),
+        places.astype(np.int32),
+        normals,
         np.minimum(np.exp(logs[:, :channels]), MOST_KD).astype(np.float32),
         np.minimum(np.exp(logs[:, channels:-1]), MOST_KS).astype(np.float32),
-        np.clip(alpha, LEAST_ALPHA, 1.0).astype(np.float32),
-        covariance[is_fitted],
+        np.clip(np.exp(logs[:, -1]), LEAST_ALPHA, 1.0).astype(np.float32),
+        covariance,
     )
-
-
-@dataclass(frozen=True)
-class _Centres:
-    """Materials about which those of a view's pixels lie: those of triangles, drawn to each other; of triangles
-    without any, those around them."""
-
-    normals: Singles
-    """[h, w, 3]"""
-    logs: Singles
-    """[h, w, 2 channels + 1] logarithms of kd, ks and alpha; NaN where nothing is known."""
-    colours: Singles
-    """[h, w, channels] logarithms of kd without their mean, drawn to those around."""
-    covariance: Singles
-    """[h, w, 15]"""
-
-    def prior(self, block: PixelBlock) -> Prior:
-        """Materials of a block's pixels in their own channels; NaN without any."""
-        at = np.unravel_index(block.pixels, self.logs.shape[:2])
-        logs, channels = self.logs[at].astype(np.float64), self.logs.shape[2] // 2
-        rows = np.arange(len(logs))
-        return Prior(
-            self.normals[at].astype(np.float64),
-            np.exp(logs[rows, block.channel]),
-            np.exp(logs[rows, channels + block.channel]),
-            np.exp(logs[:, -1]),
-        )
-
-
-def _centres_of(
-    result: RunResult, view: ViewSamples, triangle_of_pixel: NDArray[np.int32], mesh_normals: Floats
-) -> _Centres:
-    """Return the centres of a view; `mesh_normals` [triangles, 3] are those of triangles without a fit."""
-    places = np.searchsorted(result.triangles, view.triangles)
-    materials = result.materials(GGX_NORMAL.name, places)
-    of_triangles = result.material_covariances(GGX_NORMAL.name, places)
-    kd, alpha = np.maximum(materials.kd, LEAST_KD), materials.alpha
-    triangle_logs = np.log(np.column_stack([kd, np.maximum(materials.ks, LEAST_KS * kd), alpha]))
-    has_fit = np.isfinite(triangle_logs).all(axis=1) & np.isfinite(of_triangles).all(axis=(1, 2))
-    has_fit &= (triangle_logs[:, : kd.shape[1]] < math.log(MOST_KD)).all(axis=1)
-    has_fit &= (np.einsum("nii->ni", of_triangles)[:, :3] < MOST_VARIANCE[:3]).all(axis=1)
-    is_seen = triangle_of_pixel >= 0
-    is_known = is_seen & np.append(has_fit, False)[triangle_of_pixel]
-    triangle, channels = triangle_of_pixel[is_known], result.channels
-    covariance = np.zeros((*is_seen.shape, UNKNOWNS * (UNKNOWNS + 1) // 2), np.float32)
-    covariance[is_known] = lower_half(of_triangles)[triangle]
-    logs = np.full((*is_seen.shape, 2 * channels + 1), np.nan, np.float32)
-    logs[is_known] = triangle_logs[triangle]
-    side_px = _window_px(triangle)
-    shine = np.stack([logs[..., channels:-1].mean(axis=-1), logs[..., -1]], axis=-1)
-    step = settle_triangles(shine, covariance, is_known, side_px)
-    logs += np.repeat(step[..., _KD:], [channels, channels, 1], axis=-1)
-    logs[..., -1] = np.clip(logs[..., -1], math.log(LEAST_ALPHA), 0.0)
-    normals = np.zeros((*is_seen.shape, 3), np.float32)
-    normals[is_known] = turned_normals(materials.normals[triangle], step[is_known][:, :2].astype(np.float64))
-    is_missing = is_seen & ~is_known
-    normals[is_missing] = mesh_normals[triangle_of_pixel[is_missing]]
-    logs[is_missing] = mean_around(logs, is_known, side_px, default=np.nan)[is_missing]
-    colours = logs[..., :channels] - logs[..., :channels].mean(axis=-1, keepdims=True)
-    colours = settle_colours(colours, covariance[..., VARIANCES[_KD]], is_known, side_px)
-    covariance[is_missing] = lower_half(np.diag(np.square([TILT, TILT, 1.0, LOG_KS, LOG_ALPHA])))
-    return _Centres(normals, logs, colours, covariance)
 
 
 def _with_colours(logs: Floats, colours: Singles, channel: NDArray[np.int8]) -> Floats:
@@ -180,31 +141,3 @@ def _with_colours(logs: Floats, colours: Singles, channel: NDArray[np.int8]) -> 
     column = channel[:, None].astype(np.int64)
     own_logs, own_colour = np.take_along_axis(logs, column, 1), np.take_along_axis(colours, column, 1)
     return np.asarray(own_logs + colours - own_colour)
-
-
-def _window_px(triangle_of_pixel: NDArray[np.int32]) -> int:
-    """Side of a window that holds enough triangles to say how they spread."""
-    counts = np.bincount(triangle_of_pixel)
-    side_px = math.sqrt(TRIANGLES_AROUND * float(np.median(counts[counts > 0]))) if len(counts) else 0.0
-    return max(WINDOW_PX, 2 * round(side_px / 2) + 1)
-
-
-def _u_inter_reflection(view: ViewSamples) -> Floats:
-    """[triangles] relative standard uncertainty of kd, of the inter-reflection that was taken off its samples,
-    which is off alike under all LEDs."""
-    with h5py.File(view.path, "r") as file:
-        if INTER_REFLECTION not in file:
-            return np.zeros(len(view.triangles))
-        data = file[INTER_REFLECTION]
-        parts = [u_inter_reflection(data[first : first + _ROWS]) for first in range(0, len(data), _ROWS)]
-    sums = [np.where(np.isfinite(part), part, 0.0).sum(axis=(1, 2)) for part in parts]
-    count = [np.isfinite(part).sum(axis=(1, 2)) for part in parts]
-    mean: Floats = np.concatenate(sums) / np.maximum(np.concatenate(count), 1)
-    return mean
-
-
-def _lights(result: RunResult, view: ViewSamples, left_out: Sequence[int]) -> Lights:
-    group = groups_of_leds(view.led_mm, result.middle_mm)
-    columns = np.flatnonzero(~np.isin(view.leds, left_out))
-    columns = columns[np.argsort(group[columns], kind="stable")]
-    return Lights(columns, view.led_mm[columns], group[columns], view.camera_mm)

@@ -1,0 +1,59 @@
+"""Size of texels as the command line has it, and what is told of texels before they are made."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from coupole.errors import InputError
+from coupole.reflectance.texels.texel_grid import TexelSize
+from coupole.viewing.terminal import bytes_text, duration_text
+
+if TYPE_CHECKING:
+    from coupole.reflectance.texels.texel_forecast import TexelForecast
+
+_MOST_MM = 100.0
+
+
+def read_size(text: str) -> TexelSize:
+    """Read what `--texels` names. Raises InputError."""
+    if text == "auto":
+        return TexelSize()
+    try:
+        width_mm = float(text)
+    except ValueError:
+        width_mm = math.nan
+    if not 0.0 < width_mm <= _MOST_MM:
+        raise InputError(
+            f"--texels: expected auto, each view's own pixels, or a width on the surface in mm up to "
+            f"{_MOST_MM:g}, such as 0.2; got {text!r}"
+        )
+    return TexelSize(width_mm)
+
+
+def lines_of(forecast: TexelForecast) -> Iterator[str]:
+    """Yield what a user is told of texels before they are made."""
+    views, size_mm = forecast.views, forecast.size.mm
+    sides = sorted({view.side_px for view in views})
+    pixels = "single pixels" if sides == [1] else f"{' and '.join(f'{n} x {n}' for n in sides)} pixels each"
+    number, widths = _rounded(forecast.texels), _range([view.texel_mm for view in views])
+    in_views = f"{len(views)} view{'s' if len(views) > 1 else ''}"
+    yield f"texels: some {number:,} in {in_views}, {pixels}, {widths} mm on the surface"
+    memory, disk = bytes_text(forecast.memory_bytes), bytes_text(forecast.disk_bytes)
+    duration = duration_text(forecast.time_s)
+    yield f"they take some {memory} of memory, {disk} of disk, and {duration} here after the fits of triangles"
+    if size_mm is not None and size_mm > forecast.edge_mm:
+        yield (
+            f"texels of {size_mm:g} mm are larger than the mesh's triangles, whose edge is {forecast.edge_mm:.2g} "
+            "mm (median): without --texels each of these has a material, too"
+        )
+
+
+def _range(values: list[float]) -> str:
+    low, high = f"{min(values):.2g}", f"{max(values):.2g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def _rounded(count: int) -> int:
+    return int(round(count, 1 - math.floor(math.log10(count)))) if count else 0

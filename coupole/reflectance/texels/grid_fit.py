@@ -1,0 +1,211 @@
+"""Materials of texels of several pixels: one fit for each, to the means of its channels, as triangles are fitted.
+
+Normal, lightness, ks and roughness are fitted to the mean of the channels, about the material of the triangle that
+most of a texel's pixels see, and neighbours have their word on them as on single pixels. All channels of a texel
+are measured, and give its colour together with those of the texels beside it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from coupole.reflectance.ggx import lobe
+from coupole.reflectance.normal_fit import colour_weight
+from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples
+from coupole.reflectance.texels.pixel_file import ViewTexels
+from coupole.reflectance.texels.pixel_fit import Lights, PixelMaterials, fit_pixels
+from coupole.reflectance.texels.texel_values import TexelBlock, TexelReader
+from coupole.reflectance.texels.view_centres import ALPHA, KD, KS, centres_of, lights_of
+from coupole.reflectance.texels.view_texels import Fitted, Say, view_texels
+from coupole.reflectance.triangle_fit import between, towards
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+
+_TOGETHER = 1 << 16
+"""Texels that are fitted together."""
+_PART = 1 << 12
+_MOST_WIDER = 4.0
+"""Largest factor of kd's variance."""
+_SPREAD_PX, _LEAST_SPREAD = 2.5, 1.0
+"""Standard deviation of the weights with which texels around count for a colour, px, and its least, texels."""
+
+
+def texels_of_grid(
+    result: RunResult,
+    view: ViewSamples,
+    reader: TexelReader,
+    left_out: Sequence[int],
+    memory_bytes: int,
+    threads: int,
+    say: Say,
+) -> ViewTexels:
+    """Fit all texels of a view, under its LEDs but those `left_out`; frames are read once for each band of texels
+    whose values fit into the memory. Raises StorageError for a damaged frame."""
+    grid, channels = reader.grid, result.channels
+    centres = centres_of(result, view, grid.triangle, reader.mesh_normals)
+    lights = lights_of(result, view, left_out)
+    fits, count = Fitted.empty(grid.triangle.shape), 0
+    colours = np.zeros((grid.triangle.size, channels), np.float32)
+    u_colours = np.zeros(grid.triangle.size, np.float32)
+    for rows in reader.bands(memory_bytes):
+        block = reader.read_band(rows, threads)
+        for first in range(0, len(block.texels), _TOGETHER):
+            some = slice(first, min(first + _TOGETHER, len(block.texels)))
+            part = TexelBlock(block.texels[some], block.places_mm[some], block.values[some])
+            prior, shine = centres.grey_prior(part.texels)
+            values = part.values.astype(np.float32)
+            fit = fit_pixels(values.mean(axis=1), part.places_mm, lights, prior, threads)
+            fits.add(part.texels, prior, fit)
+            of_fits = colours_of(values, part.places_mm, lights, fit, shine, threads)
+            colours[part.texels], u_colours[part.texels] = of_fits
+        count += len(block.texels)
+        say(count, reader.count)
+    of_grid = colours.reshape(*grid.triangle.shape, channels), u_colours.reshape(grid.triangle.shape)
+    fits.is_fitted[...] &= np.isfinite(of_grid[0]).all(axis=-1)
+    is_fitted = fits.is_fitted
+    whole_colours, u_whole = colours_around(*of_grid, centres.colours, is_fitted, grid.side_px)
+    normals = fits.settle(view, centres, grid.triangle)
+    fits.covariance[is_fitted, VARIANCES[KD]] *= _wider(whole_colours[is_fitted])
+    fits.covariance[is_fitted, VARIANCES[KD]] += u_whole[is_fitted] ** 2
+    logs = centres.logs[is_fitted].astype(np.float64)
+    deviation = fits.deviation[is_fitted]
+    grey = np.log(np.exp(logs[:, :channels]).mean(axis=1)) + deviation[:, KD]
+    logs[:, :channels] = grey[:, None] + whole_colours[is_fitted]
+    logs[:, channels:-1] += deviation[:, KS, None]
+    logs[:, -1] += deviation[:, ALPHA]
+    first_pixels, number_of_pixel = _pixels_of(grid.texel_of_pixel, np.flatnonzero(is_fitted))
+    return replace(
+        view_texels(first_pixels, normals, logs, fits.covariance[is_fitted]),
+        texel_of_pixel=number_of_pixel,
+        side_px=grid.side_px,
+    )
+
+
+def _wider(colours: Singles) -> Singles:
+    """[n] mean over the channels of the factors of kd's variance, where colours [n, channels] differ: what a lobe
+    of another form makes of kd is as large in a dark channel as in a light one."""
+    factors: Singles = np.clip(np.exp(-2.0 * colours).mean(axis=1), 1.0, _MOST_WIDER)
+    return factors
+
+
+def colours_around(
+    colours: Singles, u_colours: Singles, of_triangles: Singles, is_fitted: NDArray[np.bool_], side_px: int
+) -> tuple[Singles, Singles]:
+    """Colours of texels [h, w, channels], logarithms of kd over the channels' mean, with those around, and their
+    standard uncertainty [h, w].
+
+    A texel's red and blue pixels are not in the same places, and paint that changes between them looks like a
+    colour. So what a texel's colour has beyond its triangle's is taken from the texels around, too, within some
+    pixels; the spread that this takes away says how uncertain the rest is. Logarithms' means are those of no
+    colour: kd's mean over the channels stays as it was fitted.
+    """
+    width = max(_SPREAD_PX / side_px, _LEAST_SPREAD)
+    weight = is_fitted.astype(np.float32)
+    around = np.maximum(gaussian_filter(weight, width, mode="mirror"), 1e-6)
+    triangle_colours = of_triangles - np.log(np.exp(of_triangles).mean(axis=-1, keepdims=True))
+    more = np.where(is_fitted[..., None], colours - triangle_colours, np.float32(0.0))
+    smooth = np.stack(
+        [gaussian_filter(plane, width, mode="mirror") / around for plane in np.moveaxis(more, -1, 0)], axis=-1
+    )
+    lost_variance = np.where(is_fitted, np.square(more - smooth).mean(axis=-1), np.float32(0.0))
+    lost_variance = gaussian_filter(lost_variance, 2.0 * width, mode="mirror") / np.maximum(
+        gaussian_filter(weight, 2.0 * width, mode="mirror"), 1e-6
+    )
+    kept_share = 1.0 / (4.0 * np.pi * width**2)  # of the variance of what is different from texel to texel
+    whole = triangle_colours + smooth
+    whole -= np.log(np.exp(whole).mean(axis=-1, keepdims=True))
+    own_variance = np.square(np.where(is_fitted, u_colours, np.float32(0.0)))
+    u_whole = np.sqrt(kept_share * (own_variance + lost_variance / (1.0 - kept_share)))
+    return whole.astype(np.float32), u_whole.astype(np.float32)
+
+
+def _pixels_of(
+    texel_of_pixel: NDArray[np.int32], texels: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """The first pixel of each of the `texels` [n], row by row in the picture, and [h, w] which of them a pixel
+    belongs to; -1 for none."""
+    number = np.full(int(texel_of_pixel.max(initial=0)) + 2, -1, np.int32)
+    number[texels] = np.arange(len(texels))
+    number_of_pixel = number[texel_of_pixel]  # -1, for no texel, takes the last
+    pixels = np.flatnonzero(number_of_pixel.reshape(-1) >= 0)
+    _, first = np.unique(number_of_pixel.reshape(-1)[pixels], return_index=True)
+    return pixels[first], number_of_pixel
+
+
+def colours_of(
+    values: Singles, places_mm: Singles, lights: Lights, fit: PixelMaterials, shine: Floats, threads: int | None
+) -> tuple[Floats, Floats]:
+    """[n, channels] logarithms of kd over the mean of the channels, of texels with fits, and their standard
+    uncertainty [n], mean of channels. `values` [n, channels, leds of the view]; `shine` [n, channels] is ks over
+    the channels' mean. NaN without a fit."""
+    count, channels = values.shape[:2]
+    kd, u_kd = np.full((count, channels), np.nan), np.full((count, channels), np.nan)
+    grey = np.exp(fit.logs)
+
+    def fill(first: int) -> None:
+        some = slice(first, min(first + _PART, count))
+        of_lights = np.ascontiguousarray(values[some][:, :, lights.columns])
+        _colours(
+            of_lights, places_mm[some], lights.places_mm, lights.camera_mm, fit.normals[some], grey[some],
+            shine[some], kd[some], u_kd[some],
+        )  # fmt: skip
+
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+        list(pool.map(fill, range(0, count, _PART)))
+    mean = kd.mean(axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log(kd / mean), np.sqrt(np.mean((u_kd / kd) ** 2, axis=1))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _colours(values, places_mm, led_mm, camera_mm, normals, grey, shine, kd, u_kd):  # type: ignore[no-untyped-def]
+    """Each channel's kd by least squares, and its uncertainty by the residuals. What is fitted is how a channel's
+    values differ from their mean over the channels: there the error of a lobe of another form is gone."""
+    channels, leds = values.shape[1:]
+    cosines, lobes, weights = np.empty(leds), np.empty(leds), np.empty(leds)
+    for texel in range(len(values)):
+        if not grey[texel, 2] > 0.0:
+            continue
+        sample = values[texel]
+        _weigh(sample, places_mm[texel], led_mm, camera_mm, normals[texel], grey[texel], cosines, lobes, weights)
+        total = np.sum(weights * cosines * cosines)
+        if not total > 0.0:
+            continue
+        for channel in range(channels):
+            more, square, more_shine = 0.0, 0.0, shine[texel, channel] - 1.0
+            for led in np.flatnonzero(weights):
+                difference = sample[channel, led] - sample[:, led].mean() - lobes[led] * more_shine
+                more += weights[led] * cosines[led] * difference / total
+            for led in np.flatnonzero(weights):
+                difference = sample[channel, led] - sample[:, led].mean() - lobes[led] * more_shine
+                square += (weights[led] * cosines[led] * (difference - cosines[led] * more) / total) ** 2
+            kd[texel, channel], u_kd[texel, channel] = grey[texel, 0] + more, np.sqrt(square)
+        if not kd[texel].min() > 0.0:
+            kd[texel] = np.nan
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(sample, place_mm, led_mm, camera_mm, normal, grey, cosines, lobes, weights):  # type: ignore[no-untyped-def]
+    """Fill for each LED the cosine of incidence, what the lobe of the mean gives, and the weight of its values
+    [channels, leds], 0 where one of them is missing or the LED is behind the surface."""
+    light, half, view = np.empty(3), np.empty(3), np.empty(3)
+    towards(place_mm, camera_mm, view)
+    nv = max(normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2], 1e-3)
+    for led in range(len(led_mm)):
+        towards(place_mm, led_mm[led], light)
+        between(light, view, half)
+        nl = normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2]
+        nh = normal[0] * half[0] + normal[1] * half[1] + normal[2] * half[2]
+        weights[led] = cosines[led] = lobes[led] = 0.0
+        if nl > 0.0 and np.isfinite(sample[:, led].sum()):
+            cosines[led], lobes[led] = nl, nl * grey[1] * lobe(nl, nv, nh, grey[2])[0]
+            weights[led] = colour_weight(nl * grey[0] + lobes[led], sample[:, led], grey[0])

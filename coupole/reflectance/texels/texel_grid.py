@@ -1,0 +1,141 @@
+"""Texels of a size that was asked for: squares of a view's pixels that share one material.
+
+How many pixels a texel is wide follows from what a pixel of the view sees on the surface. Pixels of a square that
+see another surface than most of it, nearer or farther away, belong to no texel.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
+
+_SAMPLED = 1_000_000
+"""Pixels, about, by which their size on the surface is found."""
+
+
+@dataclass(frozen=True)
+class TexelSize:
+    """Width of texels that was asked for."""
+
+    mm: float | None = None
+    """Width on the surface; None for single pixels of each view, `auto`."""
+
+    @property
+    def text(self) -> str:
+        """Text of the command line."""
+        return "auto" if self.mm is None else f"{self.mm:g}"
+
+    @property
+    def in_words(self) -> str:
+        """Name for people."""
+        return "single pixels (auto)" if self.mm is None else f"{self.mm:g} mm"
+
+    def side_px(self, of_pixel_mm: float) -> int:
+        """Width of a texel, px, in a view whose pixels are that wide on the surface."""
+        return 1 if self.mm is None else max(1, round(self.mm / of_pixel_mm))
+
+
+@dataclass(frozen=True)
+class TexelGrid:
+    """Texels of a view, each a square of pixels: what they are on, and which pixels are theirs."""
+
+    side_px: int
+    triangle: NDArray[np.int32]
+    """[rows, columns] row of the view's file of what most of a texel's pixels see; -1 for none."""
+    texel_of_pixel: NDArray[np.int32]
+    """[h, w] place in the grid, row by row; -1 for none."""
+    places_mm: NDArray[np.float32]
+    """[rows, columns, 3] mean of what a texel's pixels see, base frame."""
+
+
+def pixel_mm(surface: Surface) -> float:
+    """Return the width of a pixel of a view on the surface, mm: of a square of the area that it sees, median. If
+    the mesh is so coarse that pixels see its triangles' centres, the mean."""
+    step = max(1, math.isqrt(surface.triangle_of_pixel.size // _SAMPLED))
+    places_mm = surface.places_mm
+    here = places_mm[:-1:step, :-1:step]
+    right, down = places_mm[:-1:step, 1::step] - here, places_mm[1::step, :-1:step] - here
+    areas_mm2 = np.linalg.norm(np.cross(right, down), axis=2)
+    median_mm2 = float(np.nanmedian(areas_mm2)) if np.isfinite(areas_mm2).any() else 0.0
+    if median_mm2 > 0.0:
+        return math.sqrt(median_mm2)
+    seen_mm = surface.centres_mm
+    extent_mm2 = float(np.prod(np.sort(np.ptp(seen_mm, axis=0))[1:]))
+    return math.sqrt(extent_mm2 / max(1, int(np.count_nonzero(surface.triangle_of_pixel >= 0))))
+
+
+def texel_grid(surface: Surface, side_px: int) -> TexelGrid:
+    """Cut a view's picture into squares of `side_px`."""
+    shape = surface.triangle_of_pixel.shape
+    rows, columns = (-(-length // side_px) for length in shape)
+    triangle = np.full((rows, columns), -1, np.int32)
+    places_mm = np.zeros((rows, columns, 3), np.float32)
+    texel_of_pixel = np.full(shape, -1, np.int32)
+    most_mm = side_px * pixel_mm(surface)
+    in_strips(
+        rows,
+        lambda some: _cut_rows(
+            some.start, some.stop, side_px, most_mm, surface.triangle_of_pixel, surface.places_mm,
+            surface.centres_mm, surface.normals, triangle, places_mm, texel_of_pixel,
+        ),
+    )  # fmt: skip
+    return TexelGrid(side_px, triangle, texel_of_pixel, places_mm)
+
+
+@numba.njit(cache=True, nogil=True)
+def _cut_rows(  # type: ignore[no-untyped-def]
+    first, end, side_px, most_mm, triangle_of_pixel, seen_mm, centres_mm, normals, triangle, places_mm,
+    texel_of_pixel
+):  # fmt: skip
+    """Fill rows of texels. A pixel is left out if it sees a place farther than `most_mm` before or behind the
+    plane of what most pixels of its square see."""
+    for row in range(first, end):
+        down = slice(row * side_px, (row + 1) * side_px)
+        for column in range(triangle.shape[1]):
+            across = slice(column * side_px, (column + 1) * side_px)
+            numbers = triangle_of_pixel[down, across].copy().reshape(-1)
+            numbers = numbers[numbers >= 0]
+            if len(numbers) == 0:
+                continue
+            most = _most_frequent(numbers)
+            triangle[row, column] = most
+            _gather(
+                triangle_of_pixel[down, across], seen_mm[down, across], centres_mm[most], normals[most], most_mm,
+                row * triangle.shape[1] + column, places_mm[row, column], texel_of_pixel[down, across],
+            )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(triangle, seen_mm, centre_mm, normal, most_mm, texel, place_mm, texel_of_pixel):  # type: ignore[no-untyped-def]
+    """Give a square's pixels to its texel, and find the mean place of what they see."""
+    members = 0
+    for y in range(triangle.shape[0]):
+        for x in range(triangle.shape[1]):
+            above_mm = 0.0
+            for k in range(3):
+                above_mm += (seen_mm[y, x, k] - centre_mm[k]) * normal[k]
+            if triangle[y, x] >= 0 and abs(above_mm) <= most_mm:
+                texel_of_pixel[y, x] = texel
+                members += 1
+                for k in range(3):
+                    place_mm[k] += seen_mm[y, x, k]
+    for k in range(3):
+        place_mm[k] /= members
+
+
+@numba.njit(cache=True, nogil=True)
+def _most_frequent(numbers):  # type: ignore[no-untyped-def]
+    """Return the number that is there most often; of several the lowest. `numbers` [n] are sorted in place."""
+    numbers.sort()
+    best, best_count, count = numbers[0], 0, 0
+    for place in range(len(numbers)):
+        count = count + 1 if place > 0 and numbers[place] == numbers[place - 1] else 1
+        if count > best_count:
+            best, best_count = numbers[place], count
+    return best

@@ -1,0 +1,212 @@
+"""Values of a view's texels under all its LEDs: means of their pixels, channel by channel, band by band.
+
+Means are taken of a few LEDs' frames at a time, so that only those of the texels stay in memory, not the pixels'
+own. Of eight LEDs at once the lists of a band's pixels are filled as for single pixels (`pixel_values`).
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass
+
+import h5py
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.extraction.extraction import Geometry
+from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
+from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
+from coupole.reflectance.extraction.sample_codes import REACHED
+from coupole.reflectance.extraction.sample_kernel import NO_VALUE
+from coupole.reflectance.extraction.seen_surface import SeenSurface
+from coupole.reflectance.extraction.view_samples import ViewPass
+from coupole.reflectance.lanes import LANES
+from coupole.reflectance.new_light.pictured_surface import Surface
+from coupole.reflectance.run_result import ViewSamples
+from coupole.reflectance.texels.pixel_values import fill_rows, light_of
+from coupole.reflectance.texels.texel_grid import TexelGrid
+
+_TEXELS = 1 << 13
+"""Texels whose means a thread takes in one go."""
+PIXEL_BYTES = 64
+"""Memory of a pixel of a band beside the values of its texel: lists, darks, and values of eight LEDs."""
+
+
+@dataclass(frozen=True)
+class TexelBlock:
+    """Texels of some rows of a view's grid."""
+
+    texels: NDArray[np.int64]
+    """[n] places in the grid, row by row; rising."""
+    places_mm: NDArray[np.float32]
+    """[n, 3] base frame."""
+    values: NDArray[np.float16]
+    """[n, channels, leds] mean over a texel's pixels of f times the cosine of incidence, 1/sr; NaN where there is
+    none: a pixel is clipped, or more than half of a channel's pixels lie in shadow."""
+
+
+class TexelReader:
+    """A view's texels, ready for its frames; `samples` is its file in a result whose fits are there."""
+
+    def __init__(
+        self,
+        measured_run: MeasuredRun,
+        geometry: Geometry,
+        radiometry: Radiometry,
+        view: MeasuredView,
+        surface: Surface,
+        samples: ViewSamples,
+        grid: TexelGrid,
+    ) -> None:
+        self._run, self._view, self._radiometry = measured_run, view, radiometry
+        self._facets = geometry.of(samples.triangles)
+        self._triangle_of_pixel, self._samples = surface.triangle_of_pixel, samples
+        self._seen_mm = surface.places_mm.reshape(-1, 3)
+        self.mesh_normals = surface.normals
+        """[triangles, 3]"""
+        self.grid = grid
+        self.pixels_of_channels = grid.side_px**2 * channel_shares(radiometry)
+        """[channels] pixels of a whole texel."""
+
+    @property
+    def count(self) -> int:
+        """Number of the texels."""
+        return int(np.count_nonzero(self.grid.triangle >= 0))
+
+    def bands(self, memory_bytes: int) -> list[slice]:
+        """Rows of the grid whose texels' values fit into a memory."""
+        counts = np.count_nonzero(self.grid.triangle >= 0, axis=1)
+        row_bytes = counts * texel_bytes(self._radiometry.channels, len(self._samples.leds), self.grid.side_px)
+        rows, first = [], 0
+        while first < len(counts):
+            end = first + max(1, int(np.searchsorted(np.cumsum(row_bytes[first:]), memory_bytes, side="right")))
+            if counts[first:end].any():
+                rows.append(slice(first, end))
+            first = end
+        return rows
+
+    def read_band(self, rows: slice, threads: int) -> TexelBlock:
+        """Read all frames, for the texels of some rows of the grid. Raises StorageError for a damaged frame."""
+        band = _Band.of(self.grid, rows, self._triangle_of_pixel)
+        reader = SignalReader(self._radiometry, SeenSurface(band.triangle_of_pixel, self._samples.triangles))
+        response = reader.response._replace(least_dn=np.float32(-np.inf))
+        entries = _Entries.of(reader, self.grid.texel_of_pixel.reshape(-1), band.texels)
+        view_pass = ViewPass(self._run, self._view, self._facets, reader)
+        channels = self._radiometry.channels
+        values = np.full((len(band.texels), channels, len(self._samples.leds)), np.nan, np.float16)
+        of_pixels = np.full((len(reader.lists.places), LANES), NO_VALUE, np.uint16)
+        seen_mm = self._seen_mm[reader.lists.places]
+        root_share = np.float32(np.sum(1.0 / self.pixels_of_channels) / channels**2)
+        batches = view_pass.batches()
+        with closing(batches), ThreadPoolExecutor(threads) as pool, h5py.File(self._samples.path, "r") as file:
+            for part, batch in zip(view_pass.parts, batches, strict=True):
+                codes, direct = light_of(file, entries.rows, part, channels)
+                of_pixels[:] = NO_VALUE
+                of_leds = of_pixels[:, : part.stop - part.start]
+                fill_rows(
+                    pool, entries.rows, reader, response, batch, seen_mm, (codes, direct), of_leds, root_share
+                )
+                is_reached = codes[:, : part.stop - part.start] == REACHED
+
+                def mean(first: int, part: slice = part, is_reached: NDArray[np.bool_] = is_reached,
+                         of_leds: NDArray[np.uint16] = of_leds) -> None:  # fmt: skip
+                    some = slice(first, min(first + _TEXELS, len(values)))
+                    values[some, :, part] = entries.means(some, of_leds, is_reached, channels)
+
+                list(pool.map(mean, range(0, len(values), _TEXELS)))
+        return TexelBlock(band.texels, self.grid.places_mm.reshape(-1, 3)[band.texels], values)
+
+
+def channel_shares(radiometry: Radiometry) -> NDArray[np.float64]:
+    """[channels] share of the camera's pixels that a channel has."""
+    counts = np.bincount(radiometry.channel.ravel(), minlength=radiometry.channels)
+    shares: NDArray[np.float64] = counts / radiometry.channel.size
+    return shares
+
+
+def texel_bytes(channels: int, leds: int, side_px: int) -> int:
+    """Memory that a texel takes while its band is read."""
+    return 2 * channels * leds + PIXEL_BYTES * side_px**2
+
+
+@dataclass(frozen=True)
+class _Band:
+    """Rows of a grid."""
+
+    triangle_of_pixel: NDArray[np.int32]
+    """[h, w] -1 outside of the band, too."""
+    texels: NDArray[np.int64]
+    """[n] places in the grid; rising."""
+
+    @classmethod
+    def of(cls, grid: TexelGrid, rows: slice, triangle_of_pixel: NDArray[np.int32]) -> _Band:
+        of_pixels = slice(rows.start * grid.side_px, rows.stop * grid.side_px)
+        triangle = np.full_like(triangle_of_pixel, -1)
+        triangle[of_pixels] = np.where(grid.texel_of_pixel[of_pixels] >= 0, triangle_of_pixel[of_pixels], -1)
+        texels = np.flatnonzero(grid.triangle[rows] >= 0) + rows.start * grid.triangle.shape[1]
+        return cls(triangle, texels)
+
+
+@dataclass(frozen=True)
+class _Entries:
+    """Pixels of a band in the order of its texels."""
+
+    rows: slice
+    """Rows of the view's file that the band's pixels see."""
+    order: NDArray[np.int64]
+    """[pixels] places in the lists of the reader."""
+    starts: NDArray[np.int64]
+    """[texels + 1] of a texel's pixels in `order`."""
+    channel: NDArray[np.int64]
+    """[pixels] by the lists."""
+    triangle: NDArray[np.int64]
+    """[pixels] by the lists, from the first of `rows`."""
+
+    @classmethod
+    def of(cls, reader: SignalReader, texel_of_pixel: NDArray[np.int32], texels: NDArray[np.int64]) -> _Entries:
+        count, channels = reader.pixels.shape
+        of_triangles = reader.pixels.sum(axis=1)
+        used_rows = np.flatnonzero(of_triangles)
+        rows = slice(int(used_rows[0]), int(used_rows[-1]) + 1)
+        texel = np.searchsorted(texels, texel_of_pixel[reader.lists.places])
+        return cls(
+            rows,
+            np.argsort(texel, kind="stable"),
+            np.concatenate([[0], np.cumsum(np.bincount(texel, minlength=len(texels)))]),
+            np.repeat(np.tile(np.arange(channels), count), reader.pixels.ravel()),
+            np.repeat(np.arange(count), of_triangles) - rows.start,
+        )
+
+    def means(
+        self, texels: slice, of_pixels: NDArray[np.uint16], is_reached: NDArray[np.bool_], channels: int
+    ) -> NDArray[np.float32]:
+        """[n, channels, leds] means of some texels, of bits of float16 [pixels, leds] by the lists."""
+        starts = self.starts[texels.start : texels.stop + 1]
+        some = self.order[starts[0] : starts[-1]]
+        means = np.full((len(starts) - 1, channels, of_pixels.shape[1]), np.nan, np.float32)
+        values = of_pixels[some].view(np.float16).astype(np.float32)
+        _mean(starts - starts[0], self.channel[some], is_reached[self.triangle[some]], values, means)
+        return means
+
+
+@numba.njit(cache=True, nogil=True)
+def _mean(starts, channel, is_reached, values, means):  # type: ignore[no-untyped-def]
+    """Fill `means` [texels, channels, leds] from values [pixels, leds]: over pixels that light has reached, if
+    these are at least half of all; NaN if one of them has no value."""
+    channels, leds = means.shape[1:]
+    sums, counts = np.empty((channels, leds)), np.empty((channels, leds), np.int64)
+    members = np.empty(channels, np.int64)
+    for texel in range(len(means)):
+        sums[:], counts[:], members[:] = 0.0, 0, 0
+        for pixel in range(starts[texel], starts[texel + 1]):
+            members[channel[pixel]] += 1
+            for led in range(leds):
+                if is_reached[pixel, led]:
+                    sums[channel[pixel], led] += values[pixel, led]
+                    counts[channel[pixel], led] += 1
+        for number in range(channels):
+            for led in range(leds):
+                if counts[number, led] > 0 and 2 * counts[number, led] >= members[number]:
+                    means[texel, number, led] = sums[number, led] / counts[number, led]

@@ -51,7 +51,5 @@ def check_files(
         say("computing paths and hidden lights")
         job = without_hidden(job, run.hidden_leds if run else None)
     folder = run.folder if run else files.output or job.cell.storage_folder
-    allocated_bytes, proven = (run.allocated_bytes(), run.proven()) if run else (0, {})
-    return preflight_of(
-        job, folder, paths=paths, allocated_bytes=allocated_bytes, proven=proven, measure=measure, say=say
-    )
+    allocated, proven = (run.allocated_bytes(), run.proven()) if run else ({}, {})
+    return preflight_of(job, folder, paths=paths, allocated=allocated, proven=proven, measure=measure, say=say)

@@ -47,10 +47,18 @@ class StorageFacts:
     """Measured; 0: not measured."""
     folder: Path | None = None
     """Folder in which the run would be, or is; None: the rig's."""
-    allocated_bytes: int = 0
-    """Space that a resumed run already occupies: its views' files are allocated as a whole."""
+    allocated: Mapping[str, int] = field(default_factory=dict)
+    """Space that the views of a resumed run already occupy, by their names: their files are allocated as a "
+    "whole."""
     trouble: str = ""
     """Reason why nothing can be written there."""
+    no_holes: str = ""
+    """Reason why parts of files cannot be given back there, where that is asked for."""
+
+    @property
+    def allocated_bytes(self) -> int:
+        """Space that a resumed run already occupies."""
+        return sum(self.allocated.values())
 
 
 @dataclass(frozen=True)
@@ -93,6 +101,9 @@ class Report:
     """Shots and dark frames."""
     bytes: int = 0
     """Size of all frames on the disk."""
+    peak_bytes: int | None = None
+    """Most that the run needs on the disk at a time, samples and fits included, if frames are discarded; None if
+    all are kept."""
     duration_s: float = 0.0
     """Expected duration, s."""
     ideal_s: float = 0.0
@@ -156,7 +167,7 @@ def check(
     heat = heat_of(bursts, [view.move_s for view in report.views], rig.led_limits, leds)
     report.peak_board_c, report.too_hot = heat.peak_c, heat.too_hot
     report.refusals += heat.refusals
-    _storage(report, rig, schedule, storage)
+    _storage(report, rig, schedule, storage, keeps_all=plan.discard is None)
     return report
 
 
@@ -248,7 +259,7 @@ def _most_dose(view: OpenView, lux: NDArray[np.float64], row_of_id: Mapping[int,
     return np.asarray(brightest @ np.sort(on_us)[::-1].astype(np.float64) / 3.6e9)
 
 
-def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts) -> None:
+def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts, *, keeps_all: bool) -> None:
     frame_bytes = rig.frame_bytes
     folder = storage.folder or rig.storage.folder
     report.bytes = report.frames * frame_bytes
@@ -258,7 +269,7 @@ def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts
     needed_bytes = max(0, (report.whole.bytes if report.whole else report.bytes) - storage.allocated_bytes)
     if storage.trouble:
         report.refusals.append(f"storage {folder}: expected a folder that can be written; {storage.trouble}")
-    if needed_bytes + rig.storage.reserve_bytes > storage.free_bytes:
+    if keeps_all and needed_bytes + rig.storage.reserve_bytes > storage.free_bytes:
         report.refusals.append(
             f"storage {folder}: the run needs {needed_bytes / 1e9:.2f} GB and "
             f"{rig.storage.reserve_bytes / 1e9:.2f} GB must stay free; {storage.free_bytes / 1e9:.2f} GB are free"

@@ -94,10 +94,10 @@ class Run:
     def view_path(self, view: str) -> Path:
         return self.folder / "views" / f"{view}.h5"
 
-    def allocated_bytes(self) -> int:
-        """Disk space that views already occupy: files are allocated completely before their first frame, or
-        archived."""
-        return sum(map(_settled_bytes, (self.folder / "views").glob("*.h5")))
+    def allocated_bytes(self) -> dict[str, int]:
+        """Disk space that the files of views already occupy, by name of view: files are allocated completely
+        before their first frame; later they may be archived, or frames of theirs discarded."""
+        return {path.stem: _settled_bytes(path) for path in (self.folder / "views").glob("*.h5")}
 
     @property
     def is_open(self) -> bool:
@@ -141,6 +141,11 @@ class Run:
         """LEDs that were left out of views, by name of view, because arm, camera or object occlude them."""
         leds_by_view: dict[str, list[int]] = self.about.get("hidden_leds", {})
         return leds_by_view
+
+    @property
+    def discards(self) -> bool:
+        """True if its plan has frames discarded when their samples are safe (`discard: after_fit`)."""
+        return self.about.get("discard") == "after_fit"
 
     @property
     def is_simulated(self) -> bool:

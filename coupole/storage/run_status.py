@@ -24,6 +24,7 @@ from coupole.storage.journal_events import (
     FaultNoted,
     FindingNoted,
     FrameProven,
+    FramesDiscarded,
     GapFound,
     InputsChanged,
     JournalBegun,
@@ -108,6 +109,8 @@ class Status:
     """The command line that takes what is left; empty if nothing is, or while the run is in use."""
     before_that: str = ""
     """The command line by which a person first confirms a fault of the arm; empty if none stands."""
+    discarded: int = 0
+    """Frames that were discarded when their samples were safe, as the plan said."""
     processing: Processing | None = None
     """Processing beside the acquisition; None if it was not asked for."""
 
@@ -216,6 +219,8 @@ def _note_event(found: Status, event: Event) -> None:
         case FindingNoted():
             picture = f" ({event.picture})" if event.picture else ""
             found.findings.append(f"{event.view}: {event.kind}: {event.message}{picture}")
+        case FramesDiscarded():
+            found.discarded += len(event.frames)
         case BurstEnded():
             session.light_s += event.on_s
         case JournalBegun() | ProcessingAsked() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven():
@@ -224,7 +229,8 @@ def _note_event(found: Status, event: Event) -> None:
             pass
         case _:
             assert_never(event)
-    session.ended = event.t
+    if not isinstance(event, FramesDiscarded):  # perhaps after the session
+        session.ended = event.t
 
 
 def _note_fault(status: Status, event: FaultNoted) -> None:

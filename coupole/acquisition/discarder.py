@@ -13,7 +13,7 @@ from collections.abc import Callable
 from rich.console import Console
 
 from coupole.bounded import waited_for
-from coupole.errors import CoupoleError, DiskFull
+from coupole.errors import DiskFull
 from coupole.preflight.discard_room import DiscardRoom
 from coupole.storage.discarding import discard, discarded_views
 from coupole.storage.journal_events import FramesDiscarded
@@ -35,8 +35,7 @@ class Discarder:
         """Views that are discarded."""
         self._reasons: dict[str, str] = {}
         """Why views keep their frames."""
-        self._unfinished = 0
-        """Views that were asked for and are not done."""
+        self._asked_count = self._done_count = 0
         self._asked: queue.SimpleQueue[FramesDiscarded | None] = queue.SimpleQueue()
         self._is_ending = False
         self._thread = threading.Thread(target=self._work, name="discarding", daemon=True)
@@ -44,7 +43,7 @@ class Discarder:
 
     def ask(self, event: FramesDiscarded) -> None:
         """Discard these frames, soon, in a thread of its own."""
-        self._unfinished += 1
+        self._asked_count += 1
         self._asked.put(event)
 
     def keep(self, view: str, why: str) -> None:
@@ -68,7 +67,7 @@ class Discarder:
         free_bytes = shutil.disk_usage(self._run.folder).free
         if needed_bytes <= free_bytes:
             return True
-        if self._unfinished or not (reason := hope()):
+        if self._done_count < self._asked_count or not (reason := hope()):
             return False
         kept = "".join(f"; the frames of {name} are kept: {why}" for name, why in self._reasons.items())
         raise DiskFull(
@@ -87,14 +86,14 @@ class Discarder:
         with waited_for():
             while (event := self._asked.get()) is not None and not self._is_ending:
                 self._discard(event)
-                self._unfinished -= 1
+                self._done_count += 1
 
     def _discard(self, event: FramesDiscarded) -> None:
         if event.view in self._views:
             return
         try:
             discard(self._run, event, self._note)
-        except CoupoleError as error:
+        except Exception as error:  # noqa: BLE001  the acquisition goes on, and this thread
             self._reasons[event.view] = str(error)
             alarm(f"the frames of {event.view} are not discarded: {error}. The acquisition continues")
             return

@@ -60,7 +60,7 @@ from coupole.storage.journal_events import (
     SessionStarted,
     SessionStopped,
 )
-from coupole.storage.run import Run
+from coupole.storage.run import Occupied, Run
 from coupole.storage.run_inputs import copied_s
 from coupole.storage.view_reader import refuse_lost
 from coupole.viewing.keys import key_actions
@@ -133,7 +133,7 @@ def _acquire_into(
     job, preflight = preflight_of(
         job,
         folder,
-        allocated=run.allocated_bytes() if run else {},
+        occupied=run.occupied() if run else Occupied(),
         proven=run.proven() if run else (),
     )
     preflight.refusals += beside.refusals() if beside is not None else _refuse_without_result(job)

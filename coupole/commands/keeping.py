@@ -148,14 +148,14 @@ def _show_discarded(console: Console, verification: Verification) -> None:
     counts = ", ".join(f"{count} of {view}" for view, count in verification.discarded.items())
     total = sum(verification.discarded.values())
     console.print(
-        f"{total} more frames were discarded, as the plan says (discard: after_fit): {counts}. Nobody can look at "
-        "them "
-        "again. The journal has their shots and checksums; their samples stand for them:",
+        f"{total} more frames were discarded, as the plan says (discard: after_fit): {counts}. They cannot be "
+        "looked "
+        "at again. The journal has their shots and checksums; their samples stand for them:",
         markup=False,
     )
     samples = (
         "are as they were read back before anything was discarded, or replaced after that"
-        if (verification.ok)
+        if verification.ok
         else "see above what is wrong with them"
     )
     for result in verification.results:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 import shutil
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 
 from coupole.errors import StorageError
 from coupole.motion.itinerary import Itinerary
@@ -27,10 +26,11 @@ from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, Whole,
 from coupole.storage.given_back import why_not
 from coupole.storage.ledger import ledger_of, similar_ids
 from coupole.storage.ledger_lines import History
+from coupole.storage.run import Occupied
 from coupole.storage.write_speed import measure_write_speed
 
 _DISK_GRAIN_US = 100
-NOTHING: Mapping[str, int] = MappingProxyType({})
+NOTHING = Occupied()
 LED_DUTIES = tuple(0.9**k for k in range(1, 33))
 """Largest on-time shares, tried in turn if LEDs get too hot."""
 
@@ -40,7 +40,7 @@ def preflight_of(
     folder: Path,
     *,
     paths: bool = True,
-    allocated: Mapping[str, int] = NOTHING,
+    occupied: Occupied = NOTHING,
     proven: Collection[ShotId] = (),
     measure: bool = True,
     say: Callable[[str], object] = lambda _: None,
@@ -48,13 +48,13 @@ def preflight_of(
     """Preflight's report on a job whose run would be in `folder`, and the job at the pace that LEDs and the
     measured speed of that disk allow.
 
-    Without `paths` collisions are not checked. For a resumed run, files of views are already `allocated` on the
+    Without `paths` collisions are not checked. For a resumed run, its views already `occupied` some of the
     disk and the `proven` frames are not taken again. The disk's speed is not known unless it is to `measure`;
     `say` is called with each step in words.
     """
     if measure:
         say("measuring the disk's speed")
-    storage = storage_of(folder, job.cell.rig, allocated, measure=measure)
+    storage = storage_of(folder, job.cell.rig, occupied, measure=measure)
     if job.plan.discard is not None and not storage.trouble:
         storage = replace(storage, no_holes=why_not(_existing(folder)))
     say("computing paths, heat, light and time")
@@ -68,9 +68,7 @@ def preflight_of(
     return job, report
 
 
-def storage_of(
-    folder: Path, rig: Rig, allocated: Mapping[str, int] = NOTHING, *, measure: bool = True
-) -> StorageFacts:
+def storage_of(folder: Path, rig: Rig, occupied: Occupied = NOTHING, *, measure: bool = True) -> StorageFacts:
     """State of the disk on which `folder` is, or would be."""
     existing = _existing(folder)
     write_bytes_s, trouble = 0.0, "" if existing.is_dir() else f"{existing} is a file"
@@ -82,7 +80,7 @@ def storage_of(
             )
         except StorageError as error:
             trouble = str(error)
-    return StorageFacts(free_bytes, write_bytes_s, folder, allocated, trouble)
+    return StorageFacts(free_bytes, write_bytes_s, folder, occupied, trouble)
 
 
 def _existing(folder: Path) -> Path:
@@ -159,19 +157,18 @@ def _check_discarding(job: Job, report: Report, storage: StorageFacts, proven: C
     report.warnings.append("frames are discarded when their samples are safe: the run needs `--reflectance`")
     room, folder = discard_room(job), storage.folder or job.cell.storage_folder
     remaining = job.schedule.without_proven(proven) if proven else job.schedule
-    unfinished_views = {view.name for view in remaining.views}
-    complete_views = [name for name in room.views if name not in unfinished_views]
-    report.peak_bytes = room.peak_bytes(storage.allocated, complete_views)
+    report.peak_bytes = room.peak_bytes(storage.occupied, {view.name for view in remaining.views})
     if storage.no_holes:
         problem = job.document.problem(
             ("discard",), f"expected a disk that can give back a part of a file; {folder}: {storage.no_holes}"
         )
         report.refusals.append(str(problem))
     if report.peak_bytes + room.reserve_bytes > storage.free_bytes:
+        needed, reserve, free = (n / 1e9 for n in (report.peak_bytes, room.reserve_bytes, storage.free_bytes))
         report.refusals.append(
-            f"storage {folder}: though frames are discarded, the run needs {report.peak_bytes / 1e9:.2f} GB at a "
-            f"time, at most (frames of one view, what is kept of all, samples and fits), and {room.reserve_bytes "
-            f"/ 1e9:.2f} GB must stay free; {storage.free_bytes / 1e9:.2f} GB are free"
+            f"storage {folder}: though frames are discarded, the run needs up to {needed:.2f} GB at a time "
+            f"(frames of one view, what is kept of all, samples and fits), and {reserve:.2f} GB must stay free; "
+            f"{free:.2f} GB are free"
         )
 
 

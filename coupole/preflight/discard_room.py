@@ -20,6 +20,7 @@ from coupole.plan.shot_id import Led, ShotLabel
 from coupole.preflight.framing import camera_at
 from coupole.preflight.job import Job
 from coupole.storage.frame_file import SPARE_SLOTS
+from coupole.storage.run import Occupied
 
 _BLOCK, _LANES = 4096, 8
 """Triangles and LEDs of a chunk of samples, at most."""
@@ -46,11 +47,6 @@ class ViewRoom:
     sample_bytes: int
     """Its samples, with the pictures for the check, at most."""
 
-    @property
-    def most_kept_bytes(self) -> int:
-        """Size of the file from which it is taken to have its discarded frames still."""
-        return self.kept_bytes + (self.frame_bytes - self.kept_bytes) // 2
-
 
 @dataclass(frozen=True)
 class DiscardRoom:
@@ -63,16 +59,13 @@ class DiscardRoom:
     reserve_bytes: int
     """Bytes that must stay free."""
 
-    @property
-    def whole_bytes(self) -> int:
-        """All frames together, without discarding."""
-        return sum(view.frame_bytes for view in self.views.values())
-
-    def peak_bytes(self, allocated: Mapping[str, int], complete: Collection[str]) -> int:
-        """Most bytes that the run needs at a time beyond those that are `allocated` by the files of its views;
-        views that are `complete` wait to be discarded, or are. The reserve is not counted."""
-        waiting = [name for name in complete if allocated.get(name, 0) > self.views[name].most_kept_bytes]
-        others = [name for name in self.views if name not in complete]
+    def peak_bytes(self, occupied: Occupied, unfinished: Collection[str]) -> int:
+        """Most bytes that the run needs at a time beyond those that its views occupy, if frames of the
+        `unfinished` ones are left to take; the others wait to be discarded, or are settled. The reserve is not
+        counted."""
+        allocated = occupied.allocated
+        others = [name for name in self.views if name in unfinished]
+        waiting = [name for name in self.views if name not in {*others, *occupied.settled}]
         samples = sum(self.views[name].sample_bytes for name in waiting)
         all_samples = samples + sum(self.views[name].sample_bytes for name in others)
         kept = sum(self.views[name].kept_bytes - allocated.get(name, 0) for name in (*waiting, *others))

@@ -40,7 +40,7 @@ def check_files(
     """
     from coupole.preflight.checking import preflight_of
     from coupole.preflight.job import read_job, without_hidden
-    from coupole.storage.run import Run
+    from coupole.storage.run import Occupied, Run
 
     say("reading plan, mesh and records")
     job = read_job(files.plan, files.rig)
@@ -51,5 +51,5 @@ def check_files(
         say("computing paths and hidden lights")
         job = without_hidden(job, run.hidden_leds if run else None)
     folder = run.folder if run else files.output or job.cell.storage_folder
-    allocated, proven = (run.allocated_bytes(), run.proven()) if run else ({}, {})
-    return preflight_of(job, folder, paths=paths, allocated=allocated, proven=proven, measure=measure, say=say)
+    occupied, proven = (run.occupied(), run.proven()) if run else (Occupied(), {})
+    return preflight_of(job, folder, paths=paths, occupied=occupied, proven=proven, measure=measure, say=say)

@@ -26,6 +26,7 @@ from coupole.plan.schedule import Schedule
 from coupole.preflight.exposure_scale import ExposedWhite
 from coupole.preflight.framing import ObjectCheck
 from coupole.preflight.led_limits import heat_of, refuse_on_times
+from coupole.storage.run import Occupied
 
 BURST_OVERHEAD_S = 0.14
 """Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell)."""
@@ -47,18 +48,12 @@ class StorageFacts:
     """Measured; 0: not measured."""
     folder: Path | None = None
     """Folder in which the run would be, or is; None: the rig's."""
-    allocated: Mapping[str, int] = field(default_factory=dict)
-    """Space that the views of a resumed run already occupy, by their names: their files are allocated as a "
-    "whole."""
+    occupied: Occupied = field(default_factory=Occupied)
+    """Space that the views of a resumed run already occupy: their files are allocated as a whole."""
     trouble: str = ""
     """Reason why nothing can be written there."""
     no_holes: str = ""
     """Reason why parts of files cannot be given back there, where that is asked for."""
-
-    @property
-    def allocated_bytes(self) -> int:
-        """Space that a resumed run already occupies."""
-        return sum(self.allocated.values())
 
 
 @dataclass(frozen=True)
@@ -266,7 +261,7 @@ def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts
     periods_us = [int(b.table["period_us"].min()) for bursts in schedule.bursts for b in bursts]
     report.asked_bytes_s = frame_bytes / (min(periods_us) * 1e-6) if periods_us else 0.0
     report.disk_bytes_s = storage.write_bytes_s
-    needed_bytes = max(0, (report.whole.bytes if report.whole else report.bytes) - storage.allocated_bytes)
+    needed_bytes = max(0, (report.whole.bytes if report.whole else report.bytes) - storage.occupied.bytes)
     if storage.trouble:
         report.refusals.append(f"storage {folder}: expected a folder that can be written; {storage.trouble}")
     if keeps_all and needed_bytes + rig.storage.reserve_bytes > storage.free_bytes:

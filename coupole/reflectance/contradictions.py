@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from coupole.reflectance.discarded_frames import rewrite
 from coupole.reflectance.extraction.sample_codes import BY_UNKNOWN
 from coupole.reflectance.fits import GGX_NORMAL
-from coupole.reflectance.discarded_frames import rewrite
 from coupole.reflectance.run_result import CONTRADICTED, SAMPLES, RunResult, ViewSamples
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
 

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from coupole.motion.occlusion import RAY_START_MM, blocked_segments, ray_mesh
+from coupole.reflectance.discarded_frames import rewrite
 from coupole.reflectance.extraction.frame_veils import GLARE
 from coupole.reflectance.extraction.lamp_sight import lit_on
-from coupole.reflectance.discarded_frames import rewrite
 from coupole.reflectance.result_folder import complete
 from coupole.reflectance.run_result import AS_MEASURED, INTER_REFLECTION, SAMPLES, RunResult, ViewSamples
 from coupole.reflectance.triangle_fit import TriangleSamples

@@ -182,9 +182,10 @@ def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> 
         write_synced(path.with_suffix(".json"), json.dumps(summary))
         if gives_frames:
             prove_written(out, file_name, digest)
-        return digest if gives_frames else ""
     except OSError as error:
         raise disk_error(out, error) from error
+    else:
+        return digest if gives_frames else ""
     finally:
         forget()
 

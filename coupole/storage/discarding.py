@@ -35,7 +35,6 @@ from coupole.storage.journal_events import (
 from coupole.storage.run import Run
 from coupole.storage.sample_proofs import SAMPLES, has_proofs
 
-
 NOT_YET = "the session has not finished it yet"
 
 

@@ -21,8 +21,9 @@ import os
 import platform
 import shlex
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,7 @@ from coupole.storage.journal_events import (
     JOURNAL_VERSION,
     BurstsChosen,
     FrameProven,
+    FramesDiscarded,
     ProcessingAsked,
 )
 from coupole.storage.line_file import utc_now
@@ -46,6 +48,21 @@ from coupole.storage.run_readme import readme
 from coupole.storage.stopped_process import holder_of
 
 _LOCK_TRIALS, _LOCK_NAP_S = 20, 0.01
+
+
+@dataclass(frozen=True)
+class Occupied:
+    """Disk space that the views of a run already occupy."""
+
+    allocated: Mapping[str, int] = field(default_factory=dict)
+    """Bytes by name of view."""
+    settled: frozenset[str] = frozenset()
+    """Views whose files give nothing back any more: their frames are discarded, or they are archived."""
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of all views."""
+        return sum(self.allocated.values())
 
 
 class Run:
@@ -94,7 +111,14 @@ class Run:
     def view_path(self, view: str) -> Path:
         return self.folder / "views" / f"{view}.h5"
 
-    def allocated_bytes(self) -> dict[str, int]:
+    def occupied(self) -> Occupied:
+        """Disk space that its views already occupy."""
+        events = journal.read_events(self.journal_path) if self.discards else ()
+        discarded = {event.view for event in events if isinstance(event, FramesDiscarded)}
+        archived = {path.stem for path in (self.folder / "views").glob("*.h5") if _is_archived(path)}
+        return Occupied(self._allocated_bytes(), frozenset(discarded | archived))
+
+    def _allocated_bytes(self) -> dict[str, int]:
         """Disk space that the files of views already occupy, by name of view: files are allocated completely
         before their first frame; later they may be archived, or frames of theirs discarded."""
         return {path.stem: _settled_bytes(path) for path in (self.folder / "views").glob("*.h5")}
@@ -284,6 +308,12 @@ def _new_folder(parent: Path, name: str) -> Path:
             continue
         return folder
     raise StorageError(f"{parent}: a thousand runs named {name} exist already")
+
+
+def _is_archived(view_file: Path) -> bool:
+    from coupole.storage import frame_file
+
+    return frame_file.read_layout(view_file).is_archived
 
 
 def _settled_bytes(view_file: Path) -> int:

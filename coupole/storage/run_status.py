@@ -156,6 +156,7 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
         elif isinstance(event, ProcessingAsked):
             result = event.result
         _note_event(status, event)
+    status.discarded = sum(len(event.frames) for event in events if isinstance(event, FramesDiscarded))
     status.proven = sum(shot.is_shot for shot in proven)
     status.darks_proven = sum(not shot.is_shot and not isinstance(shot.light, Sentinel) for shot in proven)
     proven_per_view = Counter(shot.view for shot in proven)
@@ -219,13 +220,13 @@ def _note_event(found: Status, event: Event) -> None:
         case FindingNoted():
             picture = f" ({event.picture})" if event.picture else ""
             found.findings.append(f"{event.view}: {event.kind}: {event.message}{picture}")
-        case FramesDiscarded():
-            found.discarded += len(event.frames)
         case BurstEnded():
             session.light_s += event.on_s
-        case JournalBegun() | ProcessingAsked() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven():
-            pass
-        case BurstsChosen() | BurstBegun() | GapFound() | ViewSealed() | InputsChanged() | TextUnread():
+        case (
+            JournalBegun() | ProcessingAsked() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven()
+            | BurstsChosen() | BurstBegun() | GapFound() | ViewSealed() | InputsChanged() | TextUnread()
+            | FramesDiscarded()
+        ):  # fmt: skip
             pass
         case _:
             assert_never(event)

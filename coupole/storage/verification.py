@@ -17,7 +17,6 @@ from coupole.storage.journal_events import BurstsChosen, FrameProven
 from coupole.storage.run import Run
 from coupole.storage.sample_proofs import problem_of
 
-
 _HAVE_A_SHOT = (frame_file.PROVEN, frame_file.DISCARDED)
 
 

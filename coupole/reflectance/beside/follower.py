@@ -79,8 +79,7 @@ class _Follower:
         self._taken: set[str] = set()
         """Views whose samples are there."""
         self._safe: dict[str, str] = {}
-        """Digests of samples that were read back, of views of which it is not said yet whether they are "
-        "discarded."""
+        """Digests of samples that were read back, of views of which is not told yet if they are discarded."""
         self._is_done = False
         """The newest session has ended with all frames."""
         self._last_frame = ""

@@ -139,6 +139,8 @@ def is_for_discarding(run: Run, out: Path) -> bool:
     """Tell whether frames of a run are discarded when this result has their samples: the plan says so, and the run
     was acquired for this result."""
     asked = run.asked_result or default_result(run.folder)
+    if not asked.is_dir():  # both may have been moved together
+        asked = run.folder.with_name(asked.name)
     return run.discards and asked.resolve() == out.resolve()
 
 

@@ -1,7 +1,7 @@
 """Disk space of a run whose frames are discarded when their samples are safe: most that is occupied at a time.
 
 The sizes of samples and fits are upper bounds, from the triangles that face a view's camera and from the layout of
-their files (`tests/preflight/test_discard_room.py` compares them with files).
+their files (`tests/runs/test_discarded_frames.py` compares them with files).
 """
 
 from __future__ import annotations

@@ -31,8 +31,8 @@ def open_for_session(run: Run) -> None:
 def complete_views(run: Run) -> list[str]:
     """Files of the views whose frames are all proven, relative to the run: nothing writes into them any more.
     Where frames are discarded, that is so when they are."""
-    views, discarded = run.complete_views(), discarded_views(run)
-    files = (run.view_path(view) for view in views if view in discarded or not run.discards)
+    views, gone_views = run.complete_views(), discarded_views(run)
+    files = (run.view_path(view) for view in views if view in gone_views or not run.discards)
     return [str(path.relative_to(run.folder)) for path in files if path.is_file()]
 
 

@@ -24,7 +24,7 @@ _ENDS_WITHIN_S = 20.0
 
 
 class Discarder:
-    """Of one session, which holds the run's lock."""
+    """Discards frames of one session's run, whose lock the session holds."""
 
     def __init__(
         self, run: Run, note: Callable[[FramesDiscarded], None], room: DiscardRoom, console: Console
@@ -34,7 +34,7 @@ class Discarder:
         self._views = set(discarded_views(run))
         """Views that are discarded."""
         self._reasons: dict[str, str] = {}
-        """Why views keep their frames."""
+        """Reasons why views keep their frames."""
         self._asked_count = self._done_count = 0
         self._asked: queue.SimpleQueue[FramesDiscarded | None] = queue.SimpleQueue()
         self._is_ending = False
@@ -69,11 +69,11 @@ class Discarder:
             return True
         if self._done_count < self._asked_count or not (reason := hope()):
             return False
-        kept = "".join(f"; the frames of {name} are kept: {why}" for name, why in self._reasons.items())
+        kept_text = "".join(f"; the frames of {name} are kept: {why}" for name, why in self._reasons.items())
         raise DiskFull(
             f"{self._run.folder}: the view {view} needs {bytes_text(needed_bytes)}, {bytes_text(free_bytes)} are "
-            f"free, and no more frames are discarded: {reason}{kept}. Free space on the disk, then resume the "
-            "run: it goes on with what is left, and with the samples"
+            f"free, and no more frames are discarded: {reason}{kept_text}. Free space on the disk, then resume "
+            "the run: it goes on with what is left, and with the samples"
         )
 
     def _waiting_views(self) -> set[str]:

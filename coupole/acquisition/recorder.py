@@ -53,8 +53,7 @@ class Recorder(Protocol):
         ...
 
     def has_room(self, view: str) -> bool:
-        """Tell whether the disk takes the frames of a view that is about to begin, or is to be asked again. Raises
-        DiskFull if it will not."""
+        """Tell whether the disk takes a view that is about to begin. Raises DiskFull if it never will."""
         ...
 
     def begin_view(
@@ -255,8 +254,7 @@ class RunRecorder:
         self._journal.write(event)
 
     def note_at_once(self, event: Event) -> None:
-        """Note an event from another thread than the sequencer's; on the disk when this returns. Raises
-        StorageError."""
+        """Note an event from any thread; on the disk when this returns. Raises StorageError."""
         self._journal.append([event_line(event)])
 
     def keep_picture(self, name: str, content: bytes) -> str:

@@ -133,7 +133,7 @@ def _acquire_into(
     job, preflight = preflight_of(
         job,
         folder,
-        occupied=run.occupied() if run else Occupied(),
+        occupied_space=run.occupied_space() if run else Occupied(),
         proven=run.proven() if run else (),
     )
     preflight.refusals += beside.refusals() if beside is not None else _refuse_without_result(job)
@@ -174,9 +174,14 @@ def _acquire_into(
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
             _acquire(job, cell, run, recorder, console, faults, light, figures=figures)
         finally:
-            if beside is not None:
-                beside.end_session()
-            recorder.close()
+            _end_recording(recorder, beside)
+
+
+def _end_recording(recorder: RunRecorder, beside: ProcessingBeside | None) -> None:
+    """Nothing is discarded any more when the recorder closes the journal."""
+    if beside is not None:
+        beside.end_session()
+    recorder.close()
 
 
 def _refuse_without_result(job: Job) -> list[str]:

@@ -98,7 +98,7 @@ def verify(
             json.dumps(
                 {
                     **document,
-                    "discarded": sum(check.discarded.values()),
+                    "discarded": sum(check.discarded_counts.values()),
                     **{key: getattr(check, key) for key in ("bad", "missing", "unlisted", "not_compared")},
                 }
             )
@@ -131,7 +131,7 @@ def _show_verified(console: Console, run: Run, verification: Verification) -> No
         console.print(
             f"ok: {verification.frames} frames, each exactly once, all checksums right; proof: {run.proof}"
         )
-    if verification.discarded:
+    if verification.discarded_counts:
         _show_discarded(console, verification)
     if verification.not_compared:
         console.print(f"[yellow]not compared with the plan:[/] {escape(verification.not_compared)}")
@@ -145,8 +145,8 @@ def _show_verified(console: Console, run: Run, verification: Verification) -> No
 
 
 def _show_discarded(console: Console, verification: Verification) -> None:
-    counts = ", ".join(f"{count} of {view}" for view, count in verification.discarded.items())
-    total = sum(verification.discarded.values())
+    counts = ", ".join(f"{count} of {view}" for view, count in verification.discarded_counts.items())
+    total = sum(verification.discarded_counts.values())
     console.print(
         f"{total} more frames were discarded, as the plan says (discard: after_fit): {counts}. They cannot be "
         "looked "

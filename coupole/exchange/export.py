@@ -74,15 +74,15 @@ def export_run(
 
 def _refuse_discarded(run: Run, frames: list[FrameProven]) -> None:
     """Raise FrameDiscarded, before anything is written, if some of the frames were discarded."""
-    gone = {shot for event in discarded_views(run).values() for shot, _ in event.frames}
-    matching_frames = [frame.shot for frame in frames if frame.shot in gone]
+    gone_shots = {shot for event in discarded_views(run).values() for shot, _ in event.frames}
+    matching_frames = [frame.shot for frame in frames if frame.shot in gone_shots]
     if matching_frames:
-        kept = next((str(frame.shot.label) for frame in frames if frame.shot not in gone), "dark*")
+        kept_label = next((str(frame.shot.label) for frame in frames if frame.shot not in gone_shots), "dark*")
         raise FrameDiscarded(
             f"{run.folder}: {len(matching_frames)} of the {len(frames)} frames that match, such as "
             f"{matching_frames[0]}, were discarded when their samples were safe, as the plan said (`discard: "
-            f"after_fit`). Name frames that are kept with --shots, such as `{kept}`; `coupole export RESULT` "
-            "writes what the samples have become"
+            f"after_fit`). Name frames that are kept with --shots, such as `{kept_label}`; `coupole export "
+            "RESULT` writes what the samples have become"
         )
 
 

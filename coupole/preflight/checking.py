@@ -40,7 +40,7 @@ def preflight_of(
     folder: Path,
     *,
     paths: bool = True,
-    occupied: Occupied = NOTHING,
+    occupied_space: Occupied = NOTHING,
     proven: Collection[ShotId] = (),
     measure: bool = True,
     say: Callable[[str], object] = lambda _: None,
@@ -48,13 +48,13 @@ def preflight_of(
     """Preflight's report on a job whose run would be in `folder`, and the job at the pace that LEDs and the
     measured speed of that disk allow.
 
-    Without `paths` collisions are not checked. For a resumed run, its views already `occupied` some of the
+    Without `paths` collisions are not checked. For a resumed run, its views occupy some of the
     disk and the `proven` frames are not taken again. The disk's speed is not known unless it is to `measure`;
     `say` is called with each step in words.
     """
     if measure:
         say("measuring the disk's speed")
-    storage = storage_of(folder, job.cell.rig, occupied, measure=measure)
+    storage = storage_of(folder, job.cell.rig, occupied_space, measure=measure)
     if job.plan.discard is not None and not storage.trouble:
         storage = replace(storage, no_holes=why_not(_existing(folder)))
     say("computing paths, heat, light and time")
@@ -68,7 +68,9 @@ def preflight_of(
     return job, report
 
 
-def storage_of(folder: Path, rig: Rig, occupied: Occupied = NOTHING, *, measure: bool = True) -> StorageFacts:
+def storage_of(
+    folder: Path, rig: Rig, occupied_space: Occupied = NOTHING, *, measure: bool = True
+) -> StorageFacts:
     """State of the disk on which `folder` is, or would be."""
     existing = _existing(folder)
     write_bytes_s, trouble = 0.0, "" if existing.is_dir() else f"{existing} is a file"
@@ -80,7 +82,7 @@ def storage_of(folder: Path, rig: Rig, occupied: Occupied = NOTHING, *, measure:
             )
         except StorageError as error:
             trouble = str(error)
-    return StorageFacts(free_bytes, write_bytes_s, folder, occupied, trouble)
+    return StorageFacts(free_bytes, write_bytes_s, folder, occupied_space, trouble)
 
 
 def _existing(folder: Path) -> Path:
@@ -136,8 +138,7 @@ def check_job(
     if report.object_check is not None:
         report.refusals += report.object_check.refusals
         report.warnings += report.object_check.warnings
-    if job.plan.discard is not None:
-        _check_discarding(job, report, storage, proven)
+    _check_discarding(job, report, storage, proven)
     report.warnings += job.shape.remarks
     if (scale := exposure_scale(job)) is not None:
         report.exposure_scale, report.white = scale.source, tuple(exposed_white(job, scale))
@@ -152,12 +153,15 @@ def check_job(
 
 
 def _check_discarding(job: Job, report: Report, storage: StorageFacts, proven: Collection[ShotId]) -> None:
-    """The disk space of a run whose frames are discarded, and reasons why they cannot be."""
+    """The disk space of a run whose frames are discarded, and reasons why they cannot be; nothing if all are
+    kept."""
+    if job.plan.discard is None:
+        return
     report.refusals += refusals_of_discarding(job)
     report.warnings.append("frames are discarded when their samples are safe: the run needs `--reflectance`")
     room, folder = discard_room(job), storage.folder or job.cell.storage_folder
     remaining = job.schedule.without_proven(proven) if proven else job.schedule
-    report.peak_bytes = room.peak_bytes(storage.occupied, {view.name for view in remaining.views})
+    report.peak_bytes = room.peak_bytes(storage.occupied_space, {view.name for view in remaining.views})
     if storage.no_holes:
         problem = job.document.problem(
             ("discard",), f"expected a disk that can give back a part of a file; {folder}: {storage.no_holes}"

@@ -53,30 +53,34 @@ class DiscardRoom:
     """Bytes of a run."""
 
     views: Mapping[str, ViewRoom]
-    """By name of view."""
+    """Bytes of each view, by its name."""
     fit_bytes: int
     """Fits and report, and the copy of samples that is made when they are replaced, at most."""
     reserve_bytes: int
     """Bytes that must stay free."""
 
-    def peak_bytes(self, occupied: Occupied, unfinished: Collection[str]) -> int:
+    def peak_bytes(self, space: Occupied, unfinished_views: Collection[str]) -> int:
         """Most bytes that the run needs at a time beyond those that its views occupy, if frames of the
-        `unfinished` ones are left to take; the others wait to be discarded, or are settled. The reserve is not
-        counted."""
-        allocated = occupied.allocated
-        others = [name for name in self.views if name in unfinished]
-        waiting = [name for name in self.views if name not in {*others, *occupied.settled}]
-        samples = sum(self.views[name].sample_bytes for name in waiting)
-        all_samples = samples + sum(self.views[name].sample_bytes for name in others)
-        kept = sum(self.views[name].kept_bytes - allocated.get(name, 0) for name in (*waiting, *others))
-        largest = max((self.views[name].frame_bytes - self.views[name].kept_bytes for name in others), default=0)
-        return max(samples, all_samples + kept + max(largest, self.fit_bytes), 0)
+        `unfinished_views` ones are left to take; the others wait to be discarded, or are settled. The reserve is
+        not counted."""
+        other_views = [name for name in self.views if name in unfinished_views]
+        waiting_views = [name for name in self.views if name not in {*other_views, *space.settled_views}]
+        samples = sum(self.views[name].sample_bytes for name in waiting_views)
+        all_samples = samples + sum(self.views[name].sample_bytes for name in other_views)
+        kept_bytes = sum(
+            self.views[name].kept_bytes - space.bytes_of_view.get(name, 0)
+            for name in (*waiting_views, *other_views)
+        )
+        largest = max(
+            (self.views[name].frame_bytes - self.views[name].kept_bytes for name in other_views), default=0
+        )
+        return max(samples, all_samples + kept_bytes + max(largest, self.fit_bytes), 0)
 
     def needed_bytes(self, view: str, waiting: Collection[str]) -> int:
         """Bytes that must be free when a view begins, while samples of the `waiting` ones are to come."""
         samples = sum(self.views[name].sample_bytes for name in waiting if name in self.views)
-        own = self.views[view]
-        return own.frame_bytes + own.sample_bytes + samples + self.reserve_bytes
+        view_room = self.views[view]
+        return view_room.frame_bytes + view_room.sample_bytes + samples + self.reserve_bytes
 
 
 def discard_room(job: Job) -> DiscardRoom:
@@ -121,18 +125,24 @@ def _leds(schedule: Schedule) -> set[int]:
 
 
 def _view_room(
-    labels: Sequence[ShotLabel], held_out: Collection[int], rig: Rig, seen: int, channels: int, *, has_glare: bool
+    labels: Sequence[ShotLabel],
+    held_out: Collection[int],
+    rig: Rig,
+    seen_count: int,
+    channels: int,
+    *,
+    has_glare: bool,
 ) -> ViewRoom:
     leds = {label.light.id for label in labels if isinstance(label.light, Led)}
-    kept = sum(not isinstance(label.light, Led) or label.light.id in held_out for label in labels)
-    rows, columns = -(-seen // _BLOCK) * _BLOCK, -(-len(leds) // _LANES) * _LANES
-    samples = rows * columns * (channels * (8 if has_glare else 6) + 1) + seen * _TRIANGLE_BYTES
+    kept_count = sum(not isinstance(label.light, Led) or label.light.id in held_out for label in labels)
+    rows, columns = -(-seen_count // _BLOCK) * _BLOCK, -(-len(leds) // _LANES) * _LANES
+    samples = rows * columns * (channels * (8 if has_glare else 6) + 1) + seen_count * _TRIANGLE_BYTES
     pixels = rig.sensor.width_px * rig.sensor.height_px
     pictures = min(_PICTURES, len(leds & set(held_out))) * (pixels // 4) * channels * 2
     small = _SMALL_BYTES // 4
     return ViewRoom(
         (len(labels) + SPARE_SLOTS) * rig.frame_bytes + small,
-        kept * rig.frame_bytes + small,
+        kept_count * rig.frame_bytes + small,
         samples + pictures + pixels * 4 + small,
     )
 

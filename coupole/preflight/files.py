@@ -51,5 +51,7 @@ def check_files(
         say("computing paths and hidden lights")
         job = without_hidden(job, run.hidden_leds if run else None)
     folder = run.folder if run else files.output or job.cell.storage_folder
-    occupied, proven = (run.occupied(), run.proven()) if run else (Occupied(), {})
-    return preflight_of(job, folder, paths=paths, occupied=occupied, proven=proven, measure=measure, say=say)
+    occupied_space, proven = (run.occupied_space(), run.proven()) if run else (Occupied(), {})
+    return preflight_of(
+        job, folder, paths=paths, occupied_space=occupied_space, proven=proven, measure=measure, say=say
+    )

@@ -48,7 +48,7 @@ class StorageFacts:
     """Measured; 0: not measured."""
     folder: Path | None = None
     """Folder in which the run would be, or is; None: the rig's."""
-    occupied: Occupied = field(default_factory=Occupied)
+    occupied_space: Occupied = field(default_factory=Occupied)
     """Space that the views of a resumed run already occupy: their files are allocated as a whole."""
     trouble: str = ""
     """Reason why nothing can be written there."""
@@ -261,7 +261,7 @@ def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts
     periods_us = [int(b.table["period_us"].min()) for bursts in schedule.bursts for b in bursts]
     report.asked_bytes_s = frame_bytes / (min(periods_us) * 1e-6) if periods_us else 0.0
     report.disk_bytes_s = storage.write_bytes_s
-    needed_bytes = max(0, (report.whole.bytes if report.whole else report.bytes) - storage.occupied.bytes)
+    needed_bytes = max(0, (report.whole.bytes if report.whole else report.bytes) - storage.occupied_space.bytes)
     if storage.trouble:
         report.refusals.append(f"storage {folder}: expected a folder that can be written; {storage.trouble}")
     if keeps_all and needed_bytes + rig.storage.reserve_bytes > storage.free_bytes:

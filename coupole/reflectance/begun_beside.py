@@ -82,11 +82,11 @@ def is_taken(out: Path, file_name: str, basis: ViewBasis) -> bool:
 
 
 def adopt(
-    out: Path, settings: Mapping[str, Any], bases: Mapping[str, ViewBasis], discarded: Collection[str]
+    out: Path, settings: Mapping[str, Any], bases: Mapping[str, ViewBasis], discarded_names: Collection[str]
 ) -> None:
     """Keep those samples taken during an acquisition that are valid for the complete run; `bases` are those of its
     views, by the names of their files. Raises InputError if the samples are of other input, if those of a view
-    whose frames were `discarded` are not valid, or a process is at work on them.
+    whose frames were discarded (`discarded_names`) are not valid, or a process is at work on them.
     """
     if not (out / FOLDER).is_dir():
         return
@@ -101,11 +101,11 @@ def adopt(
         view_notes, basis = known_views.get(path.stem), bases.get(path.stem)
         picture = out / FRAMES / path.name
         if view_notes is None or basis is None or view_notes["frames"] != basis.frames:
-            refuse_stale(discarded, path.stem, out)
+            refuse_stale(discarded_names, path.stem, out)
             for stale in (path.with_suffix(".json"), path, picture):  # the first says that the others are whole
                 stale.unlink(missing_ok=True)
         elif tuple(view_notes["left_out"]) != basis.left_out:
-            refuse_stale(discarded, path.stem, out)
+            refuse_stale(discarded_names, path.stem, out)
             picture.unlink(missing_ok=True)
 
 

@@ -107,7 +107,7 @@ def discard_complete(run: Run, out: Path, say: Callable[[str, int, int], object]
     and what a crash has left. Waits while a session holds the run. Raises StorageError."""
     if not is_complete(run.folder):
         return
-    with _locked(run):
+    with _hold_when_free(run):
         finish(run)
         views = [view for view in run.about["views"] if view not in discarded_views(run)]
         for count, view in enumerate(views, start=1):
@@ -125,9 +125,9 @@ def discard_complete(run: Run, out: Path, say: Callable[[str, int, int], object]
         _enter_finished(run)
 
 
-def refuse_stale(discarded: Collection[str], view: str, out: Path) -> None:
+def refuse_stale(discarded_names: Collection[str], view: str, out: Path) -> None:
     """Raise InputError if samples that are about to be removed stand for discarded frames."""
-    if view in discarded:
+    if view in discarded_names:
         raise InputError(
             f"{samples_path(out, view)}: does not belong to the frames that the run has now, and cannot be taken "
             "again, because frames were discarded. Nothing was changed: was the journal, a record or the mesh "
@@ -138,14 +138,14 @@ def refuse_stale(discarded: Collection[str], view: str, out: Path) -> None:
 def is_for_discarding(run: Run, out: Path) -> bool:
     """Tell whether frames of a run are discarded when this result has their samples: the plan says so, and the run
     was acquired for this result."""
-    asked = run.asked_result or default_result(run.folder)
-    if not asked.is_dir():  # both may have been moved together
-        asked = run.folder.with_name(asked.name)
-    return run.discards and asked.resolve() == out.resolve()
+    asked_result = run.asked_result or default_result(run.folder)
+    if not asked_result.is_dir():  # both may have been moved together
+        asked_result = run.folder.with_name(asked_result.name)
+    return run.discards and asked_result.resolve() == out.resolve()
 
 
 @contextmanager
-def _locked(run: Run) -> Iterator[None]:
+def _hold_when_free(run: Run) -> Iterator[None]:
     """The run's lock, when the session that has it lets it go."""
     with ExitStack() as stack:
         while True:

@@ -85,8 +85,8 @@ class RunRequest:
     @property
     def is_plain(self) -> bool:
         """True for what is made beside an acquisition too: of one run, by its own mesh and records."""
-        named = (self.mesh, self.calibrations, self.left_out, self.refined_folder, self.poses)
-        return len(self.runs) == 1 and not any(named)
+        named_files = (self.mesh, self.calibrations, self.left_out, self.refined_folder, self.poses)
+        return len(self.runs) == 1 and not any(named_files)
 
 
 @dataclass(frozen=True)

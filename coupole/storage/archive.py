@@ -83,7 +83,7 @@ def archive_run(
                 "its complete views with --partial."
             )
         finish(run)  # what a crash has left
-        discarded = discarded_views(run)
+        event_of_view = discarded_views(run)
         result = Archived(incomplete=sorted({shot.view for shot in missing} | set(open_views)))
         for view in run.about["views"]:
             path = run.view_path(view)
@@ -94,7 +94,7 @@ def archive_run(
                 continue
             name, kept_name = str(path.relative_to(run.folder)), f"{KEPT_FOLDER}/{path.name}"
             manifest.forget(run.folder, [name])
-            gone = {shot for shot, _ in discarded[view].frames} if view in discarded else ()
+            gone = {shot for shot, _ in event_of_view[view].frames} if view in event_of_view else ()
             frames = [
                 frame for shot, frame in proven.items() if run.folder / frame.file == path and shot not in gone
             ]

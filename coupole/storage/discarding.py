@@ -44,7 +44,7 @@ def is_needed(shot: ShotId, held_out: Iterable[int]) -> bool:
 
 
 def discarded_views(run: Run) -> dict[str, FramesDiscarded]:
-    """What was discarded, by name of view, as the journal has it."""
+    """Return what was discarded, by name of view, as the journal has it."""
     events = journal.read_events(run.journal_path) if run.discards else ()
     return {event.view: event for event in events if isinstance(event, FramesDiscarded)}
 
@@ -78,12 +78,12 @@ def incomplete_until(run: Run, view: str) -> str:
     """The first view that is not complete, of those begun before a view, whose dark frames count in its samples,
     and itself; empty if all are: its samples will not change any more."""
     complete_views = set(run.complete_views())
-    for begun in dict.fromkeys(
+    for begun_view in dict.fromkeys(
         shot.view for shot in run.proven() if not isinstance(shot.light, PanelMark | Sentinel)
     ):
-        if begun not in complete_views:
-            return begun
-        if begun == view:
+        if begun_view not in complete_views:
+            return begun_view
+        if begun_view == view:
             return ""
     return view
 
@@ -102,8 +102,8 @@ def _is_finished(events: Sequence[Event], view: str) -> bool:
 
 
 def to_discard(run: Run, view: str, result: Path, digest: str) -> FramesDiscarded | None:
-    """What the journal will say of a view whose samples in a result are safe, with this digest; None if it has no
-    frame to discard. The caller has asked for a `reason_to_keep`."""
+    """Return what the journal will say of a view whose samples in a result are safe, with this digest; None if it
+    has no frame to discard. The caller has asked for a `reason_to_keep`."""
     expected_shots = list(run.expected_shots())
     held_out = set(held_out_leds({shot.light.id for shot in expected_shots if isinstance(shot.light, Led)}))
     frames = tuple(

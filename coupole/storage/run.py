@@ -54,15 +54,15 @@ _LOCK_TRIALS, _LOCK_NAP_S = 20, 0.01
 class Occupied:
     """Disk space that the views of a run already occupy."""
 
-    allocated: Mapping[str, int] = field(default_factory=dict)
+    bytes_of_view: Mapping[str, int] = field(default_factory=dict)
     """Bytes by name of view."""
-    settled: frozenset[str] = frozenset()
+    settled_views: frozenset[str] = frozenset()
     """Views whose files give nothing back any more: their frames are discarded, or they are archived."""
 
     @property
     def bytes(self) -> int:
         """Bytes of all views."""
-        return sum(self.allocated.values())
+        return sum(self.bytes_of_view.values())
 
 
 class Run:
@@ -111,12 +111,12 @@ class Run:
     def view_path(self, view: str) -> Path:
         return self.folder / "views" / f"{view}.h5"
 
-    def occupied(self) -> Occupied:
+    def occupied_space(self) -> Occupied:
         """Disk space that its views already occupy."""
         events = journal.read_events(self.journal_path) if self.discards else ()
-        discarded = {event.view for event in events if isinstance(event, FramesDiscarded)}
-        archived = {path.stem for path in (self.folder / "views").glob("*.h5") if _is_archived(path)}
-        return Occupied(self._allocated_bytes(), frozenset(discarded | archived))
+        gone_views = {event.view for event in events if isinstance(event, FramesDiscarded)}
+        archived_views = {path.stem for path in (self.folder / "views").glob("*.h5") if _is_archived(path)}
+        return Occupied(self._allocated_bytes(), frozenset(gone_views | archived_views))
 
     def _allocated_bytes(self) -> dict[str, int]:
         """Disk space that the files of views already occupy, by name of view: files are allocated completely

@@ -109,7 +109,7 @@ class Status:
     """The command line that takes what is left; empty if nothing is, or while the run is in use."""
     before_that: str = ""
     """The command line by which a person first confirms a fault of the arm; empty if none stands."""
-    discarded: int = 0
+    frames_discarded: int = 0
     """Frames that were discarded when their samples were safe, as the plan said."""
     processing: Processing | None = None
     """Processing beside the acquisition; None if it was not asked for."""
@@ -156,7 +156,7 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
         elif isinstance(event, ProcessingAsked):
             result = event.result
         _note_event(status, event)
-    status.discarded = sum(len(event.frames) for event in events if isinstance(event, FramesDiscarded))
+    status.frames_discarded = sum(len(event.frames) for event in events if isinstance(event, FramesDiscarded))
     status.proven = sum(shot.is_shot for shot in proven)
     status.darks_proven = sum(not shot.is_shot and not isinstance(shot.light, Sentinel) for shot in proven)
     proven_per_view = Counter(shot.view for shot in proven)

@@ -39,7 +39,7 @@ def proofs_of(result: Path, view: str) -> list[str]:
     """Digests that the samples of a view have had since they were taken, the first first. A line that a crash has
     cut is no proof. Raises StorageError for what is no proof."""
     digests: list[str] = []
-    for proof in _read(result / NAME):
+    for proof in _read_proofs(result / NAME):
         if proof.view == view:
             digests = [proof.digest] if proof.is_first else [*digests, proof.digest]
     return digests
@@ -74,12 +74,12 @@ def problem_of(result: Path, view: str, first: str) -> str:
     if not path.is_file():
         return f"{path} is missing: put it back from a copy; nothing else has these samples"
     try:
-        proofs, found = proofs_of(result, view), digest_on_disk(path)
+        proofs, present_digest = proofs_of(result, view), digest_on_disk(path)
     except (StorageError, OSError) as error:
         return str(error)
     if not proofs or proofs[0] != first:
         return f"{result / NAME}: does not have the proof of the view {view} that the run's journal names"
-    if found not in proofs:
+    if present_digest not in proofs:
         return f"{path}: is not what was proven: it was changed, or the disk failed. Put it back from a copy"
     return ""
 
@@ -89,7 +89,7 @@ def samples_path(result: Path, view: str) -> Path:
     return result / SAMPLES / f"{view}.h5"
 
 
-def _read(path: Path) -> list[Proof]:
+def _read_proofs(path: Path) -> list[Proof]:
     try:
         lines = path.read_bytes().splitlines(keepends=True)
     except FileNotFoundError:

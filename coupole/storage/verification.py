@@ -30,7 +30,7 @@ class Verification:
     missing: list[str] = field(default_factory=list)
     listed_count: int = 0
     """Files of the manifest, each read and compared."""
-    discarded: dict[str, int] = field(default_factory=dict)
+    discarded_counts: dict[str, int] = field(default_factory=dict)
     """Number of discarded frames by view, as the plan said. The samples that stand for them were read and "
     "compared."""
     results: list[str] = field(default_factory=list)
@@ -62,7 +62,7 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
     )
     result.bad += [f"{shot}: proven {n} times in the journal" for shot, n in lines.items() if n > 1]
     plan = _read_as_planned(run, result)
-    discarded = _check_discarded(run, result, proven)
+    discarded_shots = _check_discarded(run, result, proven)
     count = 0
     for name, frames in sorted(by_file.items()):
         path = run.folder / name
@@ -77,7 +77,7 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
         twice = [shot for shot in sorted(shots) if claims[shot] > 1]
         result.bad += [f"{name}: {shot.decode()} is in {claims[shot]} slots" for shot in twice]
         for frame in sorted(frames, key=lambda f: f.index):
-            is_discarded = frame.shot in discarded
+            is_discarded = frame.shot in discarded_shots
             if problem := _frame_problem(
                 path, layout, table, frame, is_discarded=is_discarded
             ) or _other_than_planned(plan, table[frame.index], poses, frame):
@@ -103,7 +103,7 @@ def _check_discarded(run: Run, result: Verification, proven: Mapping[ShotId, Fra
         ):
             result.bad.append(f"{view}: the journal has frames discarded that it has not proven")
         frames |= {shot for shot, _ in event.frames}
-        result.discarded[view] = len(event.frames)
+        result.discarded_counts[view] = len(event.frames)
         folder = place_of_result(run, event)
         result.results += [str(folder)] if str(folder) not in result.results else []
         if problem := problem_of(folder, view, event.digest):

@@ -171,7 +171,7 @@ def test_frames_are_discarded_when_their_samples_are_safe_and_all_commands_under
     bounds_hold(cell, run, result)
 
     told = cells.here("status", run, "--json").document
-    assert told["discarded"] == 3 * DISCARDED
+    assert told["frames_discarded"] == 3 * DISCARDED
     assert told["state"] == "done"
     assert "frames were discarded when their samples were safe" in cells.here("status", run).err
     verified = cells.here("verify", run, "--json")

@@ -65,7 +65,7 @@ def _confirm(cell: Cell, console: Console, request: dict[str, Any]) -> None:
     job = without_hidden(read_job(plan, cell.document.path), run.hidden_leds if run else None)
     folder = run.folder if run else Path(request.get("output") or cell.storage_folder)
     job, preflight = preflight_of(
-        job, folder, occupied=run.occupied() if run else Occupied(), proven=run.proven() if run else ()
+        job, folder, occupied_space=run.occupied_space() if run else Occupied(), proven=run.proven() if run else ()
     )
     show_preflight(console, preflight, name=job.plan.name, rig=cell.rig.name)
     refuse(preflight)

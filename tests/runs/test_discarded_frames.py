@@ -449,9 +449,12 @@ def test_a_run_waits_for_room_and_ends_clearly_if_none_comes(
     (tmp_path / "storage").symlink_to(small_disk)
     process, worker = begun(cell)
     os.kill(worker, signal.SIGSTOP)
+    with (small_disk / "ballast").open("wb") as file:  # somebody else takes what preflight has seen
+        os.posix_fallocate(file.fileno(), 0, 25_000_000)
     if ending == "goes on":
         cells.wait_until(lambda: len(cells.events(cell.run_folder, "view")) == 3, "the third view")
-        time.sleep(0.5)
+        time.sleep(2.0)
+        assert len(list((cell.run_folder / "views").glob("*.h5"))) == 2  # it waits
         os.kill(worker, signal.SIGCONT)
         ended = cells.finish(process)
         assert ended.code == 0, ended.err
@@ -464,5 +467,6 @@ def test_a_run_waits_for_room_and_ends_clearly_if_none_comes(
         assert "no more frames are discarded" in ended.err
         assert ("stopped (SIGSTOP)" if ending == "hangs" else "killed by signal 9") in ended.err
         everything_is_there(cell.run_folder)
+        (small_disk / "ballast").unlink()
         resume(cell.run_folder)
     all_discarded(cell.run_folder, result_of(cell))

@@ -54,8 +54,8 @@ class View:
             raise FrameDiscarded(
                 f"{self.path}: {self.records[slot]['shot'].decode(errors='replace')} was discarded when its "
                 "samples of reflectance were safe, as its plan said (`discard: after_fit`). `coupole verify` says "
-                "which result has them, and `coupole relight` makes pictures from that; frames of LEDs that are "
-                "kept for the check, and dark frames, are still there"
+                "which result has them, and `coupole reflectance relight` makes pictures from that; frames of "
+                "LEDs that are kept for the check, and dark frames, are still there"
             )
 
     def is_discarded(self, slot: int) -> bool:

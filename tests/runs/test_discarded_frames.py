@@ -198,9 +198,8 @@ def test_frames_are_discarded_when_their_samples_are_safe_and_all_commands_under
     assert again.code == 0, again.err
     resume(run)
     all_discarded(run, result)
-    relit = cells.here(
-        "relight", result, "--led", "400", "--view", "top", "--uncertainty", "--out", tmp_path / "relit"
-    )
+    picture = ("--view", "top", "--led", "96", "--uncertainty", "--to", tmp_path / "relit.npy")
+    relit = cells.here("reflectance", "relight", result, *picture)
     assert relit.code == 0, relit.err
 
     assert cells.here("archive", run).code == 0

@@ -198,7 +198,7 @@ def test_frames_are_discarded_when_their_samples_are_safe_and_all_commands_under
     assert again.code == 0, again.err
     resume(run)
     all_discarded(run, result)
-    picture = ("--view", "top", "--led", "96", "--uncertainty", "--to", tmp_path / "relit.npy")
+    picture = ("--view", "top", "--led", "96", "--uncertainty", tmp_path / "u.npy", "--to", tmp_path / "relit.npy")
     relit = cells.here("reflectance", "relight", result, *picture)
     assert relit.code == 0, relit.err
 

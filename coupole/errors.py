@@ -4,6 +4,7 @@
 
     CoupoleError
     ├── InputError            2  plan, rig or arguments are wrong
+    │   └── FrameDiscarded    2  ... a frame is asked for that was discarded, as its plan said
     ├── PreflightRefused      3  the plan is well formed but must not be run
     ├── DoseBudgetReached     3  more light would exceed the object's budget
     ├── CalibrationRefused    3  the calibration misses its limits: written, but not to be used
@@ -70,6 +71,10 @@ class InputError(CoupoleError):
     def __init__(self, problems: Sequence[Problem] | str) -> None:
         self.problems: tuple[Problem, ...] = () if isinstance(problems, str) else tuple(problems)
         super().__init__(problems if isinstance(problems, str) else "\n".join(map(str, problems)))
+
+
+class FrameDiscarded(InputError):
+    """A frame is asked for whose pixels were discarded when its samples were safe, as its plan said."""
 
 
 class ExtraMissing(CoupoleError):

@@ -132,7 +132,7 @@ def extract(folder: Path, say: Callable[[str, int, int], None]) -> dict[str, Any
     (folder / "samples").mkdir(exist_ok=True)
     path = folder / "samples" / f"{VIEW}.h5"
     path.unlink(missing_ok=True)
-    return extract_view(measured_run, geometry_of(measured_run), radiometry, measured_run.views[0], path, say)
+    return extract_view(measured_run, geometry_of(measured_run), radiometry, measured_run.views[0], path, say)[0]
 
 
 def _extraction(folder: Path, rounds: int) -> Iterator[dict[str, Any]]:

@@ -11,6 +11,7 @@ from coupole.acquisition.signals import SignalReceived
 from coupole.bounded import DISK, hangs, left_behind, on_disk, run_bounded, under_way
 from coupole.errors import StorageError
 from coupole.storage import journal, manifest, run_dose
+from coupole.storage.discarding import discarded_views
 from coupole.storage.journal_events import ProcessingAsked, SessionResumed, SessionStopped, TextUnread
 from coupole.storage.run import Run
 from coupole.viewing import report
@@ -28,8 +29,10 @@ def open_for_session(run: Run) -> None:
 
 
 def complete_views(run: Run) -> list[str]:
-    """Files of the views whose frames are all proven, relative to the run: nothing writes into them any more."""
-    files = map(run.view_path, run.complete_views())
+    """Files of the views whose frames are all proven, relative to the run: nothing writes into them any more.
+    Where frames are discarded, that is so when they are."""
+    views, gone_views = run.complete_views(), discarded_views(run)
+    files = (run.view_path(view) for view in views if view in gone_views or not run.discards)
     return [str(path.relative_to(run.folder)) for path in files if path.is_file()]
 
 

@@ -21,10 +21,14 @@ from typing import Any
 
 from rich.console import Console
 
+from coupole.acquisition.discarder import Discarder
 from coupole.acquisition.signals import SignalReceived
 from coupole.errors import InputError
 from coupole.intake.plain_data import json_of
+from coupole.preflight.discard_room import DiscardRoom
+from coupole.storage.journal_events import FramesDiscarded
 from coupole.storage.processing import Progress, default_result, go_on_command
+from coupole.storage.run import Run
 from coupole.storage.stopped_process import is_stopped
 from coupole.viewing.terminal import alarm, step_bars
 
@@ -34,6 +38,8 @@ _READY_WITHIN_S = 120.0
 _TOLD_AFTER_S = 1.0
 _SILENT_S, _LEAST_CPU_S = 120.0, 1.0
 """A process that neither tells anything nor computes for so long, when all frames are there, hangs."""
+_IDLE_S = 20.0
+"""A process that waits for a complete view, and has found none for so long, will find none."""
 _LOOK_EVERY_S, _ENDS_WITHIN_S = 0.5, 5.0
 Say = Callable[[str, int, int], None]
 
@@ -53,6 +59,10 @@ class ProcessingBeside:
         self._reasons: list[str] | None = None
         self._has_answered = threading.Event()
         self._told = threading.Event()
+        self._discarder: Discarder | None = None
+        """Set from the begin of a session whose frames are discarded to its end."""
+        self._heard_s, self._cpu_at_s = 0.0, 0.0
+        """Time of the newest line, monotonic, and what the process had computed by then."""
         self._has_ended = threading.Event()
         self._is_ending = False
         self._why = ""
@@ -113,6 +123,43 @@ class ProcessingBeside:
         self._run, self._result = run, self.result_of(run)
         self._console.print(f"reflectance {self._result}", markup=False)
         self._ask({"run": str(run), "result": str(self._result)})
+
+    def discard(
+        self, run: Run, note: Callable[[FramesDiscarded], None], room: DiscardRoom
+    ) -> Callable[[str], bool]:
+        """Discard frames of this session's run when their samples are safe, as its plan says; `note` brings the
+        event into the journal, on the disk. Returns the function that tells whether there is room for a view."""
+        self._discarder = discarder = Discarder(run, note, room, self._console)
+        waited_for_view = ""
+
+        def has_room(view: str) -> bool:
+            nonlocal waited_for_view
+            if view != waited_for_view:  # its process gets the time that it may be silent anew
+                waited_for_view = view
+                self._heard_s, self._cpu_at_s = time.monotonic(), self._cpu_s()
+            return discarder.has_room(view, self._why_no_more)
+
+        return has_room
+
+    def end_session(self) -> None:
+        """The session is about to let the run go: what is left to discard is discarded by the process that makes
+        the result."""
+        if self._discarder is not None:
+            discarder, self._discarder = self._discarder, None
+            discarder.end()
+
+    def _why_no_more(self) -> str:
+        """Return why no more frames will be discarded; empty while some may be."""
+        if self._has_ended.is_set():
+            return f"the processing has ended ({self._reason})"
+        if is_stopped(self._process.pid):
+            return f"its process {self._process.pid} is stopped (SIGSTOP)"
+        silent_s = time.monotonic() - self._heard_s
+        if self._progress.step == "waiting" and silent_s > _IDLE_S:
+            return "all complete views were processed"
+        if silent_s > _SILENT_S and self._cpu_s() - self._cpu_at_s < _LEAST_CPU_S:
+            return f"its process did nothing for {_SILENT_S:g} s"
+        return ""
 
     # -- after the last frame ---------------------------------------------------------------------------------
 
@@ -213,7 +260,13 @@ class ProcessingBeside:
             self._tell_of_failure()
 
     def _hear(self, document: Any) -> None:
-        if "reasons" in document:
+        self._heard_s, self._cpu_at_s = time.monotonic(), self._cpu_s()
+        discarder = self._discarder
+        if "discard" in document and discarder is not None:
+            discarder.ask(FramesDiscarded.model_validate(document["discard"]))
+        elif "kept" in document and discarder is not None:
+            discarder.keep(str(document["kept"]), str(document["why"]))
+        elif "reasons" in document:
             self._reasons = list(map(str, document["reasons"]))
             self._has_answered.set()
         elif "times" in document:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Protocol
@@ -23,8 +23,9 @@ from coupole.plan.shot_id import ShotId
 from coupole.storage import journal, run_dose
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import make_folder, write_synced
+from coupole.storage.frame_file import SPARE_SLOTS
 from coupole.storage.frame_file_creation import Collections, create
-from coupole.storage.journal import FRAME_LINE, Journal, append_lines
+from coupole.storage.journal import FRAME_LINE, Journal, append_lines, event_line
 from coupole.storage.journal_events import Event, FrameProven
 from coupole.storage.run import Run
 from coupole.storage.view_reader import View, read_view, refuse_lost
@@ -33,8 +34,6 @@ from coupole.storage.view_writer import ViewWriter
 COMMIT_EVERY_S = 0.5
 PICTURES = "watch"
 """Folder of a run with pictures of what was found while it was acquired."""
-SPARE_SLOTS = 32
-"""Additional slots for surplus frames, until their burst has been evaluated."""
 _SLOWEST_SYNC_BYTES_S, _SLOWEST_ALLOCATION_BYTES_S = 5e6, 50e6
 """Speeds of the slowest disks that still answer: an allocation may be written out."""
 
@@ -51,6 +50,10 @@ class Recorder(Protocol):
 
     def proven(self) -> set[ShotId]:
         """Shots proven so far, also in an earlier session of the run."""
+        ...
+
+    def has_room(self, view: str) -> bool:
+        """Tell whether the disk takes a view that is about to begin. Raises DiskFull if it never will."""
         ...
 
     def begin_view(
@@ -139,6 +142,8 @@ class RunRecorder:
         self._committing: Future[None] | None = None
         self._unsynced_bytes = 0
         self._uncommitted: list[ShotId] = []
+        self.has_room_for: Callable[[str], bool] = lambda view: True
+        """Answer of `has_room`; where frames are discarded meanwhile, room may come."""
         self.committed = set(self._proven)
         """Proven shots whose lines are on the disk."""
 
@@ -147,6 +152,9 @@ class RunRecorder:
 
     def proven(self) -> set[ShotId]:
         return set(self._proven)
+
+    def has_room(self, view: str) -> bool:
+        return self.has_room_for(view)
 
     def begin_view(
         self,
@@ -244,6 +252,10 @@ class RunRecorder:
 
     def note(self, event: Event) -> None:
         self._journal.write(event)
+
+    def note_at_once(self, event: Event) -> None:
+        """Note an event from any thread; on the disk when this returns. Raises StorageError."""
+        self._journal.append([event_line(event)])
 
     def keep_picture(self, name: str, content: bytes) -> str:
         folder = self._run.folder / PICTURES

@@ -85,6 +85,7 @@ def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
     return {
         "simulated": cell.is_simulated,
         "proof": _proof(job),
+        **({"discard": job.plan.discard} if job.plan.discard else {}),
         "licence": job.plan.licence or job.cell.rig.licence,
         "contact": job.plan.contact or job.cell.rig.contact,
         "object": job.plan.object.id if job.plan.object else None,

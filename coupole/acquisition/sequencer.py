@@ -45,6 +45,7 @@ from coupole.storage.journal_events import (
 from coupole.viewing.progress import Outcome, Progress
 
 _PAUSE_NAP_S = 0.1
+_ROOM_NAP_S = 0.5
 
 
 class Sequencer:
@@ -166,6 +167,7 @@ class Sequencer:
         collections = {"shadow": {**occlusion.arrays(patches), "leds": self._job.cell.leds.ids}}
         dwell_s = self._job.cell.rig.motion.settle_dwell_s
         self.outcome.ideal_s += visit.leg.duration_s + dwell_s
+        self._wait_for_room(view.name)
         next_bursts = next_bursts or self._bursts.more(number)
         if not next_bursts:  # the view has enough without a frame
             return
@@ -314,6 +316,19 @@ class Sequencer:
         place = (self._view_name, self._view_number, len(schedule.views))
         frames = sum(self._bursts.expected_frames(number) for number in range(len(schedule.views)))
         self._observer.progress(Progress(*place, proven, frames, light, dose_lux_h, left_s))
+
+    def _wait_for_room(self, view: str) -> None:
+        """Wait, lights off and the arm at rest, while the disk has no room for a view but may have it soon."""
+        if self._recorder.has_room(view):
+            return
+        self._observer.note(
+            f"waits for room on the disk before {view}: frames of earlier views are to be discarded"
+        )
+        while not self._recorder.has_room(view):
+            self._wait_while_paused()
+            with contextlib.suppress(Held):  # the pause that follows says why
+                self._arm.attend()
+            self._cell.clock.sleep(_ROOM_NAP_S)
 
     def _wait_while_paused(self) -> None:
         control = self._control

@@ -49,9 +49,11 @@ from coupole.errors import (
 from coupole.plan.rig_devices import trusted_by_name
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.checking import calibration_refusals, check_job, preflight_of
+from coupole.preflight.discard_room import discard_room
 from coupole.preflight.job import Job, with_choices, without_hidden
 from coupole.preflight.preflight import StorageFacts
 from coupole.storage.arm_faults import ArmFaults, faults_of
+from coupole.storage.discarding import finish as finish_discarding
 from coupole.storage.journal_events import (
     FaultNoted,
     ProcessingAsked,
@@ -59,7 +61,7 @@ from coupole.storage.journal_events import (
     SessionStarted,
     SessionStopped,
 )
-from coupole.storage.run import Run
+from coupole.storage.run import Occupied, Run
 from coupole.storage.run_inputs import copied_s
 from coupole.storage.view_reader import refuse_lost
 from coupole.viewing.keys import key_actions
@@ -132,11 +134,10 @@ def _acquire_into(
     job, preflight = preflight_of(
         job,
         folder,
-        allocated_bytes=run.allocated_bytes() if run else 0,
+        occupied_space=run.occupied_space() if run else Occupied(),
         proven=run.proven() if run else (),
     )
-    if beside is not None:
-        preflight.refusals += beside.refusals()
+    preflight.refusals += beside.refusals() if beside is not None else _refuse_without_result(job)
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     refuse(preflight)
     if run is not None and not preflight.frames and not run.open_views():
@@ -169,13 +170,26 @@ def _acquire_into(
             fields = {"dose_budget_lux_h": preflight.dose_budget_lux_h, "trusted": trusted_by_name(job.cell.rig)}
             recorder.note(event.model_copy(update=fields))
             if beside is not None:
-                _begin_processing(run, recorder, beside)
+                _begin_processing(job, run, recorder, beside)
             tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
             _acquire(job, cell, run, recorder, console, faults, light, figures=figures)
         finally:
-            recorder.close()
+            _end_recording(recorder, beside)
+
+
+def _end_recording(recorder: RunRecorder, beside: ProcessingBeside | None) -> None:
+    """Nothing is discarded any more when the recorder closes the journal."""
+    if beside is not None:
+        beside.end_session()
+    recorder.close()
+
+
+def _refuse_without_result(job: Job) -> list[str]:
+    """A plan whose frames are discarded needs the result that stands for them."""
+    why = job.plan.why_with_result
+    return [str(job.document.problem(("discard",), why))] if why else []
 
 
 def _close_complete(
@@ -190,10 +204,13 @@ def _close_complete(
     _say_outcome(console, run, outcome, "done")
 
 
-def _begin_processing(run: Run, recorder: RunRecorder, beside: ProcessingBeside) -> None:
+def _begin_processing(job: Job, run: Run, recorder: RunRecorder, beside: ProcessingBeside) -> None:
     """Process the run's views from now on; a resumed run knows of it by its journal."""
     recorder.note(ProcessingAsked(result=str(beside.result_of(run.folder))))
     recorder.commit(now=True)
+    if job.plan.discard is not None:
+        on_disk(str(run.folder), partial(finish_discarding, run))
+        recorder.has_room_for = beside.discard(run, recorder.note_at_once, discard_room(job))
     beside.follow(run.folder)
 
 

@@ -98,6 +98,7 @@ def verify(
             json.dumps(
                 {
                     **document,
+                    "discarded": sum(check.discarded_counts.values()),
                     **{key: getattr(check, key) for key in ("bad", "missing", "unlisted", "not_compared")},
                 }
             )
@@ -130,6 +131,8 @@ def _show_verified(console: Console, run: Run, verification: Verification) -> No
         console.print(
             f"ok: {verification.frames} frames, each exactly once, all checksums right; proof: {run.proof}"
         )
+    if verification.discarded_counts:
+        _show_discarded(console, verification)
     if verification.not_compared:
         console.print(f"[yellow]not compared with the plan:[/] {escape(verification.not_compared)}")
     if verification.listed_count and not verification.bad:
@@ -139,6 +142,24 @@ def _show_verified(console: Console, run: Run, verification: Verification) -> No
             f"not listed there: {', '.join(verification.unlisted[:5])}"
             f"{' ...' if verification.unlisted[5:] else ''}"
         )
+
+
+def _show_discarded(console: Console, verification: Verification) -> None:
+    counts = ", ".join(f"{count} of {view}" for view, count in verification.discarded_counts.items())
+    total = sum(verification.discarded_counts.values())
+    console.print(
+        f"{total} more frames were discarded, as the plan says (discard: after_fit): {counts}. They cannot be "
+        "looked "
+        "at again. The journal has their shots and checksums; their samples stand for them:",
+        markup=False,
+    )
+    samples = (
+        "are as they were read back before anything was discarded, or replaced after that"
+        if verification.ok
+        else "see above what is wrong with them"
+    )
+    for result in verification.results:
+        console.print(f"  {result}: its samples {samples}", markup=False, soft_wrap=True)
 
 
 def archive(

@@ -137,6 +137,8 @@ class Plan(Model):
     """The camera is triggered by the LED box, or by the host, light by light."""
     reshoot_limit: Annotated[int, Field(ge=0, le=20)] = 3
     """Number of times that frames which are not proven are taken again, at most."""
+    discard: Literal["after_fit"] | None = None
+    """`after_fit`: frames are discarded when their samples are safe, but for those that the check needs."""
     watch: bool | Watch = DARKS_ONLY
     """Watching of the run: `true`, `false`, or what of it. Without it dark frames are looked at."""
     licence: Words | None = None
@@ -162,6 +164,16 @@ class Plan(Model):
         if any(isinstance(selection, NoLights) for selection in lights) and self.darks_per_view == 0:
             raise ValueError("lights, or at least one dark frame per view: otherwise a view takes no frame")
         return self
+
+    @property
+    def why_with_result(self) -> str:
+        """Return why the plan cannot be run without `--reflectance`; empty if it can."""
+        if self.discard is None:
+            return ""
+        return (
+            "expected a run with `--reflectance`: frames are discarded only when their samples are safe, and "
+            "without it none are taken. Without `discard` all frames are kept"
+        )
 
     @property
     def watching(self) -> Watch:

@@ -18,15 +18,19 @@ from coupole.plan.rig_devices import in_world, runs_tables, trusted_by_name
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.choosers import refusals_of_choosers
 from coupole.preflight.commissioned import commissioning_refusals
+from coupole.preflight.discard_room import discard_room, refusals_of_discarding
 from coupole.preflight.exposure_scale import ExposedWhite, exposed_white, exposure_scale
 from coupole.preflight.framing import ObjectCheck, check_object
 from coupole.preflight.job import Job, at_pace
 from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, Whole, check
+from coupole.storage.given_back import why_not
 from coupole.storage.ledger import ledger_of, similar_ids
 from coupole.storage.ledger_lines import History
+from coupole.storage.run import Occupied
 from coupole.storage.write_speed import measure_write_speed
 
 _DISK_GRAIN_US = 100
+NOTHING = Occupied()
 LED_DUTIES = tuple(0.9**k for k in range(1, 33))
 """Largest on-time shares, tried in turn if LEDs get too hot."""
 
@@ -36,7 +40,7 @@ def preflight_of(
     folder: Path,
     *,
     paths: bool = True,
-    allocated_bytes: int = 0,
+    occupied_space: Occupied = NOTHING,
     proven: Collection[ShotId] = (),
     measure: bool = True,
     say: Callable[[str], object] = lambda _: None,
@@ -44,13 +48,15 @@ def preflight_of(
     """Preflight's report on a job whose run would be in `folder`, and the job at the pace that LEDs and the
     measured speed of that disk allow.
 
-    Without `paths` collisions are not checked. For a resumed run, `allocated_bytes` are already on the disk
-    and the `proven` frames are not taken again. The disk's speed is not known unless it is to `measure`; `say` is
-    called with each step in words.
+    Without `paths` collisions are not checked. For a resumed run, its views occupy some of the
+    disk and the `proven` frames are not taken again. The disk's speed is not known unless it is to `measure`;
+    `say` is called with each step in words.
     """
     if measure:
         say("measuring the disk's speed")
-    storage = storage_of(folder, job.cell.rig, allocated_bytes, measure=measure)
+    storage = storage_of(folder, job.cell.rig, occupied_space, measure=measure)
+    if job.plan.discard is not None and not storage.trouble:
+        storage = replace(storage, no_holes=why_not(_existing(folder)))
     say("computing paths, heat, light and time")
     job, report = check_job(job, storage, paths=paths, proven=proven)
     if measure and not storage.write_bytes_s and not storage.trouble:
@@ -62,11 +68,11 @@ def preflight_of(
     return job, report
 
 
-def storage_of(folder: Path, rig: Rig, allocated_bytes: int = 0, *, measure: bool = True) -> StorageFacts:
+def storage_of(
+    folder: Path, rig: Rig, occupied_space: Occupied = NOTHING, *, measure: bool = True
+) -> StorageFacts:
     """State of the disk on which `folder` is, or would be."""
-    existing = folder
-    while not existing.exists():
-        existing = existing.parent
+    existing = _existing(folder)
     write_bytes_s, trouble = 0.0, "" if existing.is_dir() else f"{existing} is a file"
     free_bytes = shutil.disk_usage(existing).free
     if measure and not trouble:
@@ -76,7 +82,12 @@ def storage_of(folder: Path, rig: Rig, allocated_bytes: int = 0, *, measure: boo
             )
         except StorageError as error:
             trouble = str(error)
-    return StorageFacts(free_bytes, write_bytes_s, folder, allocated_bytes, trouble)
+    return StorageFacts(free_bytes, write_bytes_s, folder, occupied_space, trouble)
+
+
+def _existing(folder: Path) -> Path:
+    """The folder, or the nearest above it that exists."""
+    return next(place for place in (folder, *folder.absolute().parents) if place.exists())
 
 
 def check_job(
@@ -127,6 +138,7 @@ def check_job(
     if report.object_check is not None:
         report.refusals += report.object_check.refusals
         report.warnings += report.object_check.warnings
+    _check_discarding(job, report, storage, proven)
     report.warnings += job.shape.remarks
     if (scale := exposure_scale(job)) is not None:
         report.exposure_scale, report.white = scale.source, tuple(exposed_white(job, scale))
@@ -138,6 +150,30 @@ def check_job(
     report.warnings += job.cell.remarks
     report.warnings += ledger_warnings(job, history, report.dose_lux_h)
     return job, report
+
+
+def _check_discarding(job: Job, report: Report, storage: StorageFacts, proven: Collection[ShotId]) -> None:
+    """The disk space of a run whose frames are discarded, and reasons why they cannot be; nothing if all are
+    kept."""
+    if job.plan.discard is None:
+        return
+    report.refusals += refusals_of_discarding(job)
+    report.warnings.append("frames are discarded when their samples are safe: the run needs `--reflectance`")
+    room, folder = discard_room(job), storage.folder or job.cell.storage_folder
+    remaining = job.schedule.without_proven(proven) if proven else job.schedule
+    report.peak_bytes = room.peak_bytes(storage.occupied_space, {view.name for view in remaining.views})
+    if storage.no_holes:
+        problem = job.document.problem(
+            ("discard",), f"expected a disk that can give back a part of a file; {folder}: {storage.no_holes}"
+        )
+        report.refusals.append(str(problem))
+    if report.peak_bytes + room.reserve_bytes > storage.free_bytes:
+        needed, reserve, free = (n / 1e9 for n in (report.peak_bytes, room.reserve_bytes, storage.free_bytes))
+        report.refusals.append(
+            f"storage {folder}: though frames are discarded, the run needs up to {needed:.2f} GB at a time "
+            f"(frames of one view, what is kept of all, samples and fits), and {reserve:.2f} GB must stay free; "
+            f"{free:.2f} GB are free"
+        )
 
 
 def allowed_lux_h(job: Job, history: History) -> float | None:

@@ -40,7 +40,7 @@ def check_files(
     """
     from coupole.preflight.checking import preflight_of
     from coupole.preflight.job import read_job, without_hidden
-    from coupole.storage.run import Run
+    from coupole.storage.run import Occupied, Run
 
     say("reading plan, mesh and records")
     job = read_job(files.plan, files.rig)
@@ -51,7 +51,7 @@ def check_files(
         say("computing paths and hidden lights")
         job = without_hidden(job, run.hidden_leds if run else None)
     folder = run.folder if run else files.output or job.cell.storage_folder
-    allocated_bytes, proven = (run.allocated_bytes(), run.proven()) if run else (0, {})
+    occupied_space, proven = (run.occupied_space(), run.proven()) if run else (Occupied(), {})
     return preflight_of(
-        job, folder, paths=paths, allocated_bytes=allocated_bytes, proven=proven, measure=measure, say=say
+        job, folder, paths=paths, occupied_space=occupied_space, proven=proven, measure=measure, say=say
     )

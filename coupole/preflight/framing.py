@@ -201,7 +201,11 @@ def _camera_pose(view: ViewPose, number: int, rig: Rig, itinerary: Itinerary) ->
     if view.support_from_camera is not None:
         return view.support_from_camera
     visit = itinerary.visits[number]
-    joints_deg = visit.joints_deg if visit is not None else np.array(view.joints_deg)
+    return camera_at(visit.joints_deg if visit is not None else np.array(view.joints_deg), rig)
+
+
+def camera_at(joints_deg: NDArray[np.float64], rig: Rig) -> Transform:
+    """`support_from_camera` at these angles of the arm."""
     base_from_camera = forward(arm_of(rig), joints_deg) @ rig.flange_from_camera.matrix()
     pose: Transform = inverse(rig.support.base_from_support.matrix()) @ base_from_camera
     return pose

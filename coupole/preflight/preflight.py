@@ -26,6 +26,7 @@ from coupole.plan.schedule import Schedule
 from coupole.preflight.exposure_scale import ExposedWhite
 from coupole.preflight.framing import ObjectCheck
 from coupole.preflight.led_limits import heat_of, refuse_on_times
+from coupole.storage.run import Occupied
 
 BURST_OVERHEAD_S = 0.14
 """Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell)."""
@@ -47,10 +48,12 @@ class StorageFacts:
     """Measured; 0: not measured."""
     folder: Path | None = None
     """Folder in which the run would be, or is; None: the rig's."""
-    allocated_bytes: int = 0
-    """Space that a resumed run already occupies: its views' files are allocated as a whole."""
+    occupied_space: Occupied = field(default_factory=Occupied)
+    """Space that the views of a resumed run already occupy: their files are allocated as a whole."""
     trouble: str = ""
     """Reason why nothing can be written there."""
+    no_holes: str = ""
+    """Reason why parts of files cannot be given back there, where that is asked for."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,9 @@ class Report:
     """Shots and dark frames."""
     bytes: int = 0
     """Size of all frames on the disk."""
+    peak_bytes: int | None = None
+    """Most that the run needs on the disk at a time, samples and fits included, if frames are discarded; None if
+    all are kept."""
     duration_s: float = 0.0
     """Expected duration, s."""
     ideal_s: float = 0.0
@@ -156,7 +162,7 @@ def check(
     heat = heat_of(bursts, [view.move_s for view in report.views], rig.led_limits, leds)
     report.peak_board_c, report.too_hot = heat.peak_c, heat.too_hot
     report.refusals += heat.refusals
-    _storage(report, rig, schedule, storage)
+    _storage(report, rig, schedule, storage, keeps_all=plan.discard is None)
     return report
 
 
@@ -248,17 +254,17 @@ def _most_dose(view: OpenView, lux: NDArray[np.float64], row_of_id: Mapping[int,
     return np.asarray(brightest @ np.sort(on_us)[::-1].astype(np.float64) / 3.6e9)
 
 
-def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts) -> None:
+def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts, *, keeps_all: bool) -> None:
     frame_bytes = rig.frame_bytes
     folder = storage.folder or rig.storage.folder
     report.bytes = report.frames * frame_bytes
     periods_us = [int(b.table["period_us"].min()) for bursts in schedule.bursts for b in bursts]
     report.asked_bytes_s = frame_bytes / (min(periods_us) * 1e-6) if periods_us else 0.0
     report.disk_bytes_s = storage.write_bytes_s
-    needed_bytes = max(0, (report.whole.bytes if report.whole else report.bytes) - storage.allocated_bytes)
+    needed_bytes = max(0, (report.whole.bytes if report.whole else report.bytes) - storage.occupied_space.bytes)
     if storage.trouble:
         report.refusals.append(f"storage {folder}: expected a folder that can be written; {storage.trouble}")
-    if needed_bytes + rig.storage.reserve_bytes > storage.free_bytes:
+    if keeps_all and needed_bytes + rig.storage.reserve_bytes > storage.free_bytes:
         report.refusals.append(
             f"storage {folder}: the run needs {needed_bytes / 1e9:.2f} GB and "
             f"{rig.storage.reserve_bytes / 1e9:.2f} GB must stay free; {storage.free_bytes / 1e9:.2f} GB are free"

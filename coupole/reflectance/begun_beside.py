@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import coupole
 from coupole.calibration.light.frames import LightFrames
 from coupole.errors import InputError
 from coupole.intake.plain_data import read_json
+from coupole.reflectance.discarded_frames import refuse_stale
 from coupole.reflectance.result_folder import SETTINGS, read_settings
 from coupole.reflectance.run_result import FRAMES
 from coupole.storage.durable import make_folder, write_synced
@@ -80,10 +81,12 @@ def is_taken(out: Path, file_name: str, basis: ViewBasis) -> bool:
     )
 
 
-def adopt(out: Path, settings: Mapping[str, Any], bases: Mapping[str, ViewBasis]) -> None:
+def adopt(
+    out: Path, settings: Mapping[str, Any], bases: Mapping[str, ViewBasis], discarded_names: Collection[str]
+) -> None:
     """Keep those samples taken during an acquisition that are valid for the complete run; `bases` are those of its
-    views, by the names of their files. Raises InputError if the samples are of other input, or a process is at
-    work on them.
+    views, by the names of their files. Raises InputError if the samples are of other input, if those of a view
+    whose frames were discarded (`discarded_names`) are not valid, or a process is at work on them.
     """
     if not (out / FOLDER).is_dir():
         return
@@ -98,9 +101,11 @@ def adopt(out: Path, settings: Mapping[str, Any], bases: Mapping[str, ViewBasis]
         view_notes, basis = known_views.get(path.stem), bases.get(path.stem)
         picture = out / FRAMES / path.name
         if view_notes is None or basis is None or view_notes["frames"] != basis.frames:
+            refuse_stale(discarded_names, path.stem, out)
             for stale in (path.with_suffix(".json"), path, picture):  # the first says that the others are whole
                 stale.unlink(missing_ok=True)
         elif tuple(view_notes["left_out"]) != basis.left_out:
+            refuse_stale(discarded_names, path.stem, out)
             picture.unlink(missing_ok=True)
 
 

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from coupole.reflectance.discarded_frames import rewrite
 from coupole.reflectance.extraction.sample_codes import BY_UNKNOWN
 from coupole.reflectance.fits import GGX_NORMAL
-from coupole.reflectance.result_folder import complete
 from coupole.reflectance.run_result import CONTRADICTED, SAMPLES, RunResult, ViewSamples
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
 
@@ -123,4 +123,4 @@ def leave_out(view: ViewSamples, found_contradictions: Iterable[Found]) -> None:
                     file["f"][contradictions.rows], file["codes"][contradictions.rows] = f, codes
             file.attrs[CONTRADICTED], file.attrs[SAMPLES] = count, total - count
 
-    complete(view.path, write)
+    rewrite(view.path, write)

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from coupole.motion.occlusion import RAY_START_MM, blocked_segments, ray_mesh
+from coupole.reflectance.discarded_frames import rewrite
 from coupole.reflectance.extraction.frame_veils import GLARE
 from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.result_folder import complete
@@ -344,7 +345,7 @@ def _subtract_view(
             file.attrs[SAMPLES] = sample_count
             file.attrs[INTER_REFLECTION] = np.quantile(every, [0.5, 0.95]) if len(every) else [0.0, 0.0]
 
-    complete(view.path, write)
+    rewrite(view.path, write)
 
 
 def _off(

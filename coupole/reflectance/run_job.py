@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -17,12 +17,20 @@ from uuid import uuid4
 
 from coupole.errors import InputError
 from coupole.intake.plain_data import read_json
+from coupole.plan.held_out import held_out_leds
 from coupole.plan.shot_id import Led
 from coupole.reflectance.alignment.colmap_model import read_model
 from coupole.reflectance.alignment.colmap_poses import read_poses
 from coupole.reflectance.alignment.refined_geometry import ABOUT, read_refined, what_was_refined
 from coupole.reflectance.begun_beside import ViewBasis, adopt, clear_beside, frames_basis, is_taken, note_view
 from coupole.reflectance.block_work import Said, Workshop, silent, workshop
+from coupole.reflectance.discarded_frames import (
+    discard_complete,
+    is_for_discarding,
+    prove_written,
+    read_back_or_drop,
+    refuse_without_frames,
+)
 from coupole.reflectance.extraction.extraction import Geometry, extract_view, geometry_of
 from coupole.reflectance.extraction.frames_for_check import write_frames
 from coupole.reflectance.extraction.measured_run import (
@@ -38,13 +46,12 @@ from coupole.reflectance.run_check import check_result
 from coupole.reflectance.run_fits import fit_result
 from coupole.reflectance.run_result import FRAMES, OBJECT, RunResult
 from coupole.reflectance.run_result_files import write_object
+from coupole.storage.discarding import discarded_views, incomplete_until
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sha256, write_synced
 from coupole.storage.run import Run
 from coupole.storage.run_json import RUN_JSON
-
-HELD_OUT_EVERY, HELD_OUT_FIRST = 12, 4
-"""Step and first place of the LEDs that are kept for the check, if none are named."""
+from coupole.storage.sample_proofs import proofs_of
 
 
 @dataclass(frozen=True)
@@ -74,6 +81,12 @@ class RunRequest:
             path and path.resolve() for path in (self.mesh, self.refined_folder, self.poses)
         )
         return Sources(mesh, tuple(path.resolve() for path in self.calibrations), refined_path, poses)
+
+    @property
+    def is_plain(self) -> bool:
+        """True for what is made beside an acquisition too: of one run, by its own mesh and records."""
+        named_files = (self.mesh, self.calibrations, self.left_out, self.refined_folder, self.poses)
+        return len(self.runs) == 1 and not any(named_files)
 
 
 @dataclass(frozen=True)
@@ -108,14 +121,20 @@ def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None
     """The samples of all views. Raises as `reflectance_of`."""
     token = uuid4().hex
     measured_runs = read_runs(request, token)
+    for measured_run in measured_runs:
+        refuse_without_frames(measured_run.run, out)
     try:
         with workshop(scheduler) as shop:
             settings = settings_of(request, token, measured_runs)
-            adopt(out, settings, _bases(measured_runs, settings["left_out"]))
+            adopt(
+                out, settings, _bases(measured_runs, settings["left_out"]), discarded_views(measured_runs[0].run)
+            )
             begin(out, settings)
             complete(out / OBJECT, partial(_write_object, measured_runs[0]))
             shop.refuse_blind(out.resolve(), SETTINGS)
             _extract(request, token, measured_runs, out.resolve(), shop, say)
+        if discards(request, measured_runs[0].run, out):
+            discard_complete(measured_runs[0].run, out, say)
         settings = read_settings(out)
         if settings["subtracted"]:
             support = settings["support_reflectance"]
@@ -126,34 +145,54 @@ def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None
         forget()
 
 
-def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> None:
+def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> str:
     """The samples of a complete view of a run that is still acquired, with the run's own mesh and records. Files
     that are there already, and agree with the view's frames, stay. A result that was begun with all frames of its
     runs stays as well. Raises as `reflectance_of`.
+
+    Returns the digest of the samples if the view's frames may be discarded for them: they were read back just now,
+    and are what was written; else an empty text.
     """
     if (out / SETTINGS).exists():
-        return
+        return ""
     request, token = RunRequest((run,)), uuid4().hex
+    opened_run = Run(run)
+    if view_name in discarded_views(opened_run):
+        return ""
+    is_final = not incomplete_until(opened_run, view_name)  # before its frames are read
+    gives_frames = is_final and discards(request, opened_run, out)
     try:
         (measured_run,) = read_runs(request, token)
         view = next((view for view in measured_run.views if view.name == view_name), None)
         if view is None:  # dark frames or panels alone
-            return
+            return ""
         left_out = tuple(held_out_leds(_expected_leds(measured_run.run)))
         basis = ViewBasis(frames_basis(measured_run.frames, view_name), left_out)
         file_name = view_file_name([measured_run], measured_run, view)
         if is_taken(out, file_name, basis):
-            return
+            digest = read_back_or_drop(out, file_name) if gives_frames else ""
+            if digest or not gives_frames:
+                return digest
         path = out / "samples" / f"{file_name}.h5"
         path.with_suffix(".json").unlink(missing_ok=True)
         note_view(out, run.name, settings_of(request, token, [measured_run]), file_name, basis)
         complete(out / OBJECT, partial(_write_object, measured_run))
-        summary = _extract_one(token, request.sources, None, say, _View(run.resolve(), view_name, path, left_out))
+        task = _View(run.resolve(), view_name, path, left_out)
+        summary, digest = _extract_one(token, request.sources, None, say, task)
         write_synced(path.with_suffix(".json"), json.dumps(summary))
+        if gives_frames:
+            prove_written(out, file_name, digest)
     except OSError as error:
         raise disk_error(out, error) from error
+    else:
+        return digest if gives_frames else ""
     finally:
         forget()
+
+
+def discards(request: RunRequest, run: Run, out: Path) -> bool:
+    """Tell whether frames of a run are discarded when the result of a request has their samples."""
+    return request.is_plain and is_for_discarding(run, out)
 
 
 def _write_object(measured_run: MeasuredRun, path: Path) -> None:
@@ -163,11 +202,6 @@ def _write_object(measured_run: MeasuredRun, path: Path) -> None:
 def _expected_leds(run: Run) -> set[int]:
     """LEDs of all views; where they are chosen in the run, of those that were chosen so far."""
     return {shot.light.id for shot in run.expected_shots() if isinstance(shot.light, Led)}
-
-
-def held_out_leds(leds: Collection[int]) -> list[int]:
-    """LEDs that are kept for the check, if none are named."""
-    return sorted(leds)[HELD_OUT_FIRST::HELD_OUT_EVERY]
 
 
 def _bases(measured_runs: Sequence[MeasuredRun], left_out: Sequence[int]) -> dict[str, ViewBasis]:
@@ -252,6 +286,10 @@ def _extract(
         for run, measured_run in zip(request.runs, measured_runs, strict=True)
         for view in measured_run.views
     ]
+    gives_frames = discards(request, measured_runs[0].run, out)
+    for run_view in remaining_views if gives_frames else ():
+        if not proofs_of(out, run_view.path.stem):  # killed before it was read back
+            run_view.path.with_suffix(".json").unlink(missing_ok=True)
     remaining_views = [run_view for run_view in remaining_views if not run_view.is_whole]
     sources = request.sources
     for run_view in remaining_views:
@@ -262,10 +300,12 @@ def _extract(
         path = read_model(sources.poses).path
         shop.refuse_blind(path.parent, path.name)
     extract = partial(_extract_one, token, sources, shop.threads, shop.reporter(say))
-    for number, (run_view, summary) in enumerate(
+    for number, (run_view, (summary, digest)) in enumerate(
         zip(remaining_views, shop.map(extract, remaining_views), strict=True), start=1
     ):
         write_synced(run_view.path.with_suffix(".json"), json.dumps(summary))
+        if gives_frames and digest:
+            prove_written(out, run_view.path.stem, digest)
         say("views", number, len(remaining_views))
     shop.everywhere(forget)
 
@@ -276,18 +316,19 @@ def _extract_one(
     threads: int | None,
     say: Said,
     task: _View,
-) -> dict[str, Any]:
-    """Write the files of a view's samples and frames for the check; what the report says of them."""
+) -> tuple[dict[str, Any], str]:
+    """Write the files of a view's samples and frames for the check; what the report says of them, and the digest
+    of the samples that were written, empty if they were there."""
     measured_run, geometry, radiometry = prepare_run(token, task.run, sources)
     view = next(view for view in measured_run.views if view.name == task.view)
     summary_path = task.path.with_suffix(".json")
-    summary: dict[str, Any] = (
-        read_json(summary_path, allow_nan=True)
+    summary, digest = (
+        (read_json(summary_path, allow_nan=True), "")
         if summary_path.exists()  # of samples whose pictures for the check alone are missing
         else extract_view(measured_run, geometry, radiometry, view, task.path, say, threads=threads)
     )
     complete(task.frames_path, partial(write_frames, radiometry, view, task.path, task.left_out, threads))
-    return summary
+    return summary, digest
 
 
 @lru_cache(maxsize=1)

@@ -15,6 +15,7 @@ from coupole.errors import UnprovenError
 from coupole.storage import frame_file, manifest
 from coupole.storage.archive_view import ArchivedView, Progress, archive_view
 from coupole.storage.bitshuffle import Codec
+from coupole.storage.discarding import discarded_views, finish
 from coupole.storage.run import Run
 
 KEPT_FOLDER = "unarchived"
@@ -81,6 +82,8 @@ def archive_run(
                 f"{run.folder}: what {open_views[0]} needs is not chosen yet. Resume the run first, or archive "
                 "its complete views with --partial."
             )
+        finish(run)  # what a crash has left
+        event_of_view = discarded_views(run)
         result = Archived(incomplete=sorted({shot.view for shot in missing} | set(open_views)))
         for view in run.about["views"]:
             path = run.view_path(view)
@@ -91,7 +94,10 @@ def archive_run(
                 continue
             name, kept_name = str(path.relative_to(run.folder)), f"{KEPT_FOLDER}/{path.name}"
             manifest.forget(run.folder, [name])
-            frames = [frame for frame in proven.values() if run.folder / frame.file == path]
+            gone = {shot for shot, _ in event_of_view[view].frames} if view in event_of_view else ()
+            frames = [
+                frame for shot, frame in proven.items() if run.folder / frame.file == path and shot not in gone
+            ]
             archived_view = archive_view(
                 path, frames, codec, progress, keep_in=run.folder / KEPT_FOLDER if keep else None
             )

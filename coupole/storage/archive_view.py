@@ -4,7 +4,8 @@ The frames of `NAME.h5` are compressed into `NAME.archive`, which is synced, rea
 as any reader would, and compared with the frame table and the journal. Then it is renamed to `NAME.h5`. So at
 every moment a complete file has the view's name, and after a crash archiving can be repeated.
 
-Only proven frames are kept. Any other slot is free in the archive and has no stored pixels; they read as 65535.
+Only proven frames are kept. Any other slot is free in the archive, or that of a frame that was discarded before,
+and has no stored pixels; they read as 65535.
 """
 
 from __future__ import annotations
@@ -215,9 +216,9 @@ def _copy_all_but_frames(
     data.attrs["not_stored"] = f"slots without a proven frame have no pixels and read as {bitshuffle.FILL_DN}"
     table = after[frame_file.FRAMES]
     records = table[:]
-    records[[slot for slot in range(len(records)) if slot not in proven_slots]] = np.zeros(
-        (), frame_file.FRAME_DTYPE
-    )
+    is_kept = records["state"] == frame_file.DISCARDED
+    is_kept[list(proven_slots)] = True
+    records[~is_kept] = np.zeros((), frame_file.FRAME_DTYPE)
     table[:] = records
     return data
 

@@ -3,7 +3,8 @@
 It is a NeXus HDF5 file: frames `[n, H, W]` uint16 and a table of fixed records, both contiguous, which
 `coupole.storage.frame_file_creation` allocates once. `coupole.storage.view_writer` then writes bytes straight to
 their offsets, so the file is valid HDF5 at every moment and a crash cannot break it. The record of a slot is its
-state: free, a frame not yet proven, or a proven shot with its checksum.
+state: free, a frame not yet proven, a proven shot with its checksum, or one whose pixels were discarded
+(`coupole.storage.discarding`).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from coupole.errors import StorageError
 from coupole.plan.shot_id import MAX_CHARACTERS
 
-FREE, STORED, PROVEN = 0, 1, 2
+FREE, STORED, PROVEN, DISCARDED = 0, 1, 2, 3
 
 FRAME_DTYPE = np.dtype(
     [
@@ -45,7 +46,7 @@ FRAME_DTYPE = np.dtype(
         ("pose", "<u2"),
     ]
 )
-"""Frame table: content of each slot (state 0 free, 1 stored but not proven, 2 proven)."""
+"""Frame table: content of each slot (state 0 free, 1 stored but not proven, 2 proven, 3 proven and discarded)."""
 
 POSE_DTYPE = np.dtype(
     [
@@ -57,6 +58,8 @@ POSE_DTYPE = np.dtype(
 )
 """Measured poses; a frame's `pose` is the number of its pose in this table."""
 
+SPARE_SLOTS = 32
+"""Slots of a view's file for surplus frames, until their burst has been evaluated."""
 PAGE = mmap.PAGESIZE
 MAX_POSES = 256
 PATTERNS = ("MONO", "RGGB", "BGGR", "GRBG", "GBRG")

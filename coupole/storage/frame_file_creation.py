@@ -42,7 +42,8 @@ _POSES_ATTRIBUTES = {
     "frames_of_reference": f"{_MAPS_CAMERA}; {_MAPS_FLANGE}; 4x4, p_base = matrix @ (x, y, z, 1)",
 }
 _FRAMES_ATTRIBUTES = {
-    "state_values": "0 free, 1 a frame that is not proven, 2 the proven frame of `shot`",
+    "state_values": "0 free, 1 a frame that is not proven, 2 the proven frame of `shot`, 3 as 2, but its pixels "
+    "were discarded: they read as 0",
     "led_none": 65535,
     "exposure_us_units": "us",
     "t_trigger_ns_units": "ns",

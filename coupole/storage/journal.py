@@ -7,6 +7,7 @@ which the caller calls after it has synced the frames; lines are then written an
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -29,6 +30,7 @@ class Journal:
     def __init__(self, path: Path) -> None:
         self._file = LineFile(path)
         self._lines: list[str] = []
+        self._writing = threading.Lock()
         self._head = [event_line(JournalBegun())] if self._file.was_empty else []
 
     def write(self, event: Event) -> None:
@@ -45,11 +47,12 @@ class Journal:
         self.append(self.take())
 
     def append(self, lines: list[str]) -> None:
-        """Write and sync lines from `take`; may run on another thread than `write` and `take`."""
+        """Write and sync lines from `take`, or of `event_line`; may run on several threads."""
         if not lines:
             return
-        self._file.append([*self._head, *lines])
-        self._head = []
+        with self._writing:
+            self._file.append([*self._head, *lines])
+            self._head = []
 
     @property
     def is_at_its_path(self) -> bool:

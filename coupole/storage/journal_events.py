@@ -250,6 +250,23 @@ class FindingNoted(JournalEvent):
     """A PNG file with the light before, after, and their difference, relative to the run's folder."""
 
 
+class FramesDiscarded(JournalEvent):
+    """Frames of a view are discarded, as its plan says, because their samples are safe; synced before the first of
+    them is touched."""
+
+    event: Literal["discard"] = "discard"
+    view: str
+    """Name of the view."""
+    frames: tuple[tuple[Shot, str], ...]
+    """Each frame with the checksum of its bytes, 16 hexadecimal digits, as in its `frame` line."""
+    result: str
+    """Folder of the result that has their samples, a whole path."""
+    samples: InnerPath
+    """The file with the samples, relative to that folder."""
+    digest: str
+    """Digest of the arrays in that file, as they were written and read back: SHA-256."""
+
+
 class FaultNoted(JournalEvent):
     """Something failed."""
 
@@ -336,6 +353,7 @@ Event: TypeAlias = (
     | GapFound
     | ReshootBegun
     | FindingNoted
+    | FramesDiscarded
     | FaultNoted
     | InputsChanged
     | Paused

@@ -21,8 +21,9 @@ import os
 import platform
 import shlex
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,7 @@ from coupole.storage.journal_events import (
     JOURNAL_VERSION,
     BurstsChosen,
     FrameProven,
+    FramesDiscarded,
     ProcessingAsked,
 )
 from coupole.storage.line_file import utc_now
@@ -46,6 +48,21 @@ from coupole.storage.run_readme import readme
 from coupole.storage.stopped_process import holder_of
 
 _LOCK_TRIALS, _LOCK_NAP_S = 20, 0.01
+
+
+@dataclass(frozen=True)
+class Occupied:
+    """Disk space that the views of a run already occupy."""
+
+    bytes_of_view: Mapping[str, int] = field(default_factory=dict)
+    """Bytes by name of view."""
+    settled_views: frozenset[str] = frozenset()
+    """Views whose files give nothing back any more: their frames are discarded, or they are archived."""
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of all views."""
+        return sum(self.bytes_of_view.values())
 
 
 class Run:
@@ -94,10 +111,17 @@ class Run:
     def view_path(self, view: str) -> Path:
         return self.folder / "views" / f"{view}.h5"
 
-    def allocated_bytes(self) -> int:
-        """Disk space that views already occupy: files are allocated completely before their first frame, or
-        archived."""
-        return sum(map(_settled_bytes, (self.folder / "views").glob("*.h5")))
+    def occupied_space(self) -> Occupied:
+        """Disk space that its views already occupy."""
+        events = journal.read_events(self.journal_path) if self.discards else ()
+        gone_views = {event.view for event in events if isinstance(event, FramesDiscarded)}
+        archived_views = {path.stem for path in (self.folder / "views").glob("*.h5") if _is_archived(path)}
+        return Occupied(self._allocated_bytes(), frozenset(gone_views | archived_views))
+
+    def _allocated_bytes(self) -> dict[str, int]:
+        """Disk space that the files of views already occupy, by name of view: files are allocated completely
+        before their first frame; later they may be archived, or frames of theirs discarded."""
+        return {path.stem: _settled_bytes(path) for path in (self.folder / "views").glob("*.h5")}
 
     @property
     def is_open(self) -> bool:
@@ -141,6 +165,11 @@ class Run:
         """LEDs that were left out of views, by name of view, because arm, camera or object occlude them."""
         leds_by_view: dict[str, list[int]] = self.about.get("hidden_leds", {})
         return leds_by_view
+
+    @property
+    def discards(self) -> bool:
+        """True if its plan has frames discarded when their samples are safe (`discard: after_fit`)."""
+        return self.about.get("discard") == "after_fit"
 
     @property
     def is_simulated(self) -> bool:
@@ -279,6 +308,12 @@ def _new_folder(parent: Path, name: str) -> Path:
             continue
         return folder
     raise StorageError(f"{parent}: a thousand runs named {name} exist already")
+
+
+def _is_archived(view_file: Path) -> bool:
+    from coupole.storage import frame_file
+
+    return frame_file.read_layout(view_file).is_archived
 
 
 def _settled_bytes(view_file: Path) -> int:

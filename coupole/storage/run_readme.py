@@ -40,7 +40,7 @@ A picture is named <view>/<light>/e<exposure>: `{view}/led0417/e0` is view {view
 Only rows of `frames` with state 2 are proven pictures. Pixel values are raw: DN, with the pattern of the colour
 filter in `bayer_pattern`, the black level in `black_level`, saturation in `saturation_value`.
 If `data` has the type uint8, three bytes hold two pixels; its attribute `packing` says how.
-
+{discarded}
 Units and frames of reference
 -----------------------------
 Lengths are in mm, angles in degrees, exposures in us. Transforms `a_from_b` are 4x4 and map coordinates of b to
@@ -52,6 +52,11 @@ flange     the robot's last flange
 camera     origin at the projection centre, x right and y down in the picture, z forward
 The pose of each picture is the row `pose` of `entry/instrument/robot/poses`. LEDs are in `entry/instrument/leds`,
 the lens in `entry/instrument/lens`.
+"""
+_DISCARDED = """\
+Pictures may have been discarded when the samples of reflectance that were taken from them were safe, as the plan
+said. Their rows in `frames` have state 3 and their pixels read as 0; lines "discard" of journal.jsonl name them,
+with the folder of the samples, which is not this one.
 """
 
 
@@ -71,4 +76,5 @@ def readme(folder_name: str, about: dict[str, Any]) -> str:
         licence=about.get("licence") or "not stated",
         contact=about.get("contact") or "not stated",
         view=views[0],
+        discarded=_DISCARDED if about.get("discard") else "",
     )

@@ -24,6 +24,7 @@ from coupole.storage.journal_events import (
     FaultNoted,
     FindingNoted,
     FrameProven,
+    FramesDiscarded,
     GapFound,
     InputsChanged,
     JournalBegun,
@@ -108,6 +109,8 @@ class Status:
     """The command line that takes what is left; empty if nothing is, or while the run is in use."""
     before_that: str = ""
     """The command line by which a person first confirms a fault of the arm; empty if none stands."""
+    frames_discarded: int = 0
+    """Frames that were discarded when their samples were safe, as the plan said."""
     processing: Processing | None = None
     """Processing beside the acquisition; None if it was not asked for."""
 
@@ -153,6 +156,7 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
         elif isinstance(event, ProcessingAsked):
             result = event.result
         _note_event(status, event)
+    status.frames_discarded = sum(len(event.frames) for event in events if isinstance(event, FramesDiscarded))
     status.proven = sum(shot.is_shot for shot in proven)
     status.darks_proven = sum(not shot.is_shot and not isinstance(shot.light, Sentinel) for shot in proven)
     proven_per_view = Counter(shot.view for shot in proven)
@@ -218,13 +222,16 @@ def _note_event(found: Status, event: Event) -> None:
             found.findings.append(f"{event.view}: {event.kind}: {event.message}{picture}")
         case BurstEnded():
             session.light_s += event.on_s
-        case JournalBegun() | ProcessingAsked() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven():
-            pass
-        case BurstsChosen() | BurstBegun() | GapFound() | ViewSealed() | InputsChanged() | TextUnread():
+        case (
+            JournalBegun() | ProcessingAsked() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven()
+            | BurstsChosen() | BurstBegun() | GapFound() | ViewSealed() | InputsChanged() | TextUnread()
+            | FramesDiscarded()
+        ):  # fmt: skip
             pass
         case _:
             assert_never(event)
-    session.ended = event.t
+    if not isinstance(event, FramesDiscarded):  # perhaps after the session
+        session.ended = event.t
 
 
 def _note_fault(status: Status, event: FaultNoted) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,12 @@ from coupole.errors import InputError, StorageError
 from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file, journal, manifest
 from coupole.storage.as_planned import AsPlanned, as_planned
+from coupole.storage.discarding import discarded_views, place_of_result
 from coupole.storage.journal_events import BurstsChosen, FrameProven
 from coupole.storage.run import Run
+from coupole.storage.sample_proofs import problem_of
+
+_HAVE_A_SHOT = (frame_file.PROVEN, frame_file.DISCARDED)
 
 
 @dataclass
@@ -26,6 +30,11 @@ class Verification:
     missing: list[str] = field(default_factory=list)
     listed_count: int = 0
     """Files of the manifest, each read and compared."""
+    discarded_counts: dict[str, int] = field(default_factory=dict)
+    """Number of discarded frames by view, as the plan said. The samples that stand for them were read and "
+    "compared."""
+    results: list[str] = field(default_factory=list)
+    """Folders of the results that have these samples."""
     unlisted: list[str] = field(default_factory=list)
     """Files that the manifest does not cover yet."""
     not_compared: str = ""
@@ -38,7 +47,8 @@ class Verification:
 
 def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: None) -> Verification:
     """Read every proven frame back: each shot of the plan exactly once, each record and checksum right. Compare
-    its light, exposure and pose with the plan that the run keeps, and every file that the manifest lists."""
+    its light, exposure and pose with the plan that the run keeps, and every file that the manifest lists. In the
+    place of frames that were discarded, their samples are read."""
     result = Verification()
     proven = run.proven()
     result.missing = [str(shot) for shot in run.expected_shots() if shot not in proven]
@@ -52,6 +62,7 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
     )
     result.bad += [f"{shot}: proven {n} times in the journal" for shot, n in lines.items() if n > 1]
     plan = _read_as_planned(run, result)
+    discarded_shots = _check_discarded(run, result, proven)
     count = 0
     for name, frames in sorted(by_file.items()):
         path = run.folder / name
@@ -61,16 +72,17 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
         except StorageError as error:
             result.bad.append(str(error))
             continue
-        claims = Counter(record["shot"] for record in table if record["state"] == frame_file.PROVEN)
+        claims = Counter(record["shot"] for record in table if record["state"] in _HAVE_A_SHOT)
         shots = {str(frame.shot).encode() for frame in frames}  # what the journal does not know, a crash left
         twice = [shot for shot in sorted(shots) if claims[shot] > 1]
         result.bad += [f"{name}: {shot.decode()} is in {claims[shot]} slots" for shot in twice]
         for frame in sorted(frames, key=lambda f: f.index):
-            if problem := _frame_problem(path, layout, table, frame) or _other_than_planned(
-                plan, table[frame.index], poses, frame
-            ):
+            is_discarded = frame.shot in discarded_shots
+            if problem := _frame_problem(
+                path, layout, table, frame, is_discarded=is_discarded
+            ) or _other_than_planned(plan, table[frame.index], poses, frame):
                 result.bad.append(problem)
-            result.frames += 1
+            result.frames += not is_discarded
             count += 1
             progress(count, len(proven))
     reported_files = {name for name in by_file if any(Path(name).name in problem for problem in result.bad)}
@@ -80,6 +92,26 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
     result.listed_count = len(manifest.read_checksums(run.folder))
     result.unlisted = manifest.unlisted_files(run.folder)
     return result
+
+
+def _check_discarded(run: Run, result: Verification, proven: Mapping[ShotId, FrameProven]) -> set[ShotId]:
+    """Frames that were discarded; what is wrong with the samples that stand for them is noted."""
+    frames: set[ShotId] = set()
+    for view, event in discarded_views(run).items():
+        if event.view != view or any(
+            shot not in proven or proven[shot].xxh3 != xxh3 for shot, xxh3 in event.frames
+        ):
+            result.bad.append(f"{view}: the journal has frames discarded that it has not proven")
+        frames |= {shot for shot, _ in event.frames}
+        result.discarded_counts[view] = len(event.frames)
+        folder = place_of_result(run, event)
+        result.results += [str(folder)] if str(folder) not in result.results else []
+        if problem := problem_of(folder, view, event.digest):
+            result.bad.append(
+                f"{view}: {len(event.frames)} frames were discarded, and the samples that stand for them are not "
+                f"right: {problem}"
+            )
+    return frames
 
 
 def _unchosen(run: Run) -> list[str]:
@@ -112,13 +144,19 @@ def _other_than_planned(run_plan: AsPlanned | None, record: Any, poses: Any, fra
     return run_plan.problem(frame.shot, record, poses[record["pose"]])
 
 
-def _frame_problem(path: Path, layout: frame_file.Layout, table: Any, frame: FrameProven) -> str:
+def _frame_problem(
+    path: Path, layout: frame_file.Layout, table: Any, frame: FrameProven, *, is_discarded: bool
+) -> str:
     if not 0 <= frame.index < layout.frames:
         return f"{frame.shot}: slot {frame.index} is not in {path.name}"
     record = table[frame.index]
-    if record["state"] != frame_file.PROVEN or record["shot"] != str(frame.shot).encode():
+    states = _HAVE_A_SHOT if is_discarded else (frame_file.PROVEN,)
+    if record["state"] not in states or record["shot"] != str(frame.shot).encode():
         recorded_shot = record["shot"].decode(errors="replace")
         return f"{frame.shot}: slot {frame.index} of {path.name} is recorded as `{recorded_shot}`"
+    if is_discarded:
+        recorded_xxh3 = f"{int(record['xxh3']):016x}"
+        return "" if recorded_xxh3 == frame.xxh3 else f"{frame.shot}: its record has the checksum {recorded_xxh3}"
     try:
         checksum = frame_file.checksum(frame_file.read_frame(path, layout, frame.index))
     except StorageError as error:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import ChecksumMismatch, StorageError
+from coupole.errors import ChecksumMismatch, FrameDiscarded, StorageError
 from coupole.storage import frame_file
 from coupole.storage.frame_file import Layout
 from coupole.storage.journal_events import FrameProven
@@ -34,17 +34,33 @@ class View:
     white_dn: int
 
     def pixels(self, slot: int) -> NDArray[np.uint16]:
-        """[H, W], DN. Raises StorageError."""
+        """[H, W], DN. Raises StorageError, FrameDiscarded."""
+        self._refuse_discarded(slot)
         return frame_file.read_frame(self.path, self.layout, slot)
 
     def proven_pixels(self, frame: FrameProven) -> NDArray[np.uint16]:
-        """[H, W], DN, of a frame of this file. Raises StorageError; ChecksumMismatch if not what was proven."""
+        """[H, W], DN, of a frame of this file. Raises StorageError, FrameDiscarded; ChecksumMismatch if not what
+        was proven."""
         return self._proven(frame, self.pixels(frame.index))
 
     def read_proven_pixels(self, frame: FrameProven, pixels: NDArray[np.uint16]) -> None:
         """The same into memory [H, W] of the caller, as `frame_file.read_frame_into`."""
+        self._refuse_discarded(frame.index)
         frame_file.read_frame_into(self.path, self.layout, frame.index, pixels)
         self._proven(frame, pixels)
+
+    def _refuse_discarded(self, slot: int) -> None:
+        if self.is_discarded(slot):
+            raise FrameDiscarded(
+                f"{self.path}: {self.records[slot]['shot'].decode(errors='replace')} was discarded when its "
+                "samples of reflectance were safe, as its plan said (`discard: after_fit`). `coupole verify` says "
+                "which result has them, and `coupole reflectance relight` makes pictures from that; frames of "
+                "LEDs that are kept for the check, and dark frames, are still there"
+            )
+
+    def is_discarded(self, slot: int) -> bool:
+        """Tell whether the pixels of a proven frame were discarded."""
+        return bool(self.records[slot]["state"] == frame_file.DISCARDED)
 
     def _proven(self, frame: FrameProven, pixels: NDArray[np.uint16]) -> NDArray[np.uint16]:
         if f"{frame_file.checksum(pixels):016x}" != frame.xxh3:

@@ -33,6 +33,8 @@ def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> 
     at_most = ", at most" if report.is_bound else ""
     table.add_row(f"views, shots, frames{at_most}", counts)
     table.add_row(f"on disk{at_most}", size + (_speeds(report) if report.frames else ""))
+    if report.peak_bytes is not None:
+        table.add_row("on disk at a time, at most", f"{bytes_text(report.peak_bytes)}: frames are discarded")
     if report.timings:
         table.add_row("a frame every", "; ".join(map(_pace, report.timings)))
     table.add_row(f"duration{at_most}", f"{duration} (at best {duration_text(report.ideal_s)})")
@@ -75,6 +77,7 @@ def document_of(report: Report) -> dict[str, Any]:
         "shots": report.shots,
         "frames": report.frames,
         "bytes": report.bytes,
+        "peak_bytes": report.peak_bytes,
         "duration_s": report.duration_s,
         "ideal_s": report.ideal_s,
         "dose_lux_h": report.dose_lux_h,

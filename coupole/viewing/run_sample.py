@@ -120,8 +120,9 @@ def _look_into(view: SampledView, file: View, shots: Sequence[FrameProven]) -> N
     for exposure_us, of_exposure in sorted(by_exposure.items()):
         sample = SampledExposure(exposure_us, len(of_exposure))
         view.exposures.append(sample)
-        places = np.unique(np.linspace(0, len(of_exposure) - 1, count).round().astype(int))
-        for event in (of_exposure[place] for place in places):
+        kept_frames = [event for event in of_exposure if not file.is_discarded(event.index)]
+        places = np.unique(np.linspace(0, len(kept_frames) - 1, count).round().astype(int)) if kept_frames else ()
+        for event in (kept_frames[place] for place in places):
             raw = file.pixels(event.index)
             sample.add(str(event.shot), raw, coding)
             picture = look(raw, coding, _PICTURE_WIDTH_PX, saturation=True, focus=False)

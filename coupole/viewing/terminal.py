@@ -221,6 +221,11 @@ def show_status(console: Console, status: Status) -> None:
     console.print(f"  light on the object: {status.dose_lux_h:.3f} lux.h")
     for view, (proven, total) in status.views.items():
         console.print(f"  {view}: {proven} of {total} frames")
+    if status.frames_discarded:
+        console.print(
+            f"  {status.frames_discarded} frames were discarded when their samples were safe, as the plan says "
+            "(discard: after_fit)"
+        )
     for finding in status.findings:
         console.print("  [yellow]found:[/]", Text(finding))
     if status.processing is not None:

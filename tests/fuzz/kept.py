@@ -86,7 +86,7 @@ def read_run(path: Path) -> None:
     readers = (
         lambda: status(run).figures(),
         lambda: verify(run),
-        run.allocated_bytes,
+        run.occupied_space,
         run.refuse_old_journal,
         lambda: [frame.read() for frame in open_light_frames([folder]).lit],
         lambda: export_run(run, "tiff", folder.parent / "exported", views=[], shots=[], overwrite=True),

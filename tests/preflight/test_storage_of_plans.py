@@ -15,6 +15,7 @@ from preflight_cases import RIG, checked, only_refusal, plan_of, rig_of
 from coupole.plan.marks import MARKS
 from coupole.preflight.checking import storage_of
 from coupole.preflight.preflight import StorageFacts
+from coupole.storage.run import Occupied
 from coupole.storage.write_speed import measure_write_speed
 
 
@@ -34,19 +35,21 @@ def test_the_folder_of_the_run_is_named_not_that_of_the_rig() -> None:
 def test_what_a_resumed_run_has_allocated_is_not_asked_for_again() -> None:
     assert RIG is not None
     need = (1080 + 2 + MARKS) * RIG.frame_bytes + RIG.storage.reserve_bytes
-    facts = StorageFacts(need - 10**6, allocated_bytes=10**6)
+    facts = StorageFacts(need - 10**6, occupied_space=Occupied({"top": 10**6}))
     assert checked(plan_of(), storage=facts).refusals == []
-    assert len(checked(plan_of(), storage=replace(facts, allocated_bytes=10**6 - 1)).refusals) == 1
+    assert (
+        len(checked(plan_of(), storage=replace(facts, occupied_space=Occupied({"top": 10**6 - 1}))).refusals) == 1
+    )
 
 
 def test_a_disk_that_cannot_be_written_is_refused_and_not_taken_for_one_without_limit(tmp_path: Path) -> None:
-    occupied = tmp_path / "runs"
-    occupied.write_text("a file where the folder of the runs should be")
-    facts = storage_of(occupied / "below", rig_of())
+    occupied_space = tmp_path / "runs"
+    occupied_space.write_text("a file where the folder of the runs should be")
+    facts = storage_of(occupied_space / "below", rig_of())
     assert facts.write_bytes_s == 0.0
     refusal = only_refusal(checked(plan_of(), storage=replace(facts, free_bytes=10**15)))
     assert refusal == (
-        f"storage {occupied / 'below'}: expected a folder that can be written; {occupied} is a file"
+        f"storage {occupied_space / 'below'}: expected a folder that can be written; {occupied_space} is a file"
     )
 
 

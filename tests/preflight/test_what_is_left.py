@@ -13,6 +13,7 @@ from coupole.plan.shot_id import ShotId
 from coupole.preflight.checking import check_job
 from coupole.preflight.job import Job, read_job
 from coupole.preflight.preflight import Report, StorageFacts
+from coupole.storage.run import Occupied
 from coupole.viewing.preflight_table import show_preflight
 
 ROOMY = StorageFacts(10**15, 4e9)
@@ -87,6 +88,6 @@ def test_the_same_bytes_are_not_asked_for_twice(demo: Job, tmp_path: Path) -> No
     frame_bytes, reserve = demo.cell.rig.frame_bytes, demo.cell.rig.storage.reserve_bytes
     a_view = 1092 * frame_bytes
     for free_bytes, refused in ((a_view + reserve, False), (a_view + reserve - 1, True)):
-        facts = StorageFacts(free_bytes, 4e9, tmp_path, allocated_bytes=2 * a_view)
+        facts = StorageFacts(free_bytes, 4e9, tmp_path, Occupied({"top": 2 * a_view}))
         _, report = check_job(demo, facts, paths=False, proven=proven_of(demo, 1, 500))
         assert bool(report.refusals) == refused

@@ -223,7 +223,7 @@ def test_the_ratio_is_that_of_the_proven_frames(made: MadeRun) -> None:
 
 
 def test_archived_views_need_no_more_room_when_a_run_is_resumed(archived: MadeRun) -> None:
-    assert archived.run.allocated_bytes() == 2 * 7 * archives.FORMAT.frame_bytes
+    assert archived.run.occupied_space().bytes == 2 * 7 * archives.FORMAT.frame_bytes
 
 
 # -- what is archived, and what is not --------------------------------------------------------------------

@@ -99,6 +99,9 @@ class WatchedRecorder:
     def proven(self) -> set[ShotId]:
         return self._recorder.proven()
 
+    def has_room(self, view: str) -> bool:
+        return self._recorder.has_room(view)
+
     def begin_view(
         self,
         view: str,

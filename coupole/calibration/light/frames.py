@@ -47,6 +47,8 @@ class LightFrame:
     """[6] measured with the pose."""
     read_into: Callable[[NDArray[np.uint16]], None] | None = None
     """The same as `read` into memory [H, W], C order, if the frame's file can do that."""
+    is_kept: bool = True
+    """False if its pixels were discarded when their samples were safe: it cannot be read."""
 
     @property
     def view(self) -> str:
@@ -108,7 +110,8 @@ class LightFrames:
     @cached_property
     def size_px(self) -> tuple[int, int]:
         """Width and height."""
-        height_px, width_px = self.frames[0].read().shape
+        readable = next((frame for frame in self.frames if frame.is_kept), self.frames[0])
+        height_px, width_px = readable.read().shape
         return width_px, height_px
 
     def seen_through(self, flange_from_camera: Floats, arm: CalibratedArm | None = None) -> LightFrames:
@@ -206,6 +209,7 @@ def _of_view(
                 partial(file.proven_pixels, frame),
                 np.array(poses[int(record["pose"])]["joints_deg"], dtype=np.float64),
                 partial(file.read_proven_pixels, frame),
+                not file.is_discarded(frame.index),
             )
         )
     optics = file.number("focal_length_mm"), file.number("focus_distance_mm"), file.number("pixel_pitch_um")

@@ -25,7 +25,7 @@ from coupole.plan.cell import Cell
 from coupole.plan.rig_devices import in_world
 from coupole.preflight.checking import preflight_of
 from coupole.preflight.job import read_job, without_hidden
-from coupole.storage.run import Run
+from coupole.storage.run import Occupied, Run
 from coupole.viewing.keys import key_actions
 from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Progress
@@ -65,7 +65,7 @@ def _confirm(cell: Cell, console: Console, request: dict[str, Any]) -> None:
     job = without_hidden(read_job(plan, cell.document.path), run.hidden_leds if run else None)
     folder = run.folder if run else Path(request.get("output") or cell.storage_folder)
     job, preflight = preflight_of(
-        job, folder, allocated_bytes=run.allocated_bytes() if run else 0, proven=run.proven() if run else ()
+        job, folder, occupied_space=run.occupied_space() if run else Occupied(), proven=run.proven() if run else ()
     )
     show_preflight(console, preflight, name=job.plan.name, rig=cell.rig.name)
     refuse(preflight)

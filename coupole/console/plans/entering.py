@@ -80,6 +80,8 @@ class Entering:
             return self._acquisitions.begin_at_once(by, **fields)
         files = plan or (read_plan(run.plan_path) if run else None)
         assert files is not None
+        if files.plan.why_with_result and not (request.reflectance or (run and run.asked_result)):
+            raise InputError([files.document.problem(("discard",), files.plan.why_with_result)])
         fields["needs"] = self._needs(files, fields, by)
         self._refuse(Entry(id="new", by=by, entered="", **fields), request.before)
         may_still()

@@ -14,6 +14,7 @@ from coupole.storage.journal_events import (
     FaultNoted,
     FindingNoted,
     FrameProven,
+    FramesDiscarded,
     GapFound,
     InputsChanged,
     JournalBegun,
@@ -62,6 +63,10 @@ def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
             return f"{event.view}: {len(event.shots)} shots are taken again"
         case FindingNoted():
             return f"{event.view}: {event.kind}: {event.message}; {len(event.shots)} shots are concerned"
+        case FramesDiscarded():
+            return (
+                f"{event.view}: {len(event.frames)} frames are discarded, as the plan says: their samples are safe"
+            )
         case FaultNoted():
             return f"{'held' if event.is_hold else 'fault'}: {event.message}"
         case InputsChanged():

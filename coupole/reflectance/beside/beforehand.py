@@ -27,6 +27,9 @@ from coupole.reflectance.extraction.measured_run import (
     refuse_other_gain,
 )
 from coupole.scan.mesh_files import read_mesh
+from coupole.storage.discarding import discarded_views, place_of_result
+from coupole.storage.processing import default_result
+from coupole.storage.run import Run
 
 _CHECKED: tuple[Kind, ...] = ("dark", "response", "flat-field", "glare")
 
@@ -42,6 +45,8 @@ def reasons_against(plan: Path, rig: Path | None, result: Path | None, run: Path
 
 
 def _of_folder(result: Path | None, run: Path | None) -> Iterator[str]:
+    if run is not None and (other := _other_result(Run(run), result)):
+        yield f"--result: frames of this run were discarded for the samples in {other}; no other can be made"
     if result is None:
         return
     if not result.exists():
@@ -54,6 +59,13 @@ def _of_folder(result: Path | None, run: Path | None) -> Iterator[str]:
     is_own = run is not None and is_of_run(result, run.name)
     if not result.is_dir() or (not is_own and any(result.iterdir())):
         yield f"--result {result}: expected a new folder, or that of this run's result; found other content"
+
+
+def _other_result(run: Run, result: Path | None) -> Path | None:
+    """The folder of the result that stands for discarded frames of a run, if it is another."""
+    named = (result or default_result(run.folder)).resolve()
+    places = (place_of_result(run, event) for event in discarded_views(run).values())
+    return next((place for place in places if place.resolve() != named), None)
 
 
 def _why_not_made(folder: Path, existing: Path) -> str:

@@ -14,6 +14,7 @@ from coupole.errors import CoupoleError, reason
 from coupole.reflectance.beside.first_look import write_normals
 from coupole.reflectance.result_pages import run_reflectance_page
 from coupole.reflectance.run_job import RunRequest, extract_beside, reflectance_of
+from coupole.storage.discarding import NOT_YET, reason_to_keep, to_discard
 from coupole.storage.journal import Follower
 from coupole.storage.journal_events import FrameProven, SessionStopped, ViewBegun, ViewSealed
 from coupole.storage.processing import PICTURE, Progress, Step, hold_result, tell
@@ -77,6 +78,8 @@ class _Follower:
         self._journal = Follower(run.journal_path)
         self._taken: set[str] = set()
         """Views whose samples are there."""
+        self._safe: dict[str, str] = {}
+        """Digests of samples that were read back, of views of which is not told yet if they are discarded."""
         self._is_done = False
         """The newest session has ended with all frames."""
         self._last_frame = ""
@@ -88,6 +91,8 @@ class _Follower:
         looks = True
         while True:
             looks |= self._read_news()
+            if looks:
+                self._offer_safe()
             if looks and not self._take_samples():
                 if self._is_done:
                     break
@@ -124,13 +129,27 @@ class _Follower:
             return False
         view = remaining_views[0]
         self._teller.step("extracting", detail=view)
-        extract_beside(self._run.folder, view, self._result, self._teller.part)
+        if digest := extract_beside(self._run.folder, view, self._result, self._teller.part):
+            self._safe[view] = digest
         self._taken.add(view)
         if not self._is_done:
             with contextlib.suppress(OSError):  # a picture alone
                 write_normals(self._result, view, self._result / PICTURE)
         self._teller.step("waiting", views_done=len(self._taken))
         return True
+
+    def _offer_safe(self) -> None:
+        """Tell the acquisition, which holds the run, of the frames that may be discarded now. What it does not do,
+        because it has ended, is done when the result is made."""
+        for view, digest in list(self._safe.items()):
+            why = reason_to_keep(self._run, view)
+            if why == NOT_YET:
+                continue
+            del self._safe[view]
+            event = None if why else to_discard(self._run, view, self._result.resolve(), digest)
+            self._teller.say(
+                {"kept": view, "why": why} if event is None else {"discard": event.model_dump(mode="json")}
+            )
 
     def _seconds_since_last_frame(self) -> float | None:
         """None if no frame's time is known."""

@@ -27,6 +27,7 @@ from coupole.reflectance.extraction.sample_codes import BY_CELL, CODES, REACHED
 from coupole.reflectance.extraction.seen_surface import SeenSurface, seen_surface
 from coupole.reflectance.extraction.view_samples import BLOCK, Samples, ViewPass
 from coupole.reflectance.result_folder import complete
+from coupole.storage.array_digest import ArrayDigest
 
 Floats = NDArray[np.float64]
 
@@ -71,17 +72,18 @@ def extract_view(
     say: Say,
     *,
     threads: int | None = None,
-) -> dict[str, Any]:
-    """Write a view's samples to an HDF5 file, whole or not at all; what the report says of them."""
+) -> tuple[dict[str, Any], str]:
+    """Write a view's samples to an HDF5 file, whole or not at all; what the report says of them, and the digest of
+    what was written (`coupole.storage.array_digest`)."""
     threads = threads or len(os.sched_getaffinity(0))
     work, surface = view_pass(measured_run, geometry, radiometry, view, threads)
     codes_of = shadows_of(work, geometry)
-    sample_count, of_code = 0, np.zeros(len(CODES), np.int64)
+    sample_count, of_code, digest = 0, np.zeros(len(CODES), np.int64), ArrayDigest()
 
     def write(part: Path) -> None:
         nonlocal sample_count
         with h5py.File(part, "w") as file:
-            _write_head(file, work, surface)
+            _write_head(file, work, surface, digest)
             file.attrs["view"] = path.stem
             data = _begin_samples(file, work)
             frame_count = 0
@@ -94,6 +96,7 @@ def extract_view(
                 ):
                     if name in data:
                         _write_chunk(data[name], some, values)
+                        digest.add(name, values, (some.rows.start, some.leds.start, 0)[: values.ndim])
                 sample_count += int(np.count_nonzero(np.isfinite(some.f)))
                 of_code[:] += np.bincount(some.codes.ravel(), minlength=len(CODES))
                 if some.rows.stop == len(surface.triangles):
@@ -101,10 +104,12 @@ def extract_view(
                     say(f"samples of {view.name}", frame_count, len(view.frames))
             if work.reader.u_glare:
                 u_glare = np.stack([work.reader.u_glare[int(led)] for led in work.leds])
-                _dataset(file, U_GLARE, u_glare, "relative standard uncertainty of the glare in an LED's frames")
+                described = "relative standard uncertainty of the glare in an LED's frames"
+                _dataset(file, U_GLARE, u_glare, described, digest)
+            digest.add_attributes(file)
 
     complete(path, write, unless=path.with_suffix(".json"))
-    return {
+    summary = {
         "view": path.stem,
         "pixels": surface.pixels,
         "triangles": len(surface.triangles),
@@ -112,6 +117,7 @@ def extract_view(
         "samples": sample_count,
         "share_by_code": {name: float(of_code[code] / of_code.sum()) for name, code in CODES.items()},
     }
+    return summary, digest.sha256
 
 
 def view_pass(
@@ -175,7 +181,7 @@ def _hidden_by_cell(work: ViewPass) -> Callable[[NDArray[np.int64]], NDArray[np.
     return hidden_from_leds
 
 
-def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface) -> None:
+def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface, digest: ArrayDigest) -> None:
     measured_run, view, leds = work.measured_run, work.view, work.leds
     file.attrs["channels"] = "".join(measured_run.channels)
     file.attrs["simulated"] = measured_run.run.is_simulated
@@ -183,25 +189,34 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface) -> None:
     file.attrs["led_u_mm"] = measured_run.led_u_mm  # of each coordinate of an LED's place
     u_lateral_mm = view.pointing.u_lateral_mm(measured_run.lens, view.base_from_camera, work.facets.centres_mm)
     file.attrs["lateral_u_mm"] = u_lateral_mm  # of where pixels look, across the line of sight
+    digest.add("seen", surface.places)
     file.create_dataset("seen", data=surface.places, compression="gzip", compression_opts=1, track_times=False)
     file["seen"].attrs["told"] = "[h, w] place in `triangles` of what a pixel sees, -1 where it is not used"
-    _dataset(file, "triangles", surface.triangles, "numbers of the mesh's triangles, from 0")
-    _dataset(file, "pixels", work.reader.pixels, "pixels of each channel on each triangle")
+    _dataset(file, "triangles", surface.triangles, "numbers of the mesh's triangles, from 0", digest)
+    _dataset(file, "pixels", work.reader.pixels, "pixels of each channel on each triangle", digest)
     description = "relative standard uncertainty, shared by a triangle's samples, from pixels' own responses"
-    _dataset(file, "u_response", work.reader.u_response, description)
-    _dataset(file, "centres_mm", work.facets.centres_mm, "of the triangles, mm, base frame")
-    _dataset(file, "normals", work.facets.normals, "of the triangles, unit, base frame")
-    _dataset(file, "camera_mm", view.base_from_camera[:3, 3], "projection centre, mm, base frame")
-    _dataset(file, "leds", leds, "numbers of the LEDs")
+    _dataset(file, "u_response", work.reader.u_response, description, digest)
+    _dataset(file, "centres_mm", work.facets.centres_mm, "of the triangles, mm, base frame", digest)
+    _dataset(file, "normals", work.facets.normals, "of the triangles, unit, base frame", digest)
+    _dataset(file, "camera_mm", view.base_from_camera[:3, 3], "projection centre, mm, base frame", digest)
+    _dataset(file, "leds", leds, "numbers of the LEDs", digest)
     centres_mm, normals = measured_run.leds.of(leds)
-    _dataset(file, "led_positions_mm", centres_mm, "mm, base frame")
-    _dataset(file, "led_normals", normals, "unit, base frame")
+    _dataset(file, "led_positions_mm", centres_mm, "mm, base frame", digest)
+    _dataset(file, "led_normals", normals, "unit, base frame", digest)
     powers = measured_run.powers.of(leds)
-    _dataset(file, "led_u_own", powers.u_own, "relative standard uncertainty of an LED's power, its own")
+    _dataset(file, "led_u_own", powers.u_own, "relative standard uncertainty of an LED's power, its own", digest)
     u_shared = np.hypot(powers.u_shared, measured_run.u_signal)
-    _dataset(file, "led_u_shared", u_shared, "relative, shared by all samples: powers, response, fall-off, drift")
+    _dataset(
+        file,
+        "led_u_shared",
+        u_shared,
+        "relative, shared by all samples: powers, response, fall-off, drift",
+        digest,
+    )
     scales = np.stack([_dn_share(measured_run, view, int(led)) for led in leds])
-    _dataset(file, "full_scales", scales, "of the camera that f cos_i E/Phi of 1 gives in the longest exposure")
+    _dataset(
+        file, "full_scales", scales, "of the camera that f cos_i E/Phi of 1 gives in the longest exposure", digest
+    )
 
 
 def _dn_share(measured_run: MeasuredRun, view: MeasuredView, led: int) -> Floats:
@@ -212,8 +227,9 @@ def _dn_share(measured_run: MeasuredRun, view: MeasuredView, led: int) -> Floats
     return share
 
 
-def _dataset(file: h5py.File, name: str, values: NDArray[Any], description: str) -> None:
+def _dataset(file: h5py.File, name: str, values: NDArray[Any], description: str, digest: ArrayDigest) -> None:
     file.create_dataset(name, data=values, track_times=False).attrs["told"] = description
+    digest.add(name, values)
 
 
 def _begin_samples(file: h5py.File, work: ViewPass) -> dict[str, h5py.Dataset]:

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError, PreflightRefused
 from coupole.geometry import farthest_first
+from coupole.plan.held_out import HELD_OUT_EVERY
 from coupole.plan.plan import LookAt
 from coupole.preflight.checking import calibration_refusals, check_job
 from coupole.preflight.job import Job, read_job
 from coupole.preflight.preflight import Report, StorageFacts
-from coupole.reflectance.run_job import HELD_OUT_EVERY
 from coupole.reflectance.suggestion.candidate_views import Candidate, candidates_of
 from coupole.reflectance.suggestion.plan_text import PlanText
 from coupole.reflectance.suggestion.rehearsal import NORMAL_DEG, ExpectedUncertainty, rehearse

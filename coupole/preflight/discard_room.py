@@ -1,0 +1,160 @@
+"""Disk space of a run whose frames are discarded when their samples are safe: most that is occupied at a time.
+
+The sizes of samples and fits are upper bounds, from the triangles that face a view's camera and from the layout of
+their files (`tests/runs/test_discarded_frames.py` compares them with files).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.plan.exposures import AutoExposure
+from coupole.plan.held_out import held_out_leds
+from coupole.plan.rig import Rig
+from coupole.plan.schedule import Schedule, ViewPose
+from coupole.plan.shot_id import Led, ShotLabel
+from coupole.preflight.framing import camera_at
+from coupole.preflight.job import Job
+from coupole.storage.frame_file import SPARE_SLOTS
+from coupole.storage.run import Occupied
+
+_BLOCK, _LANES = 4096, 8
+"""Triangles and LEDs of a chunk of samples, at most."""
+_TRIANGLE_BYTES = 200
+"""Bytes of a triangle in a view's file beside its samples."""
+_PICTURES = 12
+"""Pictures of a view for the check, at most."""
+_FIT_BYTES, _MATERIAL_BYTES = 1250, 360
+"""Bytes of the fits of a view's triangle for each channel, and of those of a triangle of the mesh."""
+_SMALL_BYTES = 4_000_000
+"""Bytes of reports and of what belongs to no triangle; those of a view are less."""
+_LEAST_COSINE = -0.05
+"""Triangles that face the camera so little cannot be seen, also from a pose that is a little off."""
+
+
+@dataclass(frozen=True)
+class ViewRoom:
+    """Bytes of a view."""
+
+    frame_bytes: int
+    """Its file, while it is taken."""
+    kept_bytes: int
+    """The file, when frames were discarded."""
+    sample_bytes: int
+    """Its samples, with the pictures for the check, at most."""
+
+
+@dataclass(frozen=True)
+class DiscardRoom:
+    """Bytes of a run."""
+
+    views: Mapping[str, ViewRoom]
+    """Bytes of each view, by its name."""
+    fit_bytes: int
+    """Fits and report, and the copy of samples that is made when they are replaced, at most."""
+    reserve_bytes: int
+    """Bytes that must stay free."""
+
+    def peak_bytes(self, space: Occupied, unfinished_views: Collection[str]) -> int:
+        """Most bytes that the run needs at a time beyond those that its views occupy, if frames of the
+        `unfinished_views` ones are left to take; the others wait to be discarded, or are settled. The reserve is
+        not counted."""
+        other_views = [name for name in self.views if name in unfinished_views]
+        waiting_views = [name for name in self.views if name not in {*other_views, *space.settled_views}]
+        samples = sum(self.views[name].sample_bytes for name in waiting_views)
+        all_samples = samples + sum(self.views[name].sample_bytes for name in other_views)
+        kept_bytes = sum(
+            self.views[name].kept_bytes - space.bytes_of_view.get(name, 0)
+            for name in (*waiting_views, *other_views)
+        )
+        largest = max(
+            (self.views[name].frame_bytes - self.views[name].kept_bytes for name in other_views), default=0
+        )
+        return max(samples, all_samples + kept_bytes + max(largest, self.fit_bytes), 0)
+
+    def needed_bytes(self, view: str, waiting: Collection[str]) -> int:
+        """Bytes that must be free when a view begins, while samples of the `waiting` ones are to come."""
+        samples = sum(self.views[name].sample_bytes for name in waiting if name in self.views)
+        view_room = self.views[view]
+        return view_room.frame_bytes + view_room.sample_bytes + samples + self.reserve_bytes
+
+
+def discard_room(job: Job) -> DiscardRoom:
+    """Return the room that a job's views need."""
+    rig, schedule = job.cell.rig, job.schedule
+    held_out = set(held_out_leds(_leds(schedule)))
+    channels = 1 if rig.sensor.bayer_pattern == "MONO" else 3
+    has_glare = any(item.record.kind == "glare" for item in job.calibrations or ())
+    views, seen_counts = {}, []
+    for view, bursts in zip(schedule.views, schedule.bursts, strict=True):
+        labels = [label for burst in bursts for label in burst.labels if label is not None]
+        seen_counts.append(_most_seen(job.shape.corners_mm, rig, view))
+        views[view.name] = _view_room(labels, held_out, rig, seen_counts[-1], channels, has_glare=has_glare)
+    fits = sum(seen_counts) * channels * _FIT_BYTES + len(job.shape.corners_mm) * _MATERIAL_BYTES
+    copy = max((view.sample_bytes for view in views.values()), default=0)
+    return DiscardRoom(views, fits + copy + _SMALL_BYTES, rig.storage.reserve_bytes)
+
+
+def refusals_of_discarding(job: Job) -> list[str]:
+    """Reasons why the frames of a plan cannot be discarded, with the place in the plan."""
+    if job.plan.discard is None:
+        return []
+    messages = []
+    if job.plan.chooses_lights:
+        messages.append(
+            "expected LEDs that are known beforehand: which of them are kept for the check is known after the "
+            "last view alone with `lights: {kind: adaptive}`, so no frame could be discarded"
+        )
+    elif isinstance(job.plan.exposure, AutoExposure) and any(view.lights for view in job.plan.views):
+        messages.append(
+            "expected the same lights in all views with `exposure: {kind: auto}`: otherwise it is not known "
+            "beforehand which LEDs are kept for the check"
+        )
+    elif not held_out_leds(_leds(job.schedule)):
+        messages.append("expected five LEDs or more, so that the frames of one are kept for the check")
+    return [str(job.document.problem(("discard",), message)) for message in messages]
+
+
+def _leds(schedule: Schedule) -> set[int]:
+    labels = (label for bursts in schedule.bursts for burst in bursts for label in burst.labels)
+    return {label.light.id for label in labels if label is not None and isinstance(label.light, Led)}
+
+
+def _view_room(
+    labels: Sequence[ShotLabel],
+    held_out: Collection[int],
+    rig: Rig,
+    seen_count: int,
+    channels: int,
+    *,
+    has_glare: bool,
+) -> ViewRoom:
+    leds = {label.light.id for label in labels if isinstance(label.light, Led)}
+    kept_count = sum(not isinstance(label.light, Led) or label.light.id in held_out for label in labels)
+    rows, columns = -(-seen_count // _BLOCK) * _BLOCK, -(-len(leds) // _LANES) * _LANES
+    samples = rows * columns * (channels * (8 if has_glare else 6) + 1) + seen_count * _TRIANGLE_BYTES
+    pixels = rig.sensor.width_px * rig.sensor.height_px
+    pictures = min(_PICTURES, len(leds & set(held_out))) * (pixels // 4) * channels * 2
+    small = _SMALL_BYTES // 4
+    return ViewRoom(
+        (len(labels) + SPARE_SLOTS) * rig.frame_bytes + small,
+        kept_count * rig.frame_bytes + small,
+        samples + pictures + pixels * 4 + small,
+    )
+
+
+def _most_seen(corners_mm: NDArray[np.float64], rig: Rig, view: ViewPose) -> int:
+    """Most triangles [n, 3, 3] (support frame) that a view can see."""
+    pixels = rig.sensor.width_px * rig.sensor.height_px
+    pose = view.support_from_camera
+    if pose is None:
+        pose = camera_at(np.array(view.joints_deg), rig)
+    normals = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    towards = pose[:3, 3] - corners_mm.mean(axis=1)
+    lengths = np.linalg.norm(normals, axis=1) * np.linalg.norm(towards, axis=1)
+    facing = np.einsum("nk,nk->n", normals, towards) > _LEAST_COSINE * lengths
+    return min(int(np.count_nonzero(facing)), pixels)

@@ -1,0 +1,174 @@
+"""Results of runs whose frames are discarded when their samples are safe (`discard: after_fit`)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from coupole.errors import ChecksumMismatch, FrameDiscarded, InputError
+from coupole.reflectance.result_folder import complete, in_the_making
+from coupole.storage import manifest
+from coupole.storage.array_digest import digest_on_disk
+from coupole.storage.discarding import (
+    append_to_journal,
+    discard,
+    discarded_views,
+    finish,
+    place_of_result,
+    reason_to_keep,
+    to_discard,
+)
+from coupole.storage.processing import default_result, go_on_command
+from coupole.storage.run import Run
+from coupole.storage.run_status import is_complete
+from coupole.storage.sample_proofs import has_proofs, note, problem_of, proofs_of, prove, samples_path
+
+_LOCK_NAP_S = 0.2
+_MOST_HASHED_BYTES = 2_000_000_000
+"""Files of views beyond it are left to `verify --manifest`."""
+
+
+# -- the result that stands for the frames --------------------------------------------------------------------
+
+
+def refuse_without_frames(run: Run, out: Path) -> None:
+    """Raise FrameDiscarded if frames of a run were discarded for the samples of another result than this; and
+    StorageError if this one's are not what was proven."""
+    for view, event in discarded_views(run).items():
+        result = place_of_result(run, event)
+        if result.resolve() != out.resolve():
+            raise FrameDiscarded(
+                f"{run.folder}: {len(event.frames)} frames of the view {view} were discarded when their samples "
+                f"were safe, as its plan says (`discard: after_fit`). Only {result} has these samples: go on with "
+                f"`{go_on_command(run.folder, result)}`. A result with other settings needs a run of its own"
+            )
+        if problem := problem_of(result, view, event.digest):
+            raise ChecksumMismatch(
+                f"{problem}. It stands for {len(event.frames)} discarded frames of {run.folder}"
+            )
+
+
+# -- proof, and what follows from it --------------------------------------------------------------------------
+
+
+def prove_written(out: Path, view: str, digest: str) -> None:
+    """Read the samples of a view back, and note it. If they differ from what was written, they are taken again the
+    next time. Raises ChecksumMismatch, StorageError."""
+    try:
+        prove(out, view, digest)
+    except ChecksumMismatch:
+        samples_path(out, view).with_suffix(".json").unlink(missing_ok=True)
+        raise
+
+
+def read_back_again(out: Path, view: str) -> str:
+    """Return the digest of the samples of a view that an earlier process has proven, if they still are what they
+    were; empty if they were never proven. Raises ChecksumMismatch, StorageError."""
+    proofs = proofs_of(out, view)
+    if not proofs:
+        return ""
+    if problem := problem_of(out, view, proofs[0]):
+        raise ChecksumMismatch(problem)
+    return proofs[0]
+
+
+def read_back_or_drop(out: Path, view: str) -> str:
+    """The same for a view whose frames are there: samples that are not what they were are taken again, and the
+    text is empty."""
+    try:
+        return read_back_again(out, view)
+    except ChecksumMismatch:
+        samples_path(out, view).with_suffix(".json").unlink(missing_ok=True)
+        return ""
+
+
+def rewrite(path: Path, write: Callable[[Path], Any]) -> None:
+    """Replace a view's file of samples, as `complete` does. Where it may stand for discarded frames, the old file
+    is compared with its proof first, and the new one is read back and noted before it takes its place. Raises
+    ChecksumMismatch, StorageError, OSError."""
+    out, view = path.parents[1], path.stem
+    if not has_proofs(out):
+        complete(path, write)
+        return
+    read_back_again(out, view)
+    with in_the_making(path) as part:
+        write(part)
+        digest = digest_on_disk(part)
+        if digest_on_disk(part) != digest:
+            raise ChecksumMismatch(f"{part}: differs each time it is read; check disk and memory of this machine")
+        note(out, view, digest)
+
+
+def discard_complete(run: Run, out: Path, say: Callable[[str, int, int], object]) -> None:
+    """Discard, after a run's last session, what its plan says, of all views whose samples in its result are safe;
+    and what a crash has left. Waits while a session holds the run. Raises StorageError."""
+    if not is_complete(run.folder):
+        return
+    with _hold_when_free(run):
+        finish(run)
+        views = [view for view in run.about["views"] if view not in discarded_views(run)]
+        for count, view in enumerate(views, start=1):
+            if reason_to_keep(run, view) or not samples_path(out, view).exists():
+                continue
+            if not (digest := read_back_or_drop(out, view)):
+                raise ChecksumMismatch(
+                    f"{samples_path(out, view)}: is not what was written. Its frames are kept; give the command "
+                    "again: the samples are taken again"
+                )
+            if (event := to_discard(run, view, out.resolve(), digest)) is not None:
+                _forget(run, view)
+                discard(run, event, append_to_journal(run))
+            say("frames discarded", count, len(views))
+        _enter_finished(run)
+
+
+def refuse_stale(discarded_names: Collection[str], view: str, out: Path) -> None:
+    """Raise InputError if samples that are about to be removed stand for discarded frames."""
+    if view in discarded_names:
+        raise InputError(
+            f"{samples_path(out, view)}: does not belong to the frames that the run has now, and cannot be taken "
+            "again, because frames were discarded. Nothing was changed: was the journal, a record or the mesh "
+            "changed? Put back what was there"
+        )
+
+
+def is_for_discarding(run: Run, out: Path) -> bool:
+    """Tell whether frames of a run are discarded when this result has their samples: the plan says so, and the run
+    was acquired for this result."""
+    asked_result = run.asked_result or default_result(run.folder)
+    if not asked_result.is_dir():  # both may have been moved together
+        asked_result = run.folder.with_name(asked_result.name)
+    return run.discards and asked_result.resolve() == out.resolve()
+
+
+@contextmanager
+def _hold_when_free(run: Run) -> Iterator[None]:
+    """The run's lock, when the session that has it lets it go."""
+    with ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(run.hold_lock())
+                break
+            except InputError:
+                time.sleep(_LOCK_NAP_S)
+        yield
+
+
+def _forget(run: Run, view: str) -> None:
+    """Take the journal and a view's file out of the manifest, before they change."""
+    paths = run.journal_path, run.view_path(view)
+    manifest.forget(run.folder, [str(path.relative_to(run.folder)) for path in paths])
+
+
+def _enter_finished(run: Run) -> None:
+    """Enter the files that do not change any more in the manifest, if they are not too large."""
+    paths = [run.journal_path, *map(run.view_path, run.about["views"])]
+    listed_names = manifest.read_checksums(run.folder)
+    names = {str(path.relative_to(run.folder)): path.stat().st_size for path in paths if path.is_file()}
+    manifest.enter(
+        run.folder,
+        [name for name, size in names.items() if name not in listed_names and size < _MOST_HASHED_BYTES],
+    )

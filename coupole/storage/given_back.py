@@ -1,0 +1,45 @@
+"""Gives the disk space of parts of a file back, in place: its size and all other bytes stay (fallocate(2))."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import sys
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+_KEEP_SIZE, _PUNCH_HOLE = 1, 2
+_TRIAL_BYTES = 2**20
+
+
+def give_back(fd: int, parts: Iterable[tuple[int, int]]) -> None:
+    """Give back parts of an open file, (offset, length) in bytes each; they read as zeros afterwards. Blocks of
+    the file system that a part fills in part alone are overwritten by zeros there. Done again, nothing changes.
+    On the disk when this returns. Raises OSError."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    for offset, length in parts:
+        mode = _KEEP_SIZE | _PUNCH_HOLE
+        while libc.fallocate(fd, mode, ctypes.c_int64(offset), ctypes.c_int64(length)):
+            if (number := ctypes.get_errno()) != errno.EINTR:
+                raise OSError(number, os.strerror(number))
+    os.fsync(fd)
+
+
+def why_not(folder: Path) -> str:
+    """Try it in a folder that exists. Return why nothing can be given back there; empty if it can."""
+    if sys.platform != "linux":
+        return "this system cannot give back a part of a file"
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"\1" * _TRIAL_BYTES)
+            file.flush()
+            os.fsync(file.fileno())
+            before = os.fstat(file.fileno()).st_blocks
+            give_back(file.fileno(), [(0, _TRIAL_BYTES // 2)])
+            if os.fstat(file.fileno()).st_blocks >= before:
+                return "its file system did not free what was given back"
+    except OSError as error:
+        return f"its file system cannot give back a part of a file ({error.strerror})"
+    return ""

@@ -1,0 +1,471 @@
+"""`discard: after_fit`: frames go when their samples are safe, by the plan's words alone; nothing is ever lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cells
+import h5py
+import numpy as np
+import pytest
+import xxhash
+from beside_runs import begun, beside, cell_of_three_views, files, hurry, is_beside, result_of
+from cells import CellFolder
+from killed_discarding import REWRITTEN, STEPS
+
+from coupole.errors import ChecksumMismatch, StorageError
+from coupole.preflight.discard_room import discard_room
+from coupole.preflight.job import read_job
+from coupole.reflectance.run_job import RunRequest, extract_runs
+from coupole.storage import discarding, sample_proofs
+from coupole.storage.given_back import why_not
+from coupole.storage.journal_events import FindingNoted
+from coupole.storage.run import Run
+
+pytestmark = [
+    pytest.mark.timeout(900),
+    pytest.mark.skipif(bool(why_not(Path("/tmp"))), reason="the disk cannot give back parts of files"),
+]
+KEPT_LEDS = (96, 384, 672, 960)  # every twelfth of the plan's LEDs, from the fifth on
+DISCARDED = 45 - len(KEPT_LEDS)
+
+
+def discarding_cell(folder: Path, **plan: object) -> CellFolder:
+    return cell_of_three_views(folder, discard="after_fit", **plan)
+
+
+@pytest.fixture(scope="module")
+def acquired(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose processing was killed before it had samples: all its frames are there. It was moved since."""
+    folder = tmp_path_factory.mktemp("acquired")
+    cell = discarding_cell(folder)
+    process, worker = begun(cell)
+    os.kill(worker, signal.SIGKILL)
+    ended = cells.finish(process)
+    assert ended.code == 0, ended.err
+    run = cell.run_folder
+    assert not cells.events(run, "discard")
+    everything_is_there(run)
+    shutil.move(folder / "storage", folder / "moved")
+    return folder / "moved" / run.name
+
+
+@pytest.fixture
+def pending(acquired: Path, tmp_path: Path) -> tuple[Path, Path]:
+    """A copy of that run, and the folder of its result, which is not there."""
+    run = tmp_path / acquired.name
+    shutil.copytree(acquired, run)
+    return run, tmp_path / f"{acquired.name}-reflectance"
+
+
+@pytest.fixture(scope="module")
+def samples_of_all_frames(acquired: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The samples as they are taken from all frames, into a result for which nothing is discarded."""
+    out = tmp_path_factory.mktemp("other") / "result"
+    extract_runs(RunRequest((acquired,)), out)
+    everything_is_there(acquired)
+    return {path.name: path.read_bytes() for path in (out / "samples").glob("*.h5")}
+
+
+def frames(run: Path) -> Iterator[tuple[str, bool, bool]]:
+    """Shot, whether its pixels are what was proven, and whether its slot is marked as discarded."""
+    for line in cells.events(run, "frame"):
+        with h5py.File(run / line["file"]) as file:
+            pixels = file["entry/instrument/detector/data"][line["index"]]
+            state = file["entry/instrument/detector/frames"][line["index"]]["state"]
+        is_there = f"{xxhash.xxh3_64_intdigest(np.ascontiguousarray(pixels).data.cast('B')):016x}" == line["xxh3"]
+        yield line["shot"], is_there, state == 3
+
+
+def everything_is_there(run: Path) -> None:
+    assert all(is_there and not is_marked for _, is_there, is_marked in frames(run))
+
+
+def nothing_is_lost(run: Path, result: Path) -> int:
+    """Every frame is there, or the journal says that it was discarded and its samples are what was read back.
+    Returns the number of frames whose pixels are gone."""
+    discarded = {}
+    for line in cells.events(run, "discard"):
+        discarded |= {shot: (line["view"], line["digest"], xxh3) for shot, xxh3 in line["frames"]}
+    proven = {line["shot"]: line["xxh3"] for line in cells.events(run, "frame")}
+    gone = 0
+    for shot, is_there, _ in frames(run):
+        if not is_there:
+            gone += 1
+            view, digest, xxh3 = discarded[shot]
+            assert xxh3 == proven[shot]
+            assert sample_proofs.problem_of(result, view, digest) == ""
+    assert cells.here("verify", run).code == 0
+    return gone
+
+
+def all_discarded(run: Path, result: Path, *, views: int = 3) -> None:
+    """What is kept is what the check needs, and the space of all else is free."""
+    assert nothing_is_lost(run, result) == views * DISCARDED
+    for shot, is_there, is_marked in frames(run):
+        label = shot.split("/")[1]
+        is_kept = not label.startswith("led") or int(label[3:7]) in KEPT_LEDS
+        assert (is_there, is_marked) == (is_kept, not is_kept), shot
+    for path in (run / "views").glob("*.h5"):
+        kept = (57 - DISCARDED) * 512 * 384 * 2
+        assert kept <= path.stat().st_blocks * 512 < kept + 2**20
+
+
+def bounds_hold(cell: CellFolder, run: Path, result: Path) -> None:
+    """What preflight says of the disk is enough, and not much too much."""
+    room = discard_room(read_job(cell.plan))
+    for name, view in room.views.items():
+        samples = [result / "samples" / f"{name}.h5", result / "samples/frames" / f"{name}.h5"]
+        size = sum(path.stat().st_size for path in samples)
+        assert view.sample_bytes / 3 < size <= view.sample_bytes
+        file = (run / "views" / f"{name}.h5").stat()
+        assert file.st_size <= view.frame_bytes
+        assert file.st_blocks * 512 <= view.kept_bytes
+    others = sum(path.stat().st_size for path in files(result).values() if "samples" not in path.parts)
+    assert others <= room.fit_bytes
+
+
+def spoil(samples: Path) -> None:
+    """Change one bit of one sample."""
+    with h5py.File(samples, "r+") as file:
+        file["codes"][7, 3] ^= 1
+
+
+def resume(run: Path) -> None:
+    """Resume a run to its result."""
+    process = cells.start("acquire", "--resume", run, "--yes", "--json")
+    worker = beside(process.pid)
+    cells.wait_until(lambda: os.sched_getscheduler(worker) == os.SCHED_IDLE, "the lowest priority")
+    hurry(worker)
+    ended = cells.finish(process)
+    assert ended.code == 0, ended.err
+    assert ended.document["reflectance"]["is_whole"], ended.err
+
+
+def killed(step: str, run: Path, out: Path) -> int:
+    program = Path(__file__).with_name("killed_discarding.py")
+    return subprocess.run([sys.executable, program, step, run, out], check=False).returncode
+
+
+# -- the run --------------------------------------------------------------------------------------------------
+
+
+def test_frames_are_discarded_when_their_samples_are_safe_and_all_commands_understand(tmp_path: Path) -> None:
+    cell = discarding_cell(tmp_path)
+    process, _ = begun(cell)
+    ended = cells.finish(process)
+    assert ended.code == 0, ended.err
+    assert ended.document["reflectance"]["is_whole"], ended.err
+    run, result = cell.run_folder, result_of(cell)
+    all_discarded(run, result)
+
+    bounds_hold(cell, run, result)
+
+    told = cells.here("status", run, "--json").document
+    assert told["frames_discarded"] == 3 * DISCARDED
+    assert told["state"] == "done"
+    assert "frames were discarded when their samples were safe" in cells.here("status", run).err
+    verified = cells.here("verify", run, "--json")
+    assert verified.document["ok"]
+    assert (verified.document["frames"], verified.document["discarded"]) == (3 * 16, 3 * DISCARDED)
+    assert str(result) in cells.here("verify", run).err
+    assert cells.here("report", run).code == 0
+    assert not verified.document["unlisted"]
+
+    refused = cells.here("export", run, "--to", "tiff", "--out", tmp_path / "tiffs")
+    assert refused.code == 2
+    assert "were discarded when their samples were safe" in refused.err
+    assert not (tmp_path / "tiffs").exists()
+    shots = [word for led in KEPT_LEDS for word in ("--shots", f"led{led:04d}/e0")]
+    assert cells.here("export", run, "--to", "tiff", "--out", tmp_path / "tiffs", *shots).code == 0
+    assert len(list((tmp_path / "tiffs").iterdir())) == 3 * len(KEPT_LEDS)
+    other = cells.here("reflectance", run, "--out", tmp_path / "other")
+    assert other.code == 2
+    assert f"coupole reflectance {run} --out {result}" in other.err
+    other = cells.here("acquire", "--resume", run, "--result", tmp_path / "other", "--yes")
+    assert other.code == 3
+    assert "no other can be made" in other.err
+    again = cells.here("reflectance", run, "--out", result)
+    assert again.code == 0, again.err
+    resume(run)
+    all_discarded(run, result)
+    picture = ("--view", "top", "--led", "96", "--uncertainty", tmp_path / "u.npy", "--to", tmp_path / "relit.npy")
+    relit = cells.here("reflectance", "relight", result, *picture)
+    assert relit.code == 0, relit.err
+
+    assert cells.here("archive", run).code == 0
+    verified = cells.here("verify", run, "--json")
+    assert verified.document["ok"]
+    assert verified.document["discarded"] == 3 * DISCARDED
+    assert cells.here("reflectance", run, "--out", result).code == 0
+
+
+def test_the_result_is_the_same_as_that_of_all_frames(
+    acquired: Path, pending: tuple[Path, Path], tmp_path: Path
+) -> None:
+    run, result = pending
+    for one, out in ((run, result), (acquired, tmp_path / "of-all")):
+        ended = cells.here("reflectance", one, "--out", out)
+        assert ended.code == 0, ended.err
+    all_discarded(run, result)
+    everything_is_there(acquired)
+    mine, others = files(result), files(tmp_path / "of-all")
+    assert mine.keys() - others.keys() == {sample_proofs.NAME}
+    for name in others.keys() - {"result.json", "report.html"}:
+        assert mine[name].read_bytes() == others[name].read_bytes(), name
+
+
+def test_without_the_plans_word_nothing_is_discarded(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path, lights={"kind": "every", "every": 60})
+    process, worker = begun(cell)
+    cells.wait_until(
+        lambda: list((result_of(cell) / "samples").glob("*.json")) or not is_beside(worker), "samples"
+    )
+    process.send_signal(signal.SIGINT)
+    cells.finish(process)
+    everything_is_there(cell.run_folder)
+    assert not (result_of(cell) / sample_proofs.NAME).exists()
+
+
+# -- refused before anything moves ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("plan", "options", "words"),
+    [
+        ({}, (), "expected a run with `--reflectance`"),
+        (
+            {"lights": {"kind": "adaptive", "until": {"lights": 20}}},
+            ("--reflectance",),
+            "expected LEDs that are known beforehand",
+        ),
+        ({"lights": {"kind": "ids", "ids": [1, 2, 3]}}, ("--reflectance",), "expected five LEDs or more"),
+        ({"calibrations": "none"}, ("--reflectance",), "expected calibration records"),
+    ],
+)
+def test_a_plan_that_cannot_be_processed_beside_is_refused(
+    tmp_path: Path, plan: dict[str, object], options: tuple[str, ...], words: str
+) -> None:
+    cell = discarding_cell(tmp_path)
+    cell.write(**plan)
+    ended = cell.acquire(*options)
+    assert ended.code == 3, ended.err
+    assert words in ended.err
+    if "calibrations" not in plan:
+        place = re.search(rf"{re.escape(str(cell.plan))}:(\d+):(\d+): discard: ", ended.err)
+        assert place is not None, ended.err
+        line = cell.plan.read_text().splitlines()[int(place[1]) - 1]
+        assert "after_fit" in line[int(place[2]) - 1 :][:24]
+    assert not (tmp_path / "storage").exists() or not list((tmp_path / "storage").glob("2*"))
+
+
+def test_preflight_tells_the_space_at_a_time_and_refuses_less(tmp_path: Path, small_disk: Path) -> None:
+    cell = discarding_cell(tmp_path)
+    cell.rig_data["storage"]["folder"] = str(small_disk)
+    cell.write()
+    checked = cells.here("check", cell.plan, "--json")
+    assert checked.code == 0, checked.err
+    peak = checked.document["peak_bytes"]
+    free = os.statvfs(small_disk).f_bavail * os.statvfs(small_disk).f_frsize
+    with (small_disk / "ballast").open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, free - peak + 100_000)
+    refused = cells.here("check", cell.plan, "--no-disk-speed", "--json")
+    assert refused.code == 3
+    assert "though frames are discarded, the run needs" in refused.document["refusals"][0]
+
+
+# -- killed between any two steps -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_killed_at_any_step_no_frame_is_lost_and_it_goes_on(
+    step: str, pending: tuple[Path, Path], samples_of_all_frames: dict[str, bytes]
+) -> None:
+    run, result = pending
+    assert killed(step, run, result) == -signal.SIGKILL
+    nothing_is_lost(run, result)
+    assert killed("", run, result) == 0
+    all_discarded(run, result)
+    for name, content in samples_of_all_frames.items():
+        assert (result / "samples" / name).read_bytes() == content
+
+
+@pytest.mark.parametrize("step", REWRITTEN)
+def test_killed_while_samples_are_replaced_they_are_proven_still(step: str, pending: tuple[Path, Path]) -> None:
+    run, result = pending
+    assert killed(step, run, result) == -signal.SIGKILL
+    all_discarded(run, result)
+    ended = cells.here("reflectance", run, "--out", result)
+    assert ended.code == 0, ended.err
+    all_discarded(run, result)
+
+
+def test_an_acquisition_that_is_killed_while_it_discards_is_resumed(tmp_path: Path) -> None:
+    cell = discarding_cell(tmp_path)
+    process, worker = begun(cell)
+    cells.wait_until(lambda: cells.events(cell.run_folder, "discard"), "a view that is discarded")
+    process.kill()
+    cells.finish(process)
+    end_s = time.monotonic() + 5.0
+    while is_beside(worker) and time.monotonic() < end_s:
+        time.sleep(0.02)
+    run, result = cell.run_folder, result_of(cell)
+    if cells.here("status", run, "--json").document["frames_left"] == 0:
+        nothing_is_lost(run, result)
+    resume(run)
+    all_discarded(run, result)
+
+
+# -- whatever is not sure, stays ------------------------------------------------------------------------------
+
+
+def test_samples_that_differ_when_read_back_discard_nothing_and_are_taken_again(
+    pending: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, result = pending
+    real = sample_proofs.digest_on_disk
+
+    def of_a_disk_that_fails(path: Path) -> str:
+        spoil(path)
+        return real(path)
+
+    monkeypatch.setattr(sample_proofs, "digest_on_disk", of_a_disk_that_fails)
+    with pytest.raises(ChecksumMismatch, match="differs from what was written"):
+        extract_runs(RunRequest((run,)), result)
+    everything_is_there(run)
+    monkeypatch.undo()
+    extract_runs(RunRequest((run,)), result)
+    all_discarded(run, result)
+
+
+def test_a_journal_that_takes_nothing_discards_nothing(
+    pending: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, result = pending
+
+    def full(*_: object) -> None:
+        raise StorageError("the disk is full")
+
+    monkeypatch.setattr("coupole.storage.journal.append_lines", full)
+    with pytest.raises(StorageError, match="full"):
+        extract_runs(RunRequest((run,)), result)
+    everything_is_there(run)
+    monkeypatch.undo()
+    extract_runs(RunRequest((run,)), result)
+    all_discarded(run, result)
+
+
+def test_a_view_with_a_finding_keeps_its_frames(pending: tuple[Path, Path]) -> None:
+    run, result = pending
+    shot = next(iter(Run(run).proven()))
+    finding = FindingNoted(
+        kind="moved", view="side", shots=(shot,), figure=1.0, limit=0.1, unit="mm", message="It moved."
+    )
+    with (run / "journal.jsonl").open("a") as journal:
+        journal.write(json.dumps(finding.model_dump(mode="json")) + "\n")
+    extract_runs(RunRequest((run,)), result)
+    assert nothing_is_lost(run, result) == 2 * DISCARDED
+    assert all(is_there for shot, is_there, _ in frames(run) if shot.startswith("side/"))
+
+
+def test_views_after_one_that_is_not_complete_keep_their_frames(pending: tuple[Path, Path]) -> None:
+    run, _ = pending
+    journal = run / "journal.jsonl"
+    views = list(dict.fromkeys(str(shot.view) for shot in Run(run).proven()))
+    first_light = next(line for line in journal.read_text().splitlines(True) if f'"{views[1]}/led' in line)
+    journal.write_text(journal.read_text().replace(first_light, ""))
+    assert discarding.reason_to_keep(Run(run), views[0]) == ""
+    for view in views[1:]:
+        assert discarding.reason_to_keep(Run(run), view) == f"the view {views[1]} is not complete"
+
+
+def test_a_view_whose_samples_are_damaged_or_gone_is_told_and_nothing_is_made_of_it(
+    pending: tuple[Path, Path],
+) -> None:
+    run, result = pending
+    extract_runs(RunRequest((run,)), result)
+    path = result / "samples/top.h5"
+    whole = path.read_bytes()
+    spoil(path)
+    for words in ("is not what was proven", "is missing"):
+        ended = cells.here("verify", run)
+        assert ended.code == 6, ended.err
+        assert words in ended.err
+        with pytest.raises(ChecksumMismatch, match=words):
+            extract_runs(RunRequest((run,)), result)
+        path.unlink(missing_ok=True)
+    path.write_bytes(whole)
+    assert cells.here("verify", run).code == 0
+
+
+def test_a_frame_that_was_discarded_cannot_be_claimed_by_another_hash(pending: tuple[Path, Path]) -> None:
+    run, result = pending
+    extract_runs(RunRequest((run,)), result)
+    journal = run / "journal.jsonl"
+    lines = journal.read_text().splitlines(keepends=True)
+    place = next(n for n, line in enumerate(lines) if line.startswith('{"event":"discard"'))
+    event = json.loads(lines[place])
+    event["frames"][0][1] = "0" * 16
+    lines[place] = json.dumps(event, separators=(",", ":")) + "\n"
+    journal.write_text("".join(lines))
+    ended = cells.here("verify", run)
+    assert ended.code == 6
+    assert "frames discarded that it has not proven" in ended.err
+
+
+# -- a small disk ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of its own, with room for less than three views and their samples."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", "size=140m", "tmpfs", str(disk)]
+    mounted = subprocess.run(words, check=False, capture_output=True, text=True)
+    if mounted.returncode != 0:
+        pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.parametrize("ending", ["goes on", "is killed", "hangs"])
+def test_a_run_waits_for_room_and_ends_clearly_if_none_comes(
+    tmp_path: Path, small_disk: Path, ending: str
+) -> None:
+    cell = discarding_cell(tmp_path)
+    cell.rig_data["storage"]["folder"] = str(small_disk)
+    cell.write()
+    (tmp_path / "storage").symlink_to(small_disk)
+    process, worker = begun(cell)
+    if ending != "goes on":
+        os.kill(worker, signal.SIGSTOP)
+    with (small_disk / "ballast").open("wb") as file:  # somebody else takes what preflight has seen
+        os.posix_fallocate(file.fileno(), 0, 25_000_000)
+    if ending == "goes on":
+        ended = cells.finish(process)
+        assert ended.code == 0, ended.err
+        kinds = [line["event"] for line in cells.events(cell.run_folder)]
+        third = [n for n, kind in enumerate(kinds) if kind == "settled"][2]
+        assert "discard" in kinds[:third]  # it has waited for it
+        assert ended.document["reflectance"]["is_whole"], ended.err
+    else:
+        if ending == "is killed":
+            os.kill(worker, signal.SIGKILL)
+        ended = cells.finish(process)
+        assert ended.code == 6, ended.err
+        assert "no more frames are discarded" in ended.err
+        assert ("stopped (SIGSTOP)" if ending == "hangs" else "killed by signal 9") in ended.err
+        everything_is_there(cell.run_folder)
+        (small_disk / "ballast").unlink()
+        resume(cell.run_folder)
+    all_discarded(cell.run_folder, result_of(cell))

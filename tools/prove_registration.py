@@ -67,7 +67,7 @@ def main() -> int:
         f"in 95 % regions {100 * coverage:.1f} % of the poses; mean squared error {squared_ratio:.2f} times the "
         f"stated one; {off_mm:.3f} mm at worst; {minutes:.1f} minutes at most; {gb:.2f} GB in the largest process"
     )
-    wrong = any(outcome.unplaced for outcome in outcomes) or off_mm > MOST_OFF_MM or coverage < LEAST_COVERED
+    wrong = any(outcome.unplaced_count for outcome in outcomes) or off_mm > MOST_OFF_MM or coverage < LEAST_COVERED
     return int(wrong or minutes > MOST_MINUTES or gb > MOST_GB)
 
 
@@ -75,7 +75,7 @@ def main() -> int:
 class Outcome:
     """Errors of one registration."""
 
-    unplaced: int
+    unplaced_count: int
     off_mm: float
     """Root mean square displacement of the worst scan's points."""
     coverage: float
@@ -112,8 +112,7 @@ def register_once(folder: Path, arguments: argparse.Namespace, seed: int) -> Out
         f"{minutes:.1f} minutes",
         flush=True,
     )
-    unplaced = len(registration.unplaced_numbers)
-    return Outcome(unplaced, float(off_mm.max()), coverage, squared_ratio, minutes)
+    return Outcome(len(registration.unplaced_numbers), float(off_mm.max()), coverage, squared_ratio, minutes)
 
 
 def make_scans(folder: Path, count: int, across: int, seed: int) -> dict[str, np.ndarray]:

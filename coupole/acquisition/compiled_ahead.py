@@ -1,4 +1,4 @@
-"""What a run calls is compiled before its devices are open: on a fresh machine this takes seconds to a minute, in
+"""Compiles the kernels of a run before its devices are open: on a fresh machine this takes seconds to a minute, in
 which the arm and the lamps would wait, and frames with them."""
 
 from __future__ import annotations

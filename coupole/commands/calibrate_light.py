@@ -238,8 +238,8 @@ def light_of(cell: Cell) -> LightSpectrum | None:
     if cell.rig.dome.spectrum is None:
         return None
     path = cell.document.resolve(cell.rig.dome.spectrum)
-    measured = read_spectrum(path, unit="power")
-    return LightSpectrum(measured.wavelengths_nm, measured.values, path.name)
+    spectrum = read_spectrum(path, unit="power")
+    return LightSpectrum(spectrum.wavelengths_nm, spectrum.values, path.name)
 
 
 def lens_of(record_path: Path | None, frames: LightFrames) -> Intrinsics:

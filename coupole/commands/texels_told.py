@@ -37,7 +37,7 @@ def lines_of(forecast: TexelForecast) -> Iterator[str]:
     views, size_mm = forecast.views, forecast.size.mm
     sides = sorted({view.side_px for view in views})
     pixels = "single pixels" if sides == [1] else f"{' and '.join(f'{n} x {n}' for n in sides)} pixels each"
-    number, widths = _rounded(forecast.texels), _range([view.texel_mm for view in views])
+    number, widths = _two_figures(forecast.texels), _range([view.texel_mm for view in views])
     in_views = f"{len(views)} view{'s' if len(views) > 1 else ''}"
     yield f"texels: some {number:,} in {in_views}, {pixels}, {widths} mm on the surface"
     memory, disk = bytes_text(forecast.memory_bytes), bytes_text(forecast.disk_bytes)
@@ -55,5 +55,5 @@ def _range(values: list[float]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def _rounded(count: int) -> int:
+def _two_figures(count: int) -> int:
     return int(round(count, 1 - math.floor(math.log10(count)))) if count else 0

@@ -263,8 +263,8 @@ def hidden_by(
 
 def compile_now() -> None:
     """Compile the kernel of `hidden_by`."""
-    point_mm, asked = np.zeros((1, 3)), np.ones((1, 1), np.bool_)
-    hidden_by(point_mm, point_mm + 1.0, np.zeros((1, 2, 3)), np.ones(1), asked)
+    point_mm, is_asked = np.zeros((1, 3)), np.ones((1, 1), np.bool_)
+    hidden_by(point_mm, point_mm + 1.0, np.zeros((1, 2, 3)), np.ones(1), is_asked)
 
 
 def sight_of(rig: Rig, support_from_camera: Transform) -> Sight:

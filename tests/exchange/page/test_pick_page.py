@@ -187,6 +187,8 @@ def test_the_surface_is_drawn_in_the_colours_of_its_parts(pick: Page) -> None:
 
 def test_a_mesh_that_is_too_fine_is_simplified_for_the_page(tmp_path: Path) -> None:
     fine = trimesh.creation.icosphere(4, 50.0)
-    count = write_pick_page(np.asarray(fine.vertices), np.asarray(fine.faces), "ball", tmp_path / "p.html", most_triangles=2000)
+    count = write_pick_page(
+        np.asarray(fine.vertices), np.asarray(fine.faces), "ball", tmp_path / "p.html", most_triangles=2000
+    )
     assert 500 < count <= 2000
     assert '"title": "ball"' in (tmp_path / "p.html").read_text()

@@ -31,8 +31,8 @@ class Verification:
     listed_count: int = 0
     """Files of the manifest, each read and compared."""
     discarded_counts: dict[str, int] = field(default_factory=dict)
-    """Number of discarded frames by view, as the plan said. The samples that stand for them were read and "
-    "compared."""
+    """Number of discarded frames by view, as the plan said. The samples that stand for them were read and
+    compared."""
     results: list[str] = field(default_factory=list)
     """Folders of the results that have these samples."""
     unlisted: list[str] = field(default_factory=list)

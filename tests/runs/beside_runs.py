@@ -22,9 +22,8 @@ def cell_of_three_views(folder: Path, **plan: Any) -> CellFolder:
     cell = shipped_cell(folder)
     cell.write(
         views=[cells.TOP, SIDE, LOW],
-        lights={"kind": "every", "every": 24},
         calibrations=[str(RECORDS / f"{kind}.yaml") for kind in KINDS],
-        **plan,
+        **{"lights": {"kind": "every", "every": 24}, **plan},
     )
     return cell
 

@@ -117,7 +117,7 @@ def test_a_run_that_is_killed_leaves_no_process(tmp_path: Path, *, stopped: bool
     while is_beside(worker) and time.monotonic() < end_s:
         time.sleep(0.02)
     assert not is_beside(worker)
-    assert status(cell.run_folder)["state"] == "ended"
+    cells.wait_until(lambda: status(cell.run_folder)["state"] == "ended", "the end of what held the run")
     assert status(cell.run_folder)["remedy"] == ""  # the run goes on first, and the processing with it
 
 

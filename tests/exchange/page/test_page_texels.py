@@ -21,7 +21,8 @@ from coupole.reflectance.new_light.light_kinds import DistantLight
 from coupole.reflectance.new_light.pictured_surface import surface_of_view
 from coupole.reflectance.run_relighting import scene_from
 from coupole.reflectance.run_result import RunResult
-from coupole.reflectance.texels.pixel_file import ViewTexels, texels_path, write_view_texels
+from coupole.reflectance.texels.pixel_file import TexelFileHead, ViewTexels, texels_path, write_view_texels
+from coupole.reflectance.texels.texel_grid import TexelSize
 
 pytestmark = needs_chromium
 LIGHT = (-0.4, -0.3, 0.8)
@@ -51,7 +52,10 @@ def detailed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     path = texels_path(result, view)
     path.parent.mkdir()
-    write_view_texels(path, texels, "top", surface.triangle_of_pixel.shape[::-1], np.zeros(3), 0.0, simulated=True)
+    size_px = surface.triangle_of_pixel.shape[::-1]
+    write_view_texels(
+        path, texels, TexelFileHead("top", size_px, TexelSize(), 0.1, np.zeros(3), 0.0, is_simulated=True)
+    )
     (path.parent / "texels.json").write_text(json.dumps({"mae": {TEXELS: 0.01, "ggx": 0.1}}))
     return folder
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
 
 from coupole.calibration.artefact import NOT_TRACEABLE, facts_of, sentence_of
 from coupole.calibration.record import Kind, Record
-from coupole.pages.page_parts import Inline, Section
+from coupole.pages.page_parts import Section
 
 WITHOUT_ARTEFACT: dict[Kind, str] = {
     "dark": "no artefact is needed: figures of the camera in its own unit, DN",
@@ -46,12 +45,9 @@ def overdue_of(record: Record, day: datetime.date) -> tuple[str, ...]:
 
 def traceability_section(record: Record) -> Section:
     """The part of a record's page that says which certificates it rests on."""
-    facts: dict[str, Inline] = {}
-    sections: list[Section] = []
-    for number, item in enumerate(record.artefacts):
-        facts = dict(facts_of(item))
-        sections.append(Section(f"artefact-{number + 1}", f"The {item.role}", facts=facts))
-    words: Sequence[Inline] = () if sections else trace_of(record)
-    if sections and overdue_of(record, record.created.date()):
-        words = overdue_of(record, record.created.date())
+    sections = [
+        Section(f"artefact-{number}", f"The {item.role}", facts=dict(facts_of(item)))
+        for number, item in enumerate(record.artefacts, start=1)
+    ]
+    words = overdue_of(record, record.created.date()) if sections else trace_of(record)
     return Section("traceability", "Traceability", words=words, sections=sections)

@@ -8,14 +8,15 @@ its uncertainty.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 
 import numpy as np
 
 from coupole.calibration.in_force import InForce
+from coupole.calibration.light.drift_records import CHANNEL
 from coupole.calibration.record import Record
+from coupole.storage.durable import sha256
 
 _SIGNIFICANT = 2.0
 
@@ -34,7 +35,7 @@ def _by_drift_records(items: Sequence[InForce]) -> Iterator[str]:
     for item in items:
         if item.record.kind != "led-power":
             continue
-        digest = hashlib.sha256(item.path.read_bytes()).hexdigest()
+        digest = sha256(item.path)
         for candidate in items:
             if candidate.record.kind == "drift" and digest in {line.sha256 for line in candidate.record.inputs}:
                 yield from _by_drift_record(item, candidate.record)
@@ -57,8 +58,8 @@ def _by_drift_record(item: InForce, drift: Record) -> Iterator[str]:
 
 
 def _relative_u(record: Record) -> float:
-    """Relative standard uncertainty of the mean power in green."""
-    mean = next(parameter for parameter in record.parameters if parameter.name == "mean_power.G")
+    """Relative standard uncertainty of the mean power in the channel by which drift is measured."""
+    mean = next(parameter for parameter in record.parameters if parameter.name == f"mean_power.{CHANNEL}")
     return mean.u / max(abs(mean.value or 0.0), 1e-300)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coupole.commands.common import JsonOption, fail
-from coupole.errors import CalibrationRefused, CoupoleError, InputError, StorageError
+from coupole.errors import CalibrationRefused, CoupoleError, InputError, StorageError, reason
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -99,4 +99,4 @@ def _write_json(path: Path, document: dict[str, object]) -> None:
     try:
         path.write_text(f"{json.dumps(document, indent=1)}\n", encoding="utf-8")
     except OSError as error:
-        raise StorageError(f"{path}: cannot write the certificate: {error.strerror}. Free its disk.") from error
+        raise StorageError(f"{path}: cannot write the certificate: {reason(error)}. Free its disk.") from error

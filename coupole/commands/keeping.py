@@ -149,8 +149,7 @@ def _show_discarded(console: Console, verification: Verification) -> None:
     total = sum(verification.discarded_counts.values())
     console.print(
         f"{total} more frames were discarded, as the plan says (discard: after_fit): {counts}. They cannot be "
-        "looked "
-        "at again. The journal has their shots and checksums; their samples stand for them:",
+        "looked at again. The journal has their shots and checksums; their samples stand for them:",
         markup=False,
     )
     samples = (

@@ -6,14 +6,11 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from coupole.errors import InputError
-from coupole.reflectance.texels.texel_grid import TexelSize
+from coupole.reflectance.texels.texel_grid import TexelSize, size_refused
 from coupole.viewing.terminal import bytes_text, duration_text
 
 if TYPE_CHECKING:
     from coupole.reflectance.texels.texel_forecast import TexelForecast
-
-_MOST_MM = 100.0
 
 
 def read_size(text: str) -> TexelSize:
@@ -21,15 +18,9 @@ def read_size(text: str) -> TexelSize:
     if text == "auto":
         return TexelSize()
     try:
-        width_mm = float(text)
+        return TexelSize(float(text))
     except ValueError:
-        width_mm = math.nan
-    if not 0.0 < width_mm <= _MOST_MM:
-        raise InputError(
-            f"--texels: expected auto, each view's own pixels, or a width on the surface in mm up to "
-            f"{_MOST_MM:g}, such as 0.2; got {text!r}"
-        )
-    return TexelSize(width_mm)
+        raise size_refused(text) from None
 
 
 def lines_of(forecast: TexelForecast) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from coupole.errors import InputError
 from coupole.reflectance.new_light.pictured_surface import Surface
 from coupole.reflectance.texels.texel_grid import TexelSize, pixel_mm, texel_grid
 from coupole.reflectance.texels.texel_values import _mean
@@ -65,6 +66,20 @@ def test_a_pixel_is_as_wide_as_the_square_of_what_it_sees() -> None:
 )
 def test_texels_are_the_nearest_whole_number_of_pixels_wide(mm: float | None, side_px: int) -> None:
     assert TexelSize(mm).side_px(0.1) == side_px
+
+
+@pytest.mark.parametrize("mm", [0.0, -0.2, 101.0, float("nan"), float("inf")])
+def test_what_is_no_width_is_refused_also_in_python(mm: float) -> None:
+    with pytest.raises(InputError, match="expected auto, each view's own pixels, or a width"):
+        TexelSize(mm)
+
+
+def test_a_square_whose_pixels_all_lie_elsewhere_is_no_texel() -> None:
+    surface = drawn(np.zeros(1), np.zeros((4, 8), int))
+    surface.places_mm[:, 4:, 2] = 50.0
+    grid = texel_grid(surface, 4)
+    np.testing.assert_array_equal(grid.triangle, [[0, -1]])
+    assert (grid.texel_of_pixel[:, 4:] == -1).all()
 
 
 def means(values: list[list[float]], reached: list[list[bool]], channel: list[int]) -> np.ndarray:

@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import cells
 import h5py
-import numpy as np
 import pytest
-import xxhash
-from beside_runs import begun, beside, cell_of_three_views, files, hurry, is_beside, result_of
+from beside_runs import begun, cell_of_three_views, files, is_beside, result_of
 from cells import CellFolder
+from discarded_runs import (
+    DISCARDED,
+    KEPT_LEDS,
+    all_discarded,
+    discarding_cell,
+    everything_is_there,
+    frames,
+    nothing_is_lost,
+    resume,
+)
 from killed_discarding import REWRITTEN, STEPS
 
 from coupole.errors import ChecksumMismatch, StorageError
@@ -33,14 +40,10 @@ from coupole.storage.run import Run
 
 pytestmark = [
     pytest.mark.timeout(900),
-    pytest.mark.skipif(bool(why_not(Path("/tmp"))), reason="the disk cannot give back parts of files"),
+    pytest.mark.skipif(
+        bool(why_not(Path(tempfile.gettempdir()))), reason="the disk cannot give back parts of files"
+    ),
 ]
-KEPT_LEDS = (96, 384, 672, 960)  # every twelfth of the plan's LEDs, from the fifth on
-DISCARDED = 45 - len(KEPT_LEDS)
-
-
-def discarding_cell(folder: Path, **plan: object) -> CellFolder:
-    return cell_of_three_views(folder, discard="after_fit", **plan)
 
 
 @pytest.fixture(scope="module")
@@ -76,50 +79,6 @@ def samples_of_all_frames(acquired: Path, tmp_path_factory: pytest.TempPathFacto
     return {path.name: path.read_bytes() for path in (out / "samples").glob("*.h5")}
 
 
-def frames(run: Path) -> Iterator[tuple[str, bool, bool]]:
-    """Shot, whether its pixels are what was proven, and whether its slot is marked as discarded."""
-    for line in cells.events(run, "frame"):
-        with h5py.File(run / line["file"]) as file:
-            pixels = file["entry/instrument/detector/data"][line["index"]]
-            state = file["entry/instrument/detector/frames"][line["index"]]["state"]
-        is_there = f"{xxhash.xxh3_64_intdigest(np.ascontiguousarray(pixels).data.cast('B')):016x}" == line["xxh3"]
-        yield line["shot"], is_there, state == 3
-
-
-def everything_is_there(run: Path) -> None:
-    assert all(is_there and not is_marked for _, is_there, is_marked in frames(run))
-
-
-def nothing_is_lost(run: Path, result: Path) -> int:
-    """Every frame is there, or the journal says that it was discarded and its samples are what was read back.
-    Returns the number of frames whose pixels are gone."""
-    discarded = {}
-    for line in cells.events(run, "discard"):
-        discarded |= {shot: (line["view"], line["digest"], xxh3) for shot, xxh3 in line["frames"]}
-    proven = {line["shot"]: line["xxh3"] for line in cells.events(run, "frame")}
-    gone = 0
-    for shot, is_there, _ in frames(run):
-        if not is_there:
-            gone += 1
-            view, digest, xxh3 = discarded[shot]
-            assert xxh3 == proven[shot]
-            assert sample_proofs.problem_of(result, view, digest) == ""
-    assert cells.here("verify", run).code == 0
-    return gone
-
-
-def all_discarded(run: Path, result: Path, *, views: int = 3) -> None:
-    """What is kept is what the check needs, and the space of all else is free."""
-    assert nothing_is_lost(run, result) == views * DISCARDED
-    for shot, is_there, is_marked in frames(run):
-        label = shot.split("/")[1]
-        is_kept = not label.startswith("led") or int(label[3:7]) in KEPT_LEDS
-        assert (is_there, is_marked) == (is_kept, not is_kept), shot
-    for path in (run / "views").glob("*.h5"):
-        kept = (57 - DISCARDED) * 512 * 384 * 2
-        assert kept <= path.stat().st_blocks * 512 < kept + 2**20
-
-
 def bounds_hold(cell: CellFolder, run: Path, result: Path) -> None:
     """What preflight says of the disk is enough, and not much too much."""
     room = discard_room(read_job(cell.plan))
@@ -138,17 +97,6 @@ def spoil(samples: Path) -> None:
     """Change one bit of one sample."""
     with h5py.File(samples, "r+") as file:
         file["codes"][7, 3] ^= 1
-
-
-def resume(run: Path) -> None:
-    """Resume a run to its result."""
-    process = cells.start("acquire", "--resume", run, "--yes", "--json")
-    worker = beside(process.pid)
-    cells.wait_until(lambda: os.sched_getscheduler(worker) == os.SCHED_IDLE, "the lowest priority")
-    hurry(worker)
-    ended = cells.finish(process)
-    assert ended.code == 0, ended.err
-    assert ended.document["reflectance"]["is_whole"], ended.err
 
 
 def killed(step: str, run: Path, out: Path) -> int:
@@ -234,53 +182,6 @@ def test_without_the_plans_word_nothing_is_discarded(tmp_path: Path) -> None:
     cells.finish(process)
     everything_is_there(cell.run_folder)
     assert not (result_of(cell) / sample_proofs.NAME).exists()
-
-
-# -- refused before anything moves ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("plan", "options", "words"),
-    [
-        ({}, (), "expected a run with `--reflectance`"),
-        (
-            {"lights": {"kind": "adaptive", "until": {"lights": 20}}},
-            ("--reflectance",),
-            "expected LEDs that are known beforehand",
-        ),
-        ({"lights": {"kind": "ids", "ids": [1, 2, 3]}}, ("--reflectance",), "expected five LEDs or more"),
-        ({"calibrations": "none"}, ("--reflectance",), "expected calibration records"),
-    ],
-)
-def test_a_plan_that_cannot_be_processed_beside_is_refused(
-    tmp_path: Path, plan: dict[str, object], options: tuple[str, ...], words: str
-) -> None:
-    cell = discarding_cell(tmp_path)
-    cell.write(**plan)
-    ended = cell.acquire(*options)
-    assert ended.code == 3, ended.err
-    assert words in ended.err
-    if "calibrations" not in plan:
-        place = re.search(rf"{re.escape(str(cell.plan))}:(\d+):(\d+): discard: ", ended.err)
-        assert place is not None, ended.err
-        line = cell.plan.read_text().splitlines()[int(place[1]) - 1]
-        assert "after_fit" in line[int(place[2]) - 1 :][:24]
-    assert not (tmp_path / "storage").exists() or not list((tmp_path / "storage").glob("2*"))
-
-
-def test_preflight_tells_the_space_at_a_time_and_refuses_less(tmp_path: Path, small_disk: Path) -> None:
-    cell = discarding_cell(tmp_path)
-    cell.rig_data["storage"]["folder"] = str(small_disk)
-    cell.write()
-    checked = cells.here("check", cell.plan, "--json")
-    assert checked.code == 0, checked.err
-    peak = checked.document["peak_bytes"]
-    free = os.statvfs(small_disk).f_bavail * os.statvfs(small_disk).f_frsize
-    with (small_disk / "ballast").open("wb") as file:
-        os.posix_fallocate(file.fileno(), 0, free - peak + 100_000)
-    refused = cells.here("check", cell.plan, "--no-disk-speed", "--json")
-    assert refused.code == 3
-    assert "though frames are discarded, the run needs" in refused.document["refusals"][0]
 
 
 # -- killed between any two steps -----------------------------------------------------------------------------
@@ -420,52 +321,3 @@ def test_a_frame_that_was_discarded_cannot_be_claimed_by_another_hash(pending: t
     ended = cells.here("verify", run)
     assert ended.code == 6
     assert "frames discarded that it has not proven" in ended.err
-
-
-# -- a small disk ---------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of its own, with room for less than three views and their samples."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    words = ["mount", "-t", "tmpfs", "-o", "size=140m", "tmpfs", str(disk)]
-    mounted = subprocess.run(words, check=False, capture_output=True, text=True)
-    if mounted.returncode != 0:
-        pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
-
-
-@pytest.mark.parametrize("ending", ["goes on", "is killed", "hangs"])
-def test_a_run_waits_for_room_and_ends_clearly_if_none_comes(
-    tmp_path: Path, small_disk: Path, ending: str
-) -> None:
-    cell = discarding_cell(tmp_path)
-    cell.rig_data["storage"]["folder"] = str(small_disk)
-    cell.write()
-    (tmp_path / "storage").symlink_to(small_disk)
-    process, worker = begun(cell)
-    if ending != "goes on":
-        os.kill(worker, signal.SIGSTOP)
-    with (small_disk / "ballast").open("wb") as file:  # somebody else takes what preflight has seen
-        os.posix_fallocate(file.fileno(), 0, 25_000_000)
-    if ending == "goes on":
-        ended = cells.finish(process)
-        assert ended.code == 0, ended.err
-        kinds = [line["event"] for line in cells.events(cell.run_folder)]
-        third = [n for n, kind in enumerate(kinds) if kind == "settled"][2]
-        assert "discard" in kinds[:third]  # it has waited for it
-        assert ended.document["reflectance"]["is_whole"], ended.err
-    else:
-        if ending == "is killed":
-            os.kill(worker, signal.SIGKILL)
-        ended = cells.finish(process)
-        assert ended.code == 6, ended.err
-        assert "no more frames are discarded" in ended.err
-        assert ("stopped (SIGSTOP)" if ending == "hangs" else "killed by signal 9") in ended.err
-        everything_is_there(cell.run_folder)
-        (small_disk / "ballast").unlink()
-        resume(cell.run_folder)
-    all_discarded(cell.run_folder, result_of(cell))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from coupole.calibration.artefact import NOT_TRACEABLE
 from coupole.calibration.in_force import InForce, read_in_force
 from coupole.calibration.record import Kind, records_named
 from coupole.calibration.traceability import is_traceable, trace_of
+from coupole.storage.durable import sha256
 
 NEEDS: dict[Kind, tuple[Kind, ...]] = {"leds": ("hand-eye",), "mesh": ("hand-eye",), "drift": ("led-power",)}
 """Kinds of records that hold only with one of another kind."""
@@ -36,10 +36,10 @@ def chain_of(paths: Sequence[Path]) -> tuple[ChainLink, ...]:
     waiting = [*read_in_force(records_named(list(paths)))]
     beside: dict[str, InForce] = {}
     for folder in dict.fromkeys(item.path.parent for item in waiting):
-        beside |= {_digest(item.path): item for item in read_in_force(records_named([folder]))}
+        beside |= {sha256(item.path): item for item in read_in_force(records_named([folder]))}
     while waiting:
         item = waiting.pop(0)
-        digest = _digest(item.path)
+        digest = sha256(item.path)
         if digest not in records_by_digest:
             records_by_digest[digest] = item
             waiting += [beside[line.sha256] for line in item.record.inputs if line.sha256 in beside]
@@ -71,7 +71,3 @@ def _gaps(item: InForce, records_by_digest: dict[str, InForce]) -> list[str]:
     for source_record in made_from:
         gaps += _gaps(source_record, records_by_digest)
     return gaps
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -13,18 +13,24 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.errors import InputError
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 
 _SAMPLED = 1_000_000
 """Pixels, about, by which their size on the surface is found."""
+_MOST_MM = 100.0
 
 
 @dataclass(frozen=True)
 class TexelSize:
-    """Width of texels that was asked for."""
+    """Width of texels that was asked for. Raises InputError for one that cannot be."""
 
     mm: float | None = None
     """Width on the surface; None for single pixels of each view, `auto`."""
+
+    def __post_init__(self) -> None:
+        if self.mm is not None and not 0.0 < self.mm <= _MOST_MM:
+            raise size_refused(f"{self.mm:g}")
 
     @property
     def text(self) -> str:
@@ -39,6 +45,14 @@ class TexelSize:
     def side_px(self, of_pixel_mm: float) -> int:
         """Width of a texel, px, in a view whose pixels are that wide on the surface."""
         return 1 if self.mm is None else max(1, round(self.mm / of_pixel_mm))
+
+
+def size_refused(text: str) -> InputError:
+    """Return the error for what is no size of texels."""
+    return InputError(
+        f"--texels: expected auto, each view's own pixels, or a width on the surface in mm up to {_MOST_MM:g}, "
+        f"such as 0.2; got {text!r}"
+    )
 
 
 @dataclass(frozen=True)
@@ -104,16 +118,17 @@ def _cut_rows(  # type: ignore[no-untyped-def]
             if len(numbers) == 0:
                 continue
             most = _most_frequent(numbers)
-            triangle[row, column] = most
-            _gather(
+            members = _gather(
                 triangle_of_pixel[down, across], seen_mm[down, across], centres_mm[most], normals[most], most_mm,
                 row * triangle.shape[1] + column, places_mm[row, column], texel_of_pixel[down, across],
             )  # fmt: skip
+            if members > 0:
+                triangle[row, column] = most
 
 
 @numba.njit(cache=True, nogil=True)
 def _gather(triangle, seen_mm, centre_mm, normal, most_mm, texel, place_mm, texel_of_pixel):  # type: ignore[no-untyped-def]
-    """Give a square's pixels to its texel, and find the mean place of what they see."""
+    """Give a square's pixels to its texel, and find the mean place of what they see. Returns how many they are."""
     members = 0
     for y in range(triangle.shape[0]):
         for x in range(triangle.shape[1]):
@@ -126,7 +141,8 @@ def _gather(triangle, seen_mm, centre_mm, normal, most_mm, texel, place_mm, texe
                 for k in range(3):
                     place_mm[k] += seen_mm[y, x, k]
     for k in range(3):
-        place_mm[k] /= members
+        place_mm[k] /= max(members, 1)
+    return members
 
 
 @numba.njit(cache=True, nogil=True)

@@ -37,7 +37,7 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "faults")]
 from failing_calls import KINDS, count_calls, run_case  # noqa: E402
 from happenings import MEANWHILE, Event  # noqa: E402
 from judged_sessions import draw_pair, drawn_kind, run_events  # noqa: E402
-from nursery import Nursery  # noqa: E402
+from nursery import NURSERY  # noqa: E402
 
 from sim.world import client  # noqa: E402
 
@@ -69,7 +69,7 @@ def case_of(line: dict[str, Any]) -> Case:
 
 def begin_job(parent_pid: int) -> None:
     """Have this process fork its worlds, and end soon after the one that started it, also if that is killed."""
-    client._launch = Nursery().start  # as the tests do
+    client._launch = NURSERY.start  # as the tests do
 
     def look() -> None:
         while os.getppid() == parent_pid:

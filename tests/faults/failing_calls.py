@@ -22,7 +22,7 @@ import cells
 from cells import TOP, CellFolder, Ended
 from expected_pictures import mislabelled
 from never_returning import LIMITS_S, Hang, begin
-from places import REPO
+from nursery import NURSERY
 from real_cells import true_dose_lux_h
 
 from coupole.acquisition import opened_cell
@@ -281,28 +281,17 @@ class Watch:
 
 def _killed(cell: CellFolder, k: int, watch: Watch) -> Ended:
     """The session in a process of its own, which kills itself at its k-th call."""
-    code = (
-        "import sys; sys.path[:0] = sys.argv[1:3]\n"
-        "import failing_calls\n"
-        "failing_calls.acquire_and_die(sys.argv[3], int(sys.argv[4]))\n"
-    )
-    arguments = [str(REPO / "tests"), str(REPO / "tests" / "faults"), str(cell.folder), str(k)]
-    with subprocess.Popen(
-        [sys.executable, "-c", code, *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=REPO,
-    ) as process:
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with NURSERY.function("failing_calls:acquire_and_die", [str(cell.folder), str(k)], **streams) as process:
         out, err = process.communicate(timeout=cells.PATIENCE_S)
         watch.begin()
     return Ended(process.returncode, out, err)
 
 
-def acquire_and_die(folder: str, k: int) -> None:
+def acquire_and_die(folder: str, k: str) -> None:
     """In a process of its own: kills it at the k-th call of its devices."""
     cell = CellFolder(Path(folder), speed=SPEED, write_now=False)
-    sys.exit(acquire(cell, Failure(k, "sigkill")).code)
+    sys.exit(acquire(cell, Failure(int(k), "sigkill")).code)
 
 
 def _wrong_in_the_cell(case: Case, world: World) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
     from coupole.appearance.matter.glossy_face import Geometry
     from coupole.heritage.analysis.layer_samples import LayerGiven
+    from coupole.heritage.analysis.other_thickness import FilmAtThickness
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,18 @@ class Instrument:
         return geometry
 
 
+@dataclass(frozen=True)
+class Wishes:
+    """Results beyond K and S."""
+
+    at_um: tuple[float, ...]
+    """Thicknesses at which the film is predicted."""
+    other_paint: Path | None
+    """Another grinding of the pigment."""
+    out: Path | None
+    """Folder for the files."""
+
+
 @flatten_options
 def layer(
     samples: Annotated[
@@ -104,6 +118,15 @@ def layer(
         Path | None,
         typer.Option(
             help=("Paint file of another grinding of the pigment, to compute the ratio of their grain sizes.")
+        ),
+    ] = None,
+    at_um: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--at-um",
+            min=0.01,
+            help="Predict the film at this thickness, over the grounds that were measured; repeat for more.",
+            show_default=False,
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for paint file and report.")] = None,
@@ -127,7 +150,7 @@ def layer(
             if films.are_named():
                 raise InputError(f"{samples}: names the films; leave out --over-black and the like")
             description, folder = read_films(samples)
-        document = _coefficients_document(description, folder, other_grinding, out)
+        document = _coefficients_document(description, folder, Wishes(tuple(at_um or ()), other_grinding, out))
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -166,13 +189,13 @@ def _layer_description(
     )
 
 
-def _coefficients_document(
-    layer: LayerGiven, folder: Path, other_paint_path: Path | None, out: Path | None
-) -> dict[str, Any]:
-    from coupole.heritage.analysis import four_flux_fit, layer_fit, layer_model
+def _coefficients_document(layer: LayerGiven, folder: Path, wishes: Wishes) -> dict[str, Any]:
+    from coupole.heritage.analysis import four_flux_fit, layer_fit, layer_model, other_thickness
     from coupole.heritage.analysis.layer_samples import paint_file, read_samples
 
     samples = read_samples(layer, folder)
+    if wishes.at_um and not samples.is_per_mm:
+        raise InputError("--at-um: needs the thickness of the measured films: give --thickness-um")
     fit = layer_fit.fit(samples.films, samples.face, layer.noise)
     four = None
     if samples.directional is None:
@@ -212,19 +235,40 @@ def _coefficients_document(
             "u_s_i": four.u_forward.tolist(),
             "u_s_j": four.u_backward.tolist(),
         }
-    if other_paint_path is not None:
-        document["grains"] = _grains(paint, other_paint_path)
-    if out is not None:
+    predicted_films = other_thickness.films_at(
+        fit, samples.films, samples.face, [1e-3 * thickness_um for thickness_um in wishes.at_um]
+    )
+    if predicted_films:
+        document["at"] = [_film_document(film) for film in predicted_films]
+    if wishes.other_paint is not None:
+        document["grains"] = _grains(paint, wishes.other_paint)
+    if wishes.out is not None:
         from coupole.appearance.matter.paint_file import ENDING, encode
         from coupole.heritage.result_pages.layer_page import layer_page
 
         stem = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in layer.name)
         files = {
             f"{stem}{ENDING}": encode(paint),
-            f"{stem}.html": layer_page(layer, samples, fit, model, four),
+            f"{stem}.html": layer_page(layer, samples, fit, model, four, predicted_films),
         }
-        document["files"] = _write_files(out, files)
+        document["files"] = _write_files(wishes.out, files)
     return document
+
+
+def _film_document(film: FilmAtThickness) -> dict[str, Any]:
+    """Facts for `--json`; a band in which the measured films hide their grounds is null."""
+    from coupole.heritage.analysis.layer_fit import COVERAGE_FACTOR
+
+    def values(array: Any) -> list[float | None]:
+        return [float(value) if isfinite(value) else None for value in array]
+
+    return {
+        "thickness_um": 1e3 * film.thickness_mm,
+        "over": Path(film.ground_name).name,
+        "reflectance": values(film.reflectance),
+        "half_width": values(COVERAGE_FACTOR * film.u_reflectance),
+        "half_width_of_model": values(COVERAGE_FACTOR * film.u_model),
+    }
 
 
 def _misfit(fit: Any) -> float | None:
@@ -292,6 +336,7 @@ def _say(document: dict[str, Any], console: Console) -> None:
         )
     if (misfit := document["misfit"]) is not None:
         console.print(f"the films differ from a single K and S by {misfit:.1f} times what noise explains")
+    _say_films(document, console)
     if grains := document.get("grains"):
         console.print(
             f"its grains are {grains['ratio']:.2f} +- {2 * grains['u_ratio']:.2f} times as large as those of "
@@ -300,3 +345,19 @@ def _say(document: dict[str, Any], console: Console) -> None:
         )
     for path in document.get("files", ()):
         console.print(path, markup=False)
+
+
+def _say_films(document: dict[str, Any], console: Console) -> None:
+    """A line for each predicted film, about the middle band that is known."""
+    for film in document.get("at", ()):
+        name = f"at {film['thickness_um']:g} um over {film['over']}"
+        bands = [number for number, value in enumerate(film["reflectance"]) if value is not None]
+        if not bands:
+            console.print(f"{name}: not known; the measured films hide their grounds", markup=False)
+            continue
+        at = bands[len(bands) // 2]
+        console.print(
+            f"{name}: {film['reflectance'][at]:.3f} +- {film['half_width'][at]:.3f} (95 %) at "
+            f"{document['wavelength_nm'][at]:g} nm; the model alone: +- {film['half_width_of_model'][at]:.3f}",
+            markup=False,
+        )

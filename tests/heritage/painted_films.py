@@ -49,8 +49,20 @@ class Walk:
         return float(np.mean(np.where(self.ground_hits == 0, 1.0, ground**self.ground_hits) * left))
 
 
-def walk(optical_depth: float, photons: int, seed: int) -> Walk:
-    """Lambertian light into a layer that scatters to all sides alike, over a Lambertian ground."""
+def _scattered(cosine: np.ndarray, mean_cosine: float, rng: np.random.Generator) -> np.ndarray:
+    """Cosines to the layer's normal after one scattering."""
+    drawn = rng.random(len(cosine))
+    if mean_cosine == 0.0:
+        return np.asarray(2.0 * drawn - 1.0)
+    g = mean_cosine
+    turn = (1.0 + g * g - ((1.0 - g * g) / (1.0 - g + 2.0 * g * drawn)) ** 2) / (2.0 * g)
+    across = np.sqrt(np.maximum(1.0 - cosine**2, 0.0) * np.maximum(1.0 - turn**2, 0.0))
+    return np.asarray(cosine * turn + across * np.cos(2.0 * np.pi * rng.random(len(cosine))))
+
+
+def walk(optical_depth: float, photons: int, seed: int, mean_cosine: float = 0.0) -> Walk:
+    """Lambertian light into a layer of grains over a Lambertian ground. The grains scatter to all sides alike, or
+    with a mean cosine as Henyey and Greenstein have it."""
     rng = np.random.default_rng(seed)
     cosine = np.sqrt(rng.random(photons))
     depth, path, hits = np.zeros(photons), np.zeros(photons), np.zeros(photons, int)
@@ -65,6 +77,7 @@ def walk(optical_depth: float, photons: int, seed: int) -> Walk:
         done.append((hits[top], path[top]))
         hits = hits + floor
         depth = np.where(floor, optical_depth, depth + cosine * step)
-        turned = np.where(floor, -np.sqrt(rng.random(len(depth))), 2.0 * rng.random(len(depth)) - 1.0)
+        scattered = _scattered(cosine, mean_cosine, rng)
+        turned = np.where(floor, -np.sqrt(rng.random(len(depth))), scattered)
         depth, path, hits, cosine = depth[~top], path[~top], hits[~top], turned[~top]
     return Walk(*(np.concatenate(part) for part in zip(*done, strict=True)))

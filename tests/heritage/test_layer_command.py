@@ -68,6 +68,31 @@ def test_a_drawdown_card_gives_k_and_s_in_their_intervals_a_paint_file_and_a_pag
     assert (page.count("<polygon"), page.count("<script")) == (2, 0)
 
 
+def test_a_film_is_predicted_at_another_thickness_with_its_interval_in_text_json_and_page(
+    films: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ["layer", *options(films, thickness_um="30", noise="0.002", name="ochre"), "--at-um", "60"]
+    code, out, _ = run(monkeypatch, capsys, *asked, "--json", "--out", str(tmp_path / "out"))
+
+    told = json.loads(out)["at"]
+    assert (code, [film["over"] for film in told]) == (0, ["black.csv", "white.csv"])
+    for film, ground in zip(told, (0.02, 0.9), strict=True):
+        truth = in_air(np.array([two_fluxes(k, s, 0.06, ground) for k, s in zip(K, S, strict=True)]))
+        nm = np.linspace(400, 700, len(film["reflectance"]))
+        off = np.abs(np.array(film["reflectance"]) - np.interp(nm, NM, truth))
+        assert np.mean(off < film["half_width"]) > 0.9
+        assert np.all(np.array(film["half_width"]) > film["half_width_of_model"])
+    assert "Predicted at 60 um" in (tmp_path / "out" / "ochre.html").read_text()
+    assert "at 60 um over white.csv" in "".join(run(monkeypatch, capsys, *asked)[1:])
+
+
+def test_a_thickness_cannot_be_asked_for_without_that_of_the_films(
+    films: dict[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, err = run(monkeypatch, capsys, "layer", *options(films), "--at-um", "60")
+    assert (code, "give --thickness-um" in err) == (2, True)
+
+
 def test_a_series_in_a_yaml_file_is_solved_and_says_how_well_it_agrees(
     films: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,9 +5,9 @@ logarithm of exposure g(z) of each value z, such that g(z) = ln E + ln t for all
 difference is that the pixels' ln E are eliminated, so thousands of pixels cost no more than a few. Noise is that
 of values: g is looked up at the value that a pixel's mean predicts, and the noisy value only adds g' times its
 difference (where g is looked up at noisy values, least squares prefers stairs and waves, which steps of 4 do not
-contradict). And g is a Gaussian process: its slope over ln z wanders, by an amount that the photographs themselves
-make most likely. Where they cannot tell, as with waves of the period of all steps, this is what the uncertainty
-holds. A power law costs nothing, so that a linear sensor comes out straight.
+contradict). And g is a Gaussian process: its slope over ln z wanders, by amounts that count as much
+as they make the photographs likely. Where photographs cannot tell, as with waves of the period of all steps, this
+is what the uncertainty holds. A power law costs nothing, so that a linear sensor comes out straight.
 """
 
 from __future__ import annotations
@@ -33,15 +33,12 @@ for less in the next round."""
 _LEAST_FITTED, _MOST_FITTED = 0.02, 0.97
 """Predicted values between which a sample is fitted; a choice by noisy values would favour high noise."""
 _STIFF, _WANDERS = -2.0, np.arange(-7.0, 2.1, 0.25)
-"""ln of the wander of the slope, in the first rounds and to choose from."""
+"""ln of the wander of the slope, in the first rounds and then."""
 _POWER_WIDTH = 0.35
 """Width of the window in ln z over which a slope is taken for weights."""
 _LEAST_POWER, _MOST_POWER = 0.3, 8.0
 _QUANTIZATION = 0.29
 """Standard deviation of rounding, in levels."""
-_WIDENED = 2.0
-"""Factor of the covariance: the wander that is likeliest tells little of waves that no pixel contradicts. It was
-found with the cameras of `tools/prove_brackets.py`, which are others now."""
 _MIDDLE = NODES // 2
 _LOG_NODES = np.log(np.maximum(np.arange(NODES), 0.5))
 """ln of the nodes' values in steps; between nodes g is linear over it."""
@@ -159,9 +156,9 @@ def _solve_curve(
     fit = _Fit(start, np.ones_like(samples), max(1.0 / 255.0, least_noise))
     for number in range(_ROUNDS):
         wanders = _WANDERS if number >= _SMOOTH_ROUNDS else np.array([_STIFF])
-        fit, inverse, weights = _next_fit(fit, samples, log_t, wanders, least_noise)
+        fit, covariance_of_others, weights = _next_fit(fit, samples, log_t, wanders, least_noise)
     covariance = np.zeros((NODES, NODES))
-    covariance[np.ix_(_OTHERS, _OTHERS)] = _WIDENED * inverse
+    covariance[np.ix_(_OTHERS, _OTHERS)] = covariance_of_others
     counts = np.histogram(samples[weights > 0.0], bins=NODES, range=(0.0, 1.0))[0]
     bins, is_shown = np.flatnonzero(counts), np.zeros(NODES, bool)
     is_shown[bins.min() : bins.max() + 1] = True
@@ -171,7 +168,7 @@ def _solve_curve(
 def _next_fit(
     fit: _Fit, samples: Array, log_t: Array, wanders: Array, least_noise: float
 ) -> tuple[_Fit, Array, Array]:
-    """One round: the fit, the inverse of its normal equations without the middle, and the weights."""
+    """One round: the fit, its covariance without the middle, and the weights."""
     rising, powers = np.maximum.accumulate(fit.g) + 1e-9 * np.arange(NODES), _powers(fit.g)
     weights = ((samples > DARK) & (samples < SATURATED)) * fit.robust
     predicted_values = _predict_values(samples, weights, log_t, rising, powers)
@@ -181,8 +178,8 @@ def _next_fit(
     weights = usable * fit.robust / (slope * fit.noise) ** 2
     target = log_t - slope * (samples - predicted_values)
     normal = _normal_equations(predicted_values, weights, target)
-    g, inverse = _likeliest(*normal, wanders)
-    return _with_noise(g, weights, _at(g, predicted_values) - target, slope, least_noise), inverse, weights
+    g, covariance = _averaged(*normal, wanders)
+    return _with_noise(g, weights, _at(g, predicted_values) - target, slope, least_noise), covariance, weights
 
 
 def _predict_values(samples: Array, weights: Array, log_t: Array, g: Array, powers: Array) -> Array:
@@ -229,21 +226,26 @@ def _normal_equations(predicted_values: Array, weights: Array, target: Array) ->
     return matrix, right, float((weights * target**2).sum() - (target_sums**2 / total).sum())
 
 
-def _likeliest(matrix: Array, right: Array, squares: float, wanders: Array) -> tuple[Array, Array]:
-    """g [NODES] and its covariance without the middle, for the wander that makes the samples likeliest."""
+def _averaged(matrix: Array, right: Array, squares: float, wanders: Array) -> tuple[Array, Array]:
+    """g [NODES] and its covariance without the middle: the mean over wanders by how likely each makes the samples,
+    which all count alike beforehand (Hoeting et al., "Bayesian model averaging", Stat. Sci. 14, 382, 1999)."""
     matrix, right, roughness = matrix[np.ix_(_OTHERS, _OTHERS)], right[_OTHERS], _roughness()
-    best, likeliest, best_normal = np.zeros(NODES - 1), -np.inf, matrix
-    for wander in wanders:
+    log_likelihoods, curves = np.zeros(len(wanders)), np.zeros((len(wanders), NODES - 1))
+    inverses = np.zeros((len(wanders), NODES - 1, NODES - 1))
+    for number, wander in enumerate(wanders):
         stiff = matrix + roughness * np.exp(-2.0 * wander)
-        candidate = np.linalg.solve(stiff, right)
-        log_likelihood = -0.5 * (
-            np.linalg.slogdet(stiff)[1] + 2.0 * (NODES - 2) * wander + squares - right @ candidate
+        inverses[number] = np.linalg.inv(stiff)
+        curves[number] = inverses[number] @ right
+        log_likelihoods[number] = -0.5 * (
+            np.linalg.slogdet(stiff)[1] + 2.0 * (NODES - 2) * wander + squares - right @ curves[number]
         )
-        if log_likelihood > likeliest:
-            best, likeliest, best_normal = candidate, float(log_likelihood), stiff
+    shares = np.exp(log_likelihoods - log_likelihoods.max())
+    shares /= shares.sum()
     g = np.zeros(NODES)
-    g[_OTHERS] = best
-    return g, np.asarray(np.linalg.inv(best_normal), float)
+    g[_OTHERS] = shares @ curves
+    off = curves - g[_OTHERS]
+    covariance = np.tensordot(shares, inverses, 1) + np.einsum("w,wi,wj->ij", shares, off, off)
+    return g, np.asarray(covariance)
 
 
 def _roughness() -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -11,13 +12,19 @@ from coupole.heritage.analysis.four_flux_fit import FourFlux
 from coupole.heritage.analysis.layer_fit import COVERAGE_FACTOR, Coefficients
 from coupole.heritage.analysis.layer_model import Deserved
 from coupole.heritage.analysis.layer_samples import LayerGiven, Samples
+from coupole.heritage.analysis.other_thickness import FilmAtThickness
 from coupole.pages.page_charts import Array, Curve, chart
 from coupole.pages.page_parts import Code, Page, Plot, Section
 from coupole.pages.page_rendering import render
 
 
 def layer_page(
-    description: LayerGiven, samples: Samples, fit: Coefficients, model: Deserved, four: FourFlux | None
+    description: LayerGiven,
+    samples: Samples,
+    fit: Coefficients,
+    model: Deserved,
+    four: FourFlux | None,
+    predicted_films: Sequence[FilmAtThickness] = (),
 ) -> str:
     """HTML."""
     nm, sure = samples.wavelengths_nm, fit.determined_bands
@@ -50,6 +57,12 @@ def layer_page(
                     figure_size="wide",
                 ),
                 Section("four", "Four fluxes", figures=_four_fluxes(nm, four, unit), figure_size="wide"),
+                Section(
+                    "at",
+                    "At other thicknesses",
+                    figures=_other_thicknesses(nm, predicted_films),
+                    figure_size="wide",
+                ),
             ],
         )
     )
@@ -87,6 +100,23 @@ def _four_fluxes(nm: Array, four: FourFlux | None, unit: str) -> Sequence[Plot]:
         _with_band("s_j, backward", four.backward, four.u_backward),
     ]
     return [chart(f"Directional light, {unit}, 95 % bands", nm, curves)]
+
+
+def _other_thicknesses(nm: Array, films: Sequence[FilmAtThickness]) -> Sequence[Plot]:
+    """One drawing for each thickness, of the bands that are known."""
+    plots = []
+    for thickness_mm in dict.fromkeys(film.thickness_mm for film in films):
+        same = [film for film in films if film.thickness_mm == thickness_mm]
+        known = np.isfinite(same[0].reflectance)
+        if known.sum() < 2:
+            continue
+        curves = [
+            _with_band(f"over {Path(film.ground_name).name}", film.reflectance[known], film.u_reflectance[known])
+            for film in same
+        ]
+        title = f"Predicted at {1e3 * thickness_mm:g} um, with 95 % bands that include the model's error"
+        plots.append(chart(title, nm[known], curves))
+    return plots
 
 
 def _with_band(name: str, values: Array, u: Array) -> Curve:

@@ -1,0 +1,135 @@
+"""A film's spectrum at another thickness than the measured one, with the error of the two-flux model.
+
+Over another ground the two fluxes are exact: they define a film's reflectance and transmittance for diffuse light,
+and a diffusing ground makes all light diffuse. At another thickness they are a model: light inside a layer is not
+diffuse near its faces. Radiative transfer tells how far they may be off. Two other layers, one with grains that
+scatter evenly to all sides and one with grains that scatter forward, are given the reflectance and the
+transmittance of the measured film, and are made as thick as asked. The largest difference of these two from two
+fluxes is taken as the half width of a rectangular distribution about two fluxes (JCGM 100, 4.3.7).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from coupole.appearance.matter import kubelka_munk
+from coupole.appearance.matter.glossy_face import Face
+from coupole.appearance.matter.scattering_layer import diffuse_response
+from coupole.appearance.spectra.grid import Array
+from coupole.errors import InputError
+from coupole.heritage.analysis import layer_fit
+from coupole.heritage.analysis.layer_fit import Coefficients, Film
+
+MEAN_COSINES = (0.0, 0.8)
+"""Grains that scatter evenly, and grains larger than the wavelength in a binder: 0.7 to 0.9 by Mie's theory."""
+_ROUNDS, _STEP = 12, 1e-4
+_THINNEST, _THICKEST = -14.0, 7.0
+"""ln of optical depths between which a layer is looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class FilmAtThickness:
+    """Spectrum that a film would show; NaN in bands in which the measured films do not tell S."""
+
+    thickness_mm: float
+    ground_name: str
+    reflectance: Array
+    """[n], as the instrument sees it."""
+    u_measured: Array
+    """[n], standard uncertainty from noise, grounds and thicknesses of the measured films."""
+    u_model: Array
+    """[n], standard uncertainty from the two-flux model."""
+
+    @property
+    def u_reflectance(self) -> Array:
+        """[n], standard uncertainty of both."""
+        return np.hypot(self.u_measured, self.u_model)
+
+
+def films_at(
+    coefficients: Coefficients, films: Sequence[Film], face: Face, thicknesses_mm: Sequence[float]
+) -> list[FilmAtThickness]:
+    """Predict the film at each thickness over each ground that was measured. Raises InputError if no film over a
+    ground was."""
+    grounds = {film.ground_name: film for film in films if film.ground is not None}
+    if thicknesses_mm and not grounds:
+        raise InputError("expected a film over a ground, whose thickness is known; found opaque ones only")
+    return [
+        film_at(coefficients, films, face, thickness_mm, ground)
+        for thickness_mm in thicknesses_mm
+        for ground in grounds.values()
+    ]
+
+
+def film_at(
+    coefficients: Coefficients, films: Sequence[Film], face: Face, thickness_mm: float, over: Film
+) -> FilmAtThickness:
+    """Predict the film of a thickness over the ground of one of the measured films."""
+    background = np.asarray(over.ground, float)
+    reference_mm = _nearest_mm(films, thickness_mm)
+    prediction = layer_fit.predict(coefficients, face, thickness_mm, background)
+    two_fluxes = np.maximum(coefficients.absorption, 0.0), coefficients.scattering
+    by_two_fluxes = _seen(*kubelka_munk.layer(*two_fluxes, thickness_mm), background, face)
+    rho, tau = kubelka_munk.layer(*two_fluxes, reference_mm)
+    off = np.zeros_like(rho)
+    for mean_cosine in MEAN_COSINES:
+        depths = _matching_depths(rho, tau, two_fluxes, reference_mm, mean_cosine)
+        scaled = [depth * thickness_mm / reference_mm for depth in depths]
+        by_transfer = _seen(*diffuse_response(scaled[0], scaled[1], mean_cosine), background, face)
+        off = np.maximum(off, np.abs(by_transfer - by_two_fluxes))
+    told = np.where(coefficients.determined_bands, 1.0, np.nan)
+    return FilmAtThickness(
+        thickness_mm,
+        over.ground_name,
+        prediction.seen * told,
+        prediction.u_seen * told,
+        off / np.sqrt(3.0) * told,
+    )
+
+
+def _nearest_mm(films: Sequence[Film], thickness_mm: float) -> float:
+    """The thickness of a film over a ground that is nearest by ratio."""
+    measured_mm = [film.thickness_mm for film in films if film.ground is not None]
+    return min(measured_mm, key=lambda thickness: abs(np.log(thickness / thickness_mm)))
+
+
+def _seen(rho: Array, tau: Array, ground: Array, face: Face) -> Array:
+    inside = kubelka_munk.over(rho, tau, ground)
+    return np.asarray(face.passing * inside / (1.0 - face.inner * inside) + face.gloss)
+
+
+def _matching_depths(
+    rho: Array, tau: Array, two_fluxes: tuple[Array, Array], thickness_mm: float, mean_cosine: float
+) -> tuple[Array, Array]:
+    """Optical depths [n] of absorption and of scattering of the layer that reflects rho and transmits tau.
+
+    K = 2 k and S = 3/4 s (1 - mean cosine), which hold for thick layers, are where Newton's steps begin.
+    """
+    k, s = two_fluxes
+    start = np.stack([0.5 * k * thickness_mm, 4.0 / 3.0 * s * thickness_mm / (1.0 - mean_cosine)])
+    logs = np.log(np.maximum(start, np.exp(_THINNEST)))
+    asked = np.stack([rho, np.log(tau)])
+
+    def off(logs: Array) -> Array:
+        absorbed, scattered = np.exp(logs)
+        rho_here, tau_here = diffuse_response(absorbed, scattered, mean_cosine)
+        return np.asarray(np.stack([rho_here, np.log(tau_here)]) - asked)
+
+    for _ in range(_ROUNDS):
+        logs = np.clip(logs - _newton_step(off, logs), _THINNEST, _THICKEST)
+    depths = np.exp(logs)
+    return depths[0], depths[1]
+
+
+def _newton_step(off: Callable[[Array], Array], logs: Array) -> Array:
+    """[2, n], at most a factor of e in each."""
+    here = off(logs)
+    slopes = np.stack([(off(logs + _STEP * unit) - here) / _STEP for unit in np.eye(2)[:, :, None]], axis=1)
+    matrices = np.moveaxis(slopes, -1, 0)
+    floor = 1e-12 * np.eye(2)
+    normal = np.einsum("nij,nik->njk", matrices, matrices) + floor
+    step = np.linalg.solve(normal, np.einsum("nij,in->nj", matrices, here)[..., None])[..., 0]
+    return np.asarray(np.clip(step.T, -1.0, 1.0))

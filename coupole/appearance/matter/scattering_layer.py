@@ -26,19 +26,19 @@ def diffuse_response(absorption: Array, scattering: Array, mean_cosine: float) -
     optical depths, `mean_cosine` is that of one scattering, from 0 up to 0.9."""
     cosines, weights, forward, backward = _directions(mean_cosine)
     straight_on = mean_cosine ** (2 * DIRECTIONS)
-    reduced = np.asarray(scattering, float)[:, None, None] * (1.0 - straight_on)
-    extinction = np.asarray(absorption, float)[:, None, None] + reduced
+    optical_depth = np.asarray(scattering, float)[:, None, None] * (1.0 - straight_on)
+    extinction = np.asarray(absorption, float)[:, None, None] + optical_depth
     unit = np.eye(DIRECTIONS)
-    a = (extinction * unit - 0.5 * reduced * forward * weights) / cosines[:, None] / 2**_DOUBLINGS
-    b = 0.5 * reduced * backward * weights / cosines[:, None] / 2**_DOUBLINGS
-    reflected = b - 0.5 * (a @ b + b @ a)
-    passed = unit - a + 0.5 * (a @ a + b @ b)
+    a = (extinction * unit - 0.5 * optical_depth * forward * weights) / cosines[:, None] / 2**_DOUBLINGS
+    b = 0.5 * optical_depth * backward * weights / cosines[:, None] / 2**_DOUBLINGS
+    reflection = b - 0.5 * (a @ b + b @ a)
+    transmission = unit - a + 0.5 * (a @ a + b @ b)
     for _ in range(_DOUBLINGS):
-        between = passed @ np.linalg.inv(unit - reflected @ reflected)
-        reflected = reflected + between @ reflected @ passed
-        passed = between @ passed
+        between = transmission @ np.linalg.inv(unit - reflection @ reflection)
+        reflection = reflection + between @ reflection @ transmission
+        transmission = between @ transmission
     flux = 2.0 * weights * cosines
-    return np.asarray((flux @ reflected).sum(axis=-1)), np.asarray((flux @ passed).sum(axis=-1))
+    return np.asarray((flux @ reflection).sum(axis=-1)), np.asarray((flux @ transmission).sum(axis=-1))
 
 
 @cache

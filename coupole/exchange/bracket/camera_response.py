@@ -178,7 +178,7 @@ def _next_fit(
     weights = usable * fit.robust / (slope * fit.noise) ** 2
     target = log_t - slope * (samples - predicted_values)
     normal = _normal_equations(predicted_values, weights, target)
-    g, covariance = _averaged(*normal, wanders)
+    g, covariance = _average_curve(*normal, wanders)
     return _with_noise(g, weights, _at(g, predicted_values) - target, slope, least_noise), covariance, weights
 
 
@@ -226,7 +226,7 @@ def _normal_equations(predicted_values: Array, weights: Array, target: Array) ->
     return matrix, right, float((weights * target**2).sum() - (target_sums**2 / total).sum())
 
 
-def _averaged(matrix: Array, right: Array, squares: float, wanders: Array) -> tuple[Array, Array]:
+def _average_curve(matrix: Array, right: Array, squares: float, wanders: Array) -> tuple[Array, Array]:
     """g [NODES] and its covariance without the middle: the mean over wanders by how likely each makes the samples,
     which all count alike beforehand (Hoeting et al., "Bayesian model averaging", Stat. Sci. 14, 382, 1999)."""
     matrix, right, roughness = matrix[np.ix_(_OTHERS, _OTHERS)], right[_OTHERS], _roughness()

@@ -72,21 +72,23 @@ def film_at(
     reference_mm = _nearest_mm(films, thickness_mm)
     prediction = layer_fit.predict(coefficients, face, thickness_mm, background)
     two_fluxes = np.maximum(coefficients.absorption, 0.0), coefficients.scattering
-    by_two_fluxes = _seen(*kubelka_munk.layer(*two_fluxes, thickness_mm), background, face)
+    by_two_fluxes = _film_reflectance(*kubelka_munk.layer(*two_fluxes, thickness_mm), background, face)
     rho, tau = kubelka_munk.layer(*two_fluxes, reference_mm)
     off = np.zeros_like(rho)
     for mean_cosine in MEAN_COSINES:
         depths = _matching_depths(rho, tau, two_fluxes, reference_mm, mean_cosine)
-        scaled = [depth * thickness_mm / reference_mm for depth in depths]
-        by_transfer = _seen(*diffuse_response(scaled[0], scaled[1], mean_cosine), background, face)
+        depths_here = [depth * thickness_mm / reference_mm for depth in depths]
+        by_transfer = _film_reflectance(
+            *diffuse_response(depths_here[0], depths_here[1], mean_cosine), background, face
+        )
         off = np.maximum(off, np.abs(by_transfer - by_two_fluxes))
-    told = np.where(coefficients.determined_bands, 1.0, np.nan)
+    determined = np.where(coefficients.determined_bands, 1.0, np.nan)
     return FilmAtThickness(
         thickness_mm,
         over.ground_name,
-        prediction.seen * told,
-        prediction.u_seen * told,
-        off / np.sqrt(3.0) * told,
+        prediction.seen * determined,
+        prediction.u_seen * determined,
+        off / np.sqrt(3.0) * determined,
     )
 
 
@@ -96,7 +98,7 @@ def _nearest_mm(films: Sequence[Film], thickness_mm: float) -> float:
     return min(measured_mm, key=lambda thickness: abs(np.log(thickness / thickness_mm)))
 
 
-def _seen(rho: Array, tau: Array, ground: Array, face: Face) -> Array:
+def _film_reflectance(rho: Array, tau: Array, ground: Array, face: Face) -> Array:
     inside = kubelka_munk.over(rho, tau, ground)
     return np.asarray(face.passing * inside / (1.0 - face.inner * inside) + face.gloss)
 
@@ -111,12 +113,12 @@ def _matching_depths(
     k, s = two_fluxes
     start = np.stack([0.5 * k * thickness_mm, 4.0 / 3.0 * s * thickness_mm / (1.0 - mean_cosine)])
     logs = np.log(np.maximum(start, np.exp(_THINNEST)))
-    asked = np.stack([rho, np.log(tau)])
+    target = np.stack([rho, np.log(tau)])
 
     def off(logs: Array) -> Array:
-        absorbed, scattered = np.exp(logs)
-        rho_here, tau_here = diffuse_response(absorbed, scattered, mean_cosine)
-        return np.asarray(np.stack([rho_here, np.log(tau_here)]) - asked)
+        absorption, scattering = np.exp(logs)
+        rho_here, tau_here = diffuse_response(absorption, scattering, mean_cosine)
+        return np.asarray(np.stack([rho_here, np.log(tau_here)]) - target)
 
     for _ in range(_ROUNDS):
         logs = np.clip(logs - _newton_step(off, logs), _THINNEST, _THICKEST)

@@ -107,15 +107,17 @@ def _other_thicknesses(nm: Array, films: Sequence[FilmAtThickness]) -> Sequence[
     plots = []
     for thickness_mm in dict.fromkeys(film.thickness_mm for film in films):
         same = [film for film in films if film.thickness_mm == thickness_mm]
-        known = np.isfinite(same[0].reflectance)
-        if known.sum() < 2:
+        is_known = np.isfinite(same[0].reflectance)
+        if is_known.sum() < 2:
             continue
         curves = [
-            _with_band(f"over {Path(film.ground_name).name}", film.reflectance[known], film.u_reflectance[known])
+            _with_band(
+                f"over {Path(film.ground_name).name}", film.reflectance[is_known], film.u_reflectance[is_known]
+            )
             for film in same
         ]
         title = f"Predicted at {1e3 * thickness_mm:g} um, with 95 % bands that include the model's error"
-        plots.append(chart(title, nm[known], curves))
+        plots.append(chart(title, nm[is_known], curves))
     return plots
 
 

@@ -11,6 +11,7 @@ EXTRA_OF = {
     "av": "pictures",
     "bluesky": "bluesky",
     "colour": "materials",
+    "colour_cxf": "materials",
     "cv2": "pictures",
     "dask": "xarray",
     "distributed": "cluster",
@@ -36,6 +37,7 @@ EXTRA_OF = {
     "tiled": "bluesky",
     "uvicorn": "console",
     "xarray": "xarray",
+    "xsdata": "materials",
 }
 """Extra of pyproject.toml by the name under which a library is imported."""
 

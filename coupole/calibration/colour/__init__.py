@@ -2,7 +2,8 @@
 
 ::
 
-    chart.py            the chart: patches, place, edges; chart_values.py: what was measured of its patches
+    chart.py            the chart: patches, place, edges; chart_values.py, cxf_values.py: what was measured of
+                        its patches
     colorimetry.py      XYZ of spectra, L*a*b*, CIEDE2000
     chart_views.py      patches and edges in frames of runs; chart_pictures.py: in plain pictures
     chart_signals.py    one signal for each patch from many lights, shaded and saturated ones left out

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from coupole.calibration.artefact import Described, read_described
+from coupole.calibration.colour import cxf_values
 from coupole.calibration.colour.chart_values import Unit, read_chart_values
 from coupole.calibration.colour.colorimetry import lab_of
 from coupole.calibration.rotations import Floats
@@ -54,7 +55,9 @@ class Chart(Described):
     names: tuple[tuple[str, ...], ...] | None = None
     """Names of the patches in the file of values, row by row from the top; without it A1, A2, ..., B1, ..."""
     values: FilePath
-    """Spectra, L*a*b* or XYZ of the patches (CGATS or CSV), beside this file."""
+    """Spectra, L*a*b* or XYZ of the patches (CGATS, CSV or CxF), beside this file."""
+    cxf_type: str | None = None
+    """ObjectType of the objects of a CxF file that are used, where a patch is measured more than once."""
     unit: Unit = "auto"
     """Unit of spectra: percent or fraction; auto tells by their size."""
     u_lab: Annotated[float, Field(ge=0)] = 0.3
@@ -162,7 +165,10 @@ def read_chart(path: Path, without: Sequence[str] = ()) -> KnownChart:
     if unknown := sorted(set(chart.neutral or ()) - {*names, *chart.without}):
         raise InputError([document.problem(("neutral",), f"the chart has no patch {', '.join(unknown)}")])
     values_path = document.resolve(chart.values)
-    values = read_chart_values(values_path, chart.unit)
+    if values_path.suffix.lower() in cxf_values.ENDINGS:
+        values = cxf_values.read_cxf_values(values_path, chart.unit, chart.cxf_type)
+    else:
+        values = read_chart_values(values_path, chart.unit)
     if missing := [name for name in names if name not in values.xyz]:
         absent = ", ".join(missing[:8]) + (f" and {len(missing) - 8} more" if len(missing) > 8 else "")
         has = ", ".join(list(values.xyz)[:6])

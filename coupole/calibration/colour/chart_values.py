@@ -59,7 +59,7 @@ def read_chart_values(path: Path, unit: Unit = "auto") -> ChartValues:
     if len(bands) >= _LEAST_BANDS:
         bands.sort()
         table = _numbers(path, rows, [at for _, at in bands])
-        xyz = xyz_of_spectra(np.array([nm for nm, _ in bands]), _fractions(path, table, unit))
+        xyz = xyz_of_spectra(np.array([nm for nm, _ in bands]), reflectance_fractions(path, table, unit))
         return ChartValues(dict(zip(names, xyz, strict=True)))
     for columns, turn in ((_LAB, xyz_of), (_XYZ, lambda values: values / 100.0)):
         for column_names in columns:
@@ -139,7 +139,8 @@ def _numbers(path: Path, rows: Rows, columns: Sequence[int]) -> Floats:
     return table
 
 
-def _fractions(path: Path, table: Floats, unit: Unit) -> Floats:
+def reflectance_fractions(path: Path, table: Floats, unit: Unit) -> Floats:
+    """The table as fractions. Raises InputError: a unit that cannot be told, values that no reflectance has."""
     peak = float(table.max())
     if unit == "auto" and _FRACTION_AT_MOST < peak < _PERCENT_AT_LEAST:
         raise InputError(

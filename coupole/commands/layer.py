@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from coupole.appearance.matter.glossy_face import Geometry
+    from coupole.heritage.analysis.four_flux_fit import FourFlux
     from coupole.heritage.analysis.layer_samples import LayerGiven
     from coupole.heritage.analysis.other_thickness import FilmAtThickness
 
@@ -227,14 +228,7 @@ def _coefficients_document(layer: LayerGiven, folder: Path, wishes: Wishes) -> d
         "misfit": _misfit(fit),
     }
     if four is not None:
-        document["four_fluxes"] = {
-            "k": four.direct_absorption.tolist(),
-            "s_i": four.forward.tolist(),
-            "s_j": four.backward.tolist(),
-            "u_k": four.u_direct_absorption.tolist(),
-            "u_s_i": four.u_forward.tolist(),
-            "u_s_j": four.u_backward.tolist(),
-        }
+        document["four_fluxes"] = _four_flux_document(four)
     predicted_films = other_thickness.films_at(
         fit, samples.films, samples.face, [1e-3 * thickness_um for thickness_um in wishes.at_um]
     )
@@ -253,6 +247,17 @@ def _coefficients_document(layer: LayerGiven, folder: Path, wishes: Wishes) -> d
         }
         document["files"] = _write_files(wishes.out, files)
     return document
+
+
+def _four_flux_document(four: FourFlux) -> dict[str, list[float]]:
+    return {
+        "k": four.direct_absorption.tolist(),
+        "s_i": four.forward.tolist(),
+        "s_j": four.backward.tolist(),
+        "u_k": four.u_direct_absorption.tolist(),
+        "u_s_i": four.u_forward.tolist(),
+        "u_s_j": four.u_backward.tolist(),
+    }
 
 
 def _film_document(film: FilmAtThickness) -> dict[str, Any]:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from colour_cxf.cxf3 import CxF
 
 ENDINGS = (".cxf", ".mxf", ".xml")
-"""Of files that are read as CxF; i1Profiler writes .mxf."""
+"""Ends of the names of CxF files; i1Profiler writes .mxf."""
 _LEAST_BANDS = 10
 
 
@@ -38,7 +38,7 @@ def read_cxf_values(path: Path, unit: Unit = "auto", object_type: str | None = N
     Raises InputError: no CxF3, a patch twice, spectra without wavelengths, no colours, or colours under another
     light.
     """
-    document = _read(path)
+    document = _parse(path)
     resources = document.resources
     collection = None if resources is None else resources.object_collection
     objects = [
@@ -50,13 +50,13 @@ def read_cxf_values(path: Path, unit: Unit = "auto", object_type: str | None = N
     specifications: dict[str, Any] = {}
     if resources is not None and resources.color_specification_collection is not None:
         specifications = {item.id: item for item in resources.color_specification_collection.color_specification}
-    spectra = {name: _chosen(values, "ReflectanceSpectrum") for name, _, values in objects}
+    spectra = {name: _first_colour(values, "ReflectanceSpectrum") for name, _, values in objects}
     if all(spectrum is not None for spectrum in spectra.values()):
         return ChartValues(_colours_of_spectra(path, spectra, specifications, unit))
     return ChartValues({name: _colour(path, name, values, specifications) for name, _, values in objects})
 
 
-def _read(path: Path) -> CxF:
+def _parse(path: Path) -> CxF:
     from colour_cxf.cxf3 import CxF
     from xsdata.exceptions import ParserError
     from xsdata.formats.dataclass.parsers import XmlParser
@@ -103,7 +103,7 @@ def _patch_name(item: Any) -> str:
 def _objects_of_type(
     path: Path, objects: Sequence[tuple[str, str, Any]], object_type: str | None
 ) -> list[tuple[str, str, Any]]:
-    """Those of the type, each name once."""
+    """The objects of the type, each name once."""
     types = list(dict.fromkeys(of_type for _, of_type, _ in objects))
     if object_type is not None and object_type not in types:
         raise InputError(f"{path}: has no objects of type {object_type}; it has {', '.join(types) or 'none'}")
@@ -119,7 +119,7 @@ def _objects_of_type(
     return matching
 
 
-def _chosen(values: Any, kind: str) -> Any | None:
+def _first_colour(values: Any, kind: str) -> Any | None:
     """The first colour of a kind, by the name of its element."""
     return next((item for item in values.choice if type(item).__name__.lower() == kind.lower()), None)
 
@@ -137,8 +137,8 @@ def _colours_of_spectra(
 
 
 def _wavelengths_nm(path: Path, name: str, spectrum: Any, specification: Any) -> Floats:
-    measured = getattr(specification, "measurement_spec", None)
-    band_range = getattr(measured, "wavelength_range", None)
+    measurement = getattr(specification, "measurement_spec", None)
+    band_range = getattr(measurement, "wavelength_range", None)
     start = spectrum.start_wl if spectrum.start_wl is not None else getattr(band_range, "start_wl", None)
     increment = getattr(band_range, "increment", None)
     if start is None or not increment:
@@ -155,8 +155,8 @@ def _wavelengths_nm(path: Path, name: str, spectrum: Any, specification: Any) ->
 
 def _colour(path: Path, name: str, values: Any, specifications: dict[str, Any]) -> Floats:
     """XYZ of L*a*b* or XYZ. Raises InputError if neither is there, or if it is for another light or observer."""
-    lab = _chosen(values, "ColorCielab")
-    colour = lab if lab is not None else _chosen(values, "ColorCiexyz")
+    lab = _first_colour(values, "ColorCielab")
+    colour = lab if lab is not None else _first_colour(values, "ColorCiexyz")
     if colour is None:
         raise InputError(f"{path}: {name} has no ReflectanceSpectrum, ColorCIELab or ColorCIEXYZ")
     tristimulus = getattr(specifications.get(colour.color_specification), "tristimulus_spec", None)

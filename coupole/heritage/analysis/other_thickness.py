@@ -28,6 +28,8 @@ MEAN_COSINES = (0.0, 0.8)
 _ROUNDS, _STEP = 12, 1e-4
 _THINNEST, _THICKEST = -14.0, 7.0
 """ln of optical depths between which a layer is looked for."""
+_LEAST_TRANSMITTANCE = 1e-9
+"""Less is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +115,13 @@ def _matching_depths(
     k, s = two_fluxes
     start = np.stack([0.5 * k * thickness_mm, 4.0 / 3.0 * s * thickness_mm / (1.0 - mean_cosine)])
     logs = np.log(np.maximum(start, np.exp(_THINNEST)))
-    target = np.stack([rho, np.log(tau)])
+    target = np.stack([rho, np.log(np.maximum(tau, _LEAST_TRANSMITTANCE))])
 
     def off(logs: Array) -> Array:
         absorption, scattering = np.exp(logs)
         rho_here, tau_here = diffuse_response(absorption, scattering, mean_cosine)
-        return np.asarray(np.stack([rho_here, np.log(tau_here)]) - target)
+        log_tau = np.log(np.maximum(tau_here, _LEAST_TRANSMITTANCE))
+        return np.asarray(np.stack([rho_here, log_tau]) - target)
 
     for _ in range(_ROUNDS):
         logs = np.clip(logs - _newton_step(off, logs), _THINNEST, _THICKEST)

@@ -153,12 +153,12 @@ def _show_discarded(console: Console, verification: Verification) -> None:
         markup=False,
     )
     samples = (
-        "are as they were read back before anything was discarded, or replaced after that"
-        if verification.ok
-        else "see above what is wrong with them"
+        ": its samples are as they were read back before anything was discarded, or replaced after that"
+        if not verification.bad
+        else " (what is wrong is said above)"
     )
     for result in verification.results:
-        console.print(f"  {result}: its samples {samples}", markup=False, soft_wrap=True)
+        console.print(f"  {result}{samples}", markup=False, soft_wrap=True)
 
 
 def archive(

@@ -51,6 +51,17 @@ def refuse_without_frames(run: Run, out: Path) -> None:
             )
 
 
+def refuse_texels(run: Run, out: Path) -> None:
+    """Raise FrameDiscarded if texels, which need the frames of all LEDs, are asked for of a run whose frames are
+    discarded, or will be for this result."""
+    if discarded_views(run) or is_for_discarding(run, out):
+        raise FrameDiscarded(
+            f"--texels: needs the frames of all LEDs, and those of {run.folder} are discarded, as its plan says "
+            "(`discard: after_fit`). Nothing was changed. Give the command without --texels, or acquire the "
+            "object by a plan without `discard`"
+        )
+
+
 # -- proof, and what follows from it --------------------------------------------------------------------------
 
 

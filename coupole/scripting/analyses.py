@@ -218,8 +218,12 @@ def fit_runs(
 
     forecast = None
     if texels is not None:
+        from coupole.reflectance.discarded_frames import refuse_texels
         from coupole.reflectance.texels.texel_forecast import foresee_texels
+        from coupole.storage.run import Run
 
+        for run in request.runs:
+            refuse_texels(Run(run), out)
         forecast = foresee_texels(request, out, texels)
         if forecast is not None and tell is not None:
             tell(forecast)

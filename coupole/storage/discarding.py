@@ -9,7 +9,7 @@ are there, or their samples are safe and the journal says so; `finish` then does
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from coupole.errors import ChecksumMismatch, StorageError
 from coupole.plan.held_out import held_out_leds
 from coupole.plan.shot_id import Led, PanelMark, Sentinel, ShotId
-from coupole.storage import frame_file, journal
+from coupole.storage import frame_file, journal, manifest
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.frame_file import DISCARDED, FRAME_DTYPE, FREE, PROVEN, Layout
-from coupole.storage.given_back import give_back
+from coupole.storage.given_back import give_back, is_blank
 from coupole.storage.journal_events import (
     Event,
     FindingNoted,
@@ -130,12 +130,15 @@ def discard(run: Run, event: FramesDiscarded, note: Callable[[FramesDiscarded], 
 
 
 def finish(run: Run) -> None:
-    """Give back what the journal says is discarded, and a crash has left. For whoever holds the run's lock. Raises
-    StorageError."""
+    """Give back what the journal says is discarded, and a crash has left. A file that changes by that is taken out
+    of the manifest first. For whoever holds the run's lock. Raises StorageError."""
     for event in discarded_views(run).values():
         path = run.view_path(event.view)
         if path.exists() and not frame_file.read_layout(path).is_archived:
-            _give_back(path, _layout(path), _slots(path, event))
+            layout, slots = _layout(path), _slots(path, event)
+            if not _is_given_back(path, layout, slots):
+                manifest.forget(run.folder, [str(path.relative_to(run.folder))])
+            _give_back(path, layout, slots)
 
 
 def append_to_journal(run: Run) -> Callable[[FramesDiscarded], None]:
@@ -166,6 +169,18 @@ def _slots(path: Path, event: FramesDiscarded) -> NDArray[np.int64]:
         ) from error
 
 
+def _is_given_back(path: Path, layout: Layout, slots: NDArray[np.int64]) -> bool:
+    """Tell whether `_give_back` would leave each byte of a file as it is."""
+    table = frame_file.read_frames(path)
+    if not (table["state"][slots] == DISCARDED).all():
+        return False
+    try:
+        with path.open("rb") as file:
+            return is_blank(file.fileno(), _empty_parts(layout, table))
+    except OSError as error:
+        raise disk_error(path, error) from error
+
+
 def _give_back(path: Path, layout: Layout, slots: NDArray[np.int64]) -> None:
     """Mark the slots first: a reader never takes a hole for a frame. Slots without a frame are given back too."""
     table = frame_file.read_frames(path)
@@ -176,14 +191,19 @@ def _give_back(path: Path, layout: Layout, slots: NDArray[np.int64]) -> None:
             for first, end in _stretches(slots):
                 _write(fd, table[first:end].tobytes(), layout.table_offset + first * FRAME_DTYPE.itemsize)
             os.fsync(fd)
-            empty_slots = np.flatnonzero(np.isin(table["state"], (DISCARDED, FREE)))
-            size = layout.frame_bytes
-            parts = ((layout.data_offset + a * size, (b - a) * size) for a, b in _stretches(empty_slots))
-            give_back(fd, parts)
+            give_back(fd, _empty_parts(layout, table))
         finally:
             os.close(fd)
     except OSError as error:
         raise disk_error(path, error) from error
+
+
+def _empty_parts(layout: Layout, table: NDArray[np.void]) -> Iterator[tuple[int, int]]:
+    """Offset and length in bytes of each stretch of slots that have no frame, or not any more."""
+    empty_slots = np.flatnonzero(np.isin(table["state"], (DISCARDED, FREE)))
+    size = layout.frame_bytes
+    for first, end in _stretches(empty_slots):
+        yield layout.data_offset + first * size, (end - first) * size
 
 
 def _stretches(slots: NDArray[np.int64]) -> list[tuple[int, int]]:

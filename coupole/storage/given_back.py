@@ -27,6 +27,30 @@ def give_back(fd: int, parts: Iterable[tuple[int, int]]) -> None:
     os.fsync(fd)
 
 
+def is_blank(fd: int, parts: Iterable[tuple[int, int]]) -> bool:
+    """Tell whether parts of an open file, (offset, length) in bytes each, read as zeros. Holes are passed over.
+    Raises OSError."""
+    for start, length in parts:
+        offset, end = start, start + length
+        while (offset := _next_data(fd, offset)) < end:
+            if not (chunk := os.pread(fd, min(end - offset, _TRIAL_BYTES), offset)):
+                break
+            if chunk.count(0) < len(chunk):
+                return False
+            offset += len(chunk)
+    return True
+
+
+def _next_data(fd: int, offset: int) -> int:
+    """Place of the next byte of a file that is not in a hole; beyond every file if there is none."""
+    try:
+        return os.lseek(fd, offset, os.SEEK_DATA)
+    except OSError as error:
+        if error.errno != errno.ENXIO:
+            raise
+        return sys.maxsize
+
+
 def why_not(folder: Path) -> str:
     """Try it in a folder that exists. Return why nothing can be given back there; empty if it can."""
     if sys.platform != "linux":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any, assert_never
 from coupole.errors import CoupoleError
 from coupole.plan.shot_id import Sentinel
 from coupole.storage import journal, run_dose
+from coupole.storage.discarding import place_of_result
 from coupole.storage.durable import sha256
 from coupole.storage.journal_events import (
     ArmSettled,
@@ -177,8 +178,21 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
             status.before_that = _confirmation(run)
     if result:
         frames_left = bool(status.frames_left or status.open_views)
-        status.processing = processing_of(run.folder, Path(result), frames_left=frames_left, in_use=in_use)
+        gone = [event for event in events if isinstance(event, FramesDiscarded)]
+        place = place_of_result(run, gone[-1]) if gone else Path(result)
+        told = processing_of(run.folder, place, frames_left=frames_left, in_use=in_use)
+        status.processing = _without_samples(told, place, gone)
     return status
+
+
+def _without_samples(told: Processing, place: Path, gone: Sequence[FramesDiscarded]) -> Processing:
+    """What is told of the processing, unless samples that stand for discarded frames are not where they were: then
+    no command goes on from there."""
+    missing = [place / event.samples for event in gone if not (place / event.samples).exists()]
+    if not missing:
+        return told
+    why = f"{missing[0]} is missing: put it back from a copy; nothing else has these samples"
+    return Processing(told.result, "failed", told.views_done, told.views, why=why)
 
 
 def _confirmation(run: Run) -> str:

@@ -139,6 +139,9 @@ def test_frames_are_discarded_when_their_samples_are_safe_and_all_commands_under
     other = cells.here("reflectance", run, "--out", tmp_path / "other")
     assert other.code == 2
     assert f"coupole reflectance {run} --out {result}" in other.err
+    texels = cells.here("reflectance", run, "--out", result, "--texels", "2")
+    assert texels.code == 2
+    assert "--texels: needs the frames of all LEDs" in texels.err
     other = cells.here("acquire", "--resume", run, "--result", tmp_path / "other", "--yes")
     assert other.code == 3
     assert "no other can be made" in other.err
@@ -194,6 +197,7 @@ def test_killed_at_any_step_no_frame_is_lost_and_it_goes_on(
     run, result = pending
     assert killed(step, run, result) == -signal.SIGKILL
     nothing_is_lost(run, result)
+    assert cells.here("verify", run, "--manifest").code == 0  # lists files as they are now
     assert killed("", run, result) == 0
     all_discarded(run, result)
     for name, content in samples_of_all_frames.items():
@@ -304,6 +308,9 @@ def test_a_view_whose_samples_are_damaged_or_gone_is_told_and_nothing_is_made_of
         with pytest.raises(ChecksumMismatch, match=words):
             extract_runs(RunRequest((run,)), result)
         path.unlink(missing_ok=True)
+    told = cells.here("status", run, "--json").document["processing"]
+    assert (told["state"], told["remedy"]) == ("failed", "")
+    assert "top.h5 is missing: put it back" in told["why"]
     path.write_bytes(whole)
     assert cells.here("verify", run).code == 0
 

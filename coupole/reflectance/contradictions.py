@@ -110,7 +110,7 @@ def _mark(values, whole, u_noise, led_mm, centres_mm, normals, kd, places_beside
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _compare(values, whole, u_noise, kd, cosine):  # type: ignore[no-untyped-def]
-    """Whether a sample is darker than the material in all channels that it has, by more than its noise; mean of
+    """Tell whether a sample is darker than the material in all its channels, by more than its noise; and the mean of
     its channels over the material's, NaN where there is none."""
     count, low_count, total = 0, 0, 0.0
     for channel in range(len(values)):
@@ -126,7 +126,7 @@ def _compare(values, whole, u_noise, kd, cosine):  # type: ignore[no-untyped-def
 
 @numba.njit(cache=True, nogil=True)
 def _is_darker(mean, places, own_ratio, ratios_beside):  # type: ignore[no-untyped-def]
-    """Whether the LEDs beside an LED, `places` in `mean`, agree with the material, and it does not;
+    """Tell whether the LEDs beside an LED, `places` in `mean`, agree with the material, and it does not;
     `ratios_beside` is memory."""
     count = 0
     for place in places:

@@ -41,7 +41,7 @@ side."""
 
 @dataclass(frozen=True)
 class Growth:
-    """Ingredients of a result of the views so far."""
+    """Views, run and folder of a result of the views so far."""
 
     run: Path
     result: Path

@@ -110,8 +110,8 @@ def _mark(values, whole, u_noise, led_mm, centres_mm, normals, kd, places_beside
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _compare(values, whole, u_noise, kd, cosine):  # type: ignore[no-untyped-def]
-    """Tell whether a sample is darker than the material in all its channels, by more than its noise; and the mean of
-    its channels over the material's, NaN where there is none."""
+    """Tell whether a sample is darker than the material in all its channels, by more than its noise. The mean
+    of its channels over the material's comes with it, NaN where there is none."""
     count, low_count, total = 0, 0, 0.0
     for channel in range(len(values)):
         ratio = values[channel] / whole[channel]

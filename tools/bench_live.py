@@ -83,15 +83,15 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
     samples_s = statistics.median(run.result_figures["samples_after_last_frame_s"] for run in beside_runs)
     result_s = statistics.median(run.result_figures["result_after_last_frame_s"] for run in beside_runs)
     move_s = statistics.median(run.move_s for run in beside_runs)
-    yield {
-        "name": "samples_after_last_frame",
-        "value": samples_s,
-        "unit": "s",
-        "peer": "longest_move",
-        "ratio": move_s / samples_s,
-        "peer_value": round(move_s, 2),
-        "result_after_last_frame_s": round(result_s, 2),
-    }
+    for name, value_s in (("samples_after_last_frame", samples_s), ("result_after_last_frame", result_s)):
+        yield {
+            "name": name,
+            "value": value_s,
+            "unit": "s",
+            "peer": "longest_move",
+            "ratio": move_s / value_s,
+            "peer_value": round(move_s, 2),
+        }
 
 
 def _live_run(root: Path, size: Size, *options: str) -> LiveRun:

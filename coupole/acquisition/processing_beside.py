@@ -29,6 +29,7 @@ from coupole.preflight.discard_room import DiscardRoom
 from coupole.storage.journal_events import FramesDiscarded
 from coupole.storage.processing import Progress, default_result, go_on_command
 from coupole.storage.run import Run
+from coupole.storage.so_far import LINK
 from coupole.storage.stopped_process import is_stopped
 from coupole.viewing.terminal import alarm, step_bars
 
@@ -276,6 +277,13 @@ class ProcessingBeside:
             self._told.set()
             if self._progress.views_done != before.views_done:
                 self._console.print(f"reflectance: samples of {self._views_text} are there", markup=False)
+            if self._progress.fitted_views != before.fitted_views:
+                self._say_grown()
+
+    def _say_grown(self) -> None:
+        assert self._result is not None
+        count, of = self._progress.fitted_views, self._progress.views
+        self._console.print(f"reflectance so far, from {count} of {of} views: {self._result / LINK}", markup=False)
 
     def _tell_of_failure(self) -> None:
         alarm(

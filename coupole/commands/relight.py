@@ -16,6 +16,7 @@ from coupole.commands.option_groups import flatten_options
 from coupole.commands.relight_for_the_eye import PEAK_QUANTILE, EyeColours, bright, write_relit_for_the_eye
 from coupole.errors import CoupoleError, InputError
 from coupole.scripting.relit_result import Relit, open_result
+from coupole.storage import so_far
 
 if TYPE_CHECKING:
     import numpy as np
@@ -212,6 +213,8 @@ def relight(
         console.print(f"white is {document['white']:.4g}")
     if as_json:
         print(json.dumps(document))
+    elif growing := so_far.words(document):
+        console.print(growing, markup=False)
 
 
 def _refuse_target(to: Path, more: MoreOutput, *, for_the_eye: bool) -> None:

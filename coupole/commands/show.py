@@ -16,6 +16,7 @@ from coupole.commands.common import JsonOption, fail
 from coupole.commands.completion import materials
 from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError
+from coupole.storage import so_far
 
 if TYPE_CHECKING:
     from coupole.exchange.look.look_blocks import Look
@@ -111,6 +112,7 @@ def show(source: SourceArgument, out: OutOption, options: ShowOptions, as_json: 
             raise InputError(
                 f"{source}: is neither run, result (`coupole reflectance RUN --out FOLDER` makes one) nor scene"
             )
+        source = so_far.as_it_is_now(source)
         with step_bars(console) as bars:
             bars("read", 0, 1)
             look = _look(source, options, bars)

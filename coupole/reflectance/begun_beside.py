@@ -22,6 +22,7 @@ from coupole.intake.plain_data import read_json
 from coupole.reflectance.discarded_frames import refuse_stale
 from coupole.reflectance.result_folder import SETTINGS, read_settings
 from coupole.reflectance.run_result import FRAMES
+from coupole.storage import so_far
 from coupole.storage.durable import make_folder, write_synced
 from coupole.storage.processing import FOLDER, refuse_held
 
@@ -111,6 +112,7 @@ def adopt(
 
 def clear_beside(out: Path) -> None:
     """Remove the files that are needed only while a result is made, when the result is complete."""
+    so_far.remove(out)
     shutil.rmtree(out / FOLDER, ignore_errors=True)
 
 

@@ -9,12 +9,15 @@ with the material, so neither the triangle nor the model is wrong.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -23,7 +26,7 @@ from coupole.reflectance.discarded_frames import rewrite
 from coupole.reflectance.extraction.sample_codes import BY_UNKNOWN
 from coupole.reflectance.fits import GGX_NORMAL
 from coupole.reflectance.run_result import CONTRADICTED, SAMPLES, RunResult, ViewSamples
-from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
+from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values, towards
 
 Floats = NDArray[np.float64]
 
@@ -38,6 +41,8 @@ _AGREE = (0.9, 1.15)
 _LEAST_DIFFUSE = 0.5
 """Least diffuse share of what the material gives."""
 _SIGMA = 5.0
+_PART = 256
+"""Triangles that a thread works on at a time."""
 
 
 @dataclass(frozen=True)
@@ -58,31 +63,80 @@ class Neighbours:
 
 
 def contradiction_mask(
-    samples: TriangleSamples, materials: TriangleMaterials, u_noise: NDArray[np.float16], beside: Neighbours
+    samples: TriangleSamples,
+    materials: TriangleMaterials,
+    u_noise: NDArray[np.float16],
+    beside: Neighbours,
+    *,
+    threads: int | None = None,
 ) -> NDArray[np.bool_]:
     """[b, leds] of one view's samples, by materials [b] and relative noise [b, leds, channels]."""
     whole = model_values(samples, materials)
-    ways = samples.led_mm - samples.centres_mm[:, None]
-    cosine = np.einsum("blk,bk->bl", ways, materials.normals) / np.linalg.norm(ways, axis=2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        diffuse = materials.kd[:, None] * np.maximum(cosine, 0.0)[..., None] / whole
-        ratio = samples.values / whole
-    u_ratio = np.nan_to_num(u_noise.astype(np.float32), nan=np.inf)  # of unknown noise nothing contradicts
-    is_finite = np.isfinite(ratio)
-    low = is_finite & (ratio < _AGREE[0]) & (ratio + _SIGMA * u_ratio * ratio < 1.0) & (diffuse > _LEAST_DIFFUSE)
-    dark: NDArray[np.bool_] = is_finite.any(axis=2) & (low | ~is_finite).all(axis=2)
-    if not dark.any():
-        return dark
-    row, led = np.nonzero(dark)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        mean = np.nansum(ratio[row], axis=2) / is_finite[row].sum(axis=2)
-    neighbour_ratios = np.take_along_axis(mean, beside.places[led], axis=1)
-    enough = np.isfinite(neighbour_ratios).sum(axis=1) >= _FEWEST_BESIDE
-    middle = np.full(len(neighbour_ratios), np.nan)
-    middle[enough] = np.nanmedian(neighbour_ratios[enough], axis=1)
-    own_ratio = mean[np.arange(len(led)), led]
-    dark[row, led] = (middle > _AGREE[0]) & (middle < _AGREE[1]) & (own_ratio < _MOST_LEFT * middle)
+    dark = np.zeros(whole.shape[:2], np.bool_)
+
+    def mark(first: int) -> None:
+        part = slice(first, first + _PART)
+        _mark(
+            samples.values[part], whole[part], u_noise[part].astype(np.float32), samples.led_mm,
+            samples.centres_mm[part], materials.normals[part], materials.kd[part], beside.places, dark[part],
+        )  # fmt: skip
+
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+        list(pool.map(mark, range(0, len(dark), _PART)))
     return dark
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mark(values, whole, u_noise, led_mm, centres_mm, normals, kd, places_beside, dark):  # type: ignore[no-untyped-def]
+    """Mark the samples of LEDs that contradict those of the LEDs beside them."""
+    count, leds, _ = values.shape
+    mean, way, ratios_beside = np.empty(leds), np.empty(3), np.empty(places_beside.shape[1])
+    for triangle in range(count):
+        any_is_low = False
+        for led in range(leds):
+            towards(centres_mm[triangle], led_mm[led], way)
+            cosine = 0.0
+            for k in range(3):
+                cosine += way[k] * normals[triangle, k]
+            is_low, mean[led] = _compare(
+                values[triangle, led], whole[triangle, led], u_noise[triangle, led], kd[triangle], max(cosine, 0.0)
+            )
+            dark[triangle, led] = is_low
+            any_is_low |= is_low
+        for led in range(leds if any_is_low else 0):
+            if dark[triangle, led]:
+                dark[triangle, led] = _is_darker(mean, places_beside[led], mean[led], ratios_beside)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _compare(values, whole, u_noise, kd, cosine):  # type: ignore[no-untyped-def]
+    """Tell whether a sample is darker than the material in all its channels, by more than its noise. The mean
+    of its channels over the material's comes with it, NaN where there is none."""
+    count, low_count, total = 0, 0, 0.0
+    for channel in range(len(values)):
+        ratio = values[channel] / whole[channel]
+        if not np.isfinite(ratio):
+            continue
+        count, total = count + 1, total + ratio
+        diffuse = kd[channel] * cosine / whole[channel]
+        is_less = ratio < _AGREE[0] and ratio + _SIGMA * u_noise[channel] * ratio < 1.0  # never of unknown noise
+        low_count += is_less and diffuse > _LEAST_DIFFUSE
+    return count > 0 and low_count == count, total / count if count else np.nan
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_darker(mean, places, own_ratio, ratios_beside):  # type: ignore[no-untyped-def]
+    """Tell whether the LEDs beside an LED, `places` in `mean`, agree with the material, and it does not;
+    `ratios_beside` is memory."""
+    count = 0
+    for place in places:
+        if np.isfinite(mean[place]):
+            ratios_beside[count] = mean[place]
+            count += 1
+    if count < _FEWEST_BESIDE:
+        return False
+    middle = np.median(ratios_beside[:count])
+    return _AGREE[0] < middle < _AGREE[1] and own_ratio < _MOST_LEFT * middle
 
 
 @dataclass(frozen=True)
@@ -98,12 +152,12 @@ class Found:
     """Number of values that the rows have."""
 
 
-def find(result: RunResult, view: ViewSamples, rows: slice) -> Found:
+def find(result: RunResult, view: ViewSamples, rows: slice, threads: int | None = None) -> Found:
     """Find samples that contradict others, by the materials of `ggx_normal`."""
     materials = result.materials(GGX_NORMAL.name, np.searchsorted(result.triangles, view.triangles[rows]))
     samples, beside = result.view_samples(view, rows), Neighbours.of(view.led_mm, result.middle_mm)
     with h5py.File(view.path, "r") as file:
-        dark = contradiction_mask(samples, materials, file["u_own"][rows], beside)
+        dark = contradiction_mask(samples, materials, file["u_own"][rows], beside, threads=threads)
         has_values = np.isfinite(file["f"][rows])
     return Found(rows, np.stack(np.nonzero(dark)), int(has_values[dark].sum()), int(has_values.sum()))
 

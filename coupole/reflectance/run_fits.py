@@ -152,16 +152,16 @@ def _uncertain_block(
 def _leave_out(result: RunResult, job: _Job, shop: Workshop, say: Said) -> None:
     view_numbers = [number for number, view in enumerate(result.views) if view.contradicted_count is None]
     tasks = _blocks_of_views(result, view_numbers, job.memory_bytes // 4, shop)
-    task_outcomes = zip(tasks, shop.map(partial(_contradictions_block, job), tasks), strict=True)
+    task_outcomes = zip(tasks, shop.map(partial(_contradictions_block, job, shop.threads), tasks), strict=True)
     for count, (number, blocks) in enumerate(groupby(task_outcomes, key=lambda one: one[0][0]), start=1):
         leave_out(result.views[number], (contradictions for _, contradictions in blocks))
         say("contradictions", count, len(view_numbers))
 
 
-def _contradictions_block(job: _Job, task: tuple[int, slice]) -> Found:
+def _contradictions_block(job: _Job, threads: int | None, task: tuple[int, slice]) -> Found:
     number, rows = task
     result = _open_result(job.folder, job.token)
-    return find(result, result.views[number], rows)
+    return find(result, result.views[number], rows, threads)
 
 
 def _blocks_of_views(

@@ -7,6 +7,7 @@ first that is missing.
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ from coupole.reflectance.discarded_frames import (
     read_back_or_drop,
     refuse_without_frames,
 )
-from coupole.reflectance.extraction.extraction import Geometry, extract_view, geometry_of
+from coupole.reflectance.extraction.extraction import Geometry, extract_view, geometry_of, surface_of
 from coupole.reflectance.extraction.frames_for_check import write_frames
 from coupole.reflectance.extraction.measured_run import (
     MeasuredRun,
@@ -41,6 +42,7 @@ from coupole.reflectance.extraction.measured_run import (
 )
 from coupole.reflectance.extraction.radiance import Radiometry
 from coupole.reflectance.inter_reflection import subtract
+from coupole.reflectance.light_paths import NOTHING_AHEAD, Ahead
 from coupole.reflectance.result_folder import SETTINGS, begin, complete, read_settings
 from coupole.reflectance.run_check import check_result
 from coupole.reflectance.run_fits import fit_result
@@ -100,24 +102,36 @@ class Sources:
 
 
 def reflectance_of(
-    request: RunRequest, out: Path, *, scheduler: str | None = None, say: Said = silent
+    request: RunRequest,
+    out: Path,
+    *,
+    scheduler: str | None = None,
+    say: Said = silent,
+    ahead: Ahead = NOTHING_AHEAD,
 ) -> dict[str, Any]:
     """Make the result, or what of it is missing, in the workers of a `scheduler` if one is named; returns what
-    `result.json` says.
+    `result.json` says. `ahead` is what was computed before of the same object.
 
     Raises InputError: runs without calibrations, of different objects or cameras, records that do not belong to
     them, a folder that holds another result, a scheduler that does not answer or whose workers do not see the
     folder; StorageError if a frame is damaged or the disk takes nothing.
     """
     begun_s = time.monotonic()
-    extract_runs(request, out, scheduler=scheduler, say=say)
+    extract_runs(request, out, scheduler=scheduler, say=say, ahead=ahead)
     fit_result(out, request.memory_bytes, scheduler=scheduler, say=say)
     about = check_result(out, request.memory_bytes, begun_s=begun_s, say=say)
     clear_beside(out)
     return about
 
 
-def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None, say: Said = silent) -> None:
+def extract_runs(
+    request: RunRequest,
+    out: Path,
+    *,
+    scheduler: str | None = None,
+    say: Said = silent,
+    ahead: Ahead = NOTHING_AHEAD,
+) -> None:
     """The samples of all views. Raises as `reflectance_of`."""
     token = uuid4().hex
     measured_runs = read_runs(request, token)
@@ -135,14 +149,19 @@ def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None
             _extract(request, token, measured_runs, out.resolve(), shop, say)
         if discards(request, measured_runs[0].run, out):
             discard_complete(measured_runs[0].run, out, say)
-        settings = read_settings(out)
-        if settings["subtracted"]:
-            support = settings["support_reflectance"]
-            subtract(RunResult(out), paper=settings["emission"] == "paper", support_reflectance=support, say=say)
+        subtract_from(out, say, ahead)
     except OSError as error:
         raise disk_error(out, error) from error
     finally:
         forget()
+
+
+def subtract_from(out: Path, say: Said, ahead: Ahead) -> None:
+    """Take inter-reflection off the samples of a result, if its settings say so. Raises OSError."""
+    settings = read_settings(out)
+    if settings["subtracted"]:
+        is_paper, support = settings["emission"] == "paper", settings["support_reflectance"]
+        subtract(RunResult(out), paper=is_paper, support_reflectance=support, say=say, ahead=ahead)
 
 
 def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> str:
@@ -166,7 +185,7 @@ def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> 
         view = next((view for view in measured_run.views if view.name == view_name), None)
         if view is None:  # dark frames or panels alone
             return ""
-        left_out = tuple(held_out_leds(_expected_leds(measured_run.run)))
+        left_out = tuple(held_out_leds(expected_leds(measured_run.run)))
         basis = ViewBasis(frames_basis(measured_run.frames, view_name), left_out)
         file_name = view_file_name([measured_run], measured_run, view)
         if is_taken(out, file_name, basis):
@@ -190,6 +209,17 @@ def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> 
         forget()
 
 
+def look_ahead(run: Path, view_name: str) -> None:
+    """Find what a view sees whose frames still come, as far as it has one. Raises as `reflectance_of`."""
+    try:
+        measured_run, geometry, _ = prepare_run(uuid4().hex, run.resolve(), RunRequest((run,)).sources)
+        for view in measured_run.views:
+            if view.name == view_name:
+                surface_of(measured_run, geometry, view, len(os.sched_getaffinity(0)))
+    finally:
+        forget()
+
+
 def discards(request: RunRequest, run: Run, out: Path) -> bool:
     """Tell whether frames of a run are discarded when the result of a request has their samples."""
     return request.is_plain and is_for_discarding(run, out)
@@ -199,7 +229,7 @@ def _write_object(measured_run: MeasuredRun, path: Path) -> None:
     write_object(path, measured_run.corners_mm, measured_run.base_from_support)
 
 
-def _expected_leds(run: Run) -> set[int]:
+def expected_leds(run: Run) -> set[int]:
     """LEDs of all views; where they are chosen in the run, of those that were chosen so far."""
     return {shot.light.id for shot in run.expected_shots() if isinstance(shot.light, Led)}
 

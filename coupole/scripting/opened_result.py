@@ -20,6 +20,7 @@ from coupole.reflectance.fits import MATERIALS
 from coupole.reflectance.new_light.light_kinds import AnyLight, DistantLight, LedLight
 from coupole.reflectance.new_light.pictured_surface import FreeCamera
 from coupole.scripting import relit_result
+from coupole.storage import so_far
 
 if TYPE_CHECKING:
     from coupole.reflectance.triangle_fit import TriangleMaterials
@@ -243,7 +244,7 @@ def open_result(path: str | os.PathLike[str]) -> Result | PicturesResult:
 
     Raises InputError if it holds neither.
     """
-    folder = Path(path).resolve()
+    folder = so_far.as_it_is_now(Path(path).resolve())
     if (folder / run_result.OBJECT).exists():
         return Result(folder)
     if (folder / picture_result.SAMPLES).exists():

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coupole.errors import InputError
+from coupole.storage import so_far
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,6 +44,7 @@ def open_result(
     """
     from coupole.reflectance import fits, relit_uncertainty, run_relighting, run_result
 
+    result = so_far.as_it_is_now(result)
     if (result / run_result.OBJECT).exists():
         if uncertain:
             fit = fit or run_relighting.best_with_texels(run_result.RunResult(result), fits.MATERIALS)
@@ -62,7 +64,7 @@ def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera
 
     if camera is not None and view is not None:
         raise InputError("--view: a free camera (--from) is not a view of the run; give one of the two")
-    is_simulated = bool(run_result.read_about(result)["simulated"])
+    about = run_result.read_about(result)
     folder = run_result.RunResult(result)
     if camera is None:
         scene = run_relighting.scene_of_view(folder, view, fit)
@@ -74,7 +76,7 @@ def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera
 
     return Relit(
         lambda lights, say: of_three(scene.picture(lights, samples, say=say)),
-        {"fit": scene.fit, "simulated": is_simulated},
+        {"fit": scene.fit, "simulated": bool(about["simulated"])} | so_far.figures(about),
         lambda lights, say: of_three(relit_uncertainty.uncertainty_of_picture(scene, lights, samples, say=say)),
         lambda lights, say: of_three(run_intervals.half_width_of_picture(scene, lights, samples, say=say)),
         has_colours=folder.channels == 3,

@@ -7,6 +7,7 @@
       progress.json         progress, for people: written again and again, never synced
       lock                  locked by the process at work
       normals.png           normals of the newest view, by a quick fit
+      RUN-2-of-3-views/     result of the views so far (`coupole.storage.so_far`)
 
 The run's journal names the result's folder (`ProcessingAsked`); nothing else connects the two processes.
 """
@@ -35,7 +36,7 @@ RESULT = "result.json"
 PICTURE = f"{FOLDER}/normals.png"
 _LOCK, _PROGRESS = f"{FOLDER}/lock", f"{FOLDER}/progress.json"
 _SUFFIX = "-reflectance"
-Step = Literal["waiting", "extracting", "fitting", "failed"]
+Step = Literal["waiting", "extracting", "growing", "fitting", "failed"]
 _own_results: set[Path] = set()
 """Results that this process has locked."""
 
@@ -56,6 +57,8 @@ class Progress(BaseModel):
     """Parts of `detail` that are done."""
     of: Annotated[int, Field(ge=0)] = 0
     """Parts of `detail`."""
+    fitted_views: Annotated[int, Field(ge=0)] = 0
+    """Views of the result so far; 0 while there is none."""
     why: str = ""
     """Reason of a failure."""
 
@@ -66,13 +69,15 @@ class Processing:
 
     result: str
     """Folder of the result."""
-    state: Literal["waiting", "extracting", "fitting", "done", "failed", "ended"]
-    """`waiting` for a complete view, `extracting` samples of one, `fitting` after the last; `done`; `failed`, or
-    `ended` before the result was whole."""
+    state: Literal["waiting", "extracting", "growing", "fitting", "done", "failed", "ended"]
+    """`waiting` for a complete view, `extracting` samples of one, `growing`: fitting what is there so far,
+    `fitting` after the last; `done`; `failed`, or `ended` before the result was whole."""
     views_done: int = 0
     """Views whose samples are there."""
     views: int = 0
     """Views of the plan."""
+    fitted_views: int = 0
+    """Views of the result so far, `RESULT/so-far`; 0 while there is none, and when the result is whole."""
     detail: str = ""
     """Fit or other step under way, with its share that is done."""
     why: str = ""
@@ -88,6 +93,8 @@ class Processing:
     def words(self) -> str:
         """Say in a few words how far it is."""
         views = f"{self.views_done} of {self.views} views extracted"
+        if self.fitted_views:
+            views += f", result so far of {self.fitted_views}"
         match self.state:
             case "done":
                 return f"done: {self.result}"
@@ -125,7 +132,7 @@ def processing_of(run: Path, result: Path, *, frames_left: bool, in_use: bool) -
     place = str(result)
     if not frames_left and _is_whole(run, result):
         return Processing(place, "done", progress.views_done, progress.views)
-    counts = progress.views_done, progress.views
+    counts = progress.views_done, progress.views, progress.fitted_views
     remedy = "" if frames_left else go_on_command(run, result)
     if progress.step == "failed":
         return Processing(place, "failed", *counts, why=progress.why, remedy=remedy)

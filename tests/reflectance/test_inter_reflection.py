@@ -9,14 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from coupole.reflectance.inter_reflection import (
-    direct_irradiance,
-    points_of,
-    radiosity,
-    scene_of,
-    seen_from,
-    subtract,
-)
+from coupole.reflectance.inter_reflection import radiosity, subtract
+from coupole.reflectance.light_paths import Ahead, direct_irradiance, points_of, scene_of, seen_from
 from coupole.reflectance.run_result import OBJECT, RunResult
 from coupole.reflectance.run_result_files import write_object
 
@@ -116,6 +110,19 @@ def test_killed_between_two_views_it_goes_on_to_the_same(tmp_path: Path) -> None
             np.testing.assert_array_equal(one[name][()], other[name][()])
     share = h5py.File(tmp_path / "whole/samples/first.h5")["inter_reflection"][()].astype(float)
     assert 0.02 < np.nanmedian(share) < 0.2
+
+
+def test_paths_of_light_that_an_earlier_result_left_change_no_bit(tmp_path: Path) -> None:
+    ahead = Ahead()
+    subtract(folded(tmp_path / "whole"), paper=False)
+    one_view = folded(tmp_path / "so-far")
+    (one_view.folder / "samples/second.h5").unlink()
+    subtract(RunResult(one_view.folder), paper=False, ahead=ahead)
+    subtract(folded(tmp_path / "with"), paper=False, ahead=ahead)
+    for view in ("first", "second"):
+        one, other = (h5py.File(tmp_path / name / f"samples/{view}.h5") for name in ("whole", "with"))
+        for name in ("f", "u_own", "inter_reflection"):
+            np.testing.assert_array_equal(one[name][()], other[name][()])
 
 
 def test_what_is_left_out_has_no_share_and_noise_grows_with_what_was_taken_off(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from coupole.console.runs.run_results import look_page
 from coupole.console.service_parts import Service
 from coupole.errors import InputError
 from coupole.storage.processing import PICTURE
+from coupole.storage.so_far import LINK, REPORT
 
 _STILL = (
     "sandbox allow-popups; default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; "
@@ -55,6 +56,14 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
         if result is None:
             raise InputError(f"{run}: is not processed beside its acquisition")
         return _file(result / PICTURE, "image/png", _STILL)
+
+    @app.get("/api/v1/runs/{run}/so-far", response_class=FileResponse)
+    def result_so_far(run: Text) -> FileResponse:
+        """Report of the result of the views so far, while the run goes on: normals, materials, uncertainty."""
+        result = service.runs.run(run).asked_result
+        if result is None:
+            raise InputError(f"{run}: is not processed beside its acquisition")
+        return _file(result / LINK / REPORT, "text/html", _STILL)
 
     @app.get("/api/v1/runs/{run}/report", response_class=FileResponse)
     def report_page(run: Text) -> FileResponse:

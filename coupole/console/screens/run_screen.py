@@ -52,6 +52,8 @@ class _Screen:
                 with ui.column().style("width:100%") as self._first_look_box:
                     ui.label("First look at the view processed last: normals, diffuse colour").classes("hint")
                     self._first_look = ui.html("", sanitize=False).style("width:100%")
+                    self._so_far = with_name(ui.link("", "", new_tab=True), "so-far")
+                    self._so_far.set_visibility(False)
                 self._first_look_box.set_visibility(False)
                 self._first_look_of = ("", 0)
             with ui.column().classes("gap"):
@@ -151,6 +153,13 @@ class _Screen:
         processing = run_progress.processing
         views = 0 if processing is None else processing.views_done
         self._first_look_box.set_visibility(views > 0)
+        fitted_views = 0 if processing is None else processing.fitted_views
+        self._so_far.set_visibility(fitted_views > 0)
+        if processing is not None and fitted_views:
+            self._so_far.text = (
+                f"Result so far, from {fitted_views} of {processing.views} views: normals, materials, uncertainty"
+            )
+            self._so_far.props(f'href="/api/v1/runs/{quote(run_progress.run)}/so-far"')
         if views and (run_progress.run, views) != self._first_look_of:
             self._first_look_of = run_progress.run, views
             address = f"/api/v1/runs/{quote(run_progress.run)}/first-look?views={views}"

@@ -27,6 +27,7 @@ from coupole.reflectance.fits import MATERIALS, TEXELS
 from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import RunResult, read_about
 from coupole.reflectance.texels.pixel_file import has_texels
+from coupole.storage import so_far
 
 Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]
@@ -118,6 +119,8 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
         errors["samples"] = "2.3 % of their value, and of how far the ends of their intervals are from it"
         samples = samples_of_result(result, support_from_base, source_about["scan_noise_um"], say)
         about["samples"], later = samples[0], later + samples[1]
+    if growing := so_far.words(source_about):
+        about["remarks"], about["told"]["So far"] = [growing], growing
     coarse = _coarse_blocks(places, triangles, of_triangles, choice.coarse_over, has_maps=bool(maps))
     return Look(about, blocks, tuple(later), coarse, errors)
 

@@ -1,5 +1,5 @@
-"""Follows a run by its journal: takes the samples of each view as soon as it is complete, and makes the result
-after the last."""
+"""Follows a run by its journal: takes the samples of each view as soon as it is complete, makes a result of the
+views so far while it waits for the next, and the result after the last."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from typing import Any
 
 from coupole.errors import CoupoleError, reason
 from coupole.reflectance.beside.first_look import write_normals
+from coupole.reflectance.beside.growing import Growth, fit_so_far
+from coupole.reflectance.light_paths import Ahead
 from coupole.reflectance.result_pages import run_reflectance_page
-from coupole.reflectance.run_job import RunRequest, extract_beside, reflectance_of
+from coupole.reflectance.run_job import RunRequest, extract_beside, look_ahead, reflectance_of
 from coupole.storage.discarding import NOT_YET, reason_to_keep, to_discard
 from coupole.storage.journal import Follower
 from coupole.storage.journal_events import FrameProven, SessionStopped, ViewBegun, ViewSealed
@@ -39,6 +41,10 @@ def process_run(folder: Path, result: Path, say: Say) -> bool:
         teller.fail(f"{type(error).__name__}: {error}. This is a defect of Coupole: please report it")
         return False
     return True
+
+
+class _ViewsCameError(Exception):
+    """A result of the views so far is given up: there are more of them now."""
 
 
 class _Teller:
@@ -75,6 +81,7 @@ class _Follower:
 
     def __init__(self, run: Run, result: Path, teller: _Teller) -> None:
         self._run, self._result, self._teller = run, result, teller
+        self._request, self._ahead = RunRequest((run.folder,)), Ahead()
         self._journal = Follower(run.journal_path)
         self._taken: set[str] = set()
         """Views whose samples are there."""
@@ -84,47 +91,55 @@ class _Follower:
         """The newest session has ended with all frames."""
         self._last_frame = ""
         """Time of the newest proven frame, UTC."""
+        self._looks = True
+        """A view may be complete that was not before."""
+        self._newest_view, self._begun_view = "", ""
+        """View of the newest proven frame; the same until it was looked at before its frames are all there."""
+        self._tried_views: tuple[str, ...] = ()
+        """Views of which a result was made, or tried, as the newest."""
+        self._may_give_up = True
+        """The newest result of the views so far was not given up: the next one may be."""
 
     def to_the_end(self) -> None:
         """Raises as `reflectance_of`."""
         self._teller.step("waiting", views=len(self._run.about["views"]))
-        looks = True
         while True:
-            looks |= self._read_news()
-            if looks:
+            self._read_news()
+            if self._looks:
                 self._offer_safe()
-            if looks and not self._take_samples():
-                if self._is_done:
-                    break
-                looks = False
-            time.sleep(_LOOK_EVERY_S)
+                if not self._take_samples():
+                    if self._is_done:
+                        break
+                    self._looks = False
+            elif not (self._look_ahead() or self._grow()):
+                time.sleep(_LOOK_EVERY_S)
         samples_s = self._seconds_since_last_frame()
         self._teller.step("fitting")
-        reflectance_of(RunRequest((self._run.folder,)), self._result, say=self._teller.part)
+        reflectance_of(self._request, self._result, say=self._teller.part, ahead=self._ahead)
         run_reflectance_page.write(self._result)
         result_s = self._seconds_since_last_frame()
         self._teller.say(
             {"times": {"samples_after_last_frame_s": samples_s, "result_after_last_frame_s": result_s}}
         )
 
-    def _read_news(self) -> bool:
-        """Read what the journal has gained; True if a view may be complete by now."""
-        looks = False
+    def _read_news(self) -> None:
+        """Read what the journal has gained, and whether a view may be complete by now."""
         for event in self._journal.news():
             match event:
                 case FrameProven():
                     self._last_frame = event.t
+                    if event.shot.is_shot and event.shot.view != self._newest_view:
+                        self._begun_view = self._newest_view = event.shot.view
                 case SessionStopped():
-                    self._is_done, looks = event.outcome == "done", True
+                    self._is_done, self._looks = event.outcome == "done", True
                 case ViewBegun() | ViewSealed():
-                    looks = True
+                    self._looks = True
                 case _:
                     pass
-        return looks
 
     def _take_samples(self) -> bool:
         """Take the samples of the first complete view that lacks them; False if there is none."""
-        remaining_views = [view for view in self._run.complete_views() if view not in self._taken]
+        remaining_views = self._remaining_views()
         if not remaining_views:
             return False
         view = remaining_views[0]
@@ -137,6 +152,52 @@ class _Follower:
                 write_normals(self._result, view, self._result / PICTURE)
         self._teller.step("waiting", views_done=len(self._taken))
         return True
+
+    def _remaining_views(self) -> list[str]:
+        return [view for view in self._run.complete_views() if view not in self._taken]
+
+    def _look_ahead(self) -> bool:
+        """Find what the view sees whose frames come now, once; False if there is nothing to do."""
+        if not self._begun_view or self._begun_view in self._taken:
+            return False
+        view, self._begun_view = self._begun_view, ""
+        with contextlib.suppress(CoupoleError, OSError):  # found, and told, when its samples are taken
+            look_ahead(self._run.folder, view)
+        return True
+
+    def _grow(self) -> bool:
+        """Make a result of the views so far, if there are more than in the newest; False if there is nothing to
+        do. When the next view is complete it is given up, but not twice in turn: of short views none would be
+        made."""
+        of = len(self._run.about["views"])
+        views = tuple(view for view in self._run.about["views"] if self._has_samples(view))
+        if not 0 < len(views) < of or views == self._tried_views:
+            return False
+        self._tried_views = views
+        growth = Growth(self._run.folder, self._result.resolve(), views, of)
+        changes: dict[str, Any] = {}
+        try:
+            if not growth.has_room():
+                return True
+            self._teller.step("growing")
+            fit_so_far(growth, self._request.memory_bytes, self._part_of_growth, self._ahead)
+            self._may_give_up, changes = True, {"fitted_views": len(views)}
+        except _ViewsCameError:
+            self._may_give_up = False
+        except (CoupoleError, OSError, MemoryError) as error:  # the result at the end comes to it again
+            changes = {"detail": f"no result of {len(views)} views ({reason(error)})"}
+        self._teller.step("waiting", **changes)
+        return True
+
+    def _has_samples(self, view: str) -> bool:
+        """False for a view of dark frames or panels alone, too."""
+        return view in self._taken and (self._result / "samples" / f"{view}.json").exists()
+
+    def _part_of_growth(self, detail: str, done_count: int, of: int) -> None:
+        self._read_news()
+        if self._is_done or (self._may_give_up and self._looks and self._remaining_views()):
+            raise _ViewsCameError
+        self._teller.part(detail, done_count, of)
 
     def _offer_safe(self) -> None:
         """Tell the acquisition, which holds the run, of the frames that may be discarded now. What it does not do,

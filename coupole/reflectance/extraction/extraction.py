@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable
 from concurrent.futures import Executor
@@ -19,6 +20,7 @@ from coupole.errors import InputError
 from coupole.geometry import apply
 from coupole.motion import occlusion
 from coupole.motion.packet_rays import PacketMesh
+from coupole.motion.remembered import Remembered
 from coupole.reflectance.extraction.frame_veils import GLARE, U_GLARE
 from coupole.reflectance.extraction.lamp_sight import Facets, lamp_codes, neighbours_of
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
@@ -36,6 +38,7 @@ _PATCHES_BESIDE = 9
 MOST_BLUR_PX = 2.0
 """Diameter of the circle of confusion."""
 Say = Callable[[str, int, int], None]
+_newest_surface: Remembered[SeenSurface] = Remembered(1)
 
 
 @dataclass(frozen=True)
@@ -125,16 +128,7 @@ def view_pass(
 ) -> tuple[ViewPass, SeenSurface]:
     """Return the pass of a view, ready for its frames, and what the view sees. Raises InputError if it sees
     nothing of the mesh."""
-    focal_mm, focus_mm, f_number = measured_run.optics
-    surface = seen_surface(
-        geometry.mesh,
-        geometry.facets.normals,
-        measured_run.lens,
-        view.base_from_camera,
-        measured_run.frames.size_px,
-        blur=(focal_mm, focus_mm, f_number, MOST_BLUR_PX),
-        threads=threads,
-    )
+    surface = surface_of(measured_run, geometry, view, threads)
     if not len(surface.triangles):
         raise InputError(
             f"{measured_run.run.folder}: no pixel of the view {view.name} shows the mesh: do mesh and hand-eye "
@@ -142,6 +136,28 @@ def view_pass(
         )
     reader = SignalReader(radiometry, surface)
     return ViewPass(measured_run, view, geometry.of(surface.triangles), reader), surface
+
+
+def surface_of(measured_run: MeasuredRun, geometry: Geometry, view: MeasuredView, threads: int) -> SeenSurface:
+    """Return what a view sees, by its pose alone: computed before the view's frames are all there, it is not
+    computed again."""
+    focal_mm, focus_mm, f_number = measured_run.optics
+    size_px = measured_run.frames.size_px
+
+    def compute() -> SeenSurface:
+        return seen_surface(
+            geometry.mesh,
+            geometry.facets.normals,
+            measured_run.lens,
+            view.base_from_camera,
+            size_px,
+            blur=(focal_mm, focus_mm, f_number, MOST_BLUR_PX),
+            threads=threads,
+        )
+
+    mesh = hashlib.sha256(measured_run.corners_mm.tobytes()).hexdigest()
+    key = (mesh, repr(measured_run.lens), view.base_from_camera, size_px, measured_run.optics)
+    return _newest_surface.result(key, compute)
 
 
 def shadows_of(work: ViewPass, geometry: Geometry) -> Callable[[slice, Executor], NDArray[np.uint8]]:

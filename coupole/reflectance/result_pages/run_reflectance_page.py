@@ -22,6 +22,7 @@ from coupole.reflectance.run_fits import predict_samples
 from coupole.reflectance.run_pictures import read_check_frames
 from coupole.reflectance.run_result import REPORT, RunResult, ViewSamples, read_about
 from coupole.reflectance.triangle_fit import FEWEST
+from coupole.storage import so_far
 from coupole.storage.run import name_without_time
 
 SIMULATED = "frames of a simulated cell"
@@ -45,6 +46,8 @@ def write(folder: Path) -> Path:
 
 def remarks(about: dict[str, Any]) -> Iterator[str]:
     """Yield what the maker of the result must know, one sentence each."""
+    if growing := so_far.words(about):
+        yield growing
     if about["simulated"]:
         yield SIMULATED
     views = f"{len(about['views'])} view{'s' if len(about['views']) > 1 else ''}"

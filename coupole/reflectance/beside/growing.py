@@ -1,0 +1,117 @@
+"""A result of the views so far, while the run goes on: fits, check and report of the samples that are there.
+
+Its samples are those of the result that is made at the end: links to its files, which are never written to but
+replaced whole. So it can be given up at any time, and nothing that it does changes that result. It leaves the
+kernels of all fits compiled, and what does not depend on views to come is remembered for the end.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from coupole.plan.held_out import held_out_leds
+from coupole.reflectance.block_work import Said
+from coupole.reflectance.light_paths import Ahead
+from coupole.reflectance.result_folder import begin
+from coupole.reflectance.result_pages import run_reflectance_page
+from coupole.reflectance.run_check import check_result
+from coupole.reflectance.run_fits import fit_result
+from coupole.reflectance.run_job import (
+    RunRequest,
+    expected_leds,
+    forget,
+    read_runs,
+    settings_of,
+    subtract_from,
+)
+from coupole.reflectance.run_result import FRAMES, OBJECT
+from coupole.storage import so_far
+from coupole.storage.run import Run
+
+_COPIES = 3
+"""Room on the disk, in sizes of the samples: each view's file is replaced twice, and old and new stand side by
+side."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Views, run and folder of a result of the views so far."""
+
+    run: Path
+    result: Path
+    """Folder of the result at the end, which has the samples."""
+    views: tuple[str, ...]
+    """Views whose samples are there, in the plan's order."""
+    of: int
+    """Views of the plan."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder in which it is made."""
+        return so_far.folder_of(self.result, self.run.name, len(self.views), self.of)
+
+    def has_room(self) -> bool:
+        """Tell whether the disk has room for it and for the frames to come, as large as those of the largest view.
+        Never for a run that discards frames, whose disk is small. Raises OSError."""
+        run = Run(self.run)
+        if run.discards:
+            return False
+        sample_bytes = sum(path.stat().st_size for path in (self.result / "samples").glob("*.h5"))
+        frame_bytes = max(run.view_path(view).stat().st_size for view in self.views) * (self.of - len(self.views))
+        return shutil.disk_usage(self.result).free > _COPIES * sample_bytes + frame_bytes
+
+
+def fit_so_far(growth: Growth, memory_bytes: int, say: Said, ahead: Ahead) -> None:
+    """Make it, and put it in its place when it is whole. What `say` raises ends it, and nothing is left but what
+    `ahead` remembers. Raises as `reflectance_of`."""
+    shutil.rmtree(growth.folder, ignore_errors=True)
+    try:
+        _begin(growth)
+        subtract_from(growth.folder, say, ahead)
+        fit_result(growth.folder, memory_bytes, say=say)
+        check_result(growth.folder, memory_bytes, say=say)
+        run_reflectance_page.write(growth.folder)
+        so_far.put_in_place(growth.result, growth.folder)
+    except BaseException:
+        shutil.rmtree(growth.folder, ignore_errors=True)
+        raise
+
+
+def _begin(growth: Growth) -> None:
+    begin(growth.folder, _settings(growth))
+    sample_names = [f"{view}{ending}" for view in growth.views for ending in (".h5", ".json")]
+    _link(growth.result / "samples", growth.folder / "samples", sample_names)
+    _link(growth.result / FRAMES, growth.folder / FRAMES, [f"{view}.h5" for view in growth.views])
+    _link(growth.result, growth.folder, [OBJECT])
+
+
+def _settings(growth: Growth) -> dict[str, Any]:
+    """Settings of a result of these views, and of how many they are."""
+    try:
+        (measured_run,) = read_runs(RunRequest((growth.run,)), token := uuid4().hex)
+        views = tuple(view for view in measured_run.views if view.name in growth.views)
+        measured_leds = {led for view in views for led in view.by_led}
+        left_out = tuple(led for led in held_out_leds(expected_leds(measured_run.run)) if led in measured_leds)
+        request = RunRequest((growth.run,), left_out=left_out)
+        settings = settings_of(request, token, [replace(measured_run, views=views)])
+    finally:
+        forget()
+    return {**settings, so_far.KEY: {"views": len(growth.views), "of": growth.of}}
+
+
+def _link(source: Path, to: Path, names: Sequence[str]) -> None:
+    """Link files, or copy them where the file system has no links."""
+    to.mkdir(exist_ok=True)
+    for name in names:
+        try:
+            os.link(source / name, to / name)
+        except FileNotFoundError:
+            raise
+        except OSError:
+            shutil.copyfile(source / name, to / name)

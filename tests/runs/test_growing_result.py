@@ -1,0 +1,100 @@
+"""The result of the views so far, while a run goes on: any command opens it, and says from how many views."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cells
+import numpy as np
+import pytest
+from beside_runs import begun, cell_of_three_views, files, result_of, same_result
+
+from coupole.reflectance.beside.growing import Growth, fit_so_far
+from coupole.reflectance.light_paths import Ahead
+from coupole.reflectance.run_job import RunRequest, extract_beside, look_ahead, reflectance_of
+from coupole.reflectance.run_result import RunResult
+
+pytestmark = pytest.mark.timeout(900)
+MEMORY_BYTES = 2_000_000_000
+
+
+def said_by(*arguments: str | Path) -> dict[str, Any]:
+    ended = cells.here(*arguments, "--json")
+    assert ended.code == 0, ended.err
+    document: dict[str, Any] = ended.document
+    return document
+
+
+def relit(folder: Path, picture: Path) -> dict[str, Any]:
+    return said_by("reflectance", "relight", folder, "--direction", "0,0,1", "--to", picture)
+
+
+def has_samples(result: Path) -> bool:
+    return any((result / "samples").glob("*.json"))
+
+
+def fitted_views(result: Path) -> int:
+    return int(json.loads((result / "beside/progress.json").read_text())["fitted_views"])
+
+
+def test_a_run_that_goes_on_has_a_result_of_its_views_so_far(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path)
+    process, _ = begun(cell)
+    cells.wait_until(lambda: len(cells.events(cell.run_folder, "view")) == 2, "the second view")
+    assert cells.here("pause", cell.run_folder).code == 0  # the second may not be lit, the third is not begun
+    result = result_of(cell)
+    cells.wait_until(lambda: has_samples(result), "samples of a view")
+    cells.wait_until(lambda: fitted_views(result), "the result of the views so far")
+    assert said_by("status", cell.run_folder)["processing"]["fitted_views"] in (1, 2)
+    folder, picture = (result / "so-far").resolve(), tmp_path / "some.npy"
+    so_far = relit(result, picture)["so_far"]
+    assert so_far["views"] in (1, 2)
+    assert np.isfinite(np.load(picture)).any()
+    views = len(RunResult(folder).views)
+    page = said_by("show", folder, "--out", tmp_path / "some.html")
+    words = f"from {views} of 3 views so far"
+    assert words in page["about"]["told"]["So far"]
+    assert words in (folder / "report.html").read_text()
+    assert cells.here("go-on", cell.run_folder).code == 0
+    ended = cells.finish(process)
+    assert ended.document["reflectance"]["is_whole"], ended.err
+    assert not (result / "so-far").is_symlink()
+    assert not (result / "beside").exists()
+    assert "so_far" not in relit(result, picture)
+    afterwards = tmp_path / "afterwards"
+    said_by("reflectance", cell.run_folder, "--out", afterwards)
+    same_result(result, afterwards)
+
+
+def test_what_is_known_ahead_and_given_up_changes_no_bit_of_the_result(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path)
+    assert cell.acquire().code == 0
+    run, result = cell.run_folder, tmp_path / "result"
+    ahead, views = Ahead(), ("top", "side")
+    for view in views:
+        look_ahead(run, view)
+        extract_beside(run, view, result)
+    before = {name: path.read_bytes() for name, path in files(result).items()}
+    growth = Growth(run, result, views, 3)
+    assert growth.has_room()
+
+    class GivenUpError(Exception):
+        pass
+
+    def give_up(detail: str, done_count: int, of: int) -> None:
+        if detail == "contradictions":
+            raise GivenUpError
+
+    with pytest.raises(GivenUpError):
+        fit_so_far(growth, MEMORY_BYTES, give_up, ahead)
+    assert {name: path.read_bytes() for name, path in files(result).items()} == before
+    assert not (result / "so-far").is_symlink()
+    fit_so_far(growth, MEMORY_BYTES, lambda *_: None, ahead)
+    assert [view.view for view in RunResult(result / "so-far").views] == ["side", "top"]
+    assert json.loads((result / "so-far/result.json").read_text())["so_far"] == {"views": 2, "of": 3}
+    assert {name: (result / name).read_bytes() for name in before} == before
+    reflectance_of(RunRequest((run,)), result, ahead=ahead)
+    reflectance_of(RunRequest((run,)), tmp_path / "afterwards")
+    same_result(result, tmp_path / "afterwards")

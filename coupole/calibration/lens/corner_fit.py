@@ -24,6 +24,7 @@ from typing import Any
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from coupole.calibration.rotations import Floats
 
@@ -43,6 +44,20 @@ _THIN = 0.01
 _SECTORS = 64
 _PART = 16
 """Corners that a thread fits at a time."""
+_REACH = 2.0
+"""Half of a window that holds all pixels of both fits, in radii: each fit may move by half a radius."""
+_BELL_REACH, _BELLS_PER_SIGMA = 6.0, 32
+
+
+def _bell_table() -> Floats:
+    """[n, 4] at the places z from -6 to 6: the normal distribution, integrated twice, once and not at all, and its
+    density."""
+    z = np.arange(-_BELL_REACH * _BELLS_PER_SIGMA, _BELL_REACH * _BELLS_PER_SIGMA + 1) / _BELLS_PER_SIGMA
+    below, bell = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
+    return np.column_stack([0.5 * ((z * z + 1.0) * below + z * bell), z * below + bell, below, bell])
+
+
+_BELLS = _bell_table()
 
 
 @dataclass(frozen=True)
@@ -71,37 +86,56 @@ def fit_corners(image: NDArray[Any], mask_tile: NDArray[np.bool_], rough: Floats
     first_radius_px = radius_px
     if radius_px > _FIRST_RADIUS_PX and enough_pixels(mask_tile, _FIRST_RADIUS_PX):
         first_radius_px = _FIRST_RADIUS_PX
-    values = np.ascontiguousarray(image, dtype=np.float32)
+    radii_px = (radius_px, first_radius_px)
     unknowns = np.full((len(rough), _UNKNOWNS), np.nan)
     mask, starts = np.ascontiguousarray(mask_tile), np.ascontiguousarray(rough, dtype=np.float64)
     # Compiled before threads call it: numba's types, looked up by several at once, fail at times.
-    _fit_all(values, mask, starts[:0], radius_px, first_radius_px, unknowns[:0])
+    _fit_windows(image, mask, starts[:0], radii_px, unknowns[:0])
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         parts = (slice(first, first + _PART) for first in range(0, len(starts), _PART))
-        list(
-            pool.map(
-                lambda part: _fit_all(values, mask, starts[part], radius_px, first_radius_px, unknowns[part]),
-                parts,
-            )
-        )
+        list(pool.map(lambda part: _fit_windows(image, mask, starts[part], radii_px, unknowns[part]), parts))
     fits = np.isfinite(unknowns[:, _X])
     return Corners(np.where(fits[:, None], unknowns[:, :2], rough), fits, unknowns[:, _SIGMA].copy())
 
 
+def _fit_windows(
+    image: NDArray[Any],
+    mask_tile: NDArray[np.bool_],
+    rough: Floats,
+    radii_px: tuple[float, float],
+    solutions: Floats,
+) -> None:
+    """Fit corners [n] into `solutions` [n, unknowns]; only the pixels that a fit can reach are converted."""
+    size_px = np.minimum(2 * int(_REACH * radii_px[0] + 2.0) + 1, image.shape[:2])
+    firsts = np.clip(np.rint(rough[:, ::-1]).astype(np.intp) - size_px // 2, 0, image.shape[:2] - size_px)
+    windows = np.empty((len(rough), *size_px), np.float32)
+    for window, (row, col) in zip(windows, firsts, strict=True):
+        window[:] = image[row : row + size_px[0], col : col + size_px[1]]
+    _fit_all(windows, firsts, mask_tile, rough, *radii_px, solutions)
+
+
 @numba.njit(cache=True, nogil=True)
-def _fit_all(image, mask_tile, rough, radius, first_radius, solutions):  # type: ignore[no-untyped-def]
+def _fit_all(windows, firsts, mask_tile, rough, radius, first_radius, solutions):  # type: ignore[no-untyped-def]
+    """Places are within a window [h, w], whose first pixel is `firsts` [row, column] of the image, until the
+    end."""
     for n in range(len(rough)):
+        image, first_row, first_col = windows[n], firsts[n, 0], firsts[n, 1]
+        mask = np.empty_like(mask_tile)
+        for row in range(mask.shape[0]):
+            for col in range(mask.shape[1]):
+                mask[row, col] = mask_tile[(row + first_row) % mask.shape[0], (col + first_col) % mask.shape[1]]
+        x, y = rough[n, 0] - first_col, rough[n, 1] - first_row
         unknowns = np.zeros(_UNKNOWNS)
-        unknowns[_X], unknowns[_Y] = rough[n]
-        if not _start(image, mask_tile, radius, unknowns):
+        unknowns[_X], unknowns[_Y] = x, y
+        if not _start(image, mask, radius, unknowns):
             continue
         # Again about the corner found: a window that is not centred on it would bias the result.
-        fits = _fit(image, mask_tile, rough[n, 0], rough[n, 1], first_radius, unknowns, _ABOUT_PX)
-        if fits and _fit(image, mask_tile, unknowns[_X], unknowns[_Y], radius, unknowns, _CLOSE_PX):
+        fits = _fit(image, mask, x, y, first_radius, unknowns, _ABOUT_PX)
+        if fits and _fit(image, mask, unknowns[_X], unknowns[_Y], radius, unknowns, _CLOSE_PX):
             # A gradient of light shifts blurred edges: p F, blurred, is p F + sigma^2 grad F.
             spread2 = unknowns[_SIGMA] ** 2 + 1.0 / 12.0
-            unknowns[_X] += spread2 * unknowns[_ALONG_X]
-            unknowns[_Y] += spread2 * unknowns[_ALONG_Y]
+            unknowns[_X] += spread2 * unknowns[_ALONG_X] + first_col
+            unknowns[_Y] += spread2 * unknowns[_ALONG_Y] + first_row
             for k in range(_UNKNOWNS):
                 solutions[n, k] = unknowns[k]
 
@@ -246,16 +280,34 @@ def _edge(apart, wide, high, sigma):  # type: ignore[no-untyped-def]
     """2 S - 1 of an edge at distance `apart` from a pixel's middle, and its derivatives by that and by sigma."""
     wide, high = max(wide, _THIN), max(high, _THIN)
     outer, inner = 0.5 * (wide + high), 0.5 * (wide - high)
-    if abs(apart) > outer + 6.0 * sigma:
+    if abs(apart) > outer + _BELL_REACH * sigma:
         return (1.0 if apart > 0.0 else -1.0), 0.0, 0.0
-    value, by_apart, by_sigma = 0.0, 0.0, 0.0
+    value, by_apart, by_sigma, per_sigma = 0.0, 0.0, 0.0, 1.0 / sigma
     for k in range(4):
-        t = apart + (outer, inner, -inner, -outer)[k]
         sign = (1.0, -1.0, -1.0, 1.0)[k]
-        below = 0.5 * math.erfc(-t / (sigma * math.sqrt(2.0)))
-        bell = sigma * math.exp(-0.5 * (t / sigma) ** 2) / math.sqrt(2.0 * math.pi)
-        value += sign * 0.5 * ((t * t + sigma * sigma) * below + t * bell)
-        by_apart += sign * (t * below + bell)
-        by_sigma += sign * sigma * below
+        twice, once, below = _integrals((apart + (outer, inner, -inner, -outer)[k]) * per_sigma)
+        value += sign * twice
+        by_apart += sign * once
+        by_sigma += sign * below
     per_area = 2.0 / (wide * high)
-    return per_area * value - 1.0, per_area * by_apart, per_area * by_sigma
+    return per_area * sigma * sigma * value - 1.0, per_area * sigma * by_apart, per_area * sigma * by_sigma
+
+
+@numba.njit(cache=True, nogil=True)
+def _integrals(z):  # type: ignore[no-untyped-def]
+    """Normal distribution at z, integrated twice, once and not at all: Taylor's series from the nearest place of
+    the table, to 1e-10."""
+    if z >= _BELL_REACH:
+        return 0.5 * (z * z + 1.0), z, 1.0
+    if z <= -_BELL_REACH:
+        return 0.0, 0.0, 0.0
+    place = int((z + _BELL_REACH) * _BELLS_PER_SIGMA + 0.5)
+    there = place / _BELLS_PER_SIGMA - _BELL_REACH
+    d = z - there
+    twice, once, below, bell = _BELLS[place, 0], _BELLS[place, 1], _BELLS[place, 2], _BELLS[place, 3]
+    slope, bend = -there * bell, (there * there - 1.0) * bell
+    return (
+        twice + d * (once + d * (below / 2.0 + d * (bell / 6.0 + d * (slope / 24.0 + d * bend / 120.0)))),
+        once + d * (below + d * (bell / 2.0 + d * (slope / 6.0 + d * bend / 24.0))),
+        below + d * (bell + d * (slope / 2.0 + d * bend / 6.0)),
+    )

@@ -128,6 +128,9 @@ class Sighting:
     """[n, 3]."""
     pixels: Floats
     """[n, 2], centre of the first pixel (0, 0)."""
+    u_px: Floats | None = None
+    """[n] standard uncertainty of a corner's coordinates, root mean square of both, by its pixels alone; None if
+    they were not fitted."""
 
 
 def read_board(path: Path) -> Board:
@@ -187,7 +190,8 @@ def _refined_corners(rough: Sighting, board: Board, picture: Picture, channel: C
         side_px = max(2, int(window_px / np.sqrt(2)))
         return replace(rough, pixels=refine(picture.plane(channel), rough.pixels, side_px))
     fit = fit_corners(values, mask, rough.pixels, window_px)
-    return Sighting(rough.name, rough.ids[fit.fits], rough.board_mm[fit.fits], fit.pixels[fit.fits])
+    u_px = np.sqrt(0.5 * np.trace(fit.covariance_px2[fit.fits], axis1=1, axis2=2))
+    return Sighting(rough.name, rough.ids[fit.fits], rough.board_mm[fit.fits], fit.pixels[fit.fits], u_px)
 
 
 def refine(image: NDArray[Any], corners: Floats, window_px: int) -> Floats:

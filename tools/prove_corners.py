@@ -6,8 +6,8 @@ Boards of 36 corners are drawn by code of the tests' own (`tests/calibration/cor
 blur, tilt, contrast and colour pattern. Printed are root mean squares of the error without noise: of our fit, of
 the same fit with one round Gaussian blur ("before"), of OpenCV's `cornerSubPix` and `findChessboardCornersSB`
 (Duda and Frese, BMVC 2018) and of the saddle of a quadratic in the smoothed image (as in Placht, ECCV 2014, and
-Ha, ICCV 2017; written here); in brackets the largest mean by quarter of a pixel; with noise our error over its stated
-uncertainty. With `--pictures`, the two diagonal halves of the pixels of grey pictures of a 9 x 6 board (PNG) are
+Ha, ICCV 2017; written here); in brackets the largest mean by quarter of a pixel; with noise our error over the
+stated u. With `--pictures`, the two diagonal halves of the pixels of grey pictures of a 9 x 6 board (PNG) are
 compared. Exits with 1 unless rms(error/u) is 0.8 to 1.25 in each stratum.
 """
 

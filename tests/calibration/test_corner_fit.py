@@ -120,9 +120,11 @@ ELLIPSE = Stratum("elliptic blur", blur="ellipse 1.4 0.6", tilt_deg=55.0)
 COMA = Stratum("coma", blur="streak 3")
 
 
-def of_board(stratum: Stratum, values: Floats, corners: Floats, blur: Blur = "own") -> Corners:
+def of_board(
+    stratum: Stratum, values: Floats, corners: Floats, blur: Blur = "own", radius_px: float = 4.5
+) -> Corners:
     pixels, mask = Picture(values, stratum.pattern, 4095.0).values_and_mask("green")
-    return fit_corners(pixels, mask, corners + STARTS_OFF, 4.5, blur=blur)
+    return fit_corners(pixels, mask, corners + STARTS_OFF, radius_px, blur=blur)
 
 
 def rms(values: Floats) -> float:
@@ -141,7 +143,7 @@ def test_an_elliptic_blur_shifts_no_corner() -> None:
 
 def test_coma_is_told_by_the_blur_and_most_of_its_shift_is_undone() -> None:
     board = draw(COMA, 1)
-    own, same = (of_board(COMA, board.values, board.corners, blur) for blur in ("own", "round"))
+    own, same = (of_board(COMA, board.values, board.corners, blur, 8.0) for blur in ("own", "round"))
     left, before = rms(own.pixels - board.corners), rms(same.pixels - board.corners)
     assert np.abs(own.skew_px3).max() > 0.05
     assert left < 0.3 * before

@@ -69,14 +69,14 @@ def errors_of(stratum: Stratum, boards: int) -> Errors:
     places: dict[str, list[Floats]] = {method: [] for method in METHODS}
     over_u = []
     for seed in range(boards):
-        drawn = draw(stratum, seed)
-        starts = drawn.corners + np.random.default_rng(seed).uniform(-0.7, 0.7, drawn.corners.shape)
-        for method, found in _found(stratum, drawn, starts).items():
-            is_found = np.isfinite(found[:, 0])
-            plain[method].append((found - drawn.corners)[is_found])
-            places[method].append(drawn.corners[is_found])
-        noisy = _fitted(stratum, with_noise(drawn.values, seed), starts, radius_of(drawn.corners), "own")
-        error = (noisy.pixels - drawn.corners)[noisy.fits]
+        board = draw(stratum, seed)
+        starts = board.corners + np.random.default_rng(seed).uniform(-0.7, 0.7, board.corners.shape)
+        for method, corners_px in _corners_by_method(stratum, board, starts).items():
+            is_found = np.isfinite(corners_px[:, 0])
+            plain[method].append((corners_px - board.corners)[is_found])
+            places[method].append(board.corners[is_found])
+        noisy = _fit_of(stratum, with_noise(board.values, seed), starts, radius_of(board.corners), "own")
+        error = (noisy.pixels - board.corners)[noisy.fits]
         factor = np.linalg.cholesky(noisy.covariance_px2[noisy.fits])
         over_u.append(np.linalg.solve(factor, error[..., None])[..., 0])
     return Errors(
@@ -93,7 +93,7 @@ def radius_of(corners: Floats) -> float:
     return float(np.clip(np.percentile(apart.min(axis=1), 5) / 3.0, 2.0, 11.0))
 
 
-def _fitted(stratum: Stratum, values: Floats, starts: Floats, radius_px: float, blur: Blur) -> Corners:
+def _fit_of(stratum: Stratum, values: Floats, starts: Floats, radius_px: float, blur: Blur) -> Corners:
     pixels, mask = Picture(values, stratum.pattern, 4095.0).values_and_mask(_channel(stratum))
     return fit_corners(pixels, mask, starts, radius_px, blur=blur)
 
@@ -102,34 +102,34 @@ def _channel(stratum: Stratum) -> Any:
     return stratum.channel
 
 
-def _found(stratum: Stratum, drawn: Drawn, starts: Floats) -> dict[str, Floats]:
+def _corners_by_method(stratum: Stratum, board: Drawn, starts: Floats) -> dict[str, Floats]:
     """Corners [36, 2] by each method; NaN where it finds none."""
-    radius_px = radius_of(drawn.corners)
-    grey = Picture(drawn.values, stratum.pattern, 4095.0).plane(_channel(stratum)).astype(np.float32)
-    found = {
+    radius_px = radius_of(board.corners)
+    grey = Picture(board.values, stratum.pattern, 4095.0).plane(_channel(stratum)).astype(np.float32)
+    corners_px = {
         name: np.where(fit.fits[:, None], fit.pixels, np.nan)
         for name, fit in (
-            ("ours", _fitted(stratum, drawn.values, starts, radius_px, "own")),
-            ("before", _fitted(stratum, drawn.values, starts, radius_px, "round")),
+            ("ours", _fit_of(stratum, board.values, starts, radius_px, "own")),
+            ("before", _fit_of(stratum, board.values, starts, radius_px, "round")),
         )
     }
     side_px = max(2, int(radius_px / np.sqrt(2.0)))
     until = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
     points = starts.astype(np.float32).reshape(-1, 1, 2)
-    refined = cv2.cornerSubPix(grey, points.copy(), (side_px, side_px), (-1, -1), until)
-    found["cornerSubPix"] = np.asarray(refined, np.float64).reshape(-1, 2)
-    found["SB"] = _by_sector_based(grey, drawn.corners)
-    found["saddle"] = np.array([_saddle(grey, start, side_px) for start in starts])
-    return found
+    refined_px = cv2.cornerSubPix(grey, points.copy(), (side_px, side_px), (-1, -1), until)
+    corners_px["cornerSubPix"] = np.asarray(refined_px, np.float64).reshape(-1, 2)
+    corners_px["SB"] = _by_sector_based(grey, board.corners)
+    corners_px["saddle"] = np.array([_saddle(grey, start, side_px) for start in starts])
+    return corners_px
 
 
 def _by_sector_based(grey: Any, corners: Floats) -> Floats:
     """OpenCV's `findChessboardCornersSB`, its corners in the order of the true ones."""
     picture = np.clip(np.rint(255.0 * grey / grey.max()), 0, 255).astype(np.uint8)
-    is_found, seen = cv2.findChessboardCornersSB(picture, (CORNERS, CORNERS), flags=cv2.CALIB_CB_ACCURACY)
+    is_found, seen_px = cv2.findChessboardCornersSB(picture, (CORNERS, CORNERS), flags=cv2.CALIB_CB_ACCURACY)
     if not is_found:
         return np.full(corners.shape, np.nan)
-    points = np.asarray(seen, np.float64).reshape(-1, 2)
+    points = np.asarray(seen_px, np.float64).reshape(-1, 2)
     apart = np.linalg.norm(points[None] - corners[:, None], axis=-1)
     nearest = points[apart.argmin(axis=1)]
     return np.where((apart.min(axis=1) < 2.0)[:, None], nearest, np.nan)
@@ -172,18 +172,18 @@ def print_halves(folder: Path) -> None:
     half = np.array([[True, False], [False, True]])
     for path in sorted(folder.glob("*.png")):
         grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        is_found, seen = cv2.findChessboardCorners(grey, (9, 6)) if grey is not None else (False, None)
+        is_found, seen_px = cv2.findChessboardCorners(grey, (9, 6)) if grey is not None else (False, None)
         if not is_found:
             print(f"{path.name}: no board of 9 x 6 corners")
             continue
-        starts = np.asarray(seen, np.float64).reshape(-1, 2)
-        first, second = (fit_corners(grey, mask, starts, radius_of(starts)) for mask in (half, ~half))
-        both = first.fits & second.fits
-        apart = first.pixels[both] - second.pixels[both]
-        factor = np.linalg.cholesky(first.covariance_px2[both] + second.covariance_px2[both])
+        starts = np.asarray(seen_px, np.float64).reshape(-1, 2)
+        first, second = (fit_corners(np.asarray(grey), mask, starts, radius_of(starts)) for mask in (half, ~half))
+        in_both = first.fits & second.fits
+        apart = first.pixels[in_both] - second.pixels[in_both]
+        factor = np.linalg.cholesky(first.covariance_px2[in_both] + second.covariance_px2[in_both])
         over_u = np.linalg.solve(factor, apart[..., None])
         print(
-            f"{path.name}: halves of {both.sum()} corners differ by {_rms(apart):.4f} px rms, "
+            f"{path.name}: halves of {in_both.sum()} corners differ by {_rms(apart):.4f} px rms, "
             f"{_rms(over_u):.2f} of the stated uncertainty"
         )
 
@@ -191,7 +191,7 @@ def print_halves(folder: Path) -> None:
 def main() -> int:
     """Run the proof; see the module's text."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--boards", type=int, default=6, help="drawn boards of each stratum")
+    parser.add_argument("--boards", type=int, default=6, help="board boards of each stratum")
     parser.add_argument("--strata", type=int, default=len(STRATA), help="number of strata")
     parser.add_argument("--first", type=int, default=0, help="number of the first one")
     parser.add_argument("--pictures", type=Path, help="folder of real pictures, PNG, of a board of 9 x 6 corners")

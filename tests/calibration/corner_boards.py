@@ -64,7 +64,7 @@ def blur_kernel(blur: str) -> Floats:
         away = length_px * (place - 1.0 / 3.0)
         along, across = _turned(x, y, 35.0)
         kernel += (1.0 - place) * _normal(along - away, across, 0.6, 0.6)
-    return kernel / kernel.sum()
+    return np.asarray(kernel / kernel.sum())
 
 
 def _turned(x: Floats, y: Floats, angle_deg: float) -> tuple[Floats, Floats]:

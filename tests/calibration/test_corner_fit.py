@@ -141,14 +141,20 @@ def test_an_elliptic_blur_shifts_no_corner() -> None:
     assert rms(same.pixels - board.corners) > 0.005
 
 
-def test_coma_is_told_by_the_blur_and_most_of_its_shift_is_undone() -> None:
+def test_most_of_the_shift_by_coma_is_undone() -> None:
     board = draw(COMA, 1)
     own, same = (of_board(COMA, board.values, board.corners, blur, 8.0) for blur in ("own", "round"))
     left, before = rms(own.pixels - board.corners), rms(same.pixels - board.corners)
-    assert np.abs(own.skew_px3).max() > 0.05
     assert left < 0.3 * before
+
+
+def test_noise_is_not_taken_for_coma() -> None:
+    """Corners alone are too few for coma to be looked for: those of a clean board are the same."""
     clean = draw(Stratum("round"), 1)
-    assert not of_board(COMA, with_noise(clean.values, 1), clean.corners).skew_px3.any()
+    values = with_noise(clean.values, 1)
+    together = of_board(COMA, values, clean.corners)
+    few = [of_board(COMA, values, clean.corners[first : first + 9]).pixels for first in range(0, 36, 9)]
+    assert np.abs(np.concatenate(few) - together.pixels).max() < 1e-6
 
 
 @pytest.mark.parametrize("stratum", [Stratum("grey"), Stratum("green", pattern="GBRG"), ELLIPSE, COMA])

@@ -146,11 +146,13 @@ def detect(board: Board, picture: Picture) -> Sighting | str:
     for ids, rough in _searches(board, picture):
         if len(ids) < LEAST_CORNERS:
             return f"{len(ids)} of {len(board.points_mm)} corners seen, {LEAST_CORNERS} needed"
-        left, top, width, height = cv2.boundingRect(rough.astype(np.float32))
-        if (share := picture.white_share(slice(top, top + height), slice(left, left + width))) > CLIPPED_SHARE:
+        first_x, first_y, width, height = cv2.boundingRect(rough.astype(np.float32))
+        if (
+            share := picture.white_share(slice(first_y, first_y + height), slice(first_x, first_x + width))
+        ) > CLIPPED_SHARE:
             return f"clipped: {share:.0%} of the pixels on the board are saturated. Expose shorter"
-        seen = Sighting(picture.name, ids, board.points_mm[ids], rough)
-        sighting = _refined_corners(seen, board, picture, "green")
+        rough_sighting = Sighting(picture.name, ids, board.points_mm[ids], rough)
+        sighting = _refined_corners(rough_sighting, board, picture, "green")
         if best is None or len(sighting.ids) >= len(best.ids):
             best = sighting
         if len(sighting.ids) == len(board.points_mm):

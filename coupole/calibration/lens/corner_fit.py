@@ -56,8 +56,6 @@ class Corners:
     """[n] blur of the image: geometric mean of those across both edges."""
     covariance_px2: Floats
     """[n, 2, 2] of the places; NaN where no corner was found."""
-    skew_px3: Floats
-    """[n, 2] third cumulant of the blur across both edges, as corrected; 0 where it is not clear."""
 
 
 def enough_pixels(mask_tile: NDArray[np.bool_], radius_px: float) -> bool:
@@ -79,29 +77,29 @@ def fit_corners(
     many = OWN if blur == "own" else ROUND
     windows = _Windows(image, np.ascontiguousarray(mask_tile), (radius_px, first_radius_px), many)
     starts, skew = np.ascontiguousarray(rough, dtype=np.float64), np.zeros((len(rough), 2))
-    fitted = _fit_in_threads(windows, starts, skew)
+    corner_fits = _fit_in_threads(windows, starts, skew)
     for _ in range(_ROUNDS if blur == "own" else 0):
-        more = _asymmetry(fitted, fitted.noise(many))
+        more = _asymmetry(corner_fits, corner_fits.noise(many))
         if not more.any():
             break
         skew += more
-        fitted = _fit_in_threads(windows, starts, skew)
-    fits = np.isfinite(fitted.solutions[:, 0])
-    pixels = np.where(fits[:, None], fitted.solutions[:, :2], rough)
+        corner_fits = _fit_in_threads(windows, starts, skew)
+    fits = np.isfinite(corner_fits.solutions[:, 0])
+    pixels = np.where(fits[:, None], corner_fits.solutions[:, :2], rough)
     covariance = np.full((len(rough), 2, 2), np.nan)
-    covariance[fits] = fitted.part(fits).covariance(fitted.noise(many), many)
-    sigma_px = np.sqrt(fitted.solutions[:, _SIGMA] * fitted.solutions[:, _SIGMA_2])
-    return Corners(pixels, fits, sigma_px, covariance, skew)
+    covariance[fits] = corner_fits.part(fits).covariance(corner_fits.noise(many), many)
+    sigma_px = np.sqrt(corner_fits.solutions[:, _SIGMA] * corner_fits.solutions[:, _SIGMA_2])
+    return Corners(pixels, fits, sigma_px, covariance)
 
 
 def _fit_in_threads(windows: _Windows, starts: Floats, skew: Floats) -> _Fitted:
-    fitted = _Fitted.empty(len(starts))
+    corner_fits = _Fitted.empty(len(starts))
     # Compiled before threads call it: numba's types, looked up by several at once, fail at times.
-    windows.fit(starts[:0], skew[:0], fitted.part(slice(0, 0)))
+    windows.fit(starts[:0], skew[:0], corner_fits.part(slice(0, 0)))
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         parts = (slice(first, first + _PART) for first in range(0, len(starts), _PART))
-        list(pool.map(lambda part: windows.fit(starts[part], skew[part], fitted.part(part)), parts))
-    return fitted
+        list(pool.map(lambda part: windows.fit(starts[part], skew[part], corner_fits.part(part)), parts))
+    return corner_fits
 
 
 @dataclass(frozen=True)
@@ -113,7 +111,7 @@ class _Windows:
     radii_px: tuple[float, float]
     many: int
 
-    def fit(self, rough: Floats, skew: Floats, fitted: _Fitted) -> None:
+    def fit(self, rough: Floats, skew: Floats, corner_fits: _Fitted) -> None:
         """Fit corners [n] of a given asymmetry [n, 2]; only the pixels that a fit can reach are converted."""
         shape = self.image.shape[:2]
         size_px = np.minimum(2 * int(_REACH * self.radii_px[0] + 2.0) + 1, shape)
@@ -121,7 +119,7 @@ class _Windows:
         windows = np.empty((len(rough), *size_px), np.float32)
         for window, (row, col) in zip(windows, firsts, strict=True):
             window[:] = self.image[row : row + size_px[0], col : col + size_px[1]]
-        arrays = (fitted.solutions, fitted.normals, fitted.scaled, fitted.sums)
+        arrays = (corner_fits.solutions, corner_fits.normals, corner_fits.scaled_normals, corner_fits.sums)
         fit_all(windows, firsts, self.mask_tile, rough, skew, self.radii_px, self.many, arrays)
 
 
@@ -132,7 +130,7 @@ class _Fitted:
 
     solutions: Floats
     normals: Floats
-    scaled: Floats
+    scaled_normals: Floats
     sums: Floats
 
     @staticmethod
@@ -141,15 +139,15 @@ class _Fitted:
         return _Fitted(np.full((count, UNKNOWNS), np.nan), matrices[0], matrices[1], np.zeros((count, SUMS)))
 
     def part(self, rows: slice | NDArray[np.bool_]) -> _Fitted:
-        return _Fitted(self.solutions[rows], self.normals[rows], self.scaled[rows], self.sums[rows])
+        return _Fitted(self.solutions[rows], self.normals[rows], self.scaled_normals[rows], self.sums[rows])
 
     def noise(self, many: int) -> tuple[float, float]:
         """Variance a + b v of a pixel of value v: a, b, not negative, by the squared residuals of all corners."""
         freedom = self.sums[:, 0] / np.maximum(self.sums[:, 0] - many, 1.0)
         count, value, value2 = np.maximum(self.sums[:, :3].sum(axis=0), 1e-30)
         square, by_value = (self.sums[:, 3:] * freedom[:, None]).sum(axis=0)
-        spread = count * value2 - value**2
-        b = (count * by_value - value * square) / spread if spread > 1e-9 * count * value2 else 0.0
+        value_spread = count * value2 - value**2
+        b = (count * by_value - value * square) / value_spread if value_spread > 1e-9 * count * value2 else 0.0
         b = min(max(b, 0.0), square / value if value > 0.0 else 0.0)
         return (square - b * value) / count, b
 
@@ -157,23 +155,23 @@ class _Fitted:
         """[n, 2, 2] of the places, px^2. Where a corner's residuals are larger than this noise, all of its
         covariance is."""
         a, b = noise
-        normal, scaled = self.normals[:, :many, :many], self.scaled[:, :many, :many]
+        normal, scaled_normals = self.normals[:, :many, :many], self.scaled_normals[:, :many, :many]
         across = np.linalg.pinv(normal, hermitian=True)[:, :2]
-        covariance = across @ (a * normal + b * scaled) @ np.swapaxes(across, 1, 2)
+        covariance = across @ (a * normal + b * scaled_normals) @ np.swapaxes(across, 1, 2)
         count, value, _, square, _ = self.sums.T
-        expected = np.maximum((a * count + b * value) * np.maximum(count - many, 1.0) / count, 1e-30)
+        expected_squares = np.maximum((a * count + b * value) * np.maximum(count - many, 1.0) / count, 1e-30)
         through = across @ self.normals[:, :many, _SKEWS]
-        left = _SKEW_LEFT * np.einsum("nij,nj->ni", through, self.solutions[:, _SKEWS])
-        covariance *= np.maximum(1.0, square / expected)[:, None, None]
-        return np.asarray(covariance + left[:, :, None] * left[:, None, :] + _FLOOR_PX**2 * np.eye(2))
+        left_px = _SKEW_LEFT * np.einsum("nij,nj->ni", through, self.solutions[:, _SKEWS])
+        covariance *= np.maximum(1.0, square / expected_squares)[:, None, None]
+        return np.asarray(covariance + left_px[:, :, None] * left_px[:, None, :] + _FLOOR_PX**2 * np.eye(2))
 
 
-def _asymmetry(fitted: _Fitted, noise: tuple[float, float]) -> Floats:
+def _asymmetry(corner_fits: _Fitted, noise: tuple[float, float]) -> Floats:
     """[n, 2] by how much the residuals ask to change the third cumulants of the blur across both edges; zero if
     they do not ask clearly."""
-    none = np.zeros((len(fitted.solutions), 2))
-    found = np.isfinite(fitted.solutions[:, 0])
-    corners = fitted.part(found)
+    none = np.zeros((len(corner_fits.solutions), 2))
+    is_found = np.isfinite(corner_fits.solutions[:, 0])
+    corners = corner_fits.part(is_found)
     if (count := len(corners.solutions)) < _LEAST_CORNERS[0]:
         return none
     free = slice(0, OWN)
@@ -190,7 +188,7 @@ def _asymmetry(fitted: _Fitted, noise: tuple[float, float]) -> Floats:
     a, b = noise
     variance = a + b * corners.sums[:, 1].sum() / corners.sums[:, 0].sum()
     if vector @ coefficients >= _CLEAR * len(coefficients) * max(variance, 1e-30):
-        none[found] = design @ coefficients
+        none[is_found] = design @ coefficients
     return none
 
 

@@ -78,7 +78,7 @@ def fit_all(windows, firsts, mask_tile, rough, skews, radii, many, results):  # 
     bordered by residuals, the same with each pixel weighted by its value, and sums for the noise: [n, 5] number of
     pixels, values, the values' squares, squared residuals, these times the values.
     """
-    solutions, normals, scaled, sums = results
+    solutions, normals, scaled_normals, sums = results
     radius, first_radius = radii
     rows = np.empty((UNKNOWNS + 3, windows.shape[1] * windows.shape[2]))
     for n in range(len(rough)):
@@ -115,7 +115,7 @@ def fit_all(windows, firsts, mask_tile, rough, skews, radii, many, results):  # 
             root = math.sqrt(max(value, 0.0))
             for k in range(UNKNOWNS + 1):
                 rows[k, i] *= root
-        _products(rows, count, UNKNOWNS + 1, scaled[n])
+        _products(rows, count, UNKNOWNS + 1, scaled_normals[n])
         # A gradient of light shifts blurred edges: p F, blurred, is p F + sigma^2 grad F.
         spread2 = unknowns[_SIGMA] * unknowns[_SIGMA_2] + 1.0 / 12.0
         unknowns[_X] += spread2 * unknowns[_ALONG_X] + first_col

@@ -79,6 +79,7 @@ PROOFS = (
         "E_n of independent boards and tiles holds as stated; wrong ones are found",
         "tools/prove_artefacts.py",
     ),
+    Proof("corners", "corners of drawn boards: bias beside peers, u that holds", "tools/prove_corners.py"),
     Proof(
         "reflectance",
         "45 cells of materials that the fit does not know: intervals, normals, fits, new views",

@@ -14,6 +14,8 @@ Channel = Literal["green", "red", "blue"]
 CHANNELS: tuple[Channel, ...] = ("green", "red", "blue")
 """Green first: the others are compared with it."""
 MONO, COLOUR = "MONO", "COLOUR"
+_RESIZED = (np.uint8, np.uint16, np.float32, np.float64)
+"""Types of which OpenCV takes means."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,40 @@ class Picture:
         mask = np.array([letter == channel[0].upper() for letter in self.pattern]).reshape(2, 2)
         return self.values, mask
 
+    def reduced(self, factor: int) -> NDArray[Any]:
+        """Green (or grey) at a fraction of the size [H // factor, W // factor]: means over squares of pixels, RAW
+        ones of the green pixels alone. Its pixel (x, y) has its middle at factor (x, y) + (factor - 1) / 2."""
+        import cv2
+
+        if factor == 1:
+            return self.plane()
+        height, width = (side // factor * factor for side in self.values.shape[:2])
+        values = self.values[:height, :width]
+        if self.pattern == COLOUR:
+            values = cv2.extractChannel(np.ascontiguousarray(values), 1)
+        elif self.pattern != MONO:
+            values = _mean_of_greens(values, self.pattern)
+        size_px = (width // factor, height // factor)
+        if values.dtype not in _RESIZED:
+            values = values.astype(np.float32)
+        if values.shape[::-1] == size_px:
+            return values
+        return np.asarray(cv2.resize(values, size_px, interpolation=cv2.INTER_AREA))
+
+    def white_share(self, rows: slice, columns: slice) -> float:
+        """Share of saturated pixels in a part of the image: of its green (or grey) pixels."""
+        values, mask = self.values_and_mask()
+        tile_rows, tile_columns = mask.shape
+        first_row, first_column = max(rows.start, 0), max(columns.start, 0)
+        first_row, first_column = first_row - first_row % tile_rows, first_column - first_column % tile_columns
+        part = values[first_row : rows.stop, first_column : columns.stop]
+        white_count = pixel_count = 0
+        for row, column in np.argwhere(mask):
+            is_white = part[row::tile_rows, column::tile_columns] >= self.white
+            white_count += int(np.count_nonzero(is_white))
+            pixel_count += is_white.size
+        return white_count / max(pixel_count, 1)
+
     def _refuse_grey(self, channel: Channel) -> None:
         if channel != "green":
             raise InputError(
@@ -84,3 +120,14 @@ def plane(frame: NDArray[Any], pattern: str, channel: Channel = "green") -> NDAr
     weights = np.array([1.0, 2.0, 1.0]) / np.sqrt(8.0 if channel == "green" else 4.0)
     # The border is mirrored about its pixels, which keeps the colour pattern.
     return np.asarray(cv2.sepFilter2D(sparse, -1, weights, weights, borderType=cv2.BORDER_REFLECT_101))
+
+
+def _mean_of_greens(frame: NDArray[Any], pattern: str) -> NDArray[Any]:
+    """[H / 2, W / 2] mean of the two green pixels in each square of four of a RAW frame."""
+    import cv2
+
+    height, width = frame.shape
+    # The columns of a row in pairs, as two channels: OpenCV takes one of them without a copy of both.
+    rows = [np.ascontiguousarray(frame[first::2]).reshape(height // 2, width // 2, 2) for first in range(2)]
+    upper, lower = (cv2.extractChannel(rows[place // 2], place % 2) for place in range(4) if pattern[place] == "G")
+    return np.asarray(cv2.addWeighted(upper, 0.5, lower, 0.5, 0.0))

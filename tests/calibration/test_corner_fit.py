@@ -8,10 +8,12 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
+from corner_boards import Stratum, draw, with_noise
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from coupole.calibration.lens.corner_fit import fit_corners
+from coupole.calibration.grey_image import Picture
+from coupole.calibration.lens.corner_fit import Blur, Corners, fit_corners
 
 SIZE_PX, RAYS, RADIUS_PX = 41, 32, 9.0
 ALL = np.ones((1, 1), np.bool_)
@@ -111,3 +113,70 @@ def test_what_is_no_corner_is_not_taken_for_one() -> None:
         found = fit_corners(image, ALL, np.array([[20.0, 20.0]]), RADIUS_PX)
         assert not found.fits.any()
         assert np.array_equal(found.pixels, [[20.0, 20.0]])
+
+
+STARTS_OFF = 0.5
+ELLIPSE = Stratum("elliptic blur", blur="ellipse 1.4 0.6", tilt_deg=55.0)
+COMA = Stratum("coma", blur="streak 3")
+
+
+def of_board(
+    stratum: Stratum, values: Floats, corners: Floats, blur: Blur = "own", radius_px: float = 4.5
+) -> Corners:
+    pixels, mask = Picture(values, stratum.pattern, 4095.0).values_and_mask("green")
+    return fit_corners(pixels, mask, corners + STARTS_OFF, radius_px, blur=blur)
+
+
+def rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def test_an_elliptic_blur_shifts_no_corner() -> None:
+    """With one round blur it does, where the board is tilted."""
+    board = draw(ELLIPSE, 1)
+    own, same = (of_board(ELLIPSE, board.values, board.corners, blur) for blur in ("own", "round"))
+    assert own.fits.all()
+    assert same.fits.all()
+    assert rms(own.pixels - board.corners) < 0.001
+    assert rms(same.pixels - board.corners) > 0.005
+
+
+def test_most_of_the_shift_by_coma_is_undone() -> None:
+    board = draw(COMA, 1)
+    own, same = (of_board(COMA, board.values, board.corners, blur, 8.0) for blur in ("own", "round"))
+    left, before = rms(own.pixels - board.corners), rms(same.pixels - board.corners)
+    assert left < 0.3 * before
+
+
+def test_noise_is_not_taken_for_coma() -> None:
+    """Corners alone are too few for coma to be looked for: those of a clean board are the same."""
+    clean = draw(Stratum("round"), 1)
+    values = with_noise(clean.values, 1)
+    together = of_board(COMA, values, clean.corners)
+    few = [of_board(COMA, values, clean.corners[first : first + 9]).pixels for first in range(0, 36, 9)]
+    assert np.abs(np.concatenate(few) - together.pixels).max() < 1e-6
+
+
+@pytest.mark.parametrize("stratum", [Stratum("grey"), Stratum("green", pattern="GBRG"), ELLIPSE, COMA])
+def test_the_stated_uncertainty_of_a_corner_holds(stratum: Stratum) -> None:
+    over_u = []
+    board = draw(stratum, 2)
+    for seed in range(3):
+        found = of_board(stratum, with_noise(board.values, seed), board.corners)
+        factor = np.linalg.cholesky(found.covariance_px2[found.fits])
+        over_u.append(np.linalg.solve(factor, (found.pixels - board.corners)[found.fits][..., None]))
+    assert 0.8 < rms(np.concatenate(over_u)) < 1.25
+
+
+def test_the_uncertainty_grows_with_the_noise() -> None:
+    board = draw(Stratum("grey"), 3)
+    quiet, loud = (
+        of_board(
+            ELLIPSE,
+            board.values + np.random.default_rng(1).normal(0.0, noise_dn, board.values.shape),
+            board.corners,
+        )
+        for noise_dn in (20.0, 80.0)
+    )
+    ratio = np.sqrt(np.trace(loud.covariance_px2.mean(axis=0)) / np.trace(quiet.covariance_px2.mean(axis=0)))
+    assert ratio == pytest.approx(4.0, rel=0.1)

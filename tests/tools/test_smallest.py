@@ -76,6 +76,7 @@ RUNS = (
     Run("prove_brackets.py --smallest", r"steps of 8: \d.* within 1\.96 u", full=True),
     Run("prove_calibrations.py --smallest", r"camera_mm.* median \d", full=True),
     Run("prove_clusters.py --smallest", r"1000 clusters for \d+ triangles: .*ratio \d", full=True),
+    Run("prove_corners.py --smallest", r"\| sharp \| 0\.00\d\d ", full=True),
     Run("prove_exports.py --smallest", r"`bird` \| \d", full=True),
     Run("prove_finishes.py --smallest", r"peaks up to 60 degrees .*: off by up to \d", full=True),
     Run("prove_watching.py --smallest", r"\d of 8 faults found and named; \d false alarms in 2", full=True),

@@ -7,6 +7,7 @@ image of one colour; they are then fitted to the pixels of that colour with thei
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,8 +25,9 @@ Count = Annotated[int, Field(ge=3, le=200)]
 Millimetres = Annotated[float, Field(gt=0, le=1000)]
 
 LEAST_CORNERS = 8
-_HALVED_FROM_PX = 1500
-"""Least side of an image whose board is searched at half its size."""
+_SEARCHED_PX = 700
+"""Least side of a reduced image in which a board is searched."""
+_REDUCTIONS = (4, 2)
 _SAME_SIDE = 0.01
 """Largest difference of a certified side of squares from that of the description."""
 CLIPPED_SHARE = 0.02
@@ -126,6 +128,9 @@ class Sighting:
     """[n, 3]."""
     pixels: Floats
     """[n, 2], centre of the first pixel (0, 0)."""
+    u_px: Floats | None = None
+    """[n] standard uncertainty of a corner's coordinates, root mean square of both, by its pixels alone; None if
+    they were not fitted."""
 
 
 def read_board(path: Path) -> Board:
@@ -137,39 +142,40 @@ def detect(board: Board, picture: Picture) -> Sighting | str:
     """The board's corners in a picture (in green if it has colours), or the reason why it cannot be used."""
     import cv2
 
-    image = picture.plane()
-    ids, rough = _search(board, image)
-    if len(ids) < LEAST_CORNERS:
-        return f"{len(ids)} of {len(board.points_mm)} corners seen, {LEAST_CORNERS} needed"
-    outline = cv2.boundingRect(rough.astype(np.float32))
-    part = image[max(outline[1], 0) : outline[1] + outline[3], max(outline[0], 0) : outline[0] + outline[2]]
-    if (share := np.count_nonzero(part >= picture.white) / part.size) > CLIPPED_SHARE:
-        return f"clipped: {share:.0%} of the pixels on the board are saturated. Expose shorter"
-    sighting = _refined_corners(Sighting(picture.name, ids, board.points_mm[ids], rough), board, picture, "green")
-    if len(sighting.ids) < LEAST_CORNERS:
-        return f"{len(sighting.ids)} of {len(ids)} corners are sharp enough, {LEAST_CORNERS} needed"
-    if np.linalg.matrix_rank(sighting.board_mm[:, :2] - sighting.board_mm[0, :2]) < 2:
+    best: Sighting | None = None
+    for ids, rough in _searches(board, picture):
+        if len(ids) < LEAST_CORNERS:
+            return f"{len(ids)} of {len(board.points_mm)} corners seen, {LEAST_CORNERS} needed"
+        first_x, first_y, width, height = cv2.boundingRect(rough.astype(np.float32))
+        if (
+            share := picture.white_share(slice(first_y, first_y + height), slice(first_x, first_x + width))
+        ) > CLIPPED_SHARE:
+            return f"clipped: {share:.0%} of the pixels on the board are saturated. Expose shorter"
+        rough_sighting = Sighting(picture.name, ids, board.points_mm[ids], rough)
+        sighting = _refined_corners(rough_sighting, board, picture, "green")
+        if best is None or len(sighting.ids) >= len(best.ids):
+            best = sighting
+        if len(sighting.ids) == len(board.points_mm):
+            break
+    assert best is not None  # the image itself is searched last
+    if len(best.ids) < LEAST_CORNERS:
+        return f"{len(best.ids)} of {len(ids)} corners are sharp enough, {LEAST_CORNERS} needed"
+    if np.linalg.matrix_rank(best.board_mm[:, :2] - best.board_mm[0, :2]) < 2:
         return "all corners seen lie on one line"
-    return sighting
+    return best
 
 
-def _search(board: Board, image: NDArray[Any]) -> tuple[NDArray[np.intp], Floats]:
-    """Return numbers and places of corners, to a pixel or so. A large image is searched at half its size first:
-    that takes a quarter of the time, and corners there are as good to begin the fit from, if all are found."""
-    import cv2
-
+def _searches(board: Board, picture: Picture) -> Iterator[tuple[NDArray[np.intp], Floats]]:
+    """Numbers and places of corners, to a pixel or so: of a large image at a quarter and at half of its size where
+    all are found, then at its own. Corners of a reduced image are as good to begin the fit from."""
     search = _chess if board.kind == "chessboard" else _charuco
-    if min(image.shape) < _HALVED_FROM_PX:
-        return search(board, _eight_bits(image))
-    height, width = image.shape
-    half = cv2.resize(
-        image[: height // 2 * 2, : width // 2 * 2], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA
-    )
-    ids, corners = search(board, _eight_bits(half))
-    if len(ids) == len(board.points_mm):
-        return ids, 2.0 * corners + 0.5
-    whole_ids, whole_corners = search(board, _eight_bits(image))
-    return (whole_ids, whole_corners) if len(whole_ids) >= len(ids) else (ids, 2.0 * corners + 0.5)
+    most: tuple[NDArray[np.intp], Floats] = np.zeros(0, dtype=np.intp), np.zeros((0, 2))
+    for factor in (*(n for n in _REDUCTIONS if min(picture.size_px) >= n * _SEARCHED_PX), 1):
+        ids, corners = search(board, _eight_bits(picture.reduced(factor)))
+        if len(ids) >= len(most[0]):
+            most = ids, factor * corners + 0.5 * (factor - 1)
+        if factor == 1 or len(ids) == len(board.points_mm):
+            yield most
 
 
 def in_channel(board: Board, picture: Picture, channel: Channel, green: Sighting) -> Sighting:
@@ -186,7 +192,8 @@ def _refined_corners(rough: Sighting, board: Board, picture: Picture, channel: C
         side_px = max(2, int(window_px / np.sqrt(2)))
         return replace(rough, pixels=refine(picture.plane(channel), rough.pixels, side_px))
     fit = fit_corners(values, mask, rough.pixels, window_px)
-    return Sighting(rough.name, rough.ids[fit.fits], rough.board_mm[fit.fits], fit.pixels[fit.fits])
+    u_px = np.sqrt(0.5 * np.trace(fit.covariance_px2[fit.fits], axis1=1, axis2=2))
+    return Sighting(rough.name, rough.ids[fit.fits], rough.board_mm[fit.fits], fit.pixels[fit.fits], u_px)
 
 
 def refine(image: NDArray[Any], corners: Floats, window_px: int) -> Floats:
@@ -207,7 +214,7 @@ def _eight_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
 
     if image.dtype == np.uint8:
         return np.ascontiguousarray(image)
-    step = max(1, image.shape[0] // 500)
+    step = max(1, image.shape[0] // 250)
     low, high = np.percentile(image[::step, ::step], [0.5, 99.5])
     scale = 255.0 / max(float(high - low), 1e-9)
     # `addWeighted` of one image, because it saturates at 0 and 255.

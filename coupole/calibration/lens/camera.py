@@ -186,6 +186,12 @@ def board_pose(sighting: Sighting, intrinsics: Intrinsics) -> Floats:
 def without_gross_errors(calibration: CameraCalibration) -> tuple[Sighting, ...]:
     """The sightings, less the corners that were left out."""
     return tuple(
-        replace(sighting, ids=sighting.ids[keep], board_mm=sighting.board_mm[keep], pixels=sighting.pixels[keep])
+        replace(
+            sighting,
+            ids=sighting.ids[keep],
+            board_mm=sighting.board_mm[keep],
+            pixels=sighting.pixels[keep],
+            u_px=None if sighting.u_px is None else sighting.u_px[keep],
+        )
         for sighting, keep in zip(calibration.sightings, calibration.accepted_masks, strict=True)
     )

@@ -1,48 +1,47 @@
 """Corners of a board to a few thousandths of a pixel: a model of two crossing edges, fitted to RAW pixels.
 
-About a corner at q the values are, with S_k the image of edge k integrated over a pixel's square,
+The model (`corner_kernel`) is that of a square pixel behind a blurred lens: sharp edges have no error that depends
+on their place between pixels, and no colour needs to be interpolated: pixels of other colours are not used. Each
+edge has a blur of its own. Two things are found from all corners of an image together:
 
-    (m + c ((2 S_1 - 1) (2 S_2 - 1) + r)) (1 + g (p - q))
-
-for level m, contrast c and a gradient g of the light. An edge under the angle a, blurred by a Gaussian of sigma,
-is seen by a square pixel as S(d) = [G(d + s) - G(d + t) - G(d - t) + G(d - s)] / (|cos a| |sin a|), where d is the
-distance of pixel and edge, s and t are half the sum and the difference of |cos a| and |sin a|, and G'' is the
-normal distribution (two boxes, then a Gaussian). So sharp edges have no error that depends on their place between
-pixels, and no colour needs to be interpolated: pixels of other colours are not used. The term r is the effect of
-blur where edges do not cross at 90 degrees: of the sign's expectation over two normal variables with the
-correlation k = n_1 n_2 of the edges' normals, the terms up to k^3 of the tetrachoric series (Pearson 1900).
+- noise: the variance a + b v of a pixel of value v, by the squared residuals. It gives each corner a covariance.
+- asymmetry of the blur (coma): its third cumulant across an edge of normal n is K n n n. The four numbers of K are
+  polynomials over the image, fitted to what the residuals of all corners say of them; then the corners are fitted
+  again with it. Found from a corner alone, it would make its noise a fifth larger. So corners are the images of
+  points by the blur's centre of gravity.
 """
 
 from __future__ import annotations
 
-import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.calibration.lens.corner_kernel import OWN, ROUND, SUMS, UNKNOWNS, fit_all
 from coupole.calibration.rotations import Floats
 
-_UNKNOWNS = 9
 _LEAST_PIXELS = 24
-_X, _Y, _FIRST, _SECOND, _SIGMA, _LEVEL, _CONTRAST, _ALONG_X, _ALONG_Y = range(_UNKNOWNS)
-_MOST_STEPS = 40
-_ABOUT_PX, _CLOSE_PX = 2e-3, 1e-4
-"""Last steps of the fits about the start, and about the corner found: a hundredth of the noise of a corner."""
 _FIRST_RADIUS_PX = 6.5
 """Largest radius of the window of the first fit, which only centres the second one's."""
-_WORST = 0.2
-"""Largest rms residual, as a share of the contrast: with a larger one the image is not that of a corner."""
-_LEAST_SIGMA_PX = 0.05
-_THIN = 0.01
-"""Least width of a box: an edge along the pixels' rows."""
-_SECTORS = 64
 _PART = 16
 """Corners that a thread fits at a time."""
+_REACH = 2.0
+"""Half of a window that holds all pixels of both fits, in radii: each fit may move by half a radius."""
+_ANGLES, _SIGMA, _SIGMA_2, _SKEWS = slice(2, 4), 4, 9, slice(12, 14)
+_ROUNDS = 3
+_LEAST_CORNERS = (12, 30, 60)
+"""Least number of corners for an asymmetry that is the same, linear, quadratic over the image."""
+_CLEAR = 3.0
+"""Least fall of the squared residuals, over their variance and the number of coefficients, for an asymmetry."""
+_FLOOR_PX = 3e-4
+"""Error of the fit without noise where the blur is symmetric: rms, by `tools/prove_corners.py`."""
+_SKEW_LEFT = 0.17
+"""Error that is left of an asymmetry's correction, as a share of it, by the same."""
+Blur = Literal["own", "round"]
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,9 @@ class Corners:
     fits: NDArray[np.bool_]
     """[n] False where no corner was found; `pixels` are then those of the start."""
     sigma_px: Floats
-    """[n] blur of the image."""
+    """[n] blur of the image: geometric mean of those across both edges."""
+    covariance_px2: Floats
+    """[n, 2, 2] of the places; NaN where no corner was found."""
 
 
 def enough_pixels(mask_tile: NDArray[np.bool_], radius_px: float) -> bool:
@@ -62,200 +63,143 @@ def enough_pixels(mask_tile: NDArray[np.bool_], radius_px: float) -> bool:
     return bool(np.pi * radius_px**2 * mask_tile.mean() >= _LEAST_PIXELS)
 
 
-def fit_corners(image: NDArray[Any], mask_tile: NDArray[np.bool_], rough: Floats, radius_px: float) -> Corners:
+def fit_corners(
+    image: NDArray[Any], mask_tile: NDArray[np.bool_], rough: Floats, radius_px: float, *, blur: Blur = "own"
+) -> Corners:
     """Corners about `rough` [n, 2] from the pixels within `radius_px`, of which there must be `enough_pixels`.
 
     `image` [H, W] are RAW values; `mask_tile` [h, w] is the mask of the pixels to use, a tile that repeats over
-    the image.
+    the image. With a `round` blur, both edges have the same, and it is symmetric.
     """
     first_radius_px = radius_px
     if radius_px > _FIRST_RADIUS_PX and enough_pixels(mask_tile, _FIRST_RADIUS_PX):
         first_radius_px = _FIRST_RADIUS_PX
-    values = np.ascontiguousarray(image, dtype=np.float32)
-    unknowns = np.full((len(rough), _UNKNOWNS), np.nan)
-    mask, starts = np.ascontiguousarray(mask_tile), np.ascontiguousarray(rough, dtype=np.float64)
+    many = OWN if blur == "own" else ROUND
+    windows = _Windows(image, np.ascontiguousarray(mask_tile), (radius_px, first_radius_px), many)
+    starts, skew = np.ascontiguousarray(rough, dtype=np.float64), np.zeros((len(rough), 2))
+    corner_fits = _fit_in_threads(windows, starts, skew)
+    for _ in range(_ROUNDS if blur == "own" else 0):
+        more = _asymmetry(corner_fits, corner_fits.noise(many))
+        if not more.any():
+            break
+        skew += more
+        corner_fits = _fit_in_threads(windows, starts, skew)
+    fits = np.isfinite(corner_fits.solutions[:, 0])
+    pixels = np.where(fits[:, None], corner_fits.solutions[:, :2], rough)
+    covariance = np.full((len(rough), 2, 2), np.nan)
+    covariance[fits] = corner_fits.part(fits).covariance(corner_fits.noise(many), many)
+    sigma_px = np.sqrt(corner_fits.solutions[:, _SIGMA] * corner_fits.solutions[:, _SIGMA_2])
+    return Corners(pixels, fits, sigma_px, covariance)
+
+
+def _fit_in_threads(windows: _Windows, starts: Floats, skew: Floats) -> _Fitted:
+    corner_fits = _Fitted.empty(len(starts))
     # Compiled before threads call it: numba's types, looked up by several at once, fail at times.
-    _fit_all(values, mask, starts[:0], radius_px, first_radius_px, unknowns[:0])
+    windows.fit(starts[:0], skew[:0], corner_fits.part(slice(0, 0)))
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         parts = (slice(first, first + _PART) for first in range(0, len(starts), _PART))
-        list(
-            pool.map(
-                lambda part: _fit_all(values, mask, starts[part], radius_px, first_radius_px, unknowns[part]),
-                parts,
-            )
-        )
-    fits = np.isfinite(unknowns[:, _X])
-    return Corners(np.where(fits[:, None], unknowns[:, :2], rough), fits, unknowns[:, _SIGMA].copy())
+        list(pool.map(lambda part: windows.fit(starts[part], skew[part], corner_fits.part(part)), parts))
+    return corner_fits
 
 
-@numba.njit(cache=True, nogil=True)
-def _fit_all(image, mask_tile, rough, radius, first_radius, solutions):  # type: ignore[no-untyped-def]
-    for n in range(len(rough)):
-        unknowns = np.zeros(_UNKNOWNS)
-        unknowns[_X], unknowns[_Y] = rough[n]
-        if not _start(image, mask_tile, radius, unknowns):
-            continue
-        # Again about the corner found: a window that is not centred on it would bias the result.
-        fits = _fit(image, mask_tile, rough[n, 0], rough[n, 1], first_radius, unknowns, _ABOUT_PX)
-        if fits and _fit(image, mask_tile, unknowns[_X], unknowns[_Y], radius, unknowns, _CLOSE_PX):
-            # A gradient of light shifts blurred edges: p F, blurred, is p F + sigma^2 grad F.
-            spread2 = unknowns[_SIGMA] ** 2 + 1.0 / 12.0
-            unknowns[_X] += spread2 * unknowns[_ALONG_X]
-            unknowns[_Y] += spread2 * unknowns[_ALONG_Y]
-            for k in range(_UNKNOWNS):
-                solutions[n, k] = unknowns[k]
+@dataclass(frozen=True)
+class _Windows:
+    """An image, and how corners are fitted in it."""
+
+    image: NDArray[Any]
+    mask_tile: NDArray[np.bool_]
+    radii_px: tuple[float, float]
+    many: int
+
+    def fit(self, rough: Floats, skew: Floats, corner_fits: _Fitted) -> None:
+        """Fit corners [n] of a given asymmetry [n, 2]; only the pixels that a fit can reach are converted."""
+        shape = self.image.shape[:2]
+        size_px = np.minimum(2 * int(_REACH * self.radii_px[0] + 2.0) + 1, shape)
+        firsts = np.clip(np.rint(rough[:, ::-1]).astype(np.intp) - size_px // 2, 0, shape - size_px)
+        windows = np.empty((len(rough), *size_px), np.float32)
+        for window, (row, col) in zip(windows, firsts, strict=True):
+            window[:] = self.image[row : row + size_px[0], col : col + size_px[1]]
+        arrays = (corner_fits.solutions, corner_fits.normals, corner_fits.scaled_normals, corner_fits.sums)
+        fit_all(windows, firsts, self.mask_tile, rough, skew, self.radii_px, self.many, arrays)
 
 
-@numba.njit(cache=True, nogil=True)
-def _start(image, mask_tile, radius, unknowns):  # type: ignore[no-untyped-def]
-    """Directions of both edges, level and contrast by the values around the corner; False without four sectors."""
-    sums, counts = np.zeros(_SECTORS), np.zeros(_SECTORS)
-    x, y = unknowns[_X], unknowns[_Y]
-    for row in range(max(0, math.ceil(y - radius)), min(image.shape[0], math.floor(y + radius) + 1)):
-        for col in range(max(0, math.ceil(x - radius)), min(image.shape[1], math.floor(x + radius) + 1)):
-            far = math.hypot(col - x, row - y)
-            if (
-                far > radius
-                or far < 0.4 * radius
-                or not mask_tile[row % mask_tile.shape[0], col % mask_tile.shape[1]]
-            ):
-                continue
-            angle = math.atan2(row - y, col - x) % (2.0 * math.pi)
-            sector = int(angle / (2.0 * math.pi) * _SECTORS) % _SECTORS
-            # Spread over neighbours, so that there is no gap where pixels are few.
-            for step in range(-2, 3):
-                weight = 3.0 - abs(step)
-                sums[(sector + step) % _SECTORS] += weight * image[row, col]
-                counts[(sector + step) % _SECTORS] += weight
-    if counts.min() == 0.0:
-        return False
-    around = sums / counts
-    level, contrast = 0.5 * (around.max() + around.min()), 0.5 * (around.max() - around.min())
-    if contrast <= 0.0:
-        return False
-    crossings, many, rises = np.zeros(4), 0, 0.0
-    for k in range(_SECTORS):
-        here, there = around[k] - level, around[(k + 1) % _SECTORS] - level
-        if (here > 0.0) != (there > 0.0):
-            if many == 4:
-                return False
-            crossings[many] = (k + 0.5 + here / (here - there)) * 2.0 * math.pi / _SECTORS
-            if many == 0:
-                rises = 1.0 if there > 0.0 else -1.0
-            many += 1
-    if many != 4:
-        return False
-    for k in range(2):
-        # Opposite crossings are one edge, seen from both sides.
-        unknowns[_FIRST + k] = 0.5 * (crossings[k] + crossings[k + 2] - math.pi)
-    unknowns[_SIGMA], unknowns[_LEVEL] = 0.7, level
-    # After the first crossing a point is on the first edge's left and on the second one's right.
-    unknowns[_CONTRAST] = -rises * contrast
-    return True
+@dataclass(frozen=True)
+class _Fitted:
+    """Solutions [n, 14], normal matrices [n, 15, 15], plain and weighted by the pixels' values, sums [n, 5]: as
+    `corner_kernel.fit_all` writes them."""
+
+    solutions: Floats
+    normals: Floats
+    scaled_normals: Floats
+    sums: Floats
+
+    @staticmethod
+    def empty(count: int) -> _Fitted:
+        matrices = np.zeros((2, count, UNKNOWNS + 1, UNKNOWNS + 1))
+        return _Fitted(np.full((count, UNKNOWNS), np.nan), matrices[0], matrices[1], np.zeros((count, SUMS)))
+
+    def part(self, rows: slice | NDArray[np.bool_]) -> _Fitted:
+        return _Fitted(self.solutions[rows], self.normals[rows], self.scaled_normals[rows], self.sums[rows])
+
+    def noise(self, many: int) -> tuple[float, float]:
+        """Variance a + b v of a pixel of value v: a, b, not negative, by the squared residuals of all corners."""
+        freedom = self.sums[:, 0] / np.maximum(self.sums[:, 0] - many, 1.0)
+        count, value, value2 = np.maximum(self.sums[:, :3].sum(axis=0), 1e-30)
+        square, by_value = (self.sums[:, 3:] * freedom[:, None]).sum(axis=0)
+        value_spread = count * value2 - value**2
+        b = (count * by_value - value * square) / value_spread if value_spread > 1e-9 * count * value2 else 0.0
+        b = min(max(b, 0.0), square / value if value > 0.0 else 0.0)
+        return (square - b * value) / count, b
+
+    def covariance(self, noise: tuple[float, float], many: int) -> Floats:
+        """[n, 2, 2] of the places, px^2. Where a corner's residuals are larger than this noise, all of its
+        covariance is."""
+        a, b = noise
+        normal, scaled_normals = self.normals[:, :many, :many], self.scaled_normals[:, :many, :many]
+        across = np.linalg.pinv(normal, hermitian=True)[:, :2]
+        covariance = across @ (a * normal + b * scaled_normals) @ np.swapaxes(across, 1, 2)
+        count, value, _, square, _ = self.sums.T
+        expected_squares = np.maximum((a * count + b * value) * np.maximum(count - many, 1.0) / count, 1e-30)
+        through = across @ self.normals[:, :many, _SKEWS]
+        left_px = _SKEW_LEFT * np.einsum("nij,nj->ni", through, self.solutions[:, _SKEWS])
+        covariance *= np.maximum(1.0, square / expected_squares)[:, None, None]
+        return np.asarray(covariance + left_px[:, :, None] * left_px[:, None, :] + _FLOOR_PX**2 * np.eye(2))
 
 
-@numba.njit(cache=True, nogil=True)
-def _fit(image, mask_tile, x, y, radius, unknowns, close_px):  # type: ignore[no-untyped-def]
-    """Levenberg-Marquardt until a step is below `close_px`; False if it diverges or the residual is too large."""
-    squares, count, normal, right = _equations(image, mask_tile, x, y, radius, unknowns)
-    damping = 1e-3
-    for _ in range(_MOST_STEPS):
-        damped_normal = normal.copy()
-        for k in range(_UNKNOWNS):
-            damped_normal[k, k] *= 1.0 + damping
-            damped_normal[k, k] += 1e-12
-        trial = unknowns + np.linalg.solve(damped_normal, right)
-        trial[_SIGMA] = min(max(trial[_SIGMA], _LEAST_SIGMA_PX), 0.5 * radius)
-        if math.hypot(trial[_X] - x, trial[_Y] - y) > 0.5 * radius or not np.all(np.isfinite(trial)):
-            return False
-        tried_squares, count, tried_normal, tried_right = _equations(image, mask_tile, x, y, radius, trial)
-        if tried_squares <= squares:
-            change = math.hypot(trial[_X] - unknowns[_X], trial[_Y] - unknowns[_Y])
-            for k in range(_UNKNOWNS):
-                unknowns[k] = trial[k]
-            squares, normal, right = tried_squares, tried_normal, tried_right
-            damping *= 0.1
-            if change < close_px:
-                break
-        else:
-            damping *= 10.0
-            if damping > 1e8:
-                break
-    return count > 2 * _UNKNOWNS and squares <= count * (_WORST * unknowns[_CONTRAST]) ** 2
+def _asymmetry(corner_fits: _Fitted, noise: tuple[float, float]) -> Floats:
+    """[n, 2] by how much the residuals ask to change the third cumulants of the blur across both edges; zero if
+    they do not ask clearly."""
+    none = np.zeros((len(corner_fits.solutions), 2))
+    is_found = np.isfinite(corner_fits.solutions[:, 0])
+    corners = corner_fits.part(is_found)
+    if (count := len(corners.solutions)) < _LEAST_CORNERS[0]:
+        return none
+    free = slice(0, OWN)
+    beside, residual_side = corners.normals[:, free, _SKEWS], corners.normals[:, :, -1]
+    through = np.linalg.pinv(corners.normals[:, free, free], hermitian=True) @ beside
+    information = corners.normals[:, _SKEWS, _SKEWS] - np.swapaxes(beside, 1, 2) @ through
+    side = residual_side[:, _SKEWS] - np.einsum("nij,ni->nj", through, residual_side[:, free])
+    design = _tensor_rows(corners.solutions, sum(count >= least for least in _LEAST_CORNERS) - 1)
+    matrix = np.einsum("nik,nij,njl->kl", design, information, design)
+    vector = np.einsum("nik,ni->k", design, side)
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
+    inverse = np.linalg.pinv(matrix / np.outer(scale, scale), rcond=1e-6, hermitian=True)
+    coefficients = inverse @ (vector / scale) / scale
+    a, b = noise
+    variance = a + b * corners.sums[:, 1].sum() / corners.sums[:, 0].sum()
+    if vector @ coefficients >= _CLEAR * len(coefficients) * max(variance, 1e-30):
+        none[is_found] = design @ coefficients
+    return none
 
 
-@numba.njit(cache=True, nogil=True)
-def _equations(image, mask_tile, middle_x, middle_y, radius, unknowns):  # type: ignore[no-untyped-def]
-    """Sum of squared residuals, number of pixels, normal matrix [9, 9] and right-hand side [9] of one step."""
-    x, y, sigma = unknowns[_X], unknowns[_Y], unknowns[_SIGMA]
-    level, contrast = unknowns[_LEVEL], unknowns[_CONTRAST]
-    cos1, sin1 = math.cos(unknowns[_FIRST]), math.sin(unknowns[_FIRST])
-    cos2, sin2 = math.cos(unknowns[_SECOND]), math.sin(unknowns[_SECOND])
-    normal, right, slope = np.zeros((_UNKNOWNS, _UNKNOWNS)), np.zeros(_UNKNOWNS), np.empty(_UNKNOWNS)
-    squares, count = 0.0, 0
-    height, width = image.shape
-    together = cos1 * cos2 + sin1 * sin2
-    blur_px = math.sqrt(sigma * sigma + 1.0 / 12.0)
-    for row in range(max(0, math.ceil(middle_y - radius)), min(height, math.floor(middle_y + radius) + 1)):
-        for col in range(max(0, math.ceil(middle_x - radius)), min(width, math.floor(middle_x + radius) + 1)):
-            if not mask_tile[row % mask_tile.shape[0], col % mask_tile.shape[1]]:
-                continue
-            if (col - middle_x) ** 2 + (row - middle_y) ** 2 > radius * radius:
-                continue
-            right_x, down_y = col - x, row - y
-            # Distance on the left of an edge that points along (cos, sin), and how far along it.
-            apart1, along1 = cos1 * down_y - sin1 * right_x, cos1 * right_x + sin1 * down_y
-            apart2, along2 = cos2 * down_y - sin2 * right_x, cos2 * right_x + sin2 * down_y
-            edge_one, one_apart, one_sigma = _edge(apart1, abs(cos1), abs(sin1), sigma)
-            edge_two, two_apart, two_sigma = _edge(apart2, abs(cos2), abs(sin2), sigma)
-            light = 1.0 + unknowns[_ALONG_X] * right_x + unknowns[_ALONG_Y] * down_y
-            checks = edge_one * edge_two + _crossing(apart1 / blur_px, apart2 / blur_px, together)
-            board = level + contrast * checks
-            by_one, by_two = light * contrast * edge_two * one_apart, light * contrast * edge_one * two_apart
-            slope[_X] = by_one * sin1 + by_two * sin2 - board * unknowns[_ALONG_X]
-            slope[_Y] = -by_one * cos1 - by_two * cos2 - board * unknowns[_ALONG_Y]
-            slope[_FIRST], slope[_SECOND] = -by_one * along1, -by_two * along2
-            slope[_SIGMA] = light * contrast * (edge_two * one_sigma + edge_one * two_sigma)
-            slope[_LEVEL], slope[_CONTRAST] = light, light * checks
-            slope[_ALONG_X], slope[_ALONG_Y] = board * right_x, board * down_y
-            residual = image[row, col] - board * light
-            squares += residual * residual
-            count += 1
-            for i in range(_UNKNOWNS):
-                right[i] += slope[i] * residual
-                for j in range(i + 1):
-                    normal[i, j] += slope[i] * slope[j]
-    for i in range(_UNKNOWNS):
-        for j in range(i):
-            normal[j, i] = normal[i, j]
-    return squares, count, normal, right
-
-
-@numba.njit(cache=True, nogil=True)
-def _crossing(a, b, together):  # type: ignore[no-untyped-def]
-    """The rest r at a point `a` and `b` standard deviations of blur away from the edges."""
-    squares = a * a + b * b
-    if squares > 72.0:
-        return 0.0
-    series = 1.0 + together * a * b / 2.0 + together * together * (a * a - 1.0) * (b * b - 1.0) / 6.0
-    return 2.0 / math.pi * math.exp(-0.5 * squares) * together * series
-
-
-@numba.njit(cache=True, nogil=True)
-def _edge(apart, wide, high, sigma):  # type: ignore[no-untyped-def]
-    """2 S - 1 of an edge at distance `apart` from a pixel's middle, and its derivatives by that and by sigma."""
-    wide, high = max(wide, _THIN), max(high, _THIN)
-    outer, inner = 0.5 * (wide + high), 0.5 * (wide - high)
-    if abs(apart) > outer + 6.0 * sigma:
-        return (1.0 if apart > 0.0 else -1.0), 0.0, 0.0
-    value, by_apart, by_sigma = 0.0, 0.0, 0.0
-    for k in range(4):
-        t = apart + (outer, inner, -inner, -outer)[k]
-        sign = (1.0, -1.0, -1.0, 1.0)[k]
-        below = 0.5 * math.erfc(-t / (sigma * math.sqrt(2.0)))
-        bell = sigma * math.exp(-0.5 * (t / sigma) ** 2) / math.sqrt(2.0 * math.pi)
-        value += sign * 0.5 * ((t * t + sigma * sigma) * below + t * bell)
-        by_apart += sign * (t * below + bell)
-        by_sigma += sign * sigma * below
-    per_area = 2.0 / (wide * high)
-    return per_area * value - 1.0, per_area * by_apart, per_area * by_sigma
+def _tensor_rows(solutions: Floats, degree: int) -> Floats:
+    """[n, 2, k] derivatives of the cumulants across the edges by the polynomials' coefficients."""
+    # The distance of an edge grows along (-sin, cos).
+    angles = solutions[:, _ANGLES]
+    normal_x, normal_y = -np.sin(angles), np.cos(angles)
+    tensor = np.stack([normal_x**3, normal_x**2 * normal_y, normal_x * normal_y**2, normal_y**3], axis=-1)
+    places = solutions[:, :2] - solutions[:, :2].mean(axis=0)
+    x, y = (places / max(float(np.abs(places).max()), 1.0)).T
+    terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)
+    rows = tensor[:, :, :, None] * terms[:, None, None, :]
+    return np.asarray(rows.reshape(len(solutions), 2, -1))

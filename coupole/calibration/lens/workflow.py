@@ -91,7 +91,11 @@ def camera_from(
             request.limits,
             {**image_figures(fit, board_images), "ray_px": ray_u_px(fit), **doubted_figures(fit.doubts)},
         ),
-        remarks=(*board_images.left_out, *sentences_of(fit.doubts)),
+        remarks=(
+            *board_images.left_out,
+            *sentences_of(fit.doubts),
+            *sentences_of_pixels(good_sightings, fit.sigma_px),
+        ),
         fixed=held_parameters(fit.intrinsics, fit.free),
         images=image_lines(good_sightings, residuals, fit.sightings),
         **content_of(board_images, sources, request),
@@ -271,6 +275,18 @@ def doubted_figures(doubts: Doubts | None) -> dict[str, float]:
 
 def sentences_of(doubts: Doubts | None) -> tuple[str, ...]:
     return () if doubts is None else tuple(doubts.sentences())
+
+
+def sentences_of_pixels(sightings: Sequence[Sighting], found_px: float) -> tuple[str, ...]:
+    """Compare the corners' noise in the adjustment with what their pixels say of it."""
+    u_px = [sighting.u_px for sighting in sightings if sighting.u_px is not None]
+    if not u_px:
+        return ()
+    by_pixels_px = float(np.sqrt(np.mean(np.concatenate(u_px) ** 2)))
+    return (
+        f"noise of a corner {found_px:.2g} px by the residuals, {by_pixels_px:.2g} px by its pixels alone; the "
+        "rest is board, lens and movement",
+    )
 
 
 def _hand_eye_figures(result: HandEyeCalibration) -> dict[str, float]:

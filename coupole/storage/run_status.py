@@ -178,21 +178,20 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
             status.before_that = _confirmation(run)
     if result:
         frames_left = bool(status.frames_left or status.open_views)
-        gone = [event for event in events if isinstance(event, FramesDiscarded)]
-        place = place_of_result(run, gone[-1]) if gone else Path(result)
-        told = processing_of(run.folder, place, frames_left=frames_left, in_use=in_use)
-        status.processing = _without_samples(told, place, gone)
+        discards = [event for event in events if isinstance(event, FramesDiscarded)]
+        place = place_of_result(run, discards[-1]) if discards else Path(result)
+        processing = processing_of(run.folder, place, frames_left=frames_left, in_use=in_use)
+        status.processing = _with_samples(processing, place, discards)
     return status
 
 
-def _without_samples(told: Processing, place: Path, gone: Sequence[FramesDiscarded]) -> Processing:
-    """What is told of the processing, unless samples that stand for discarded frames are not where they were: then
-    no command goes on from there."""
-    missing = [place / event.samples for event in gone if not (place / event.samples).exists()]
+def _with_samples(processing: Processing, place: Path, discards: Sequence[FramesDiscarded]) -> Processing:
+    """The processing, failed if samples that stand for discarded frames are not where they were."""
+    missing = [place / event.samples for event in discards if not (place / event.samples).exists()]
     if not missing:
-        return told
+        return processing
     why = f"{missing[0]} is missing: put it back from a copy; nothing else has these samples"
-    return Processing(told.result, "failed", told.views_done, told.views, why=why)
+    return Processing(processing.result, "failed", processing.views_done, processing.views, why=why)
 
 
 def _confirmation(run: Run) -> str:

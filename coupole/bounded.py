@@ -196,18 +196,19 @@ def run_bounded(
     *,
     stop: threading.Event | None = None,
     rescue: Callable[[], object] = lambda: None,
-    discard: Callable[[T], object] = lambda found: None,
+    discard: Callable[[T], object] | None = None,
     since_s: float | None = None,
 ) -> T:
     """Do it in a thread of its own, and wait until it has ended or a call is to be given up; what it raises is
     raised here. `stop` tells that it is to end, `rescue` is called before a call is given up, which may bring that
-    back; what comes after all is passed to `discard`. Calls are looked at that begin from now on, or `since_s`.
+    back; what comes after all is passed to `discard`. Without `discard` the thread ends as soon as its call
+    returns. Calls are looked at that begin from now on, or `since_s`.
 
     Raises DeviceTimeout or StorageError for a call that is given up, and what a signal raises.
     """
     since_s = time.monotonic() if since_s is None else since_s
     stopped_s = math.inf
-    runner = _Runner(do, discard)
+    runner = _Runner(do, discard or (lambda found: None))
     try:
         while not runner.has_ended(_LOOK_S):
             if stop is not None and stop.is_set():
@@ -219,6 +220,8 @@ def run_bounded(
                 rescue()
                 if not runner.has_ended(_BACK_S) and runner.leave():
                     leave_behind(call)
+                    if discard is None:
+                        runner.interrupt()
                     raise call.error()
     except BaseException:
         if not runner.is_left:  # a signal, here

@@ -1,14 +1,18 @@
 """Devices whose calls are noted (`coupole.bounded`), so that one that never returns is noticed and left behind.
 
-The limit of a call is derived from its work. Drivers have their own time-outs, which are shorter.
+The limit of a call is derived from its work. Drivers have their own time-outs, which are shorter. Once the cell
+was made safe, calls that light a lamp or move the arm are refused: a thread that was left behind in a call may go
+on when that call returns after all.
 """
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from coupole.bounded import under_way
+from coupole.errors import DeviceRefused
 from coupole.kinematics import move_duration_s
 from coupole.motion.itinerary import arm_of
 from coupole.plan.rig import Rig
@@ -25,6 +29,7 @@ _WORK_S: Mapping[str, Callable[..., float]] = {
     "flash": lambda led, on_us: on_us * 1e-6,
     "load": lambda table: len(table) * _STEP_BYTES / _SLOWEST_BYTES_S,
 }
+_LIGHTS_OR_MOVES = frozenset({"flash", "move_to", "panel", "start"})
 _SETTLES = 2.0
 """Times of a motion for which drivers wait at most."""
 
@@ -32,8 +37,9 @@ _SETTLES = 2.0
 class NotedDevice:
     """A device, but for the notes."""
 
-    def __init__(self, device: Any, kind: str, rig: Rig) -> None:
-        self._device, self._kind, self._rig = device, kind, rig
+    def __init__(self, device: Any, kind: str, rig: Rig, made_safe: threading.Event) -> None:
+        """`made_safe` is set before the lights are switched off and the arm is stopped at the end."""
+        self._device, self._kind, self._rig, self._made_safe = device, kind, rig, made_safe
         self._speed = 1.0
 
     def __getattr__(self, name: str) -> Any:
@@ -46,6 +52,7 @@ class NotedDevice:
 
         def call(*arguments: Any, **keywords: Any) -> Any:
             with under_way(of, name, work_s(*arguments, **keywords) if work_s else 0.0):
+                self._refuse_after_the_end(name)
                 return value(*arguments, **keywords)
 
         self.__dict__[name] = call  # found at once the next time
@@ -54,7 +61,18 @@ class NotedDevice:
     def move_to(self, joints_deg: Any, speed: float = 1.0) -> None:
         self._speed = speed
         with under_way(NAMES[self._kind], "move_to"):
+            self._refuse_after_the_end("move_to")
             self._device.move_to(joints_deg, speed)
+
+    def _refuse_after_the_end(self, name: str) -> None:
+        """Raise DeviceRefused for what lights or moves, once the cell was made safe."""
+        if name in _LIGHTS_OR_MOVES and self._made_safe.is_set():
+            raise DeviceRefused(
+                NAMES[self._kind],
+                expected="no light and no motion after the cell was made safe",
+                happened=f"`{name}` was called",
+                remedy="The session has ended; resume the run.",
+            )
 
     def _longest_motion_s(self) -> float:
         """Return the time of a motion from one end of the axes' ranges to the other, at the speed of the last

@@ -60,13 +60,18 @@ class OpenedCell:
     """False if the arm was not confirmed to be at rest at the end."""
     lights_confirmed: bool = True
     """False if the lights were not confirmed to be off at the end."""
-    made_safe: bool = False
-    """`make_safe` was called: nothing may be lit or moved any more."""
     switched_off_ns: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=16))
     """Times on the rig's clock, the newest last: when the box was told to switch the lights off, and when it had
     answered."""
+    _made_safe: threading.Event = field(default_factory=threading.Event, repr=False)
+    """Shared with the devices, which light and move nothing once it is set."""
     _first: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _safeguards_ended: threading.Event = field(default_factory=threading.Event, repr=False)
+
+    @property
+    def made_safe(self) -> bool:
+        """`make_safe` was called: nothing is lit or moved any more."""
+        return self._made_safe.is_set()
 
     def halt(self) -> list[Safeguard]:
         """Begin to switch the lights off and to stop the arm, side by side; returns at once. From any thread."""
@@ -90,7 +95,8 @@ class OpenedCell:
         or hangs. Signals wait. Only the first call acts, others wait for it: nothing may be lit or moved after
         it."""
         with self._first:
-            is_first, self.made_safe = not self.made_safe, True
+            is_first = not self.made_safe
+            self._made_safe.set()
         if not is_first:
             self._safeguards_ended.wait()  # each safeguard is given up after its time
             return
@@ -137,11 +143,12 @@ def open_cell(
             stack.callback(world.close)
             clock, endpoints = world.clock, world.endpoints
         devices: dict[str, Any] = {}
+        made_safe = threading.Event()
         identities: dict[str, Identity] = {}
         for kind in ("ledbox", "camera", "robot"):
             begin = partial(_open_device, cell.rig, kind, clock, endpoints, dry_run=dry_run, speed=speed or 1.0)
             device = run_bounded(begin, discard=lambda late: late.close())
-            devices[kind] = NotedDevice(device, kind, cell.rig)
+            devices[kind] = NotedDevice(device, kind, cell.rig, made_safe)
             stack.push(partial(_close, devices[kind], NAMES[kind]))
             identities[kind] = run_bounded(devices[kind].identify)
             on_opened(kind, identities[kind])
@@ -154,6 +161,7 @@ def open_cell(
             is_simulated=endpoints is not None,
             world_endpoints=endpoints,
             identities=identities,
+            _made_safe=made_safe,
         )
         try:
             yield opened_cell

@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
@@ -41,6 +42,8 @@ class Hang:
     file: str = ""
     again: bool = False
     """Later calls hang as well."""
+    lasts_s: float | None = None
+    """It returns after that time, if any is given."""
     k: int = 0
     """The k-th call of all devices hangs, in place of one with a name."""
     count: int = 0
@@ -56,6 +59,9 @@ class Hang:
         if mine:
             (folder / "hangs").write_text(name)
             (folder / "hangs").rename(folder / "hanging")
+            if self.lasts_s is not None:
+                time.sleep(self.lasts_s)
+                return
             while True:
                 os.open(folder / "fifo", os.O_RDONLY)  # nobody ever writes
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from cells import TOP, CellFolder, Ended
 from never_returning import Hang, Session, begin
+from real_cells import true_dose_lux_h
 
 from sim.world.client import World
 
@@ -70,6 +71,32 @@ more = [
         "robot.stopping_deg": "",
     }.items()
 ]
+
+
+@pytest.mark.parametrize("lasts_s", [2.6, pytest.param(3.0, marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    ("name", "after", "code"),
+    [
+        pytest.param("disk.fdatasync", "camera.arm", 6, id="a disk before a burst"),
+        pytest.param("robot.measured", "camera.configure", 4, id="an arm before a burst"),
+        pytest.param("led box.load", "", 4, id="a table that is uploaded"),
+        pytest.param("robot.stopping_deg", "", 4, id="an arm before a motion"),
+    ],
+)
+def test_what_returns_after_it_was_given_up_lights_and_moves_nothing_more(
+    name: str, after: str, code: int, lasts_s: float, cell: CellFolder
+) -> None:
+    """The thread that was left behind ends: the cell was made safe, and nobody watches."""
+    with cell.world() as world:
+        before = world.ask("state")["joints_deg"]
+        session = begin(cell, Hang(name, after, lasts_s=lasts_s))
+        session.wait_until_it_hangs()
+        ended = session.ended()
+        assert (ended.code, dark_and_still(world)) == (code, True), ended
+        assert true_dose_lux_h(cell, world).max() == 0.0
+        if name == "robot.stopping_deg":
+            assert world.ask("state")["joints_deg"] == pytest.approx(before, abs=0.05)
+    can_be_resumed(cell)
 
 
 @pytest.mark.parametrize(

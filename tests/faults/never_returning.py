@@ -42,8 +42,8 @@ class Hang:
     file: str = ""
     again: bool = False
     """Later calls hang as well."""
-    lasts_s: float | None = None
-    """It returns after that time, if any is given."""
+    returns: bool = False
+    """It returns as soon as it was given up."""
     k: int = 0
     """The k-th call of all devices hangs, in place of one with a name."""
     count: int = 0
@@ -59,8 +59,9 @@ class Hang:
         if mine:
             (folder / "hangs").write_text(name)
             (folder / "hangs").rename(folder / "hanging")
-            if self.lasts_s is not None:
-                time.sleep(self.lasts_s)
+            while self.returns and not bounded.left_behind():
+                time.sleep(0.01)
+            if self.returns:
                 return
             while True:
                 os.open(folder / "fifo", os.O_RDONLY)  # nobody ever writes

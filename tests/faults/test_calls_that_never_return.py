@@ -73,7 +73,6 @@ more = [
 ]
 
 
-@pytest.mark.parametrize("lasts_s", [2.6, pytest.param(3.0, marks=pytest.mark.full)])
 @pytest.mark.parametrize(
     ("name", "after", "code"),
     [
@@ -84,12 +83,12 @@ more = [
     ],
 )
 def test_what_returns_after_it_was_given_up_lights_and_moves_nothing_more(
-    name: str, after: str, code: int, lasts_s: float, cell: CellFolder
+    name: str, after: str, code: int, cell: CellFolder
 ) -> None:
     """The thread that was left behind ends: the cell was made safe, and nobody watches."""
     with cell.world() as world:
         before = world.ask("state")["joints_deg"]
-        session = begin(cell, Hang(name, after, lasts_s=lasts_s))
+        session = begin(cell, Hang(name, after, returns=True))
         session.wait_until_it_hangs()
         ended = session.ended()
         assert (ended.code, dark_and_still(world)) == (code, True), ended

@@ -191,7 +191,7 @@ def print_halves(folder: Path) -> None:
 def main() -> int:
     """Run the proof; see the module's text."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--boards", type=int, default=6, help="board boards of each stratum")
+    parser.add_argument("--boards", type=int, default=6, help="boards of each stratum")
     parser.add_argument("--strata", type=int, default=len(STRATA), help="number of strata")
     parser.add_argument("--first", type=int, default=0, help="number of the first one")
     parser.add_argument("--pictures", type=Path, help="folder of real pictures, PNG, of a board of 9 x 6 corners")

@@ -132,8 +132,10 @@ def _check_board(
     assert sources is not None  # `paths` has at least one
     assert target is not None
     check = compare_lengths(lengths, position.camera.covariance, 1e-6 * target.scale_u_ppm, permissible)
-    size_px = record_of_kind["hand-eye"].record.validity.size_px
-    assert size_px is not None  # a record of a lens has it
+    hand_eye = record_of_kind["hand-eye"]
+    size_px = hand_eye.record.validity.size_px
+    if size_px is None:
+        raise InputError(f"{hand_eye.path}: expected `validity.size_px`, the size of its images; found none")
     pictures = Pictures(sources.about, size_px, tuple(dict.fromkeys(inputs)))
     return check_outcome(check, sources.artefacts[0], pictures, record_of_kind, request)
 

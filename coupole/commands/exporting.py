@@ -15,6 +15,7 @@ from coupole.commands.export_options import ExportOptions, ToOption
 from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError
 from coupole.exchange.formats import Writer, format_named, refuse_others_options, source_of
+from coupole.storage import so_far
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -91,9 +92,11 @@ def export(
     from coupole.viewing.terminal import bytes_text, make_console
 
     folder = source if options.in_place else out or source / "export"
-    request = Asked(source, to, folder, overwrite, options.given_options())
+    request = Asked(so_far.as_it_is_now(source), to, folder, overwrite, options.given_options())
     console = make_console(quiet=as_json)
     try:
+        if out is None and source.name == so_far.LINK:
+            raise InputError(f"{source}: give --out; its folder is removed when the result is complete")
         if options.in_place and out is not None:
             raise InputError("--in-place writes into SOURCE: give it, or --out, not both")
         summary = _write_export(request, console)

@@ -7,7 +7,7 @@
       progress.json         progress, for people: written again and again, never synced
       lock                  locked by the process at work
       normals.png           normals of the newest view, by a quick fit
-      RUN-2-of-3-views/     result of the views so far (`coupole.storage.so_far`)
+      RUN-2-of-3-views-.../ result of the views so far (`coupole.storage.so_far`)
 
 The run's journal names the result's folder (`ProcessingAsked`); nothing else connects the two processes.
 """

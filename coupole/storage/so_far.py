@@ -3,7 +3,7 @@
 ::
 
     RESULT/so-far           link to the newest of them, until the result is whole
-    RESULT/beside/RUN-2-of-3-views/
+    RESULT/beside/RUN-2-of-3-views-1a2b3c4d/
 
 Each is a whole result, which any command opens. It is put in its place when it is whole; the one before it stays
 for those who read it, the one before that is removed.
@@ -16,36 +16,44 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
-from coupole.storage.durable import make_folder
 from coupole.storage.processing import FOLDER, RESULT
 
 LINK, REPORT = "so-far", "report.html"
 KEY = "so_far"
 """Key of the settings and of result.json: views of the result, and of the run's plan."""
-_KEPT = 2
+_KEPT, _FOLDERS = 2, "*-of-*-views-*/"
 
 
-def folder_of(result: Path, run: str, views: int, of: int) -> Path:
-    """Folder in which the result of some views of a run is made."""
-    return result / FOLDER / f"{run}-{views}-of-{of}-views"
+def new_folder(result: Path, run: str, views: int, of: int) -> Path:
+    """Folder in which the result of some views of a run is made; another one each time, because the link may lead
+    to an earlier one of the same views."""
+    return result / FOLDER / f"{run}-{views}-of-{of}-views-{uuid4().hex[:8]}"
+
+
+def remove_halves(result: Path) -> None:
+    """Remove what a process that was killed left half made."""
+    for folder in (result / FOLDER).glob(_FOLDERS):
+        if not (folder / RESULT).exists():
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def put_in_place(result: Path, new_folder: Path) -> None:
     """Let the link lead to a result of the views so far that was just made; remove what nobody reads any more.
     Raises OSError."""
-    make_folder(result)
     link = result / f"{LINK}.part"
     link.unlink(missing_ok=True)
     link.symlink_to(new_folder.relative_to(result))
     link.replace(result / LINK)
-    older = sorted(new_folder.parent.glob("*-views/"), key=lambda folder: folder.stat().st_mtime_ns)
-    for folder in [folder for folder in older if folder != new_folder][: 1 - _KEPT]:
+    older = sorted(new_folder.parent.glob(_FOLDERS), key=lambda folder: folder.stat().st_mtime_ns)
+    older = [folder for folder in older if folder != new_folder]
+    for folder in older[: max(0, len(older) - (_KEPT - 1))]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def remove(result: Path) -> None:
-    """Remove the link, when the result is whole or is made anew."""
+    """Remove the link, when the result is whole."""
     with contextlib.suppress(FileNotFoundError):
         (result / LINK).unlink()
 

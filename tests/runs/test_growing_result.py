@@ -77,7 +77,7 @@ def test_what_is_known_ahead_and_given_up_changes_no_bit_of_the_result(tmp_path:
         look_ahead(run, view)
         extract_beside(run, view, result)
     before = {name: path.read_bytes() for name, path in files(result).items()}
-    growth = Growth(run, result, views, 3)
+    growth = Growth.of_views(run, result, views, 3)
     assert growth.has_room()
 
     class GivenUpError(Exception):
@@ -95,6 +95,9 @@ def test_what_is_known_ahead_and_given_up_changes_no_bit_of_the_result(tmp_path:
     assert [view.view for view in RunResult(result / "so-far").views] == ["side", "top"]
     assert json.loads((result / "so-far/result.json").read_text())["so_far"] == {"views": 2, "of": 3}
     assert {name: (result / name).read_bytes() for name in before} == before
+    with pytest.raises(GivenUpError):  # as after a resume: the same views again
+        fit_so_far(Growth.of_views(run, result, views, 3), MEMORY_BYTES, give_up, ahead)
+    assert [view.view for view in RunResult(result / "so-far").views] == ["side", "top"]
     reflectance_of(RunRequest((run,)), result, ahead=ahead)
     reflectance_of(RunRequest((run,)), tmp_path / "afterwards")
     same_result(result, tmp_path / "afterwards")

@@ -58,7 +58,6 @@ def read_cxf_values(path: Path, unit: Unit = "auto", object_type: str | None = N
 
 def _parse(path: Path) -> CxF:
     from colour_cxf.cxf3 import CxF
-    from xsdata.exceptions import ParserError
     from xsdata.formats.dataclass.parsers import XmlParser
     from xsdata.formats.dataclass.parsers.config import ParserConfig
 
@@ -77,7 +76,7 @@ def _parse(path: Path) -> CxF:
     except ElementTree.ParseError as error:
         line, column = error.position
         raise InputError([Problem(str(path), line, column + 1, "", f"expected CxF3; {error.msg}")]) from error
-    except ParserError as error:
+    except (LookupError, ValueError) as error:  # an unknown encoding, no CxF
         raise InputError(f"{path}: expected CxF3; {error}") from error
 
 
@@ -128,12 +127,24 @@ def _colours_of_spectra(
     path: Path, spectra: dict[str, Any], specifications: dict[str, Any], unit: Unit
 ) -> dict[str, Floats]:
     colours = {}
-    table = np.concatenate([np.asarray(spectrum.value, float) for spectrum in spectra.values()])
-    scale = float(reflectance_fractions(path, table, unit).max() / table.max()) if table.max() > 0.0 else 1.0
-    for name, spectrum in spectra.items():
+    tables = {name: _numbers(path, name, spectrum.value) for name, spectrum in spectra.items()}
+    fractions = reflectance_fractions(path, np.concatenate(list(tables.values())), unit)
+    ends = np.cumsum([len(values) for values in tables.values()])
+    for (name, spectrum), values in zip(spectra.items(), np.split(fractions, ends[:-1]), strict=True):
         nm = _wavelengths_nm(path, name, spectrum, specifications.get(spectrum.color_specification))
-        colours[name] = xyz_of_spectra(nm, scale * np.asarray(spectrum.value, float)[None])[0]
+        colours[name] = xyz_of_spectra(nm, values[None])[0]
     return colours
+
+
+def _numbers(path: Path, name: str, values: Sequence[Any]) -> Floats:
+    """[n]. Raises InputError: the parser keeps what is no number as it is, and what is missing as None."""
+    try:
+        numbers = np.asarray(values, float)
+    except (TypeError, ValueError):
+        numbers = np.full(1, np.nan)
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{path}: expected finite numbers for {name}; found {' '.join(map(str, values))[:60]}")
+    return numbers
 
 
 def _wavelengths_nm(path: Path, name: str, spectrum: Any, specification: Any) -> Floats:
@@ -168,5 +179,5 @@ def _colour(path: Path, name: str, values: Any, specifications: dict[str, Any]) 
             f"{path}: expected {name} under D50 for the observer 2_Degree; found {conditions[0]}, {conditions[1]}"
         )
     if lab is not None:
-        return np.asarray(xyz_of(np.array([[lab.l, lab.a, lab.b]], float))[0])
-    return np.asarray([colour.x, colour.y, colour.z], float) / 100.0
+        return np.asarray(xyz_of(_numbers(path, name, [lab.l, lab.a, lab.b])[None])[0])
+    return np.asarray(_numbers(path, name, [colour.x, colour.y, colour.z]) / 100.0)

@@ -283,9 +283,9 @@ def sentences_of_pixels(sightings: Sequence[Sighting], found_px: float) -> tuple
     if not u_px:
         return ()
     by_pixels_px = float(np.sqrt(np.mean(np.concatenate(u_px) ** 2)))
+    rest = "; the rest is board, lens and movement" if found_px > by_pixels_px else ""
     return (
-        f"noise of a corner {found_px:.2g} px by the residuals, {by_pixels_px:.2g} px by its pixels alone; the "
-        "rest is board, lens and movement",
+        f"noise of a corner {found_px:.2g} px by the residuals, {by_pixels_px:.2g} px by its pixels alone{rest}",
     )
 
 

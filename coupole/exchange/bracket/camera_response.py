@@ -5,9 +5,9 @@ logarithm of exposure g(z) of each value z, such that g(z) = ln E + ln t for all
 difference is that the pixels' ln E are eliminated, so thousands of pixels cost no more than a few. Noise is that
 of values: g is looked up at the value that a pixel's mean predicts, and the noisy value only adds g' times its
 difference (where g is looked up at noisy values, least squares prefers stairs and waves, which steps of 4 do not
-contradict). And g is a Gaussian process: its slope over ln z wanders, by amounts that count as much
-as they make the photographs likely. Where photographs cannot tell, as with waves of the period of all steps, this
-is what the uncertainty holds. A power law costs nothing, so that a linear sensor comes out straight.
+contradict). And g is a Gaussian process: its slope over ln z wanders by an unknown amount, and each amount counts
+by how likely it makes the photographs. Where photographs cannot tell, as with waves of the period of all steps,
+this is what the uncertainty holds. A power law costs nothing, so that a linear sensor comes out straight.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ for less in the next round."""
 _LEAST_FITTED, _MOST_FITTED = 0.02, 0.97
 """Predicted values between which a sample is fitted; a choice by noisy values would favour high noise."""
 _STIFF, _WANDERS = -2.0, np.arange(-7.0, 2.1, 0.25)
-"""ln of the wander of the slope, in the first rounds and then."""
+"""ln of the wander of the slope: in the first rounds, and those that are averaged after them."""
 _POWER_WIDTH = 0.35
 """Width of the window in ln z over which a slope is taken for weights."""
 _LEAST_POWER, _MOST_POWER = 0.3, 8.0

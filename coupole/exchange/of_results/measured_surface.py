@@ -18,6 +18,7 @@ from coupole.reflectance.fits import MATERIALS, TEXELS
 from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import RunResult, read_about
 from coupole.reflectance.texels.pixel_file import read_texel_errors
+from coupole.storage import so_far
 
 Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]
@@ -95,7 +96,8 @@ class MeasuredSurface:
         """Remark that files make on themselves, where their format lets them."""
         kind = "simulated" if self.about.get("simulated") else "measured"
         version, runs = self.about["software"]["coupole"], ", ".join(sorted(self.about["runs"]))
-        return f"{kind} with Coupole {version}; fit {self.fit} of {runs}"
+        growing = so_far.words(self.about)
+        return f"{kind} with Coupole {version}; fit {self.fit} of {runs}" + (f"; {growing}" if growing else "")
 
 
 def under_a_layer(kd: NDArray[np.floating], ks: NDArray[np.floating]) -> Floats:

@@ -94,7 +94,7 @@ class _Follower:
         self._looks = True
         """A view may be complete that was not before."""
         self._newest_view, self._begun_view = "", ""
-        """View of the newest proven frame; the same until it was looked at before its frames are all there."""
+        """View of the newest proven frame; the same if what it sees was not computed yet, else empty."""
         self._tried_views: tuple[str, ...] = ()
         """Views of which a result was made, or tried, as the newest."""
         self._may_give_up = True
@@ -167,14 +167,16 @@ class _Follower:
 
     def _grow(self) -> bool:
         """Make a result of the views so far, if there are more than in the newest; False if there is nothing to
-        do. When the next view is complete it is given up, but not twice in turn: of short views none would be
-        made."""
+        do, or where LEDs are chosen in the run: those that are left out change with them. When the next view is
+        complete it is given up, but not twice in turn: of short views none would be made."""
+        if self._run.is_open:
+            return False
         of = len(self._run.about["views"])
         views = tuple(view for view in self._run.about["views"] if self._has_samples(view))
         if not 0 < len(views) < of or views == self._tried_views:
             return False
         self._tried_views = views
-        growth = Growth(self._run.folder, self._result.resolve(), views, of)
+        growth = Growth.of_views(self._run.folder, self._result.resolve(), views, of)
         changes: dict[str, Any] = {}
         try:
             if not growth.has_room():
@@ -184,7 +186,7 @@ class _Follower:
             self._may_give_up, changes = True, {"fitted_views": len(views)}
         except _ViewsCameError:
             self._may_give_up = False
-        except (CoupoleError, OSError, MemoryError) as error:  # the result at the end comes to it again
+        except Exception as error:  # noqa: BLE001  the result at the end comes to it again
             changes = {"detail": f"no result of {len(views)} views ({reason(error)})"}
         self._teller.step("waiting", **changes)
         return True

@@ -37,6 +37,8 @@ from coupole.storage.run import Run
 _COPIES = 3
 """Room on the disk, in sizes of the samples: each view's file is replaced twice, and old and new stand side by
 side."""
+_FREE_BYTES = 2**30
+"""More than what a rig keeps free by default (`reserve_bytes`)."""
 
 
 @dataclass(frozen=True)
@@ -50,27 +52,32 @@ class Growth:
     """Views whose samples are there, in the plan's order."""
     of: int
     """Views of the plan."""
+    folder: Path
+    """Folder in which it is made: a new one."""
 
-    @property
-    def folder(self) -> Path:
-        """Folder in which it is made."""
-        return so_far.folder_of(self.result, self.run.name, len(self.views), self.of)
+    @classmethod
+    def of_views(cls, run: Path, result: Path, views: tuple[str, ...], of: int) -> Growth:
+        return cls(run, result, views, of, so_far.new_folder(result, run.name, len(views), of))
 
     def has_room(self) -> bool:
-        """Tell whether the disk has room for it and for the frames to come, as large as those of the largest view.
-        Never for a run that discards frames, whose disk is small. Raises OSError."""
+        """Tell whether the disk has room for it, for `_FREE_BYTES`, and for frames and samples of the views to
+        come, as large as those of the largest view and of the mean one. Never for a run that discards frames, whose
+        disk is small. Raises OSError."""
         run = Run(self.run)
         if run.discards:
             return False
         sample_bytes = sum(path.stat().st_size for path in (self.result / "samples").glob("*.h5"))
-        frame_bytes = max(run.view_path(view).stat().st_size for view in self.views) * (self.of - len(self.views))
-        return shutil.disk_usage(self.result).free > _COPIES * sample_bytes + frame_bytes
+        views_to_come = self.of - len(self.views)
+        frame_bytes = max(run.view_path(view).stat().st_size for view in self.views) * views_to_come
+        sample_bytes_to_come = sample_bytes * views_to_come // len(self.views)
+        needed_bytes = _COPIES * sample_bytes + sample_bytes_to_come + frame_bytes + _FREE_BYTES
+        return shutil.disk_usage(self.result).free > needed_bytes
 
 
 def fit_so_far(growth: Growth, memory_bytes: int, say: Said, ahead: Ahead) -> None:
     """Make it, and put it in its place when it is whole. What `say` raises ends it, and nothing is left but what
     `ahead` remembers. Raises as `reflectance_of`."""
-    shutil.rmtree(growth.folder, ignore_errors=True)
+    so_far.remove_halves(growth.result)
     try:
         _begin(growth)
         subtract_from(growth.folder, say, ahead)

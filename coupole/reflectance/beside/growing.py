@@ -61,7 +61,7 @@ class Growth:
 
     def has_room(self) -> bool:
         """Tell whether the disk has room for it, for `_FREE_BYTES`, and for frames and samples of the views to
-        come, as large as those of the largest view and of the mean one. Never for a run that discards frames, whose
+        come, as large as those of the largest view and of the mean one. Never for a run that discards frames: its
         disk is small. Raises OSError."""
         run = Run(self.run)
         if run.discards:

@@ -15,7 +15,6 @@ from coupole.commands.export_options import ExportOptions, ToOption
 from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError
 from coupole.exchange.formats import Writer, format_named, refuse_others_options, source_of
-from coupole.storage import so_far
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -89,6 +88,7 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write a run's proven frames, its views, or a result of reflectance, as other programs read them."""
+    from coupole.storage import so_far
     from coupole.viewing.terminal import bytes_text, make_console
 
     folder = source if options.in_place else out or source / "export"

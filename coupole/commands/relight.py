@@ -16,7 +16,6 @@ from coupole.commands.option_groups import flatten_options
 from coupole.commands.relight_for_the_eye import PEAK_QUANTILE, EyeColours, bright, write_relit_for_the_eye
 from coupole.errors import CoupoleError, InputError
 from coupole.scripting.relit_result import Relit, open_result
-from coupole.storage import so_far
 
 if TYPE_CHECKING:
     import numpy as np
@@ -185,6 +184,7 @@ def relight(
     as_json: JsonOption = False,
 ) -> None:
     """Make the picture that lights which were not there would give. Lights that are named together are summed."""
+    from coupole.storage import so_far
     from coupole.viewing.terminal import make_console, step_bars
 
     console = make_console(quiet=as_json)

@@ -16,7 +16,6 @@ from coupole.commands.common import JsonOption, fail
 from coupole.commands.completion import materials
 from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError
-from coupole.storage import so_far
 
 if TYPE_CHECKING:
     from coupole.exchange.look.look_blocks import Look
@@ -104,6 +103,7 @@ class ShowOptions:
 def show(source: SourceArgument, out: OutOption, options: ShowOptions, as_json: JsonOption = False) -> None:
     """Make a page to look at a measured object: turn it, light it anew, measure it, see how well it is known."""
     from coupole.exchange.look.look_page import write_page
+    from coupole.storage import so_far
     from coupole.viewing.terminal import make_console, step_bars
 
     console = make_console(quiet=as_json)

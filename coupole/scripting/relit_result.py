@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coupole.errors import InputError
-from coupole.storage import so_far
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,6 +42,7 @@ def open_result(
     InputError: no result, or a result without this view, fit, camera or uncertainty.
     """
     from coupole.reflectance import fits, relit_uncertainty, run_relighting, run_result
+    from coupole.storage import so_far
 
     result = so_far.as_it_is_now(result)
     if (result / run_result.OBJECT).exists():
@@ -61,6 +61,7 @@ def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera
     import numpy as np
 
     from coupole.reflectance import relit_uncertainty, run_intervals, run_relighting, run_result
+    from coupole.storage import so_far
 
     if camera is not None and view is not None:
         raise InputError("--view: a free camera (--from) is not a view of the run; give one of the two")

@@ -13,7 +13,6 @@ from typing import Any, assert_never
 from coupole.errors import CoupoleError
 from coupole.plan.shot_id import Sentinel
 from coupole.storage import journal, run_dose
-from coupole.storage.discarding import place_of_result
 from coupole.storage.durable import sha256
 from coupole.storage.journal_events import (
     ArmSettled,
@@ -178,6 +177,8 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
             status.before_that = _confirmation(run)
     if result:
         frames_left = bool(status.frames_left or status.open_views)
+        from coupole.storage.discarding import place_of_result
+
         discards = [event for event in events if isinstance(event, FramesDiscarded)]
         place = place_of_result(run, discards[-1]) if discards else Path(result)
         processing = processing_of(run.folder, place, frames_left=frames_left, in_use=in_use)

@@ -94,18 +94,14 @@ def radius_of(corners: Floats) -> float:
 
 
 def _fit_of(stratum: Stratum, values: Floats, starts: Floats, radius_px: float, blur: Blur) -> Corners:
-    pixels, mask = Picture(values, stratum.pattern, 4095.0).values_and_mask(_channel(stratum))
+    pixels, mask = Picture(values, stratum.pattern, 4095.0).values_and_mask(stratum.channel)
     return fit_corners(pixels, mask, starts, radius_px, blur=blur)
-
-
-def _channel(stratum: Stratum) -> Any:
-    return stratum.channel
 
 
 def _corners_by_method(stratum: Stratum, board: Drawn, starts: Floats) -> dict[str, Floats]:
     """Corners [36, 2] by each method; NaN where it finds none."""
     radius_px = radius_of(board.corners)
-    grey = Picture(board.values, stratum.pattern, 4095.0).plane(_channel(stratum)).astype(np.float32)
+    grey = Picture(board.values, stratum.pattern, 4095.0).plane(stratum.channel).astype(np.float32)
     corners_px = {
         name: np.where(fit.fits[:, None], fit.pixels, np.nan)
         for name, fit in (

@@ -29,7 +29,7 @@ _WORK_S: Mapping[str, Callable[..., float]] = {
     "flash": lambda led, on_us: on_us * 1e-6,
     "load": lambda table: len(table) * _STEP_BYTES / _SLOWEST_BYTES_S,
 }
-_LIGHTS_OR_MOVES = frozenset({"flash", "move_to", "panel", "start"})
+_LIGHTS_OR_MOVES = frozenset({"flash", "move_to", "start"})
 _SETTLES = 2.0
 """Times of a motion for which drivers wait at most."""
 
@@ -52,7 +52,8 @@ class NotedDevice:
 
         def call(*arguments: Any, **keywords: Any) -> Any:
             with under_way(of, name, work_s(*arguments, **keywords) if work_s else 0.0):
-                self._refuse_after_the_end(name)
+                if name in _LIGHTS_OR_MOVES:
+                    self._refuse_after_the_end(name)
                 return value(*arguments, **keywords)
 
         self.__dict__[name] = call  # found at once the next time
@@ -64,9 +65,15 @@ class NotedDevice:
             self._refuse_after_the_end("move_to")
             self._device.move_to(joints_deg, speed)
 
+    def panel(self, panel: int, on: bool) -> None:
+        with under_way(NAMES[self._kind], "panel"):
+            if on:
+                self._refuse_after_the_end("panel")
+            self._device.panel(panel, on)
+
     def _refuse_after_the_end(self, name: str) -> None:
-        """Raise DeviceRefused for what lights or moves, once the cell was made safe."""
-        if name in _LIGHTS_OR_MOVES and self._made_safe.is_set():
+        """Raise DeviceRefused once the cell was made safe."""
+        if self._made_safe.is_set():
             raise DeviceRefused(
                 NAMES[self._kind],
                 expected="no light and no motion after the cell was made safe",

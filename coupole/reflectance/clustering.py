@@ -8,9 +8,7 @@ are off by degrees would blur what is pooled.
 from __future__ import annotations
 
 import math
-import os
 import warnings
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numba
@@ -20,6 +18,7 @@ from scipy.cluster.vq import kmeans2, vq
 
 from coupole.reflectance.ggx import lobe
 from coupole.reflectance.normal_fit import colours_from, fit_from
+from coupole.reflectance.parts_in_threads import in_threads
 from coupole.reflectance.triangle_fit import FEWEST, HELD, MOST_KS, USUAL, TriangleMaterials, TriangleSamples
 
 Floats = NDArray[np.float64]
@@ -102,16 +101,17 @@ def fit_pool(pool: Pool, starts: TriangleMaterials) -> TriangleMaterials:
     count, channels = len(pool.counts), pool.values.shape[2]
     parameters = np.concatenate([starts.kd, starts.ks, starts.alpha[:, None], np.full((count, 1), np.nan)], axis=1)
 
-    def fit(number: int) -> None:
-        n = pool.counts[number]
-        if n >= FEWEST:
-            _fit_one(
-                pool.values[number, :n].astype(np.float64), pool.lights[number, :n].astype(np.float64),
-                pool.views[number, :n].astype(np.float64), parameters[number],
-            )  # fmt: skip
+    enough = np.flatnonzero(pool.counts >= FEWEST)
 
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
-        list(threads.map(fit, range(count)))
+    def fit(place: int) -> None:
+        number = enough[place]
+        some = slice(0, pool.counts[number])
+        _fit_one(
+            pool.values[number, some].astype(np.float64), pool.lights[number, some].astype(np.float64),
+            pool.views[number, some].astype(np.float64), parameters[number],
+        )  # fmt: skip
+
+    in_threads(fit, len(enough))
     kd, ks = parameters[:, :channels], np.minimum(parameters[:, channels : 2 * channels], MOST_KS)
     parts = np.tile([0.0, 0.0, 1.0], (count, 1)), kd, ks, parameters[:, -2], parameters[:, -1]
     return TriangleMaterials(*map(np.ascontiguousarray, parts))  # functions are compiled for each layout

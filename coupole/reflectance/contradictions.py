@@ -9,10 +9,8 @@ with the material, so neither the triangle nor the model is wrong.
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +23,7 @@ from scipy.spatial import cKDTree
 from coupole.reflectance.discarded_frames import rewrite
 from coupole.reflectance.extraction.sample_codes import BY_UNKNOWN
 from coupole.reflectance.fits import GGX_NORMAL
+from coupole.reflectance.parts_in_threads import in_threads
 from coupole.reflectance.run_result import CONTRADICTED, SAMPLES, RunResult, ViewSamples
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values, towards
 
@@ -81,8 +80,7 @@ def contradiction_mask(
             samples.centres_mm[part], materials.normals[part], materials.kd[part], beside.places, dark[part],
         )  # fmt: skip
 
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(mark, range(0, len(dark), _PART)))
+    in_threads(mark, len(dark), part=_PART, threads=threads)
     return dark
 
 

@@ -12,8 +12,6 @@ and ks, kept apart.
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numba
@@ -23,6 +21,7 @@ from numpy.typing import NDArray
 from coupole.reflectance.ggx import UNKNOWNS, lobe, root_by_unknowns, tangents
 from coupole.reflectance.kernel_arrays import assign_rows
 from coupole.reflectance.normal_fit import CAUCHY, SPREAD_KS, colour_weight
+from coupole.reflectance.parts_in_threads import in_threads
 from coupole.reflectance.triangle_fit import (
     HELD,
     LEAST_KD,
@@ -113,8 +112,7 @@ def covariances(
             prior[part], order, group, material_covariances[part], u_kd[part], u_ks[part],
         )  # fmt: skip
 
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(fill, range(0, len(prior), _PART)))
+    in_threads(fill, len(prior), part=_PART, threads=threads)
     return MaterialUncertainty(material_covariances, u_kd, u_ks)
 
 

@@ -11,8 +11,6 @@ first spread. Both are added in quadrature.
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import numpy as np
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 from coupole.reflectance.ggx import UNKNOWNS
 from coupole.reflectance.material_uncertainty import add_scores, groups_of_leds
 from coupole.reflectance.normal_fit import SHADOW_QUANTILE, SHADOW_SHARE, PointMaterials, rank_normals
+from coupole.reflectance.parts_in_threads import in_threads
 
 Floats = NDArray[np.float64]
 
@@ -110,8 +109,7 @@ def _fit_spread_deg(
         least = SHADOW_SHARE * np.quantile(of_part[0], SHADOW_QUANTILE, axis=1)
         _fill(*of_part, np.maximum(least, 0.0), lights, half, view[None], *arrays)
 
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(fill, range(0, len(values), _BLOCK)))
+    in_threads(fill, len(values), part=_BLOCK, threads=threads)
     fit_deg: Floats = np.degrees(np.sqrt(variance))
     return fit_deg
 

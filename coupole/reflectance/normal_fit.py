@@ -9,8 +9,6 @@ this material explains pulls little.
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 
 import numba
@@ -19,6 +17,7 @@ from numpy.typing import NDArray
 
 from coupole.reflectance.ggx import UNKNOWNS, lobe, root_by_unknowns, tangents
 from coupole.reflectance.kernel_arrays import assign
+from coupole.reflectance.parts_in_threads import in_threads
 
 Floats = NDArray[np.float64]
 
@@ -87,8 +86,7 @@ def fit_materials(values: Floats, lights: Floats, view: Floats, *, threads: int 
         of_part = normals[part], albedo[part], least, parameters[part]
         _fit_all(ordered_values[part], lights, half, view[None], only_view, *of_part)
 
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(fit, range(0, len(values), _BLOCK)))
+    in_threads(fit, len(values), part=_BLOCK, threads=threads)
     return PointMaterials(
         parameters[:, :3], parameters[:, 3], parameters[:, 4], parameters[:, 5], parameters[:, 6]
     )

@@ -10,8 +10,6 @@ Machine Learning 24, 1996): the share of the model is the one with the smallest 
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import numpy as np
@@ -28,6 +26,7 @@ from coupole.reflectance.least_squares import (
     solve_by_samples,
     sums,
 )
+from coupole.reflectance.parts_in_threads import in_threads
 from coupole.reflectance.slice_basis import COUNT, LEAST_RESIDUAL, USUAL_LEFT, Basis, functions
 from coupole.reflectance.triangle_fit import FEWEST, TriangleSamples
 
@@ -67,8 +66,8 @@ def fit_slices(
         )  # fmt: skip
         coefficients[:, part] = part_coefficients
 
-    with one_thread(), ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(fit, range(0, count, _PART)))
+    with one_thread():
+        in_threads(fit, count, part=_PART, threads=threads)
     return [
         fit_coefficients if model is not None else fit_coefficients[..., :COUNT]
         for fit_coefficients, (_, model) in zip(coefficients, fits, strict=True)

@@ -9,9 +9,7 @@ three points, each off by s). The fit is that of `coupole.reflectance.normal_fit
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 
 import numba
@@ -23,6 +21,7 @@ from coupole.reflectance.ggx_fit import ROWS, fit_packs, pack
 from coupole.reflectance.kernel_arrays import assign
 from coupole.reflectance.lanes import LANES
 from coupole.reflectance.normal_fit import SPREAD_KS, USUAL_ALPHA, USUAL_KS, colours_from
+from coupole.reflectance.parts_in_threads import in_threads
 
 Floats = NDArray[np.float64]
 
@@ -119,8 +118,7 @@ def fit_triangles(
             parameters[part],
         )  # fmt: skip
 
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(fit, range(0, count, _PART)))
+    in_threads(fit, count, part=_PART, threads=threads)
     parts = (
         parameters[:, :3],
         parameters[:, 5 : 5 + channels],
@@ -151,8 +149,7 @@ def recolour_materials(
             normals[part], grey[part], np.flatnonzero(sample_mask), kd[part], ks[part],
         )  # fmt: skip
 
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(fit, range(0, len(kd), _PART)))
+    in_threads(fit, len(kd), part=_PART, threads=threads)
     return TriangleMaterials(normals, kd, ks, materials.alpha, materials.residual)
 
 

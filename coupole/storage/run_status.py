@@ -177,13 +177,20 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
             status.before_that = _confirmation(run)
     if result:
         frames_left = bool(status.frames_left or status.open_views)
-        from coupole.storage.discarding import place_of_result
-
         discards = [event for event in events if isinstance(event, FramesDiscarded)]
-        place = place_of_result(run, discards[-1]) if discards else Path(result)
+        place = _place_of_samples(run, discards) or Path(result)
         processing = processing_of(run.folder, place, frames_left=frames_left, in_use=in_use)
         status.processing = _with_samples(processing, place, discards)
     return status
+
+
+def _place_of_samples(run: Run, discards: Sequence[FramesDiscarded]) -> Path | None:
+    """Return the folder of the result whose samples stand for frames that were discarded; None if none were."""
+    if not discards:
+        return None
+    from coupole.storage.discarding import place_of_result
+
+    return place_of_result(run, discards[-1])
 
 
 def _with_samples(processing: Processing, place: Path, discards: Sequence[FramesDiscarded]) -> Processing:

@@ -12,6 +12,7 @@ for those who read it, the one before that is removed.
 from __future__ import annotations
 
 import contextlib
+import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -65,6 +66,12 @@ def as_it_is_now(result: Path) -> Path:
     if (result / RESULT).exists() and link != result:
         return result
     return link.resolve() if link.is_symlink() and link.exists() else result
+
+
+def folder_in(text: str) -> str:
+    """Return the folder of a result of some views that a text names, from `beside` on; empty if it names none."""
+    found = re.search(rf"\b{FOLDER}/[^/]+-\d+-of-\d+-views-[0-9a-f]{{8}}(?=[/'\"]|$)", text)
+    return found[0] if found else ""
 
 
 def figures(about: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,13 +8,14 @@ import signal
 import threading
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from coupole.acquisition import opened_cell, safeguard
 from coupole.acquisition.opened_cell import OpenedCell
-from coupole.errors import DeviceLost
+from coupole.acquisition.noted_devices import NotedDevice
+from coupole.errors import DeviceLost, DeviceRefused
 
 LOST = DeviceLost("device", expected="an answer", happened="there was none", remedy="None.")
 
@@ -131,6 +132,42 @@ def test_a_second_signal_does_not_cut_it_short(number: signal.Signals) -> None:
         assert signal.getsignal(number) is handler
     finally:
         signal.signal(number, before)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "arguments"),
+    [
+        ("ledbox", "start", ()),
+        ("ledbox", "flash", (7, 100.0)),
+        ("ledbox", "panel", (1, True)),
+        ("robot", "move_to", ([0.0] * 6,)),
+    ],
+)
+def test_nothing_is_lit_or_moved_once_the_cell_was_made_safe(
+    kind: str, name: str, arguments: tuple[Any, ...]
+) -> None:
+    """By a thread that was left behind in a call, and whose call returned after all."""
+    called: list[str] = []
+    made_safe, no_rig = threading.Event(), cast("Any", None)
+    device = NotedDevice(SimpleNamespace(**{name: lambda *_: called.append(name)}), kind, no_rig, made_safe)
+    getattr(device, name)(*arguments)
+    assert called == [name]
+    made_safe.set()
+    with pytest.raises(DeviceRefused, match="no light and no motion after the cell was made safe"):
+        getattr(device, name)(*arguments)
+    assert called == [name]
+
+
+def test_lamps_are_switched_off_and_the_arm_is_stopped_once_the_cell_was_made_safe() -> None:
+    called: list[str] = []
+    made_safe, no_rig = threading.Event(), cast("Any", None)
+    made_safe.set()
+    box = SimpleNamespace(lights_off=lambda: called.append("off"), panel=lambda *_: called.append("panel off"))
+    arm = SimpleNamespace(stop=lambda: called.append("arm stopped"))
+    NotedDevice(box, "ledbox", no_rig, made_safe).lights_off()
+    NotedDevice(box, "ledbox", no_rig, made_safe).panel(1, False)
+    NotedDevice(arm, "robot", no_rig, made_safe).stop()
+    assert called == ["off", "panel off", "arm stopped"]
 
 
 def test_a_cell_that_is_safe_is_not_commanded_again() -> None:

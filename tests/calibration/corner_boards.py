@@ -8,6 +8,7 @@ blur's centre of gravity.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ class Stratum:
     tilt_deg: float = 20.0
     white_dn: float = 3000.0
     pattern: str = "MONO"
-    channel: str = "green"
+    channel: Literal["green", "red", "blue"] = "green"
 
 
 @dataclass(frozen=True)

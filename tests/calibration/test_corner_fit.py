@@ -118,6 +118,7 @@ def test_what_is_no_corner_is_not_taken_for_one() -> None:
 STARTS_OFF = 0.5
 ELLIPSE = Stratum("elliptic blur", blur="ellipse 1.4 0.6", tilt_deg=55.0)
 COMA = Stratum("coma", blur="streak 3")
+GREY = Stratum("grey")
 
 
 def of_board(
@@ -150,14 +151,14 @@ def test_most_of_the_shift_by_coma_is_undone() -> None:
 
 def test_noise_is_not_taken_for_coma() -> None:
     """Corners alone are too few for coma to be looked for: those of a clean board are the same."""
-    clean = draw(Stratum("round"), 1)
+    clean = draw(GREY, 1)
     values = with_noise(clean.values, 1)
-    together = of_board(COMA, values, clean.corners)
-    few = [of_board(COMA, values, clean.corners[first : first + 9]).pixels for first in range(0, 36, 9)]
+    together = of_board(GREY, values, clean.corners)
+    few = [of_board(GREY, values, clean.corners[first : first + 9]).pixels for first in range(0, 36, 9)]
     assert np.abs(np.concatenate(few) - together.pixels).max() < 1e-6
 
 
-@pytest.mark.parametrize("stratum", [Stratum("grey"), Stratum("green", pattern="GBRG"), ELLIPSE, COMA])
+@pytest.mark.parametrize("stratum", [GREY, Stratum("green", pattern="GBRG"), ELLIPSE, COMA])
 def test_the_stated_uncertainty_of_a_corner_holds(stratum: Stratum) -> None:
     over_u = []
     board = draw(stratum, 2)
@@ -169,10 +170,10 @@ def test_the_stated_uncertainty_of_a_corner_holds(stratum: Stratum) -> None:
 
 
 def test_the_uncertainty_grows_with_the_noise() -> None:
-    board = draw(Stratum("grey"), 3)
+    board = draw(GREY, 3)
     quiet, loud = (
         of_board(
-            ELLIPSE,
+            GREY,
             board.values + np.random.default_rng(1).normal(0.0, noise_dn, board.values.shape),
             board.corners,
         )

@@ -170,6 +170,22 @@ def test_what_comes_after_all_is_passed_to_whoever_does_away_with_it(never: thre
     assert late == ["an opened camera"]
 
 
+def test_a_thread_whose_call_returns_late_does_nothing_more(never: threading.Event) -> None:
+    """A session that is left behind would fire its next burst; with `discard` it ends what it was asked for."""
+    done: list[str] = []
+
+    def work() -> None:
+        with under_way("led box", "start"):
+            never.wait()
+        done.append("the next burst")
+
+    with pytest.raises(DeviceTimeout):
+        bounded.run_bounded(work)
+    never.set()
+    cells.wait_until(lambda: not left_behind(), "the end of the thread")
+    assert done == []
+
+
 def test_a_signal_ends_the_work_as_it_ends_who_waits_for_it() -> None:
     cleaned = threading.Event()
 

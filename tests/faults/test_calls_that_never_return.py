@@ -79,7 +79,7 @@ more = [
         pytest.param("disk.fdatasync", "camera.arm", 6, id="a disk before a burst"),
         pytest.param("robot.measured", "camera.configure", 4, id="an arm before a burst"),
         pytest.param("led box.load", "", 4, id="a table that is uploaded"),
-        pytest.param("robot.stopping_deg", "", 4, id="an arm before a motion"),
+        pytest.param("robot.measured", "robot.stopping_deg", 4, id="an arm before a motion"),
     ],
 )
 def test_what_returns_after_it_was_given_up_lights_and_moves_nothing_more(
@@ -93,7 +93,7 @@ def test_what_returns_after_it_was_given_up_lights_and_moves_nothing_more(
         ended = session.ended()
         assert (ended.code, dark_and_still(world)) == (code, True), ended
         assert true_dose_lux_h(cell, world).max() == 0.0
-        if name == "robot.stopping_deg":
+        if after == "robot.stopping_deg":
             assert world.ask("state")["joints_deg"] == pytest.approx(before, abs=0.05)
     can_be_resumed(cell)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,36 @@ def has_samples(result: Path) -> bool:
 
 def fitted_views(result: Path) -> int:
     return int(json.loads((result / "beside/progress.json").read_text())["fitted_views"])
+
+
+def exports_say_that_it_grows(so_far: Path, out: Path) -> None:
+    assert cells.here("export", so_far, "--to", "ply").code == 2  # its folder is removed when all is done
+    said_by("export", so_far, "--to", "ply", "--out", out)
+    (ply,) = out.glob("*.ply")
+    assert b"made from 2 of 3 views so far" in ply.read_bytes()[:4096]
+
+
+def is_told_when_it_is_replaced(so_far: Path, out: Path) -> None:
+    """A reader holds the folder that was there; a result of more views takes its place."""
+    folder = so_far.resolve()
+    shutil.rmtree(folder / "samples")
+    refused = cells.here("export", folder, "--to", "ply", "--out", out, "--json")
+    assert refused.code == 2, refused
+    assert "a result of more views has replaced it" in refused.err
+
+
+def test_without_room_on_the_disk_none_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames and samples of the views to come are more important."""
+    cell = cell_of_three_views(tmp_path)
+    assert cell.acquire().code == 0
+    result = tmp_path / "result"
+    extract_beside(cell.run_folder, "top", result)
+    growth = Growth.of_views(cell.run_folder, result, ("top",), 3)
+    view_bytes = (cell.run_folder / "views/top.h5").stat().st_size
+    total = shutil.disk_usage(result)
+    for free_bytes, has_room in ((2**30 + 2 * view_bytes, False), (2**30 + 20 * view_bytes, True)):
+        monkeypatch.setattr(shutil, "disk_usage", lambda _, free=free_bytes: total._replace(free=free))
+        assert growth.has_room() == has_room
 
 
 def test_a_run_that_goes_on_has_a_result_of_its_views_so_far(tmp_path: Path) -> None:
@@ -95,9 +126,11 @@ def test_what_is_known_ahead_and_given_up_changes_no_bit_of_the_result(tmp_path:
     assert [view.view for view in RunResult(result / "so-far").views] == ["side", "top"]
     assert json.loads((result / "so-far/result.json").read_text())["so_far"] == {"views": 2, "of": 3}
     assert {name: (result / name).read_bytes() for name in before} == before
+    exports_say_that_it_grows(result / "so-far", tmp_path / "exported")
     with pytest.raises(GivenUpError):  # as after a resume: the same views again
         fit_so_far(Growth.of_views(run, result, views, 3), MEMORY_BYTES, give_up, ahead)
     assert [view.view for view in RunResult(result / "so-far").views] == ["side", "top"]
+    is_told_when_it_is_replaced(result / "so-far", tmp_path / "exported again")
     reflectance_of(RunRequest((run,)), result, ahead=ahead)
     reflectance_of(RunRequest((run,)), tmp_path / "afterwards")
     same_result(result, tmp_path / "afterwards")

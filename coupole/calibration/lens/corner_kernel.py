@@ -80,7 +80,7 @@ def fit_all(windows, firsts, mask_tile, rough, skews, radii, many, results):  # 
     """
     solutions, normals, scaled_normals, sums = results
     radius, first_radius = radii
-    rows = np.empty((UNKNOWNS + 3, windows.shape[1] * windows.shape[2]))
+    rows = np.empty((UNKNOWNS + 2, windows.shape[1] * windows.shape[2]))
     for n in range(len(rough)):
         image, first_row, first_col = windows[n], firsts[n, 0], firsts[n, 1]
         mask = np.empty_like(mask_tile)
@@ -236,7 +236,7 @@ def _products(rows, count, many, products):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _rows(image, mask_tile, middle_x, middle_y, radius, unknowns, many, rows):  # type: ignore[no-untyped-def]
-    """Number of pixels; `rows` [17, pixels] are the derivatives by the unknowns, the residuals, and the values of
+    """Number of pixels; `rows` [16, pixels] are the derivatives by the unknowns, the residuals, and the values of
     the model."""
     x, y, sigma, sigma_2 = unknowns[_X], unknowns[_Y], unknowns[_SIGMA], unknowns[_SIGMA_2]
     level, contrast, together = unknowns[_LEVEL], unknowns[_CONTRAST], unknowns[_CORRELATION]

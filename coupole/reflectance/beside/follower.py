@@ -13,7 +13,7 @@ from typing import Any
 from coupole.errors import CoupoleError, reason
 from coupole.reflectance.beside.first_look import write_normals
 from coupole.reflectance.beside.growing import Growth, fit_so_far
-from coupole.reflectance.light_paths import Ahead
+from coupole.reflectance.light_paths import NOTHING_AHEAD, Ahead
 from coupole.reflectance.result_pages import run_reflectance_page
 from coupole.reflectance.run_job import RunRequest, extract_beside, look_ahead, reflectance_of
 from coupole.storage.discarding import NOT_YET, reason_to_keep, to_discard
@@ -115,7 +115,8 @@ class _Follower:
                 time.sleep(_LOOK_EVERY_S)
         samples_s = self._seconds_since_last_frame()
         self._teller.step("fitting")
-        reflectance_of(self._request, self._result, say=self._teller.part, ahead=self._ahead)
+        ahead = self._ahead if self._tried_views else NOTHING_AHEAD  # nothing else would use what is kept
+        reflectance_of(self._request, self._result, say=self._teller.part, ahead=ahead)
         run_reflectance_page.write(self._result)
         result_s = self._seconds_since_last_frame()
         self._teller.say(

@@ -7,9 +7,6 @@ rays and touches no edge that was found.
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +15,7 @@ from coupole.motion.occlusion import RAY_START_MM
 from coupole.motion.packet_rays import ARGUMENTS, FAR, LANES, PacketMesh, blocked16, packet, trace
 from coupole.reflectance.new_light.beams import Beam
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
+from coupole.reflectance.parts_in_threads import in_threads
 
 Codes = NDArray[np.uint8]
 
@@ -54,8 +52,7 @@ def _trace(mesh: PacketMesh, surface: Surface, beam: Beam, pixels: NDArray[np.in
     def some(first: int) -> None:
         _trace_rays(*how, pixels[first : first + _RAYS], *on, beam.near, beam.place, flat)
 
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(some, range(0, len(pixels), _RAYS)))
+    in_threads(some, len(pixels), part=_RAYS)
 
 
 @numba.njit(cache=True, nogil=True)

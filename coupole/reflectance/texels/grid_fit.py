@@ -7,9 +7,7 @@ are measured, and give its colour together with those of the texels beside it.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numba
@@ -19,6 +17,7 @@ from scipy.ndimage import gaussian_filter
 
 from coupole.reflectance.ggx import lobe
 from coupole.reflectance.normal_fit import colour_weight
+from coupole.reflectance.parts_in_threads import in_threads
 from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples
 from coupole.reflectance.texels.pixel_file import ViewTexels
 from coupole.reflectance.texels.pixel_fit import Lights, PixelMaterials, fit_pixels
@@ -159,8 +158,7 @@ def colours_of(
             shine[some], kd[some], u_kd[some],
         )  # fmt: skip
 
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(fill, range(0, count, _PART)))
+    in_threads(fill, count, part=_PART, threads=threads)
     mean = kd.mean(axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.log(kd / mean), np.sqrt(np.mean((u_kd / kd) ** 2, axis=1))

@@ -8,8 +8,6 @@ them (`coupole.reflectance.texels.neighbours`).
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numba
@@ -21,6 +19,7 @@ from coupole.reflectance.ggx_fit import ROWS, fit_packs, pack
 from coupole.reflectance.kernel_arrays import assign, assign_rows
 from coupole.reflectance.lanes import LANES
 from coupole.reflectance.material_uncertainty import add_scores
+from coupole.reflectance.parts_in_threads import in_threads
 from coupole.reflectance.triangle_fit import between, towards
 
 Floats = NDArray[np.float64]
@@ -90,8 +89,7 @@ def fit_pixels(
             prior.kd[part], prior.ks[part], prior.alpha[part], normals[part], logs[part], covariance[part],
         )  # fmt: skip
 
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(fit, range(0, count, _PART)))
+    in_threads(fit, count, part=_PART, threads=threads)
     return PixelMaterials(normals, logs, covariance)
 
 

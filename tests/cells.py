@@ -15,7 +15,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -72,6 +74,17 @@ class Ended:
         return found
 
 
+def shipped_rig(name: str) -> dict[str, Any]:
+    """Data of a rig of `configs`, to change at will."""
+    return deepcopy(_read_rig(name))
+
+
+@cache
+def _read_rig(name: str) -> dict[str, Any]:
+    rig: dict[str, Any] = YAML(typ="safe", pure=True).load(REPO / f"configs/rigs/{name}.yaml")
+    return rig
+
+
 @dataclass
 class CellFolder:
     """Rig and plan in a folder; `speed` is the world's pace."""
@@ -83,7 +96,7 @@ class CellFolder:
     plan_data: dict[str, Any] = field(init=False)
 
     def __post_init__(self) -> None:
-        rig = YAML(typ="safe", pure=True).load(REPO / "configs/rigs/sim.yaml")
+        rig = shipped_rig("sim")
         rig["sensor"] |= {"width_px": 128, "height_px": 96, "pixel_pitch_um": 176.0}
         rig["dome"]["leds"] = str(REPO / "configs/domes/coupole.csv")
         rig["robot"]["settings"] = {
@@ -112,9 +125,7 @@ class CellFolder:
 
     def moved_by_ur(self, model: str, *, patient: bool = True) -> None:
         """From now on the arm is a UR, where the rig that comes with it has it; `patient` with a busy machine."""
-        shipped = YAML(typ="safe", pure=True).load(
-            REPO / f"configs/rigs/{'sim-ur' if model == 'ur10e' else 'sim-' + model}.yaml"
-        )
+        shipped = shipped_rig("sim-ur" if model == "ur10e" else f"sim-{model}")
         self.rig_data |= {key: shipped[key] for key in ("robot", "motion", "support")}
         if patient:
             self.rig_data["robot"]["settings"] |= {"attention_s": 0.5, "watchdog_s": 0.5}

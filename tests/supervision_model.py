@@ -3,7 +3,9 @@
 The parts are those of `coupole.supervision`: the session's process with its supervising thread and its thread of
 signals, the process that answers the arm, the arm's controller, the box with its watchdog, a person, and whatever
 freezes, hangs or kills. Any part may take its next step before any other; `time passes` by one tick only when
-each part that runs has had its turn. A thread that is late is one that hangs and returns.
+each part that runs has had its turn. A thread that is late is one that hangs and returns. The main thread may give
+up a call that hangs (`coupole.bounded.run_bounded`): it makes the cell safe, then leaves the thread behind, then
+ends the process. The call may return at any moment meanwhile.
 
 Times are ticks. The attention is `ATTENTION` of them; the others are as short as their order allows, since only
 the order decides: a look < attention < a freeze that asks < the box's watchdog.
@@ -35,12 +37,15 @@ STANDS, ASKS, ALLOWED, WATCHES, ENDED = "stands", "asks", "allowed", "watches", 
 what it commanded; has left."""
 IDLE, SUSPENDED = "idle", "suspended"
 STOP, MOVE, NOTHING = "stop", "move", ""
+WAITED_FOR, MADE_SAFE, LEFT = "waited for", "made safe", "left behind"
 
 
 class State(NamedTuple):
     process: str = RUNS
     thread: str = ASKS
     hangs: bool = False
+    given_up: str = WAITED_FOR
+    """The call in which the thread hung, if the main thread has made the cell safe since, and left it behind."""
     answering: str = RUNS
     arm: str = REST
     lamps: bool = False
@@ -83,6 +88,8 @@ class State(NamedTuple):
     """Ticks, while all runs, since a word is owed or a stop was set."""
     slipped: bool = False
     """A command was allowed before a hold, and came after it."""
+    stuck: bool = False
+    """A command was given before the cell was made safe, and stuck in the call that was given up."""
     false_lapse: bool = False
     spared: int = 0
     """How much may still happen: freezes, hangs, deaths, signals, pauses. What mends them again is free."""
@@ -90,6 +97,7 @@ class State(NamedTuple):
 
 Step = tuple[str, State]
 Rules = frozenset[str]
+LATE = "a call that returns late goes on"
 """What is done wrongly on purpose; none in the model itself."""
 
 
@@ -103,6 +111,8 @@ def steps(now: State, wrong: Rules = frozenset()) -> Iterator[Step]:
             yield f"signals: {what}", then
         for what, then in person_steps(now, wrong):
             yield f"person: {what}", then
+        for what, then in main_steps(now):
+            yield f"main: {what}", then
     if now.answering == RUNS and not now.answered:
         what, then = answering_step(now, wrong)
         yield f"answering: {what}", then._replace(answered=True, mute=0, unanswered=0)
@@ -113,8 +123,13 @@ def steps(now: State, wrong: Rules = frozenset()) -> Iterator[Step]:
 
 def thread_steps(now: State, wrong: Rules) -> Iterator[Step]:
     """The supervising thread: `ArmSupervisor.go`, the bursts, `Sequencer._wait_while_paused`."""
-    if now.thread == STANDS:
+    sent = now.stuck and now.thread == ALLOWED  # nobody can call it back
+    if now.given_up == LEFT and now.thread != ENDED and not sent and LATE not in wrong:
+        yield "is interrupted", now._replace(thread=ENDED)
+    elif now.thread == STANDS:
         yield from _standing(now)
+    elif now.thread == ALLOWED and now.given_up != WAITED_FOR and not sent and LATE not in wrong:
+        yield "is refused", now._replace(thread=ENDED)
     elif now.thread == ALLOWED:
         begun = _looked(now)._replace(thread=WATCHES, slipped=now.slipped or now.held, looked=0)
         yield "moves the arm", begun._replace(order=MOVE)
@@ -122,6 +137,17 @@ def thread_steps(now: State, wrong: Rules) -> Iterator[Step]:
             yield "lights lamps", begun._replace(lamps=True)
     elif now.thread != ENDED:
         yield from _asking(now, wrong)
+
+
+def main_steps(now: State) -> Iterator[Step]:
+    """The main thread: `coupole.bounded.run_bounded`."""
+    if now.hangs and now.given_up == WAITED_FOR:
+        stuck = now.thread == ALLOWED
+        yield "makes safe", _safe(now)._replace(given_up=MADE_SAFE, stuck=stuck, since=0)
+    elif now.given_up == MADE_SAFE and now.thread != ENDED:
+        yield "leaves it behind", now._replace(given_up=LEFT)
+    elif now.given_up == LEFT:
+        yield "ends the process", now._replace(process=DEAD)
 
 
 def _standing(now: State) -> Iterator[Step]:
@@ -301,7 +327,7 @@ def told_apart(now: State) -> State:
         unseen |= _UNSEEN_IN_THE_DARK
     if now.lost:
         unseen |= _UNSEEN_WHEN_LOST if now.arm == REST else {"mute": 0}
-    if now.since and not (now.owed or now.stop):
+    if now.since and not (now.owed or now.stop or now.given_up != WAITED_FOR):
         unseen["since"] = 0
     if now.slipped and not now.held and now.signals != SUSPENDED:
         unseen["slipped"] = False

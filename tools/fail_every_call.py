@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import itertools
 import json
 import multiprocessing
 import os
@@ -44,11 +45,18 @@ from sim.world import client  # noqa: E402
 Case = tuple[Event, ...]
 
 
+_COLLECTS_EVERY = 10
+"""Cases of a job."""
+_number_of_case = itertools.count()
+
+
 def run_one(case: Case) -> dict[str, Any]:
     """One case, in a folder that is removed."""
     begun_s = time.monotonic()
-    gc.unfreeze()  # `cells.here` freezes what a session leaves, with the files and memory that it holds
-    gc.collect()
+    if next(_number_of_case) % _COLLECTS_EVERY == 0:
+        gc.unfreeze()  # `cells.here` freezes what a session leaves, with the files and memory that it holds
+        gc.collect()
+        gc.freeze()  # half a million objects, that each session would go through
     with tempfile.TemporaryDirectory(prefix="coupole-case-") as folder:
         try:
             if len(case) == 1 and case[0].kind in KINDS:

@@ -13,8 +13,8 @@ from typing import Any, cast
 import pytest
 
 from coupole.acquisition import opened_cell, safeguard
-from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.noted_devices import NotedDevice
+from coupole.acquisition.opened_cell import OpenedCell
 from coupole.errors import DeviceLost, DeviceRefused
 
 LOST = DeviceLost("device", expected="an answer", happened="there was none", remedy="None.")

@@ -15,14 +15,24 @@ from supervision_model import (
     BRAKES,
     DELAY_LIMIT,
     FROZEN,
+    LATE,
+    LEFT,
+    MADE_SAFE,
     MOVES,
     RUNS,
     STANDS,
     SUSPENDED,
+    WAITED_FOR,
     WATCHDOG,
     State,
     search,
 )
+
+
+def acts(now: State) -> bool:
+    """A lamp is lit or the arm moves, and not by a command that was stuck in a call that was given up."""
+    return (now.lamps or now.arm == MOVES) and not now.stuck
+
 
 PROMISES: dict[str, Callable[[State], bool]] = {
     "The supervising thread has checked a moving arm within 0.1 s and a cycle, or the arm brakes": (
@@ -38,13 +48,16 @@ PROMISES: dict[str, Callable[[State], bool]] = {
         lambda now: not now.lamps or now.unspoken <= WATCHDOG
     ),
     "After a freeze that needs a confirmation, or Ctrl-Z, nothing moves or is lit before a person confirms": (
-        lambda now: not (now.owed and now.since >= AT_ONCE and (now.lamps or now.arm == MOVES))
+        lambda now: not (now.owed and now.since >= AT_ONCE and acts(now))
     ),
     "A confirmation ends no pause while the cell is still being made safe, or before the session has paused": (
         lambda now: now.pause or not (now.held or now.halting)
     ),
     "After a stop nothing moves and no lamp is lit": (
-        lambda now: not (now.stop and now.since >= AT_ONCE and (now.lamps or now.arm == MOVES))
+        lambda now: not (now.stop and now.since >= AT_ONCE and acts(now))
+    ),
+    "After a call was given up nothing moves and no lamp is lit": (
+        lambda now: now.given_up == WAITED_FOR or not (now.since >= AT_ONCE and acts(now))
     ),
     "A motion that is checked in time is never ended by the watch": lambda now: not now.false_lapse,
     "Ctrl-Z stops the process when all is safe; only an action that was allowed before the pause may follow": (
@@ -52,7 +65,7 @@ PROMISES: dict[str, Callable[[State], bool]] = {
     ),
 }
 
-ATTENDED, ANSWERED, OVER, DARK, ASKED, WORD, STOPPED, TRUE_LAPSE, SUSPENDS = PROMISES
+ATTENDED, ANSWERED, OVER, DARK, ASKED, WORD, STOPPED, GIVEN_UP, TRUE_LAPSE, SUSPENDS = PROMISES
 
 WRONG = {
     "asks whether its parent lives": ATTENDED,
@@ -64,6 +77,7 @@ WRONG = {
     "a word while it is made safe": WORD,
     "a word before it stands": WORD,
     "stop is for the thread that sleeps": STOPPED,
+    LATE: GIVEN_UP,
     "beats once": TRUE_LAPSE,
     "suspends first": SUSPENDS,
 }
@@ -75,7 +89,7 @@ SAFETY = Path(__file__).parents[2] / "docs/reference/safety.md"
 
 def test_the_promises_are_those_of_the_reference() -> None:
     section = SAFETY.read_text(encoding="utf-8").partition("**Checked by a model.**")[2].partition("\n## ")[0]
-    promised = re.findall(r"^\d\. (.+?)\.$", section, re.MULTILINE)
+    promised = re.findall(r"^\d+\. (.+?)\.$", section, re.MULTILINE)
     assert promised == list(PROMISES)
 
 
@@ -109,6 +123,8 @@ def test_a_wrong_variant_breaks_its_promise(wrong: str) -> None:
         lambda now: now.unsure and now.thread == STANDS,
         lambda now: now.thread == ALLOWED and now.held,
         lambda now: now.lamps and now.unspoken == WATCHDOG,
+        lambda now: now.given_up == LEFT and now.stuck and now.lamps,
+        lambda now: now.given_up == MADE_SAFE and now.thread == ALLOWED and not (now.stuck or now.hangs),
     ],
 )
 def test_what_the_promises_are_about_is_reached(reached: Callable[[State], bool]) -> None:

@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import os
 import random
+import threading
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from supervision_model import ASKS, ATTENTION, DEAD, MOVES, RUNS, WATCHES, State, Step, steps
 from test_kuka_rsi import CONFIG, HOME_DEG, packet
 
 from coupole import supervision
+from coupole.acquisition.noted_devices import NotedDevice
 from coupole.acquisition.observer import Control, Held
-from coupole.errors import Interrupted
+from coupole.errors import DeviceRefused, Interrupted
 from coupole.supervision import Attention
 from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.rsi_session import RsiSession
@@ -44,6 +47,9 @@ class Implementation:
         self.control, self.attention = Control(can_stand=True), Attention()
         config = replace(CONFIG, attention_s=ATTENTION * CYCLE_NS / 1e9, delay_limit=1)
         self.session = RsiSession(config)
+        self.made_safe, no_rig = threading.Event(), cast("Any", None)
+        box = SimpleNamespace(start=lambda: None)
+        self.box = NotedDevice(box, "ledbox", no_rig, self.made_safe)
         self.number, self.ipoc, self.heard_ipoc = 0, 1000, 1000
         self.session.answer(packet(self.ipoc), self.now_ns)
 
@@ -67,6 +73,11 @@ class Implementation:
         elif what == "moves the arm":
             self.driver.write_looked(self.attention.begin())
             self.send(shared_state.MOVE)
+        elif what == "is refused":
+            with pytest.raises(DeviceRefused):
+                self.box.start()
+        elif what == "lights lamps" and not before.stuck:
+            self.box.start()
         elif what == "looks" and (looked_ns := self.attention.look()):  # None before the first motion
             self.driver.write_looked(looked_ns)
 
@@ -78,6 +89,10 @@ class Implementation:
             self.control.hold(what)
         elif what == "knows":
             self.control.halting.clear()
+
+    def main(self, what: str) -> None:
+        if what == "makes safe":
+            self.made_safe.set()
 
     def person(self, what: str, *, by_key: bool) -> None:
         if what == "pauses":
@@ -109,6 +124,8 @@ class Implementation:
             self.signals(done)
         elif part == "person":
             self.person(done, by_key=by_key)
+        elif part == "main":
+            self.main(done)
         elif what in ANSWERS:
             self.answering(done)
         elif part == "time passes":
@@ -182,4 +199,6 @@ MUST_BE_TAKEN = {
     "thread: goes on",
     "thread: finds it braked",
     "thread: is held",
+    "thread: is refused",
+    "main: makes safe",
 }

@@ -82,7 +82,7 @@ def test_a_disk_that_stands_still_for_ten_seconds_in_a_burst_loses_nothing(
 def test_what_a_camera_on_the_network_lost_while_the_disk_stood_still_is_taken_again(
     cell: CellFolder, slowed: Callable[..., dict[str, str]]
 ) -> None:
-    shipped: dict[str, Any] = cells.YAML(typ="safe", pure=True).load(cells.REPO / "configs/rigs/sim-gige.yaml")
+    shipped: dict[str, Any] = cells.shipped_rig("sim-gige")
     cell.rig_data["camera"] = shipped["camera"]
     cell.write(lights={"kind": "every", "every": 2})
     with gige_port():

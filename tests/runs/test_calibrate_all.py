@@ -20,7 +20,7 @@ STEPS = ("--only", "darks", "--only", "response")
 @pytest.fixture
 def rig(tmp_path: Path) -> Path:
     """The imperfect cell with small frames, faster than life."""
-    content: dict[str, Any] = YAML(typ="safe", pure=True).load(cells.REPO / "configs/rigs/sim-imperfect.yaml")
+    content: dict[str, Any] = cells.shipped_rig("sim-imperfect")
     content["sensor"] |= {"width_px": 256, "height_px": 192, "pixel_pitch_um": 88.0}
     content["dome"]["leds"] = str(cells.REPO / "configs/domes/coupole.csv")
     content["ledbox"]["settings"]["watchdog_s"] = 40.0

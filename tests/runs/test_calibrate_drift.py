@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from cells import Ended
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from coupole.calibration.light.frames import LightFrame, open_light_frames
 from coupole.calibration.record import Record, read_record
@@ -34,7 +33,7 @@ def rig(
 ) -> Path:
     """The imperfect cell with small frames, faster than life; slower where boards cool while a session begins, of
     which a busy machine makes several seconds."""
-    content: dict[str, Any] = YAML(typ="safe", pure=True).load(cells.REPO / "configs/rigs/sim-imperfect.yaml")
+    content: dict[str, Any] = cells.shipped_rig("sim-imperfect")
     content["sensor"] |= {"width_px": 256, "height_px": 192, "pixel_pitch_um": 88.0}
     content["dome"]["leds"] = str(cells.REPO / "configs/domes/coupole.csv")
     content["ledbox"]["settings"]["watchdog_s"] = 60.0

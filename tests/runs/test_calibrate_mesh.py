@@ -31,7 +31,7 @@ def make_rig(scale: Callable[[int, int], int]) -> Callable[..., Path]:
     hand-eye record."""
 
     def make(folder: Path, *things: Mapping[str, Any]) -> Path:
-        content: dict[str, Any] = YAML(typ="safe", pure=True).load(cells.REPO / "configs/rigs/sim-imperfect.yaml")
+        content: dict[str, Any] = cells.shipped_rig("sim-imperfect")
         width_px = scale(512, 2048)
         pitch_um = 22.0 * 1024 / width_px
         content["sensor"] |= {"width_px": width_px, "height_px": width_px * 3 // 4, "pixel_pitch_um": pitch_um}

@@ -27,7 +27,7 @@ pytestmark = needs_aravis
 @pytest.fixture
 def gige(tmp_path: Path, scale: Callable[[int, int], int]) -> Iterator[CellFolder]:
     """A small cell in real time with the camera of `sim-gige.yaml`; at full scale all lights at 1024 x 768."""
-    shipped = YAML(typ="safe", pure=True).load(cells.REPO / "configs/rigs/sim-gige.yaml")
+    shipped = cells.shipped_rig("sim-gige")
     cell = CellFolder(tmp_path, speed=1.0)
     cell.rig_data["camera"] = shipped["camera"]
     if scale(0, 1):

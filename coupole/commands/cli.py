@@ -22,7 +22,7 @@ from coupole.bounded import leave
 from coupole.commands.common import fail
 from coupole.commands.examples import add_examples
 from coupole.commands.extras import lacking_extras, missing_extra
-from coupole.errors import CoupoleError, InputError, Interrupted, StorageError
+from coupole.errors import CoupoleError, Interrupted, StorageError
 from coupole.viewing import text_outlet
 
 AT_A_CELL = {
@@ -235,10 +235,6 @@ def _exit_code_of_command() -> int:
             code = error.exit_code
         elif isinstance(error, OSError) and (why := text_outlet.full_stdout()):
             code = _not_taken(why)
-        elif isinstance(error, FileNotFoundError) and (replaced := _replaced(error)):
-            fail(replaced, as_json="--json" in sys.argv)
-            _say(replaced)
-            code = replaced.exit_code
         else:
             code = _code_of_defect(error)
     if why := text_outlet.full_stdout():
@@ -256,17 +252,6 @@ def _code_of_missing(error: ImportError) -> int:
     fail(missing, as_json="--json" in sys.argv)
     _say(missing)
     return missing.exit_code
-
-
-def _replaced(error: FileNotFoundError) -> InputError | None:
-    """Return what is told of a result of the views so far that was replaced while it was read; None for another
-    file."""
-    from coupole.storage import so_far
-
-    folder = so_far.folder_in(str(error))
-    if not folder:
-        return None
-    return InputError(f"{folder}: a result of more views has replaced it meanwhile; give the command again")
 
 
 def _code_of_defect(error: Exception) -> int:

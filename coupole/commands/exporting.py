@@ -92,14 +92,14 @@ def export(
     from coupole.viewing.terminal import bytes_text, make_console
 
     folder = source if options.in_place else out or source / "export"
-    request = Asked(so_far.as_it_is_now(source), to, folder, overwrite, options.given_options())
     console = make_console(quiet=as_json)
     try:
         if out is None and source.name == so_far.LINK:
             raise InputError(f"{source}: give --out; its folder is removed when the result is complete")
         if options.in_place and out is not None:
             raise InputError("--in-place writes into SOURCE: give it, or --out, not both")
-        summary = _write_export(request, console)
+        with so_far.reading(source) as read:
+            summary = _write_export(Asked(read, to, folder, overwrite, options.given_options()), console)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise

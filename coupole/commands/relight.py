@@ -192,11 +192,11 @@ def relight(
         _refuse_target(to, more, for_the_eye=colours.for_the_eye)
         colour, lights = colours.read_colour(), lighting.read_lights()
         camera = _camera(viewpoint)
-        with step_bars(console) as bars:
+        with so_far.reading(result) as folder, step_bars(console) as bars:
             bars("read", 0, 1)
             uncertain = more.uncertainty is not None or more.interval is not None
             relit = open_result(
-                result, viewpoint.view, viewpoint.fit, camera, lighting.samples, uncertain=uncertain
+                folder, viewpoint.view, viewpoint.fit, camera, lighting.samples, uncertain=uncertain
             )
             if colour is not None:
                 document = write_relit_for_the_eye(relit, lights, to, colour, more.white, bars)

@@ -112,12 +112,11 @@ def show(source: SourceArgument, out: OutOption, options: ShowOptions, as_json: 
             raise InputError(
                 f"{source}: is neither run, result (`coupole reflectance RUN --out FOLDER` makes one) nor scene"
             )
-        source = so_far.as_it_is_now(source)
-        with step_bars(console) as bars:
+        with so_far.reading(source) as folder, step_bars(console) as bars:
             bars("read", 0, 1)
-            look = _look(source, options, bars)
+            look = _look(folder, options, bars)
             bars("write", 0, 1)
-            title = source.stem if source.is_file() else source.resolve().name
+            title = folder.stem if folder.is_file() else folder.resolve().name
             files = write_page(look, title, out)
     except CoupoleError as error:
         fail(error, as_json=as_json)

@@ -12,13 +12,14 @@ for those who read it, the one before that is removed.
 from __future__ import annotations
 
 import contextlib
-import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from coupole.errors import InputError
 from coupole.storage.processing import FOLDER, RESULT
 
 LINK, REPORT = "so-far", "report.html"
@@ -68,10 +69,23 @@ def as_it_is_now(result: Path) -> Path:
     return link.resolve() if link.is_symlink() and link.exists() else result
 
 
-def folder_in(text: str) -> str:
-    """Return the folder of a result of some views that a text names, from `beside` on; empty if it names none."""
-    found = re.search(rf"\b{FOLDER}/[^/]+-\d+-of-\d+-views-[0-9a-f]{{8}}(?=[/'\"]|$)", text)
-    return found[0] if found else ""
+@contextmanager
+def reading(result: Path) -> Iterator[Path]:
+    """Give the folder that a reader opens (`as_it_is_now`). Whatever fails inside because a result of more views
+    has replaced it meanwhile is raised as InputError."""
+    folder = as_it_is_now(result)
+    try:
+        yield folder
+    except Exception as error:
+        if _is_replaced(folder):
+            raise InputError(
+                f"{folder}: a result of more views has replaced it meanwhile; give the command again"
+            ) from error
+        raise
+
+
+def _is_replaced(folder: Path) -> bool:
+    return folder.match(f"{FOLDER}/{_FOLDERS}") and (folder.parent.parent / LINK).resolve() != folder
 
 
 def figures(about: Mapping[str, Any]) -> dict[str, Any]:

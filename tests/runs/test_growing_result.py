@@ -51,6 +51,7 @@ def is_told_when_it_is_replaced(so_far: Path, out: Path) -> None:
     """A reader holds the folder that was there; a result of more views takes its place."""
     folder = so_far.resolve()
     shutil.rmtree(folder / "samples")
+    so_far.unlink()
     refused = cells.here("export", folder, "--to", "ply", "--out", out, "--json")
     assert refused.code == 2, refused
     assert "a result of more views has replaced it" in refused.err

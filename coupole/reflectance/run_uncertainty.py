@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from coupole.reflectance.run_result import RunResult, ViewSamples
 from coupole.reflectance.sample_sources import ChannelSamples, channel_samples
-from coupole.reflectance.sample_uncertainty import SOURCES, Places, Sources, bounds, drawn_ratios
+from coupole.reflectance.sample_uncertainty import SOURCES, MonteCarlo, Places, Sources, bounds
 
 Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]
@@ -46,10 +46,12 @@ def uncertainty_of(
     some = random.choice(len(sources.u_noise), min(_DRAWN, len(sources.u_noise)), replace=False)
     places_drawn, sources_drawn = places.at(some), sources.at(some)
 
+    monte_carlo = MonteCarlo(places_drawn, _DRAWS, np.random.default_rng(1), paper=paper)
+
     def table(of: Sources) -> dict[str, Any]:
-        ratios = drawn_ratios(places_drawn, of, _DRAWS, np.random.default_rng(1), paper=paper)
+        ratios = monte_carlo.ratios(of)
         below, above = 0.5 - TABLE_COVERAGE / 2, 0.5 + TABLE_COVERAGE / 2
-        return percentiles(*np.nanquantile(ratios, [below, above], axis=1))
+        return percentiles(*_quantiles(ratios, [below, above]))
 
     whole = table(sources_drawn)
     without = {}
@@ -64,6 +66,15 @@ def uncertainty_of(
         "monte_carlo": whole | {"coverage": TABLE_COVERAGE, "samples": len(some), "draws": _DRAWS},
         "without": without,
     }
+
+
+def _quantiles(values: Floats, shares: list[float]) -> Floats:
+    """[shares, n] of values [n, draws], without NaN. `nanquantile` goes through the rows one by one."""
+    quantiles = np.asarray(np.quantile(values, shares, axis=1))
+    has_unknown = np.isnan(values).any(axis=1)
+    if has_unknown.any():
+        quantiles[:, has_unknown] = np.nanquantile(values[has_unknown], shares, axis=1)
+    return quantiles
 
 
 def percentiles(low: Floats, high: Floats) -> dict[str, Any]:

@@ -23,6 +23,8 @@ Integers = NDArray[np.int64]
 
 _SIDES = 8
 """Number of sides of a triangle on which others are looked for."""
+_SMALL_BYTES = 64 * 2**20
+"""Of a table that is read in one piece."""
 _BESIDE = 1.2
 """Distance of a neighbour over the square root of a triangle's area: at least so far the others are."""
 
@@ -201,12 +203,16 @@ def _cosines(centres_mm: Floats, normals: Floats, led_mm: Floats) -> Floats:
 
 
 def _table(data: h5py.Dataset, rows: Integers, leds: Integers, channel: int | None) -> Floats:
-    """[rows, leds] of a channel, if there are channels, by rows or by LEDs, whichever reads less of the file."""
+    """[rows, leds] of a channel, if there are channels: in one piece if that is small, else by rows or by LEDs,
+    whichever reads less of the file."""
     channel_index = () if channel is None else (channel,)
-    if len(rows) * data.shape[1] < len(leds) * data.shape[0]:
-        return np.stack([data[(int(row), slice(None), *channel_index)][leds] for row in rows]).astype(np.float64)
     first = int(rows[0])
     some = slice(first, int(rows[-1]) + 1)
+    if (some.stop - first) * data.shape[1] * data.dtype.itemsize <= _SMALL_BYTES:
+        piece = data[(some, slice(None), *channel_index)]
+        return np.asarray(piece[np.ix_(rows - first, leds)], np.float64)
+    if len(rows) * data.shape[1] < len(leds) * data.shape[0]:
+        return np.stack([data[(int(row), slice(None), *channel_index)][leds] for row in rows]).astype(np.float64)
     return np.stack([data[(some, int(led), *channel_index)][rows - first] for led in leds], axis=1).astype(
         np.float64
     )

@@ -122,31 +122,41 @@ def tilt_covariance(corners_mm: Floats, vertex_um: Floats) -> Floats:
     return covariance * ((vertex_um * 1e-3) ** 2)[:, None, None]
 
 
-def drawn_ratios(
-    places: Places, sources: Sources, draws: int, random: np.random.Generator, *, paper: bool = False
-) -> Floats:
-    """[n, draws] true over measured reflectance, by Monte Carlo: power, vertices and LEDs are drawn anew, and the
-    signal is divided by what they give. Draws in which the light would come from below are NaN."""
-    count = len(sources.u_noise)
+class MonteCarlo:
+    """Power, vertices and LEDs of n places, drawn anew so many times. Tables of the same draws differ by their
+    sources alone, and share what these leave as it is."""
 
-    def normal(*shape: int) -> Floats:
-        return random.standard_normal((count, draws, *shape))
+    def __init__(self, places: Places, draws: int, random: np.random.Generator, *, paper: bool = False) -> None:
+        self._places, self._paper = places, paper
+        self._shape = len(places.corners_mm), draws
+        self._vertices, self._leds = (random.standard_normal((*self._shape, *more)) for more in ((3, 3), (3,)))
+        self._signal, self._own, self._shared = (random.standard_normal(self._shape) for _ in range(3))
+        self._by_sources: dict[tuple[bytes, bytes], Floats] = {}
 
-    def of_each(values: Floats, dimensions: int) -> Floats:
-        return values.reshape(count, 1, *[1] * dimensions)
+    def ratios(self, sources: Sources) -> Floats:
+        """[n, draws] true over measured reflectance: the signal is divided by what power, vertices and LEDs give.
+        Draws in which the light would come from below are NaN."""
+        places = self._places
+        measured_geometry = _geometry(places.corners_mm, places.led_mm, places.led_normals, self._paper)
+        key = sources.vertex_um.tobytes(), sources.led_mm.tobytes()
+        if key not in self._by_sources:
+            self._by_sources[key] = self._drawn_geometry(sources)
+        geometry = self._by_sources[key]
+        signal = 1.0 + sources.u_signal[:, None] * self._signal
+        power = (1.0 + sources.u_own[:, None] * self._own) * (1.0 + sources.u_shared[:, None] * self._shared)
+        with np.errstate(divide="ignore"):
+            ratios: Floats = signal * measured_geometry[:, None] / (power * geometry)
+        ratios[geometry <= 0.0] = np.nan
+        return ratios
 
-    measured_geometry = _geometry(places.corners_mm, places.led_mm, places.led_normals, paper)
-    corners = places.corners_mm[:, None] + of_each(sources.vertex_um * 1e-3, 2) * normal(3, 3)
-    leds = places.led_mm[:, None] + of_each(sources.led_mm, 1) * normal(3)
-    axes = np.broadcast_to(places.led_normals[:, None], leds.shape)
-    flat = _geometry(corners.reshape(-1, 3, 3), leds.reshape(-1, 3), axes.reshape(-1, 3), paper)
-    geometry = flat.reshape(count, draws)
-    signal = 1.0 + sources.u_signal[:, None] * normal()
-    power = (1.0 + sources.u_own[:, None] * normal()) * (1.0 + sources.u_shared[:, None] * normal())
-    with np.errstate(divide="ignore"):
-        ratios: Floats = signal * measured_geometry[:, None] / (power * geometry)
-    ratios[geometry <= 0.0] = np.nan
-    return ratios
+    def _drawn_geometry(self, sources: Sources) -> Floats:
+        places, (count, _) = self._places, self._shape
+        vertices_mm = (sources.vertex_um * 1e-3).reshape(count, 1, 1, 1) * self._vertices
+        corners = places.corners_mm[:, None] + vertices_mm
+        leds = places.led_mm[:, None] + sources.led_mm.reshape(count, 1, 1) * self._leds
+        axes = np.broadcast_to(places.led_normals[:, None], leds.shape)
+        flat = _geometry(corners.reshape(-1, 3, 3), leds.reshape(-1, 3), axes.reshape(-1, 3), self._paper)
+        return flat.reshape(self._shape)
 
 
 def _geometry(corners_mm: Floats, led_mm: Floats, led_normals: Floats, paper: bool) -> Floats:

@@ -19,7 +19,7 @@ from coupole.exchange.look.look_blocks import block_of
 from coupole.exchange.look.look_of_runs import Look, weld_corners
 from coupole.exchange.look.look_page import write_page
 from coupole.exchange.look.look_samples import samples_of_view
-from coupole.reflectance.sample_uncertainty import Places, Sources, drawn_ratios
+from coupole.reflectance.sample_uncertainty import MonteCarlo, Places, Sources
 
 
 def small(numbers: int = 30) -> Look:
@@ -185,7 +185,7 @@ def test_bars_of_samples_are_the_95_percent_of_all_that_is_uncertain(tmp_path: P
     sources = Sources(
         *of_signal, each(u["led_u_own"]), each(u["led_u_shared"]), each(scan_noise_um), each(u["led_u_mm"]), none
     )
-    ratios = drawn_ratios(places, sources, 20_000, np.random.default_rng(1))
+    ratios = MonteCarlo(places, 20_000, np.random.default_rng(1)).ratios(sources)
     low, high = np.quantile(ratios, [0.025, 0.975], axis=1)
     np.testing.assert_allclose(below[:, 0], 1 - low, rtol=0.06)
     np.testing.assert_allclose(above[:, 0], high - 1, rtol=0.06)

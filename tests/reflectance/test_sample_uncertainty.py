@@ -11,7 +11,7 @@ from triangle_cases import unit
 from coupole.calibration.budget.measurement import reflectance
 from coupole.calibration.light.irradiance import Emission
 from coupole.reflectance.run_uncertainty import percentiles
-from coupole.reflectance.sample_uncertainty import SOURCES, Places, Sources, bounds, drawn_ratios, tilt_covariance
+from coupole.reflectance.sample_uncertainty import SOURCES, MonteCarlo, Places, Sources, bounds, tilt_covariance
 
 COUNT = 40
 
@@ -43,7 +43,7 @@ def test_the_closed_form_is_that_of_monte_carlo(incidence_deg: float, least: flo
     """With vertices off by 3 % of a triangle's size, as with 30 um on 1 mm, and all other sources."""
     places = placed(incidence_deg)
     whole = sources(u_noise=0.02, u_own=0.01, u_shared=0.006, vertex_um=30.0, led_mm=0.1)
-    ratios = drawn_ratios(places, whole, 20_000, np.random.default_rng(2))
+    ratios = MonteCarlo(places, 20_000, np.random.default_rng(2)).ratios(whole)
     below = 0.5 * (1 - {0.994458: 0.68, 1.959964: 0.95}[quantile])
     known = np.nanquantile(ratios, [below, 1 - below], axis=1)
     found = np.array(bounds(places, whole, quantile))
@@ -74,9 +74,9 @@ def test_each_source_alone_is_what_it_is_known_to_be() -> None:
         "led_mm": 1.0,
     }.items():
         alone = sources(**{name: value})
-        assert np.nanstd(drawn_ratios(places, alone, 2000, random)) > 1e-4
-        assert np.nanstd(drawn_ratios(places, alone.without(name), 200, random)) == 0.0
-    far = np.nanstd(drawn_ratios(places, sources(led_mm=1.0), 20_000, random), axis=1)
+        assert np.nanstd(MonteCarlo(places, 2000, random).ratios(alone)) > 1e-4
+        assert np.nanstd(MonteCarlo(places, 200, random).ratios(alone.without(name))) == 0.0
+    far = np.nanstd(MonteCarlo(places, 20_000, random).ratios(sources(led_mm=1.0)), axis=1)
     known = 1e-3 * np.sqrt(4 + np.tan(np.radians(60)) ** 2)  # distance, and incidence
     np.testing.assert_allclose(far, known, rtol=0.05)
     low, high = bounds(places, sources(led_mm=1.0), 1.0)
@@ -84,7 +84,7 @@ def test_each_source_alone_is_what_it_is_known_to_be() -> None:
 
 
 def test_draws_lit_from_below_do_not_count() -> None:
-    ratios = drawn_ratios(placed(88.0), sources(vertex_um=60.0), 500, np.random.default_rng(7))
+    ratios = MonteCarlo(placed(88.0), 500, np.random.default_rng(7)).ratios(sources(vertex_um=60.0))
     assert 0.05 < np.isnan(ratios).mean() < 0.6
     assert np.nanmin(ratios) > 0
 
@@ -125,7 +125,7 @@ def test_draws_are_those_of_the_budgets_measurement_equation(emission: Emission)
     measured = true(np.ones(COUNT), np.ones(COUNT), middle, flat, places.led_mm, places.led_normals)
     budget = true(signal, power, corners.mean(axis=2), normals, leds, axes) / measured[:, None]
     whole = sources(u_noise=0.02, u_own=0.01, u_shared=0.006, vertex_um=30.0, led_mm=0.5)
-    mine = drawn_ratios(places, whole, draws, random, paper=emission == "paper")
+    mine = MonteCarlo(places, draws, random, paper=emission == "paper").ratios(whole)
     known, found = (np.nanquantile(ratios, [0.05, 0.16, 0.5, 0.84, 0.95], axis=1) for ratios in (budget, mine))
     np.testing.assert_allclose((found - known) / (known[-1] - known[0]), 0.0, atol=0.06)
 
@@ -137,7 +137,7 @@ def test_the_papers_emission_counts_in_the_draws() -> None:
     aside = replace(places, led_normals=turned)
     some = sources(led_mm=5.0)
     widths = [
-        np.nanstd(drawn_ratios(aside, some, 4000, np.random.default_rng(1), paper=two), axis=1)
+        np.nanstd(MonteCarlo(aside, 4000, np.random.default_rng(1), paper=two).ratios(some), axis=1)
         for two in (False, True)
     ]
     assert (widths[1] > widths[0]).mean() > 0.9

@@ -10,7 +10,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import cells
 import h5py
@@ -40,6 +42,7 @@ from coupole.storage.run import Run
 
 pytestmark = [
     pytest.mark.timeout(900),
+    pytest.mark.usefixtures("hurried"),
     pytest.mark.skipif(
         bool(why_not(Path(tempfile.gettempdir()))), reason="the disk cannot give back parts of files"
     ),
@@ -187,10 +190,25 @@ def test_without_the_plans_word_nothing_is_discarded(tmp_path: Path) -> None:
     assert not (result_of(cell) / sample_proofs.NAME).exists()
 
 
+OFTEN = {
+    "they are read back, it is not noted",
+    "the journal's line is cut",
+    "the journal has the line",
+    "a part of the frames is marked",
+    "they are noted, not in place",
+}
+"""Steps after which a mistake would lose most; the others are for `--full`."""
+
+
+def seldom(steps: Iterable[str], often: set[str]) -> list[Any]:
+    """Parameters: those that are not `often` are for `--full`."""
+    return [pytest.param(step, marks=[] if step in often else pytest.mark.full) for step in steps]
+
+
 # -- killed between any two steps -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("step", seldom(STEPS, OFTEN))
 def test_killed_at_any_step_no_frame_is_lost_and_it_goes_on(
     step: str, pending: tuple[Path, Path], samples_of_all_frames: dict[str, bytes]
 ) -> None:
@@ -204,7 +222,7 @@ def test_killed_at_any_step_no_frame_is_lost_and_it_goes_on(
         assert (result / "samples" / name).read_bytes() == content
 
 
-@pytest.mark.parametrize("step", REWRITTEN)
+@pytest.mark.parametrize("step", seldom(REWRITTEN, OFTEN))
 def test_killed_while_samples_are_replaced_they_are_proven_still(step: str, pending: tuple[Path, Path]) -> None:
     run, result = pending
     assert killed(step, run, result) == -signal.SIGKILL

@@ -17,7 +17,7 @@ from coupole.reflectance.light_paths import Ahead
 from coupole.reflectance.run_job import RunRequest, extract_beside, look_ahead, reflectance_of
 from coupole.reflectance.run_result import RunResult
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("hurried")]
 MEMORY_BYTES = 2_000_000_000
 
 

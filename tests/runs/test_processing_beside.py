@@ -18,7 +18,7 @@ from beside_runs import begun, cell_of_three_views, files, is_beside, result_of,
 from cells import CellFolder
 from PIL import Image
 
-pytestmark = pytest.mark.timeout(900)  # it has the lowest priority: a busy machine makes it wait
+pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("hurried")]
 
 
 def has_samples(cell: CellFolder) -> bool:

@@ -19,6 +19,7 @@ from coupole.storage.given_back import why_not
 
 pytestmark = [
     pytest.mark.timeout(900),
+    pytest.mark.usefixtures("hurried"),
     pytest.mark.skipif(
         bool(why_not(Path(tempfile.gettempdir()))), reason="the disk cannot give back parts of files"
     ),

@@ -17,6 +17,7 @@ from coupole.commands import cli
 
 OURS = ("coupole", "drivers", "sim")
 HEAVY = {"PIL", "cv2", "embreex", "h5py", "matplotlib", "numba", "numpy", "rich", "ruamel", "scipy", "trimesh"}
+OF_PLANS = {"rich", "numpy", "ruamel"}
 OF_RECORDS = {"rich", "numpy", "h5py", "ruamel"}
 """What describes a calibration's record: some tenths of a second."""
 LATE = {"pwd", "encodings.ascii"}
@@ -59,6 +60,8 @@ def test_help_imports_the_commands_alone(tmp_path: Path) -> None:
     [
         ("reflectance nosuch --out x --texels 0", "--texels: expected auto", {"rich"}),
         ("reflectance nosuch --out x --memory much", "--memory: expected a size", {"rich"}),
+        ("plan suggest nosuch.ply", "nosuch.ply: no such file", OF_PLANS),
+        ("plan suggest README.md --budget soon", "--budget: expected a time", OF_PLANS),
         ("calibrate check-artefact nosuch", "give one of --board and --tile", OF_RECORDS),
         ("calibrate check-artefact nosuch --board b", "nosuch: no such folder", OF_RECORDS),
         ("calibrate check-artefact . --board b --mpe-um x", "--mpe-um x: expected A+L/K", OF_RECORDS),

@@ -14,7 +14,7 @@ def refuse_standing(paths: Sequence[Path]) -> None:
     """Raise InputError if one of the files that would be written is there already."""
     if standing := [path for path in paths if path.exists()]:
         raise InputError(
-            f"{standing[0]}: exists already ({len(standing)} such files). Choose another --out, or give "
+            f"{standing[0]}: exists already ({len(standing)} such files). Choose another name or folder, or give "
             "--overwrite."
         )
 

@@ -134,7 +134,7 @@ def layer(
     other_grinding: Annotated[
         Path | None,
         typer.Option(
-            help=("Paint file of another grinding of the pigment, to compute the ratio of their grain sizes.")
+            help="Paint file of another grinding of the pigment, to compute the ratio of their grain sizes."
         ),
     ] = None,
     at_um: Annotated[

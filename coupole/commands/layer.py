@@ -160,10 +160,8 @@ def layer(
     console = make_console(quiet=as_json)
     try:
         if samples is None:
-            description, folder = (
-                _layer_description(films.film_descriptions(), name or "paint", noise, instrument, bare_grounds),
-                Path(),
-            )
+            descriptions, folder = films.film_descriptions(), Path()
+            description = _layer_description(descriptions, name or "paint", noise, instrument, bare_grounds)
         else:
             if films.are_named():
                 raise InputError(f"{samples}: names the films; leave out --over-black and the like")

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coupole.calibration.check.acceptance import CHECK
-from coupole.calibration.check.permissible import parse_permissible
 from coupole.commands.calibrate_lens import Warmth, look_for_board
 from coupole.commands.calibrate_light import TargetCalibrations, frames_with_poses, setting_of
 from coupole.commands.calibrating import (
@@ -107,6 +106,8 @@ def check_artefact(
 def _refuse_wrong(paths: Sequence[Path], independent: IndependentArtefact, emission: str) -> None:
     """Raise InputError for options that do not go together, and for files that are not there: before anything is
     read, and before what takes seconds to import."""
+    from coupole.calibration.check.permissible import parse_permissible
+
     tiles = independent.tile or []
     if (independent.board is None) != bool(tiles):
         raise InputError("check-artefact: give one of --board and --tile, the artefact's description")
@@ -122,8 +123,8 @@ def _refuse_wrong(paths: Sequence[Path], independent: IndependentArtefact, emiss
     for path in paths:
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; expected a run, or a folder of pictures")
-    described = {"--board": independent.board, "--rig": independent.rig, "--poses": independent.poses}
-    options = [*described.items(), *(("--tile", tile) for tile in tiles)]
+    file_of_option = {"--board": independent.board, "--rig": independent.rig, "--poses": independent.poses}
+    options = [*file_of_option.items(), *(("--tile", tile) for tile in tiles)]
     for option, file in (*options, *(("--records", record) for record in independent.records or [])):
         if file is not None and not file.exists():
             raise InputError(f"{option}: {file}: no such file")
@@ -144,6 +145,7 @@ def _check_board(
     console: Console,
 ) -> Outcome:
     from coupole.calibration.check.board_lengths import Noise, lengths_of
+    from coupole.calibration.check.permissible import parse_permissible
     from coupole.calibration.check.workflow import (
         Pictures,
         check_outcome,

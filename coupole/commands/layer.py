@@ -98,7 +98,7 @@ class Wishes:
     out: Path | None
     """Folder for the files."""
     overwrite: bool = False
-    """Whether files that are there may be replaced."""
+    """True if files that are there may be replaced."""
 
     def files_of(self, paint_name: str) -> tuple[Path, Path] | None:
         """Return paint file and report of a paint; None if none are wanted. Raises InputError if they are there

@@ -339,7 +339,7 @@ class Companions:
 
     pictures: dict[Path, NDArray[np.float32]]
     document: dict[str, Any]
-    """What `--json` says of them."""
+    """Their part of what `--json` says."""
 
     def clear(self) -> None:
         """Remove what is in their places. Raises StorageError."""

@@ -182,7 +182,7 @@ def _fits(
     """Local fits of shape by all points of a state, and of colour by those that have one."""
     if colours is None:
         return fit_locally(surface, None, places_mm, normals, reach_mm)
-    there = np.isfinite(colours.lab).all(axis=1)
+    there = np.asarray(np.isfinite(colours.lab).all(axis=1))
     if there.all():
         return fit_locally(surface, colours.lab, places_mm, normals, reach_mm)
     shape = fit_locally(surface, None, places_mm, normals, reach_mm)

@@ -1,4 +1,4 @@
-"""What a material is computed from, for its readers: without values that have no effect in the case at hand."""
+"""Values that a material is computed from: those that have no effect in the case at hand are left out."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ _OF_LEAF = {"gold", "index", "holes", "roughness"}
 def used_values(material: BaseModel, folder: Path) -> dict[str, Any]:
     """Return a material in JSON's types, without keys that change nothing of it, such as the `ground` of an opaque
     paint; paths of its files are relative to `folder`. Raises InputError for files that cannot be read."""
-    unused = _unused(material, folder)
-    return {name: _plain(value, folder) for name, value in material if value is not None and name not in unused}
+    unused_names = _unused_names(material, folder)
+    return {
+        name: _plain(value, folder) for name, value in material if value is not None and name not in unused_names
+    }
 
 
 def _plain(value: Any, folder: Path) -> Any:
@@ -30,7 +32,7 @@ def _plain(value: Any, folder: Path) -> Any:
     return value.as_posix() if isinstance(value, Path) else value
 
 
-def _unused(material: BaseModel, folder: Path) -> set[str]:
+def _unused_names(material: BaseModel, folder: Path) -> set[str]:
     match material:
         case Paint() | PaintLayer():
             return _unused_of_paint(material)
@@ -63,12 +65,12 @@ def _unused_of_paint(paint: Paint | PaintLayer) -> set[str]:
 
 def _unused_of_gilt(gilt: Gilt, folder: Path) -> set[str]:
     leaf_is_seen, bole_is_lit, bole_is_bare = seen_of_gilt(gilt, folder)
-    unused = _unused_of_alloy(gilt) | {name for name in ("holes", "uncovered") if not getattr(gilt, name)}
+    unused_names = _unused_of_alloy(gilt) | {name for name in ("holes", "uncovered") if not getattr(gilt, name)}
     if not leaf_is_seen:
-        unused |= _OF_LEAF | ({"thickness_nm"} if gilt.uncovered == 1.0 else set())
+        unused_names |= _OF_LEAF | ({"thickness_nm"} if gilt.uncovered == 1.0 else set())
     if not bole_is_lit:
-        unused.add("bole")
-    return unused if bole_is_bare else unused | {"bole_roughness"}
+        unused_names.add("bole")
+    return unused_names if bole_is_bare else unused_names | {"bole_roughness"}
 
 
 def _unused_of_alloy(metal: Metal | Gilt | Leaf) -> set[str]:

@@ -148,8 +148,8 @@ class Sequencer:
         ]
 
     def give_up(self, proven_shots: set[ShotId]) -> None:
-        """The session's thread was left behind: its figures with these proven shots, whose lines are on the disk.
-        The light of a burst under way counts as planned."""
+        """Conclude the figures of a session whose thread was left behind, with these proven shots, whose lines are
+        on the disk. The light of a burst under way counts as planned."""
         self._dose.give_up()
         self.conclude(proven_shots)
 

@@ -50,7 +50,8 @@ def example(
         console.print(f"{len(kept_names)} files were there already, and are kept", markup=False)
     if changed_names:
         console.print(
-            f"not as they come (remove them to have them anew): {', '.join(changed_names)}", markup=False
+            f"changed since they were copied (remove them to get them again): {', '.join(changed_names)}",
+            markup=False,
         )
     if missing:
         console.print(f"some steps need {', '.join(missing)}: pip install 'coupole[bench]'", markup=False)

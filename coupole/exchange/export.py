@@ -82,7 +82,7 @@ def _refuse_discarded(run: Run, frames: list[FrameProven]) -> None:
             f"{run.folder}: {len(matching_frames)} of the {len(frames)} frames that match, such as "
             f"{matching_frames[0]}, were discarded when their samples were safe, as the plan said (`discard: "
             f"after_fit`). Name frames that are kept with --shots, such as `{kept_label}`; `coupole export "
-            "RESULT` writes what the samples have become"
+            "RESULT` exports the result that was made of the samples"
         )
 
 

@@ -236,7 +236,7 @@ def _shuffle(builder: Any, first_vector: Any, second_vector: Any, places: list[i
 
 
 def _vectors_at(builder: Any, address: Any, kind: Any, count: int) -> Iterator[Any]:
-    """Pointers to as many vectors of a kind, one behind the other, that are aligned as their numbers are."""
+    """Pointers to `count` vectors of a kind that lie one behind the other, aligned like their elements."""
     size = kind.count * 4
     for number in range(count):
         yield builder.inttoptr(builder.add(address, ir.IntType(64)(number * size)), kind.as_pointer())

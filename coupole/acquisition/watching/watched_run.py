@@ -274,8 +274,8 @@ class WatchedRecorder:
         )
 
     def _kept_picture(self, burst: Burst, finding: Found) -> str:
-        """The path of a finding's picture in the run; empty after many, and where it cannot be written: no frame
-        depends on it."""
+        """The path of a finding's picture in the run. It is empty if there are many pictures already, or if the
+        picture cannot be written, because no frame depends on it."""
         if self._pictures >= _MOST_PICTURES:
             return ""
         self._pictures += 1

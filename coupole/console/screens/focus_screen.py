@@ -20,7 +20,8 @@ from coupole.console.screens.visit import Visit, in_thread
 from coupole.errors import CoupoleError
 
 LIVE_S = 60.0
-"""Live pictures end when nobody has touched the page for so long: each is light on the object."""
+"""Live pictures end when nobody has touched the page for this time, because each picture is light on the
+object."""
 _EVERY_S = 0.1
 
 

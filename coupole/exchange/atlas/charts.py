@@ -91,7 +91,7 @@ def split_off(neighbours: Integers, chart: Integers, is_expelled: NDArray[np.boo
 
 
 def parts_of(neighbours: Integers, kind: Integers) -> Integers:
-    """[n] charts from 0: triangles of one kind [n] that hang together."""
+    """[n] number of each triangle's chart, from 0: a chart is connected triangles of one `kind` [n]."""
     parts: Integers = _numbered_parts(neighbours, kind)
     return parts
 

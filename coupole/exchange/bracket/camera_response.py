@@ -23,7 +23,7 @@ from coupole.exchange.bracket.photographs import Photographs
 Array = NDArray[np.float64]
 NODES = 256
 SATURATED, DARK = 0.98, 0.01
-"""Values from which on, and up to which, a pixel says nothing but a bound."""
+"""A pixel gives only a bound if its value is at least the first, or at most the second, of these."""
 _PIXELS = 3000
 _WIDE = 2.6
 """Least factor between exposure times that leaves waves of the response open: 4 does, 2 does not."""

@@ -27,8 +27,8 @@ _LEAST_SINGULAR = 1e-4
 
 @dataclass(frozen=True)
 class PlaneCode:
-    """A pixel's planes are `weights` times its values, less `offset`; viewers show `base` and
-    `functions` times planes."""
+    """A pixel's planes are `weights` times its values, minus `offset`. Viewers show `base` plus `functions` times
+    the planes."""
 
     weights: Floats
     """[lights, 3, planes]"""
@@ -41,7 +41,7 @@ class PlaneCode:
     about: dict[str, Any]
     """Facts about the functions, for `info.json`."""
     ranges: tuple[float, ...] = ()
-    """[planes] by which tables of functions were multiplied to be of 8 bit; empty without tables."""
+    """[planes] factors that bring the tables of functions to 8 bit; empty without tables."""
 
     def planes_of(self, view: LitView, say: Said) -> Picture:
         """[h, w, planes] of a view."""

@@ -97,8 +97,9 @@ class Found:
         lacks = "absorbs" if best.worst > 0.0 else "absorbs less, or scatters more,"
         return (
             f"no mixture of this palette matches the target: the best one differs by {best.misfit:.1f} times "
-            "its uncertainty, "
-            f"most about {best.worst_nm:g} nm, where the recipe is {abs(best.worst):.3f} {kind}. A paint is "
+            "its uncertainty. "
+            f"The largest difference is near {best.worst_nm:g} nm, "
+            f"where the recipe is {abs(best.worst):.3f} {kind}. A paint is "
             f"missing that {lacks} there"
         )
 

@@ -96,7 +96,7 @@ class _Follower:
         self._newest_view, self._begun_view = "", ""
         """View of the newest proven frame; the same if what it sees was not computed yet, else empty."""
         self._tried_views: tuple[str, ...] = ()
-        """Views of which a result was made, or tried, as the newest."""
+        """Views of the last result so far that was made or tried."""
         self._may_give_up = True
         """The newest result of the views so far was not given up: the next one may be."""
 

@@ -116,7 +116,7 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
         "places": f"{0.5e3 * step_mm:.2g} um in each coordinate"
     }
     if choice.with_samples:
-                errors["samples"] = "2.3 % of their value, and of the distance from it to each end of its interval"
+        errors["samples"] = "2.3 % of their value, and of the distance from it to each end of its interval"
         samples = samples_of_result(result, support_from_base, source_about["scan_noise_um"], say)
         about["samples"], later = samples[0], later + samples[1]
     if growing := so_far.words(source_about):

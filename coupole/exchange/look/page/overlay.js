@@ -57,7 +57,7 @@ function coloursTold(about, state) {
   if (!state.lights.some(isTinted)) {
     return state.sky > 0 || state.environment > 0 ? ["colour of sky and surroundings are hypotheses in RGB"] : [];
   }
-  const eye = state.adapted ? "eye used to the chosen light (Bradford)" : "no adaptation of the eye";
+  const eye = state.adapted ? "eye adapted to the chosen light (Bradford)" : "no adaptation of the eye";
   return [`colours of lights are hypotheses in RGB, ${eye}`];
 }
 

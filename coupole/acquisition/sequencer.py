@@ -154,8 +154,8 @@ class Sequencer:
         self.conclude(proven_shots)
 
     def _remaining(self, number: int) -> list[Burst]:
-        """Bursts that are left of a view; those that are chosen now, if an earlier session has fired
-        all. A view that has not begun chooses when the arm is about to go there."""
+        """Bursts that are left of a view. If an earlier session has fired all of them, more bursts are chosen now.
+        A view that has not begun chooses when the arm is about to go there."""
         bursts = self._bursts.bursts_left(number)
         return bursts or (self._bursts.more(number) if self._bursts.bursts(number) else [])
 

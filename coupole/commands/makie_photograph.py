@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 _AROUND_PX = 4
 """A colour is the mean of the pixels up to this far from the place that is named."""
 _TOLD_FROM = 0.01
-"""Share of clamped pixels from which it is told."""
+"""Share of clamped pixels above which a message says so."""
 
 
 @dataclass(frozen=True)
 class _Result:
-    """A photograph taken apart."""
+    """A photograph, decomposed."""
 
     parts: Makie
     metal_rgb: NDArray[np.float64]

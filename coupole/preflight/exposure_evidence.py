@@ -145,9 +145,9 @@ class Evidence:
         return Judgement(clipped_share, reached_share, full_rate, np.sort(rates)[places])
 
     def place_that_helps(self, led: int) -> int | None:
-        """Of the exposures that an LED does not have yet, the first that lets enough of its pixels reach the
-        ratio.
-        If none is enough, the last of them; None if the LED has all exposures."""
+        """The first exposure that an LED does not have yet and that lets enough of its pixels reach the ratio. If
+        no
+        exposure is enough, the last one that the LED does not have; None if the LED has all exposures."""
         frames, exposure = self.merge(led), self._exposure
         lit_pixels = np.flatnonzero(self._is_lit(led, frames))
         some_pixels = lit_pixels[:: max(1, len(lit_pixels) // _SOME_PIXELS)]

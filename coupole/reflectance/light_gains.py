@@ -15,7 +15,7 @@ from coupole.reflectance.light_interpolation import nearest
 from coupole.reflectance.normal_fit import PointMaterials
 
 SUSPECT = 0.05
-"""A gain that differs from 1 by more than this is told."""
+"""A gain that differs from 1 by more than this is reported."""
 _LIT = 0.2
 """Least cosine of the light at pixels that count."""
 GAIN_NEIGHBOURS = 3

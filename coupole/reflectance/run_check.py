@@ -81,7 +81,7 @@ class _Check:
 
     @property
     def peak(self) -> float:
-        """Peak of the pictures, by which PSNR is told."""
+        """Peak of the pictures, to which PSNR refers."""
         upper = np.searchsorted(np.cumsum(self.levels), PEAK_QUANTILE * self.levels.sum())
         return float(upper + 0.5) / _LEVELS_OF_RANGE
 

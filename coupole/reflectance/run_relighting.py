@@ -61,7 +61,7 @@ _TRIANGLES = 1 << 13
 
 
 def best_fit(result: RunResult, among: Collection[str] = FITS) -> str:
-    """The one that missed least under the LEDs kept for the check; GGX with its normal if none were."""
+    """The fit with the smallest error under the LEDs kept for the check; GGX with its normal if none were kept."""
     mae_of_fits = read_about(result.folder)["mae"].items()
     known_mae = {name: mae for name, mae in mae_of_fits if mae is not None and name in among}
     return min(known_mae, key=known_mae.__getitem__, default=GGX_NORMAL.name)

@@ -47,7 +47,7 @@ def fit_slices(
 
     The fits are to the samples `sample_mask` [samples] of one view. With a model [b, samples, channels] they are
     added to a share of it, one more coefficient at the end: the mean of a fit to what the model leaves and of one
-    to the samples, by how well each foretells samples. The more a model leaves, the less are coefficients held.
+    to the samples, by how well each predicts samples. The more a model leaves, the less are coefficients held.
     """
     count, _, channels = samples.values.shape
     coefficients = np.full((len(fits), count, channels, COUNT + 1), np.nan, np.float32)

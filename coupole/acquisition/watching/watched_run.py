@@ -163,7 +163,7 @@ class WatchedRecorder:
             self._recorder.prove(slot, shot, fields)
 
     def see_mark(self, slot: int, burst: Burst, step: int) -> None:
-        """Keep the look at a dark mark: it tells of the room. With a panel marks are not dark."""
+        """Keep the look at a dark mark, which shows the light of the room. With a panel marks are not dark."""
         if slot in self._looks and not burst.panel:
             self._seen[_unkept_mark(burst, step)] = self._looks[slot]
 

@@ -62,8 +62,8 @@ class Measured(Model):
     path: Path
     column: int | None = None
     sample: Literal["gloss excluded", "gloss included", "bare"] = "gloss excluded"
-    """How the gloss of the sample's face was measured. `bare`: the sample had no face (matt powder), so the
-    measured reflectance is also valid inside a binder."""
+    """Part of the gloss of the sample's face in the measurement. `bare`: the sample had no face (matt powder), so
+    the measured reflectance is also valid inside a binder."""
 
 
 class MeasuredPaint(Model):

@@ -174,7 +174,8 @@ class _Screen:
 
     @property
     def _was_stopped(self) -> bool:
-        """Since live pictures began, as far as is known; the bench itself refuses the next one in any case."""
+        """True if a stop since live pictures began is known here; the bench refuses the next picture in any
+        case."""
         state = self._bench.state
         return state is not None and state["stops"] > self._stops
 

@@ -140,7 +140,7 @@ def _median_by(values: Floats, weights: Floats) -> float:
 
 
 def _charts_by(places: Floats, triangles: NDArray[np.integer]) -> Integers:
-    """[n] charts: parts that hang together on the surface and in the texture, and have the same side up."""
+    """[n] charts: parts that are connected on the surface and in the texture, and have the same side up."""
     keys = np.concatenate([triangles.reshape(-1, 1), np.rint(places.reshape(-1, 2) / _SAME_PLACE)], axis=1)
     _, number = np.unique(keys.astype(np.int64), axis=0, return_inverse=True)
     is_mirrored = _double_areas_in_map(places) > 0.0

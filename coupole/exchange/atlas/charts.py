@@ -86,7 +86,8 @@ def chart_axes(corners_mm: Floats, chart: Integers) -> Floats:
 
 
 def split_off(neighbours: Integers, chart: Integers, is_expelled: NDArray[np.bool_]) -> Integers:
-    """The charts [n] anew, where expelled triangles [n] are charts of their own, as far as they hang together."""
+    """The charts [n] after expelled triangles [n] are moved to charts of their own, one for each connected
+    part."""
     return parts_of(neighbours, np.where(is_expelled, chart + chart.max() + 1, chart).astype(np.int32))
 
 

@@ -103,7 +103,7 @@ def found_response(photographs: Photographs) -> Response:
 
 
 def left_open(exposure_s: Array) -> str:
-    """Return, in words, what photographs of these times cannot tell of a response; empty if they can tell all.
+    """Return, in words, which part of a response photographs of these times cannot determine; empty if none.
 
     With all times a factor apart, g(z) may have any wave of that period in ln E, which no pixel contradicts; the
     uncertainty has what waves the smoothness of the response leaves.

@@ -33,7 +33,7 @@ _SMALLEST_SPREAD = 1e-4
 
 @dataclass(frozen=True)
 class Region:
-    """Marked points that hang together."""
+    """A region: marked points that are connected."""
 
     points: int
     middle_mm: Floats
@@ -186,7 +186,8 @@ def _of_result(points_mm: Floats, colours: Colours, places_mm: Floats) -> Floats
 
 
 def _normals(state: State) -> Floats:
-    """[n, 3]: by triangles, else by neighbours, and then which side is out is not known."""
+    """[n, 3] normals from the triangles. Without triangles they come from neighbours, and their sign is
+    unknown."""
     if state.outward is not None and np.linalg.norm(state.outward, axis=1).min() > 0:
         return state.outward
     cloud = thinned_cloud(state.points_mm, state.spacing_mm, Viewpoint("none"), state.outward)

@@ -29,7 +29,7 @@ Say = Callable[[dict[str, Any]], object]
 
 def process_run(folder: Path, result: Path, say: Say) -> bool:
     """Process a run into its result, while it is acquired and after it; True if the result is whole. `say` is
-    given the progress, and `times` at the end. What fails is told, and what is there stays."""
+    given the progress, and `times` at the end. Failures are reported, and existing results stay."""
     teller = _Teller(result, say)
     try:
         with hold_result(result):

@@ -1,7 +1,8 @@
 """Materials of texels of several pixels: one fit for each, to the means of its channels, as triangles are fitted.
 
 Normal, lightness, ks and roughness are fitted to the mean of the channels, about the material of the triangle that
-most of a texel's pixels see, and neighbours have their word on them as on single pixels. All channels of a texel
+most of a texel's pixels see, and neighbouring texels are taken into account as neighbouring pixels are. All
+channels of a texel
 are measured, and give its colour together with those of the texels beside it.
 """
 

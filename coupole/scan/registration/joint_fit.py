@@ -40,7 +40,7 @@ _LEAST_PAIRS = 30
 
 @dataclass(frozen=True)
 class JointFit:
-    """Poses of scans that hang together, and how well they are known."""
+    """Poses of connected scans, and their uncertainties."""
 
     common_from_scan: list[Floats]
     """4x4 mm; the common frame is that of the fixed scan, or of the control points."""

@@ -1,4 +1,4 @@
-// Measured samples of a triangle, beside what its fit makes of the same directions.
+// Measured samples of a triangle, beside the prediction of its fit for the same directions.
 
 /** Where a number stands in numbers that rise; -1 if it does not. */
 function placeIn(numbers, wanted) {

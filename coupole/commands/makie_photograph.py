@@ -196,7 +196,7 @@ def _check_share(alpha: NDArray[np.float64], is_unknown: NDArray[np.bool_], know
 
 
 def _about(picture: NDArray[np.float64], place: list[str], option: str, form: str) -> NDArray[np.float64]:
-    """The pixels about a place. Raises InputError for a place that is none, or has nothing known."""
+    """The pixels about a place. Raises InputError for a place outside the picture, or where nothing is known."""
     import numpy as np
 
     height, width = picture.shape[:2]

@@ -63,7 +63,7 @@ def read_clusters(folder: Path) -> Clusters:
     with h5py.File(path, "r") as file:
         if "harmonics" not in file:
             raise InputError(
-                f"{path}: was made by an earlier version; `coupole reflectance cluster {folder}` anew"
+                f"{path}: was made by an earlier version; run `coupole reflectance cluster {folder}` again"
             )
         kd, ks, alpha, residual = (file[name][()].astype(np.float64) for name in Clusters.OF_CLUSTERS)
         return Clusters(file["cluster"][()], file["borrowed"][()], kd, ks, alpha, residual, file["harmonics"][()])

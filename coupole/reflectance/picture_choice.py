@@ -20,7 +20,7 @@ from coupole.reflectance.picture_set import PictureSet
 Floats = NDArray[np.float64]
 
 _SITES = 4096
-"""Pixels by which lights are judged, about."""
+"""Approximate number of pixels by which lights are judged."""
 
 
 @dataclass(frozen=True)

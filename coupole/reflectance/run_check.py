@@ -145,7 +145,7 @@ def _check_view(
 def _modelled_values(
     result: RunResult, view: ViewSamples, rows: slice, samples: TriangleSamples, share: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return what all fits make of some samples, in shares of the camera's range."""
+    """Return the predictions of all fits for some samples, in shares of the camera's range."""
 
     def of(name: str) -> NDArray[np.float64]:
         return predict_samples(result, name, view, rows, samples) * share

@@ -1,4 +1,4 @@
-"""Coefficients of each pixel, as planes, from its values under lights, and what viewers make of them.
+"""Coefficients of each pixel, as planes, from its values under lights, and the viewers' pictures from them.
 
 Viewers show the sums as they are, so that values are encoded for displays (sRGB) before anything is fitted.
 """

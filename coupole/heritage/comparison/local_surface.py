@@ -35,7 +35,7 @@ class LocalFits:
     scatter: Floats
     """[n, c, c] covariance of a point's values about the quadric, the mean of that here and next to here."""
     leverage: Floats
-    """[n, c] variance of a value over that of one point."""
+    """[n, c] variance of a value, divided by that of one point."""
 
     @property
     def covariance(self) -> Floats:

@@ -91,8 +91,9 @@ class Comparison:
 def compare(
     before_path: Path, after_path: Path, unit: str, noise_mm: float | None, *, is_aligned: bool, say: Say
 ) -> Comparison:
-    """Compare two files, or folders of `coupole reflectance`. `noise_mm` is the standard deviation of a point,
-    else found by the scatter; `is_aligned` takes the files' frame as common. Raises InputError, ExtraMissing."""
+    """Compare two files, or folders of `coupole reflectance`. `noise_mm` is the standard deviation of a point;
+    with None it is estimated from the scatter. With `is_aligned`, both files are in one frame already. Raises
+    InputError, ExtraMissing."""
     say("reading", 0, 2)
     before = _load_state(before_path, unit)
     say("reading", 1, 2)

@@ -17,7 +17,7 @@ from coupole.errors import InputError
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 
 _SAMPLED = 1_000_000
-"""Pixels, about, by which their size on the surface is found."""
+"""Approximate number of pixels by which their size on the surface is found."""
 _MOST_MM = 100.0
 
 

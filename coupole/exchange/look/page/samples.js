@@ -87,9 +87,10 @@ function barsTold(samples) {
   if (!known.length) return "Their uncertainty is not known.";
   const ends = ["below", "above"].map((side) => known.map((one) => one[side]).sort((one, other) => one - other));
   const [below, above] = ends.map((sorted) => percent(sorted[sorted.length >> 1]));
-  return `Bars: 95 % intervals by all sources (noise, pixels' responses, inter-reflection taken off, where pixels
-    look, power of each LED and of all, the mesh's vertices, places of LEDs), as if the channels were off together;
-    in the median ${below} below, ${above} above. What samples share moves them together.`;
+  return `Bars: 95 % intervals by all sources (noise, pixels' responses, inter-reflection that was subtracted,
+    places that pixels see, power of each LED and of all, the mesh's vertices, places of LEDs), as if the errors of the
+    channels were fully correlated; in the median ${below} below, ${above} above. Errors that samples share move them
+    together.`;
 }
 
 /** What is told of samples, as markup. */

@@ -109,7 +109,7 @@ class SceneRenderer extends Renderer {
       told.push(state.adapted ? "eye adapted to the chosen light (Bradford)" : "no adaptation of the eye");
       told.push("no light from surface to surface");
     }
-    if (isStereo(state)) told.push("for two eyes, the left one's to the left");
+    if (isStereo(state)) told.push("for two eyes: the left eye's picture is on the left");
     return told.join(" · ");
   }
 

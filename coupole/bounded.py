@@ -87,7 +87,7 @@ class Call:
         return DeviceTimeout(
             self.of,
             expected=f"an end of the call `{self.operation}`",
-            happened=f"it has not returned for {lasts_s:.0f} s, and was left behind",
+            happened=f"it has not returned for {lasts_s:.0f} s; nobody waits for it any more",
             remedy="Switch the device off and on, then resume the run; if this happens again, report it with the "
             "versions of the device's library and firmware.",
         )
@@ -174,7 +174,7 @@ class _Runner(Generic[T]):
         return self._done.done()
 
     def leave(self) -> bool:
-        """Nobody waits for it from now on; False if it has just ended."""
+        """Stop waiting for the call: it is left behind. Returns False if it has just ended."""
         with self._lock:
             self.is_left = not self._done.done()
         if self.is_left:

@@ -106,7 +106,7 @@ class HostNeed:
     remedy: str
     """Action of a person that meets it, as a sentence."""
     is_vital: bool = True
-    """False: it works without, but slower or with losses."""
+    """False if the device works without it, but slower or with losses."""
 
 
 class LedBox(Protocol):
@@ -338,8 +338,9 @@ class Robot(Protocol):
     """The arm that carries the camera.
 
     A motion must be watched (`coupole.supervision`): the thread that called `move_to` calls `measured` at least
-    every 0.1 s of the machine's time until the arm is at rest, or waits in `wait_settled`, which does so. Without
-    that the axes brake on their path, whatever has become of this process; no fault is latched.
+    every 0.1 s of the machine's time until the arm is at rest, or waits in `wait_settled`, which does so.
+    Otherwise
+    the axes brake on their path, even if this process hangs or has ended; no fault is latched.
     """
 
     def identify(self) -> Identity: ...

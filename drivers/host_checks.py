@@ -33,7 +33,7 @@ def serial_port(port: str) -> list[HostNeed]:
         return [HostNeed(what, False, "is no device", "Correct `port` in the rig.")]
     if os.access(path, os.R_OK | os.W_OK):
         return [HostNeed(what, True, "is there and may be used", "")]
-    remedy = f"Say `sudo usermod -aG {_group_name(mode.st_gid)} $USER`, and log in again."
+    remedy = f"Run `sudo usermod -aG {_group_name(mode.st_gid)} $USER`, and log in again."
     return [HostNeed(what, False, "this user may not use it", remedy)]
 
 
@@ -102,7 +102,7 @@ def own_address(address: str, *, kind: socket.SocketKind) -> list[HostNeed]:
 def receive_buffer() -> HostNeed:
     """The kernel's limit for a socket that receives frames."""
     limit_bytes, least = _number(_RECEIVE_LIMIT), f"{LEAST_RECEIVE_BUFFER_BYTES >> 20} MB"
-    remedy = "Say `sudo sysctl -w net.core.rmem_max=67108864` (and write it into /etc/sysctl.d)."
+    remedy = "Run `sudo sysctl -w net.core.rmem_max=67108864` (and write it into /etc/sysctl.d)."
     return HostNeed(
         "receive buffer of the network",
         limit_bytes >= LEAST_RECEIVE_BUFFER_BYTES,

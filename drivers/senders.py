@@ -21,8 +21,8 @@ def refuse_anybody(address: str, controller: object, any_controller_by: str) -> 
     that upon themselves."""
     if not (only_here(address) or controller or any_controller_by):
         raise ValueError(
-            f"expected `controller`, the address of the arm's controller: at {address} whoever sends first would "
-            "be taken for it. Or a person writes `any_controller_by: NAME` beside it"
+            f"expected `controller`, the address of the arm's controller: at {address} the first sender would be "
+            "taken for it. Or a person writes `any_controller_by: NAME` beside it"
         )
     if controller and any_controller_by:
         raise ValueError("expected `controller` or `any_controller_by`, found both")

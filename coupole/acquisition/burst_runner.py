@@ -136,7 +136,7 @@ class BurstRunner:
             raise DeviceError(
                 "camera",
                 expected=f"to be triggered every {needed_us} us at the most",
-                happened=f"the rig's `sensor:` has it triggered every {burst.timing.period_us} us",
+                happened=f"by the rig's `sensor:` it would be triggered every {burst.timing.period_us} us",
                 remedy="Lower `max_frames_per_s`, or raise `exposure_gap_us`, in the rig.",
             )
         period_s = burst.timing.period_us * 1e-6

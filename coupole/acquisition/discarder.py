@@ -58,9 +58,9 @@ class Discarder:
         self._thread.join(_ENDS_WITHIN_S)
 
     def has_room(self, view: str, hope: Callable[[], str]) -> bool:
-        """Tell whether the disk takes a view that is about to begin, with the samples that will come; if not, it
-        may when more was discarded. Raises DiskFull if it will not: `hope` returns why nothing more is discarded,
-        or nothing while something may be."""
+        """Tell whether the disk has room for a view that is about to begin, and for the samples that will come.
+        False if there may be room when more frames are discarded. Raises DiskFull if no more frames will be
+        discarded: `hope` returns the reason, or an empty text while some may be."""
         if self._run.view_path(view).exists():
             return True
         needed_bytes = self._room.needed_bytes(view, self._waiting_views())

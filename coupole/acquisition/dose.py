@@ -186,7 +186,8 @@ def _ask_ledger(ledger: Ledger, do: Callable[[], T]) -> T:
 
 
 class FlashMeter:
-    """The light of single flashes, planned for about a second of them at a time: a file is not synced for each."""
+    """The light of single flashes. It is planned for about a second at a time, so that no file is synced for each
+    flash."""
 
     def __init__(self, job: Job, cell: OpenedCell, what_for: str, flashes_per_s: float) -> None:
         self._light = LightOnObject(job, cell, what_for)

@@ -184,7 +184,8 @@ def _match_without_labels(
 def _verdict(
     log: NDArray[np.void], timestamps_ns: NDArray[np.int64], id_steps: NDArray[np.int64], alignment: _Aligned
 ) -> Match:
-    """Labels on which all candidates agree and that one frame alone claims; missing steps; what stays open."""
+    """The match: labels on which all candidates agree and that only one frame claims, missing steps, and questions
+    that stay open."""
     edge_steps, agreed_steps, agrees = alignment.edge_rows, alignment.candidate_rows, alignment.agrees
     steps = np.full(len(agreed_steps), UNLABELLED, np.int64)
     claims = np.bincount(agreed_steps[agreed_steps >= 0], minlength=len(edge_steps))

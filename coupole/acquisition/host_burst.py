@@ -88,7 +88,7 @@ class HostBurst:
         self._cell, self._recorder, self._arm = cell, recorder, arm
         self._tell, self._wait_while_paused, self._dose, self._note = tell, wait_while_paused, dose, note
         self._panel_s = 0.0
-        """Time for which the panel of this burst was on, at most."""
+        """Greatest time for which the panel of this burst can have been on."""
 
     def fire(self, burst: Burst, frame_format: FrameFormat) -> Verdict:
         """Fire one light after the other; the dose is recorded even if this raises, that of the light which was on

@@ -45,7 +45,7 @@ from coupole.viewing.terminal import LiveFigures, RunObserver, alarm
 
 _FIGURES_EVERY_S = 0.2
 LOOKS_ON = "this process only observes the run: the run continues"
-"""Word of a live view of a run, which has nothing to make safe."""
+"""Message when a live view of a run is to stop all: it has nothing to make safe."""
 
 
 def meter(

@@ -53,7 +53,8 @@ class Recorder(Protocol):
         ...
 
     def has_room(self, view: str) -> bool:
-        """Tell whether the disk takes a view that is about to begin. Raises DiskFull if it never will."""
+        """Tell whether the disk has room for a view that is about to begin. Raises DiskFull if it never will
+        have."""
         ...
 
     def begin_view(

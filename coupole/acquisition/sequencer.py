@@ -148,14 +148,14 @@ class Sequencer:
         ]
 
     def give_up(self, proven_shots: set[ShotId]) -> None:
-        """The session's thread was left behind: its figures with these proven shots, whose lines are on the disk.
-        The light of a burst under way counts as planned."""
+        """Conclude the figures of a session whose thread was left behind, with these proven shots, whose lines are
+        on the disk. The light of a burst under way counts as planned."""
         self._dose.give_up()
         self.conclude(proven_shots)
 
     def _remaining(self, number: int) -> list[Burst]:
-        """Bursts that are left of a view; those that are chosen now, if an earlier session has fired
-        all. A view that has not begun chooses when the arm is about to go there."""
+        """Bursts that are left of a view. If an earlier session has fired all of them, more bursts are chosen now.
+        A view that has not begun chooses when the arm is about to go there."""
         bursts = self._bursts.bursts_left(number)
         return bursts or (self._bursts.more(number) if self._bursts.bursts(number) else [])
 

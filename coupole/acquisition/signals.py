@@ -40,7 +40,7 @@ _LEAVES_WITHIN_S = 300.0
 _STOPS_WITHIN_S = 0.1
 """A process that stops itself may run on for a moment: the time that it stood is not to be taken for a freeze."""
 _SAFE_WITHIN_S = 4.0
-"""Ctrl-Z stops the process after this time though it is not sure that the cell is safe; that is told."""
+"""Ctrl-Z stops the process after this time even if it is not sure that the cell is safe; a message says so."""
 
 
 class SignalReceived(BaseException):

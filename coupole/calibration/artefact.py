@@ -116,8 +116,8 @@ class CertifiedReflectance(Model):
 
         Weighted by the light within the channel's band, or by the band alone. Errors of a certificate's
         wavelengths count as fully correlated, so their uncertainties add up linearly. A band is known within 20
-        nm: the change by that shift counts as the half width of a rectangle. Raises InputError for a band of
-        which the certificate says nothing.
+        nm: the change of the mean by this shift is the half width of a rectangular distribution. Raises
+        InputError for a band of which the certificate says nothing.
         """
         first, last = self.bands_nm[channel]  # type: ignore[index]  # a sensor's channel
         wavelengths = np.array(self.values)[:, 0]

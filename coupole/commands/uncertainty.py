@@ -274,15 +274,15 @@ def _show(console: Console, budget: Budget) -> None:
             console.print(
                 f"{interval.coverage:.0%}: [{low:+.2%}, {high:+.2%}], shortest [{short[0]:+.2%}, {short[1]:+.2%}]"
             )
-    console.print(
-        "alone: half its own 68 % interval; variance: its share by the linear formula; without: how much"
-    )
-    console.print("narrower the interval is without it")
+    console.print("alone: half the 68 % interval of this source alone; variance: its share by the linear formula;")
+    console.print("without: how much narrower the interval is without this source")
     console.print(
         f"linear formula: u {budget.linear.result.u / budget.nominal:.2%}; {budget.numeric.trials} trials"
     )
     for v in budget.validations:
-        console.print(f"  at {v.coverage:.0%}, to digit {v.digits} of u (JCGM 101, section 8): it {verdict(v)}")
+        console.print(
+            f"  linear formula at {v.coverage:.0%}, to digit {v.digits} of u (JCGM 101, section 8): {verdict(v)}"
+        )
 
 
 def _show_accuracies(console: Console, result: _Result) -> None:

@@ -1,7 +1,7 @@
 """Relit pictures for the eye: by CIE XYZ to sRGB (IEC 61966-2-1), with its profile.
 
 A relit picture has 1 in all channels where a white diffuser faces a light of strength 1: it is balanced, and the
-matrix of `coupole.exchange.camera_colour` makes of it what the surface has under daylight.
+matrix of `coupole.exchange.camera_colour` converts it to the colour of the surface under daylight.
 """
 
 from __future__ import annotations

@@ -22,9 +22,10 @@ _SRGB_NAME, _LINEAR_NAME = ("sRGB built-in".encode("utf-16-be"), "sRGB, linear "
 
 
 def encode(picture: Picture, colour: CameraColour, *, linear: bool) -> bytes:
-    """The whole file. 1 is the camera's range above black in the frame's own exposure, in the channel that gets
-    most of white; the others are cut where that one is, so that what is saturated is white. Raises InputError for
-    a camera without colours."""
+    """The whole file. The value 1 is the camera's range above black, in the frame's own exposure, of the channel
+    that
+    is brightest for white. The other channels are clipped at the same level, so that saturated pixels are white.
+    Raises InputError for a camera without colours."""
     from coupole.appearance.spectra.light import linear_srgb
 
     if picture.pattern not in PATTERNS:

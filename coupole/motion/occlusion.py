@@ -108,7 +108,7 @@ class Occlusions:
     arm: ArmDescription
     patches: Patches
     mesh: Any
-    """The object's, ready for rays (`ray_mesh`)."""
+    """The object's mesh, prepared for rays (`ray_mesh`)."""
     leds_mm: NDArray[np.float64]
     """[leds, 3] in the support frame."""
     object_codes: NDArray[np.uint8]
@@ -302,8 +302,9 @@ def segment_distance_mm(p, q, a, b):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _first_met(starts, ends, axes, radii, is_asked, center, reach, capsule_numbers):  # type: ignore[no-untyped-def]
-    """Fill `capsule_numbers` [n, m]. No segment to an end is farther than `reach` from the one that starts at
-    `center`: a capsule that this one misses by more is not tested for each start."""
+    """Fill `capsule_numbers` [n, m]. All segments to an end lie within `reach` of the segment that starts at
+    `center`.
+    If this segment misses a capsule by more than `reach`, the capsule is not tested for the single starts."""
     near = np.empty(len(radii), np.int64)
     for j in range(len(ends)):
         count = 0

@@ -91,9 +91,9 @@ class OpenView:
     target_mm: tuple[float, float, float] | None
     """The point in the picture's middle, in the support frame; None where the plan gives joints."""
     bursts: tuple[Burst, ...]
-    """Bursts from which is chosen: one for each exposure and repeat, each with all LEDs of the view."""
+    """Bursts from which the shots are chosen: one for each exposure and repeat, each with all LEDs of the view."""
     bound: tuple[Burst, ...]
-    """Bursts that are at least what may be chosen."""
+    """Bursts with at least as much light and time as any choice."""
 
     @cached_property
     def leds(self) -> NDArray[np.int64]:

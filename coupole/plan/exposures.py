@@ -23,7 +23,7 @@ class FixedExposure(Model):
 
     @property
     def frames_of_light(self) -> int:
-        """Frames of each light, at most."""
+        """Greatest number of frames of each light."""
         return 1
 
 
@@ -44,7 +44,7 @@ class BracketExposure(Model):
 
     @property
     def frames_of_light(self) -> int:
-        """Frames of each light, at most."""
+        """Greatest number of frames of each light."""
         return len(self.exposures_us)
 
 
@@ -71,7 +71,7 @@ class AutoExposure(Model):
     object_share: Annotated[float, Field(ge=0.01, le=0.999)] = 0.9
     """Share of the object's pixels under each LED's direct light that reach it."""
     most_exposures: Annotated[int, Field(ge=2, le=4)] = 3
-    """Exposures of one LED in one view, at most."""
+    """Greatest number of exposures of one LED in one view."""
     first_lights: Annotated[int, Field(ge=4, le=200)] = 24
     """LEDs of the first pass, spread over the dome; never more than an eighth of the view's, but six."""
 
@@ -93,7 +93,7 @@ class AutoExposure(Model):
 
     @property
     def frames_of_light(self) -> int:
-        """Frames of each light, at most."""
+        """Greatest number of frames of each light."""
         return self.most_exposures
 
 

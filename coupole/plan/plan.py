@@ -136,7 +136,7 @@ class Plan(Model):
     trigger: Literal["hardware", "software"] = "hardware"
     """The camera is triggered by the LED box, or by the host, light by light."""
     reshoot_limit: Annotated[int, Field(ge=0, le=20)] = 3
-    """Number of times that frames which are not proven are taken again, at most."""
+    """Greatest number of times that frames which are not proven are taken again."""
     discard: Literal["after_fit"] | None = None
     """`after_fit`: frames are discarded when their samples are safe, but for those that the check needs."""
     watch: bool | Watch = DARKS_ONLY

@@ -78,7 +78,7 @@ class NoLights(Model):
 
 
 MOST_ADAPTIVE_BURSTS = 128
-"""Bursts of one view whose LEDs are chosen, at most."""
+"""Greatest number of bursts of one view whose LEDs are chosen."""
 LedSelection = Annotated[AllLights | LightIds | LightBoards | EveryLight | LightCone, Field(discriminator="kind")]
 
 
@@ -90,9 +90,9 @@ class EnoughLights(Model):
     relit_rms: Annotated[float, Field(gt=0, le=1)] | None = None
     """Expected rms error of pictures interpolated for the LEDs not lit, as a share of the view's bright level."""
     seconds: Annotated[float, Field(gt=0)] | None = None
-    """Time of the view's bursts, at most."""
+    """Greatest time of the view's bursts."""
     lux_h: Annotated[float, Field(gt=0)] | None = None
-    """Light at the view's target by the LED table, at most."""
+    """Greatest light at the view's target, by the LED table."""
 
 
 class AdaptiveLights(Model):

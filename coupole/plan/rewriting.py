@@ -1,4 +1,4 @@
-"""Paths in plans and rigs: which there are, and a file's text with other paths in it."""
+"""Paths in plans and rigs: find them in a file, and write its text with other paths."""
 
 from __future__ import annotations
 

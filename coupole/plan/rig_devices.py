@@ -46,7 +46,7 @@ _MOTION_SETTINGS = {
 }
 """Keys of the rig's `motion:` and the corresponding settings of a robot's driver."""
 _WORDS = {
-    "any_controller_by": "whoever sends first is taken for the controller",
+    "any_controller_by": "the first sender is taken for the controller",
     "without_realtime_by": "the arm may be answered at normal priority",
 }
 """Settings of drivers that hold a person's name."""

@@ -99,8 +99,8 @@ class Schedule:
         return replace(self, bursts=tuple(bursts_of_views))
 
     def with_choices(self, choices: Mapping[str, Sequence[Choice]]) -> Schedule:
-        """The same with the bursts that were chosen for views that have enough (by name of view), in place of
-        their bounds. Raises KeyError for a choice that the plan does not allow."""
+        """The same schedule with the chosen bursts of views (by name) in place of their bounds, if enough are
+        chosen. Raises KeyError for a choice that the plan does not allow."""
         bursts = []
         for number, (view, bound) in enumerate(zip(self.views, self.bursts, strict=True)):
             view_choices = choices.get(view.name, ())

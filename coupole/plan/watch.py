@@ -9,7 +9,8 @@ from pydantic import Field
 from coupole.plan.base_model import Model
 
 SENTINELS = 3
-"""LEDs of a view's sentinels: of three, one that changes alone is told from a change of all."""
+"""Number of LEDs of a view's sentinels: with three, a change of one LED alone is distinguished from a change of
+all."""
 Electrons = Annotated[float, Field(gt=0, le=1e6)]
 Share = Annotated[float, Field(gt=0, lt=1)]
 

@@ -23,7 +23,7 @@ from coupole.preflight.next_lights import FEWEST_TAKEN, NextLights, next_lights,
 Floats = NDArray[np.float64]
 
 _SITES = 2048
-"""Pixels by which LEDs are judged, about."""
+"""Approximate number of pixels by which LEDs are judged."""
 
 
 class AdaptiveLightsChooser:

@@ -67,7 +67,7 @@ class AutoExposureChooser:
         lux_of_led = dict(zip(view.leds.tolist(), self._lux(view).tolist(), strict=True))
         evidence = Evidence(self._exposure, lux_of_led, choices[0].bursts[0].leds, samples)
         if not evidence.first_leds:
-            return Choice(bursts=(), reason="no frame of the first pass is proven: there is no basis for a choice")
+            return Choice(bursts=(), reason="no frame of the first pass is proven, so no exposure can be chosen")
         if len(choices) == 1 and (probes := self._probes(view, evidence)):
             reason = _in_words("the first pass clips or is dark", probes)
             return Choice(bursts=tuple(probes), reason=reason, figures={_PROBE: True})
@@ -133,7 +133,9 @@ class AutoExposureChooser:
 
     @staticmethod
     def _still_needed(places: Sequence[int], taken_places: Sequence[int]) -> list[int]:
-        """The places that exposures at `taken_places` do not replace: the ends that lie beyond them first."""
+        """The places that exposures at `taken_places` do not replace. These are the ends of `places` that lie
+        beyond
+        `taken_places`."""
         if not taken_places:
             return list(places)
         ends = [places[0]] if places[0] < taken_places[0] else []

@@ -185,7 +185,7 @@ def why_outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identi
     lacking = []
     if result.covers is None:
         if places := _places(key for key in now if key not in before):
-            lacking = [f"an earlier version did it, which did not cover {places}"]
+            lacking = [f"an earlier version did this step, and did not cover {places}"]
         before, now = ({key: fingerprints[key] for key in before if key in now} for fingerprints in (before, now))
     changes = _changes(before, now)
     if identities is not None:
@@ -203,7 +203,7 @@ def commissioning_refusals(cell: Cell, identities: Mapping[str, Identity] | None
     try:
         record = read_commissioning(cell)
     except InputError as error:
-        return [f"commissioning: {error}; remove the file and say `{command}`"]
+        return [f"commissioning: {error}; remove the file and run `{command}`"]
     if record is None:
         return [f"commissioning: this cell has no record ({record_path(cell)}). At the cell, say `{command}`"]
     if record.simulated:

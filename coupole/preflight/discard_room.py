@@ -23,11 +23,11 @@ from coupole.storage.frame_file import SPARE_SLOTS
 from coupole.storage.run import Occupied
 
 _BLOCK, _LANES = 4096, 8
-"""Triangles and LEDs of a chunk of samples, at most."""
+"""Greatest numbers of triangles and LEDs of a chunk of samples."""
 _TRIANGLE_BYTES = 200
 """Bytes of a triangle in a view's file beside its samples."""
 _PICTURES = 12
-"""Pictures of a view for the check, at most."""
+"""Greatest number of pictures of a view for the check."""
 _FIT_BYTES, _MATERIAL_BYTES = 1250, 360
 """Bytes of the fits of a view's triangle for each channel, and of those of a triangle of the mesh."""
 _SMALL_BYTES = 4_000_000
@@ -45,7 +45,7 @@ class ViewRoom:
     kept_bytes: int
     """The file, when frames were discarded."""
     sample_bytes: int
-    """Its samples, with the pictures for the check, at most."""
+    """Greatest size of its samples, with the pictures for the check."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class DiscardRoom:
     views: Mapping[str, ViewRoom]
     """Bytes of each view, by its name."""
     fit_bytes: int
-    """Fits and report, and the copy of samples that is made when they are replaced, at most."""
+    """Greatest size of fits and report, and of the copy of samples that is made when they are replaced."""
     reserve_bytes: int
     """Bytes that must stay free."""
 

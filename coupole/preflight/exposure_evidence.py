@@ -145,8 +145,9 @@ class Evidence:
         return Judgement(clipped_share, reached_share, full_rate, np.sort(rates)[places])
 
     def place_that_helps(self, led: int) -> int | None:
-        """The first exposure that an LED does not have yet and that lets enough of its pixels reach the ratio; the
-        last that it does not have, if none is enough; None if it has all."""
+        """The first exposure that an LED does not have yet and that lets enough of its pixels reach the ratio. If
+        no
+        exposure is enough, the last one that the LED does not have; None if the LED has all exposures."""
         frames, exposure = self.merge(led), self._exposure
         lit_pixels = np.flatnonzero(self._is_lit(led, frames))
         some_pixels = lit_pixels[:: max(1, len(lit_pixels) // _SOME_PIXELS)]

@@ -27,7 +27,7 @@ def storage_needs(folder: Path) -> list[HostNeed]:
         return [HostNeed(need_name, False, f"{there} is no folder", "Name another folder in the rig.")]
     if not os.access(there, os.W_OK | os.X_OK):
         return [
-            HostNeed(need_name, False, f"this user may not write into {there}", f"Say `sudo chown $USER {there}`.")
+            HostNeed(need_name, False, f"this user may not write into {there}", f"Run `sudo chown $USER {there}`.")
         ]
     free_bytes = shutil.disk_usage(there).free
     remedy = "Archive or move older runs (`coupole archive`), or name another folder in the rig."

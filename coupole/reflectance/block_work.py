@@ -1,7 +1,7 @@
 """Whole blocks of work, here or by the workers of a cluster (dask.distributed).
 
 A block is a function of few arguments and what it is done for, with a result that is small or is a file. Workers
-share the file system of the result with whoever asks them. What a worker that died was doing, another does again.
+share the file system of the result with whoever asks them. If a worker dies, another one repeats its task.
 """
 
 from __future__ import annotations

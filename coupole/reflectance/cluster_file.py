@@ -46,8 +46,8 @@ class Clusters:
     def at(
         self, own_materials: TriangleMaterials, mesh_normals: NDArray[np.float64], block: slice | NDArray[np.int64]
     ) -> TriangleMaterials:
-        """Return the materials of triangles by their places in `RunResult.triangles`. Normals are those of their
-        `own_materials` materials, or the mesh's where they borrow."""
+        """Return the materials of triangles by their places in `RunResult.triangles`. The normals are
+        those of `own_materials`; a triangle that borrows a material has the mesh's normal."""
         number, is_borrowed = self.cluster[block], self.borrowed[block, None]
         kd, ks, alpha, residual = (getattr(self, name)[number] for name in self.OF_CLUSTERS)
         alpha[number < 0] = np.nan
@@ -63,7 +63,7 @@ def read_clusters(folder: Path) -> Clusters:
     with h5py.File(path, "r") as file:
         if "harmonics" not in file:
             raise InputError(
-                f"{path}: was made by an earlier version; `coupole reflectance cluster {folder}` anew"
+                f"{path}: was made by an earlier version; run `coupole reflectance cluster {folder}` again"
             )
         kd, ks, alpha, residual = (file[name][()].astype(np.float64) for name in Clusters.OF_CLUSTERS)
         return Clusters(file["cluster"][()], file["borrowed"][()], kd, ks, alpha, residual, file["harmonics"][()])

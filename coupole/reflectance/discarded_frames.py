@@ -157,7 +157,7 @@ def is_for_discarding(run: Run, out: Path) -> bool:
 
 @contextmanager
 def _hold_when_free(run: Run) -> Iterator[None]:
-    """The run's lock, when the session that has it lets it go."""
+    """Wait until the session that has the run's lock gives it up, then hold the lock."""
     with ExitStack() as stack:
         while True:
             try:

@@ -75,7 +75,7 @@ def root_by_unknowns(normal, t1, t2, light, half, nv, v1, v2, kd, ks, alpha, row
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def shine(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
-    """D V alone, for pictures."""
+    """D V, the specular term of GGX without ks, for pictures."""
     alpha2 = alpha * alpha
     t = nh * nh * (alpha2 - 1.0) + 1.0
     a = math.sqrt(alpha2 + (1.0 - alpha2) * nl * nl)

@@ -122,8 +122,9 @@ def _diffuse_ahead(paths: PathsOfLight, result: RunResult, view: ViewSamples) ->
 def _apparent_reflectance(
     result: RunResult, diffuse: dict[str, Floats], scene: Scene, count: int, support_reflectance: float
 ) -> Floats:
-    """[patches, channels] reflectance by the samples, the mean of a patch's triangles; of those that no view shows
-    that of all; the support has its own."""
+    """[patches, channels] reflectance of each patch by the samples: the mean over its triangles. A patch that no
+    view
+    shows has the median of all triangles. The support has its own reflectance."""
     channels = result.channels
     sums, weights = np.zeros((scene.patches, channels)), np.zeros(scene.patches)
     every = []

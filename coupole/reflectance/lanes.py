@@ -1,8 +1,8 @@
 """Eight numbers at once in compiled code: a vector of the processor as a type of numba.
 
 Numba leaves it to LLVM to find such vectors in loops, and it does not find those of loops that are short, branch,
-or read at places that a list names. Lanes are of single or double precision; +, -, * and / take them with each
-other and with numbers, rounding as single numbers do. They live in compiled code only: Python never gets one.
+or read at places that a list names. Lanes are of single or double precision; +, -, * and / work on
+lanes and numbers, and round as for single numbers. They live in compiled code only: Python never gets one.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _broadcast(context: Any, builder: Any, number: Any, kind: Any, value: Any) -
 
 
 def _made_of(build: Any) -> Any:
-    """A function of lanes and numbers, by what `build` makes of their vectors."""
+    """A function of lanes and numbers: `build` makes its code for their vectors."""
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
         number, typed_values = signature.return_type.number, zip(signature.args, values, strict=True)
@@ -236,7 +236,7 @@ def _shuffle(builder: Any, first_vector: Any, second_vector: Any, places: list[i
 
 
 def _vectors_at(builder: Any, address: Any, kind: Any, count: int) -> Iterator[Any]:
-    """Pointers to as many vectors of a kind, one behind the other, that are aligned as their numbers are."""
+    """Pointers to `count` vectors of a kind that lie one behind the other, aligned like their elements."""
     size = kind.count * 4
     for number in range(count):
         yield builder.inttoptr(builder.add(address, ir.IntType(64)(number * size)), kind.as_pointer())

@@ -87,7 +87,7 @@ def _read_dome(path: Path, dome: dict[str, Any]) -> LightFile:
     key = places if dome.get(places) else "directions"
     directions = _vectors(path, dome, key, "xyz")
     if not len(directions):
-        refuse(path, f"{key}: expected a list of lights, of x, y, z; there is none")
+        refuse(path, f"{key}: expected a list of lights, each with x, y and z; there is none")
     adjust = _vectors(path, dome, "ledAdjust", "rgb") if dome.get("ledAdjust") else None
     if adjust is not None and (len(adjust) != len(directions) or not np.all(adjust > 0)):
         refuse(path, f"ledAdjust: expected {len(directions)} of positive r, g, b")

@@ -15,7 +15,7 @@ from coupole.reflectance.light_interpolation import nearest
 from coupole.reflectance.normal_fit import PointMaterials
 
 SUSPECT = 0.05
-"""A gain that differs from 1 by more than this is told."""
+"""A gain that differs from 1 by more than this is reported."""
 _LIT = 0.2
 """Least cosine of the light at pixels that count."""
 GAIN_NEIGHBOURS = 3
@@ -25,7 +25,7 @@ GAIN_NEIGHBOURS = 3
 def gains(
     grey: NDArray[np.float64], materials: PointMaterials, lights: NDArray[np.float64], view: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[lights] of values [pixels, lights] under unit vectors [lights, 3]."""
+    """[lights] gain of each picture, from values [pixels, lights] under lights in the directions [lights, 3]."""
     pixels = np.flatnonzero(np.isfinite(materials.kd))
     half = lights + view
     half /= np.linalg.norm(half, axis=1, keepdims=True)

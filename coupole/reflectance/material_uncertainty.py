@@ -1,4 +1,4 @@
-"""Covariance of normals and materials of triangles, and what it makes of values in any direction.
+"""Covariance of normals and materials of triangles, and the uncertainty of values in any direction that follows.
 
 The fit solves equations of scores: sums over samples of weight times derivative times residual, and the priors.
 Its covariance is H^-1 M H^-1 with H the derivatives of the scores and M their variance (Huber 1967). M comes from

@@ -25,9 +25,9 @@ Floats = NDArray[np.float64]
 
 LEVEL = 0.95
 FEWEST_LIGHTS = 12
-"""Lights from which a spread over groups says anything."""
+"""Least number of lights for which the spread over groups is evidence."""
 _NORMAL_QUANTILE = math.sqrt(-math.log(1.0 - LEVEL))
-"""Radius that holds 95 % of a plane normal distribution, over its rms radius."""
+"""Radius that contains 95 % of a two-dimensional normal distribution, divided by its rms radius."""
 _STRATA = (0.25, 0.5, 0.75, 0.9, 0.97)
 """Quantiles of the fit's own spread between which strata lie."""
 _SHRINK_PIXELS = 200.0

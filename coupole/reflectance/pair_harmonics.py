@@ -24,8 +24,11 @@ Floats = NDArray[np.float64]
 
 USUAL_DEGREES, MOST_DEGREES = 10, 17
 TIKHONOV, _LEAST = 0.1, 1e-3
-"""Ridge of the highest degrees, over the mean of the normal matrix's diagonal, and of the lowest over that. On a
-simulated glossy surface a tenth and tenfold changed the error, lights and a view left out, by 3 % at most."""
+"""Ridge of the highest degrees as a share of the mean of the normal matrix's diagonal; ridge of the lowest degrees
+as
+a share of that of the highest. On a simulated glossy surface, a tenth and ten times as much changed the error,
+lights
+and a view left out, by 3 % at most."""
 _TABLES = (*recurrence(MOST_DEGREES), diagonal(MOST_DEGREES))
 
 

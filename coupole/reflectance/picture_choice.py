@@ -20,7 +20,7 @@ from coupole.reflectance.picture_set import PictureSet
 Floats = NDArray[np.float64]
 
 _SITES = 4096
-"""Pixels by which lights are judged, about."""
+"""Approximate number of pixels by which lights are judged."""
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,13 @@ class HowMany:
     """Number of lights that are chosen, and the steps in which they are."""
 
     most: int
-    """Lights that are chosen, at most."""
+    """Greatest number of lights that are chosen."""
     relit_rms: float | None = None
-    """Expected error at which is stopped, as a share of the pictures' bright level."""
+    """No more lights are chosen at this expected error, a share of the pictures' bright level."""
     first: int = FEWEST_TAKEN
     """Lights to begin with, spread over the dome."""
     at_a_time: int = 1
-    """Lights that are chosen before the next look."""
+    """Number of lights that are chosen before their pictures are looked at."""
 
 
 def choose_pictures(

@@ -30,10 +30,11 @@ _NOT_LINEAR = (0, 1, 4)
 def uncertainty_of_picture(
     scene: RelitScene, lights: Sequence[AnyLight], samples: int = SAMPLES, *, say: Say = lambda done, of: None
 ) -> NDArray[np.float32]:
-    """[h, w, channels] standard uncertainty (68 %) of `scene.picture(lights, samples)`, in its unit: linear, by
-    what normal, kd, ks and roughness of each triangle may be off, by the responses of its pixels and by the power
-    of all LEDs. 0 where no material is seen, NaN where its uncertainty is not known. It does not hold what the fit
-    cannot show (another lobe than GGX, light from surface to surface), nor any error of the lights asked for.
+    """[h, w, channels] standard uncertainty (68 %) of `scene.picture(lights, samples)`, in its unit. It
+    is a linear combination of the uncertainties of each triangle's normal, kd, ks and roughness, of the responses
+    of its pixels, and of the power of all LEDs. 0 where no material is seen, NaN where its uncertainty is not
+    known. It does not include what the fit cannot show (another lobe than GGX, light from surface to surface), nor
+    any error of the lights asked for.
 
     The picture is made again with materials moved along each independent part of their covariance, which takes
     eleven times as long as the picture alone. Raises InputError for a fit that has no covariance.

@@ -81,7 +81,7 @@ class _Check:
 
     @property
     def peak(self) -> float:
-        """Peak of the pictures, by which PSNR is told."""
+        """Peak of the pictures, to which PSNR refers."""
         upper = np.searchsorted(np.cumsum(self.levels), PEAK_QUANTILE * self.levels.sum())
         return float(upper + 0.5) / _LEVELS_OF_RANGE
 
@@ -145,7 +145,7 @@ def _check_view(
 def _modelled_values(
     result: RunResult, view: ViewSamples, rows: slice, samples: TriangleSamples, share: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return what all fits make of some samples, in shares of the camera's range."""
+    """Return the predictions of all fits for some samples, in shares of the camera's range."""
 
     def of(name: str) -> NDArray[np.float64]:
         return predict_samples(result, name, view, rows, samples) * share

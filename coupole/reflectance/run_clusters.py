@@ -106,7 +106,7 @@ def cluster_result(
 def _sample_mask(
     result: RunResult, block: slice, left_out: list[int], without_view: str | None
 ) -> NDArray[np.bool_]:
-    """[samples] of a block: those of neither the LEDs nor the view that are left out."""
+    """[samples] of a block: True for samples that are neither of the LEDs nor of the view that are left out."""
     led_in_use = ~np.isin(result.along_samples(block, "leds"), left_out)
     return np.asarray(led_in_use & (result.along_samples(block, "names") != without_view))
 

@@ -47,7 +47,7 @@ def strata_of(relative: NDArray[np.floating], residual: NDArray[np.floating]) ->
 
 @dataclass
 class WideningSamples:
-    """Errors of one fit over their uncertainty; they grow block by block."""
+    """Errors of one fit, divided by their uncertainty; each block adds some."""
 
     ratios: list[Floats] = field(default_factory=list)
     relative: list[Floats] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""Pictures of LEDs that were kept for the check, block by block of 2 x 2 pixels, beside what fits make of them."""
+"""Pictures of LEDs that were kept for the check, in blocks of 2 x 2 pixels, beside the predictions of the fits."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ _TRIANGLES = 1 << 13
 
 
 def best_fit(result: RunResult, among: Collection[str] = FITS) -> str:
-    """The one that missed least under the LEDs kept for the check; GGX with its normal if none were."""
+    """The fit with the smallest error under the LEDs kept for the check; GGX with its normal if none were kept."""
     mae_of_fits = read_about(result.folder)["mae"].items()
     known_mae = {name: mae for name, mae in mae_of_fits if mae is not None and name in among}
     return min(known_mae, key=known_mae.__getitem__, default=GGX_NORMAL.name)
@@ -221,8 +221,9 @@ def _values_of(reflecting: Slices | Pairs, light: TriangleSamples, part: slice) 
 
 
 def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = None) -> RelitScene:
-    """A measured view: the first one unless it is named; the fit that missed least under the LEDs that were kept
-    for the check unless it is named. Raises InputError for a view or a fit that is not there."""
+    """A measured view and its fit. Unless they are named, it is the first view, and the fit with the smallest
+    error
+    under the LEDs that were kept for the check. Raises InputError for a view or a fit that is not there."""
     names = [run_view.view for run_view in result.views]
     if view is not None and view not in names:
         raise InputError(f"--view: expected one of {', '.join(names)}; got {view!r}")

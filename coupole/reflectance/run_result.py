@@ -327,7 +327,8 @@ def _read_rows(data: h5py.Dataset, block: Block) -> NDArray[np.float64]:
 
 
 def u_inter_reflection(share: NDArray[np.float16]) -> NDArray[np.float64]:
-    """Relative standard uncertainty of samples from which inter-reflection was taken off, by its share."""
+    """Relative standard uncertainty of samples after the given share of them was subtracted as
+    inter-reflection."""
     fraction = share.astype(np.float64)
     return np.asarray(U_OF_INTER_REFLECTION * fraction / (1.0 - fraction))
 

@@ -22,11 +22,11 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _SIDES = 8
-"""Number of sides of a triangle on which others are looked for."""
+"""Number of sides of a triangle on which other triangles are searched for."""
 _SMALL_BYTES = 64 * 2**20
-"""Of a table that is read in one piece."""
+"""Greatest size of a table that is read in one piece."""
 _BESIDE = 1.2
-"""Distance of a neighbour over the square root of a triangle's area: at least so far the others are."""
+"""Least distance of a neighbour, divided by the square root of a triangle's area."""
 
 
 @dataclass(frozen=True)

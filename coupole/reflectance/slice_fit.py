@@ -47,7 +47,7 @@ def fit_slices(
 
     The fits are to the samples `sample_mask` [samples] of one view. With a model [b, samples, channels] they are
     added to a share of it, one more coefficient at the end: the mean of a fit to what the model leaves and of one
-    to the samples, by how well each foretells samples. The more a model leaves, the less are coefficients held.
+    to the samples, by how well each predicts samples. The more a model leaves, the less are coefficients held.
     """
     count, _, channels = samples.values.shape
     coefficients = np.full((len(fits), count, channels, COUNT + 1), np.nan, np.float32)
@@ -245,8 +245,9 @@ def _held_by(residuals, values, sample_numbers, first):  # type: ignore[no-untyp
 
 @numba.njit(cache=True, nogil=True)
 def _solve(rows, product, penalty, values, room, factor, right):  # type: ignore[no-untyped-def]
-    """Fill `right` with the coefficients, the shorter way; return whether there are some. `product` is of `gram`
-    where samples are as many as functions."""
+    """Fill `right` with the coefficients; return whether there are some. The equations are solved by samples or by
+    functions, whichever are fewer. `product` is that of `gram` if there are at least as many samples as functions.
+    """
     if rows.shape[1] < COUNT:
         return solve_by_samples(rows, penalty, values, room, factor, right)
     if not factorise(product, penalty, factor):

@@ -41,7 +41,7 @@ class StratumFactors:
 
 def fit_strata(ratios: Floats, labels: Labels, lights: NDArray[np.int64], level: float) -> StratumFactors:
     """Fit factors so that a share `level` of the `ratios` [n], residual over scale, is below the quantile in each
-    stratum; `lights` [n] are the lights of the samples, whose residuals hang together."""
+    stratum; `lights` [n] are the lights of the samples, whose residuals are correlated."""
     log_quantile = float(np.log(max(np.quantile(ratios, level), 1e-12)))
     factors = {name: np.zeros(MOST_STRATA) for name in labels}
     log_ratios = np.log(np.maximum(ratios, 1e-12)) - log_quantile

@@ -37,11 +37,11 @@ MOST_KS = 1.0
 _STARTS = (0.08, 0.2, 0.45)
 _FIRST_KS = 0.02
 _TO_CHOOSE = 256
-"""Samples, about, by which the best start is chosen."""
+"""Approximate number of samples by which the best start is chosen."""
 LEAST_KD = 1e-6
 """1/sr: of black, where a share of kd is asked for."""
 _CHOSEN, _SETTLED = 1e-4, 1e-5
-"""A fit ends when a step gains less of the cost: of a start, and of the best one."""
+"""A fit ends when a step lowers the cost by less than this share: for each start, and for the best one."""
 HELD = 1e9
 """Stiffness of a normal that is not fitted."""
 _PART = 256

@@ -41,8 +41,8 @@ _ENDS_WITHIN_S = 600.0
 
 
 class Acquisition(Iterator[Event]):
-    """A run that is being acquired: its journal's events, as they come. Use it `with` a context: it is over, and
-    the cell is safe, when the context ends."""
+    """A run that is being acquired: its journal's events, as they come. Use it in a `with` statement: when this
+    ends, the run is over and the cell is safe."""
 
     run: Path | None
     """The run's folder, absolute; None until it is made."""

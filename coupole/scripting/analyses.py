@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 CalibrationRecord = Record
 AnyPath = str | os.PathLike[str]
 Progress = Callable[[str, int, int], None]
-"""Called with the name of a step, and how many of how many parts of it are done."""
+"""Called with the name of a step, the number of its parts that are done, and the number of all its parts."""
 PRINTED_U_PPM = 5000.0
-"""Standard uncertainty of the scale of a board of which nothing but a nominal side is known."""
+"""Standard uncertainty of a board's scale if only the nominal side of its squares is known."""
 
 
 def fit_reflectance(

@@ -21,8 +21,9 @@ from coupole.storage.arm_faults import faults_of
 def open_cell(rig: str | os.PathLike[str] = "sim", *, support_is_empty: bool = False) -> Iterator[OpenedCell]:
     """Open the devices of a rig (a file, or the name of a shipped one), with its simulated world if it has one.
 
-    `cell.ledbox`, `cell.camera` and `cell.robot` keep the contracts of `coupole.devices`; `cell.clock` is the
-    rig's clock and `cell.identities` says who they are. At the end, also by an exception or Ctrl-C, the lights are
+    `cell.ledbox`, `cell.camera` and `cell.robot` are as described in `coupole.devices`; `cell.clock` is the
+    rig's clock, and `cell.identities` has the identity of each device. At the end, also by an exception or Ctrl-C,
+    the lights are
     switched off, the arm is stopped, the camera is disarmed, and the devices are closed. No path is checked for
     you, and no ledger counts the light: only a plan does both. So a real cell opens only with your word that its
     `support_is_empty`.

@@ -157,8 +157,8 @@ class Result:
         self, name: str, out: str | os.PathLike[str], *, fit: str | None = None, overwrite: bool = False
     ) -> list[Path]:
         """Write the result in a format of `coupole export` (ply, gltf, obj, usd, materialx, exr, bsdf, merl,
-        bird, alta) into the folder `out`; the files. Raises InputError for another format, and for a folder with
-        files in it (unless `overwrite`); StorageError."""
+        bird, alta) into the folder `out`; return its files. Raises InputError for another
+        format, and for a folder with files in it (unless `overwrite`); StorageError."""
         from coupole.exchange.of_results.export_result import export_result
 
         return export_result(self.folder, name, Path(out), fit=fit, overwrite=overwrite)

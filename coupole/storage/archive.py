@@ -79,8 +79,8 @@ def archive_run(
         open_views = run.open_views()
         if open_views and not partial:
             raise UnprovenError(
-                f"{run.folder}: what {open_views[0]} needs is not chosen yet. Resume the run first, or archive "
-                "its complete views with --partial."
+                f"{run.folder}: the shots of {open_views[0]} are not all chosen yet. Resume the run first, or "
+                "archive its complete views with --partial."
             )
         finish(run)  # what a crash has left
         event_of_view = discarded_views(run)

@@ -129,7 +129,7 @@ class ArmFaults:
 
 
 def faults_of(cell: Cell, identity: Identity | None = None) -> ArmFaults:
-    """Faults of a cell's arm; `identity` where it is opened."""
+    """Faults of a cell's arm; give its `identity` if the arm is opened."""
     return ArmFaults(*places_of_arm(cell, identity))
 
 

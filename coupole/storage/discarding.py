@@ -119,7 +119,8 @@ def to_discard(run: Run, view: str, result: Path, digest: str) -> FramesDiscarde
 
 
 def discard(run: Run, event: FramesDiscarded, note: Callable[[FramesDiscarded], None]) -> None:
-    """Discard the frames of an event, which `note` brings into the journal, on the disk, first. For whoever holds
+    """Discard the frames of an event, which `note` first writes to the journal on the disk. For the process that
+    holds
     the run's lock. Raises ChecksumMismatch, before anything is done, if the view's file does not have these
     frames; StorageError."""
     path = run.view_path(event.view)

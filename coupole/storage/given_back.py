@@ -63,7 +63,7 @@ def why_not(folder: Path) -> str:
             before = os.fstat(file.fileno()).st_blocks
             give_back(file.fileno(), [(0, _TRIAL_BYTES // 2)])
             if os.fstat(file.fileno()).st_blocks >= before:
-                return "its file system did not free what was given back"
+                return "its file system did not free the part of a file that was given back"
     except OSError as error:
         return f"its file system cannot give back a part of a file ({error.strerror})"
     return ""

@@ -333,7 +333,7 @@ class SessionStopped(JournalEvent):
     outcome: Literal["done", "interrupted", "failed"]
     """End of the session, in one word."""
     reason: str = ""
-    """Why, if not all was done: who stopped it, or what failed."""
+    """Reason why not all was done: who stopped it, or what failed; empty if all was done."""
     robot: dict[str, Any] = Field(default_factory=dict)
     """Figures of the robot's link."""
 

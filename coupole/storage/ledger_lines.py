@@ -44,7 +44,7 @@ class LightEntered(_Light):
 
 
 class LightPlanned(_Light):
-    """Light that is about to be given, at most."""
+    """Greatest light that is about to be given."""
 
     event: Literal["planned"] = "planned"
     id: str

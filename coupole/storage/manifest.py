@@ -35,7 +35,7 @@ _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 def read_checksums(run: Path) -> dict[str, str]:
-    """SHA-256 by path in the run; empty without a manifest. Raises StorageError for a line that is none."""
+    """SHA-256 by path in the run; empty without a manifest. Raises StorageError for another kind of line."""
     path = run / NAME
     try:
         lines = path.read_text(encoding="utf-8").splitlines()

@@ -275,7 +275,7 @@ def _changes_of(
     try:
         then = yamlfile.parse(Path(before["path"]), _plain(before["text"])).validate(model)
     except InputError:
-        yield f"the {kind} {path} is another file, and this version does not understand the old one"
+        yield f"the {kind} {path} has changed, and this version cannot read the run's copy to compare them"
         return
     now = yamlfile.read_document(path, files).validate(model)
     if changes := differences(then, now, apart):

@@ -1,4 +1,4 @@
-"""Processes of this machine as Linux tells of them: which one has locked a file, and whether one is stopped."""
+"""Processes of this machine, by Linux's `/proc`: which one has locked a file, and whether one is stopped."""
 
 from __future__ import annotations
 

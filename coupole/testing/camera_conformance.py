@@ -71,7 +71,7 @@ def take_numbers(camera: Camera, count: int) -> list[int]:
 
 
 def _while_taking(camera: Camera, count: int, act: Callable[[], object]) -> list[int]:
-    """Numbers shown by `count` frames that are taken, and given back, while `act` makes them."""
+    """Numbers shown by `count` frames. They are taken and given back in a thread while `act` causes them."""
     numbers: list[int] = []
     taker = threading.Thread(target=lambda: numbers.extend(take_numbers(camera, count)))
     taker.start()

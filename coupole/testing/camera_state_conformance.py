@@ -1,7 +1,7 @@
 """Frames of a camera that another program left in a state of its own: one class for all cameras with features.
 
-The expected frames are written down (`expected_ramp` of `camera_conformance`), and so is here what each state does
-to frames; the stand-ins do what a camera in that state does.
+`expected_ramp` of `camera_conformance` has the expected frames. This module describes what each state does to
+frames, and the simulated cameras do the same.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from coupole.plan.arm_description import shipped_arm
 HOME_DEG = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
 AWAY_DEG = np.array([50.0, -50.0, 40.0, 30.0, 60.0, -70.0])
 UNHURRIED_S = 0.5
-"""A motion ends without a look for so long: a test's own thread may wait for its turn on a busy machine."""
+"""A motion ends after this time without a look; it is long because a test's thread may wait on a busy machine."""
 
 
 class RobotCell(Protocol):

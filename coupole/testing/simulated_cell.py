@@ -18,7 +18,8 @@ from coupole.preflight.simulated_world import frozen, world_config
 from coupole.scripting.plans import Rig
 
 _UNHURRIED_S = 0.5
-"""A motion of a simulated arm ends without a look for so long: tests run on busy machines."""
+"""A motion of a simulated arm ends after this time without a look; it is long because tests run on busy
+machines."""
 
 
 @dataclass(frozen=True)

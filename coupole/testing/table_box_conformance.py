@@ -30,12 +30,13 @@ class TableLedBoxConformance:
     """
 
     limits: ClassVar[Sequence[tuple[str, int, str]]] = (("led", 65_534, ""), ("trigger_delay_us", 8001, ""))
-    """Fields of a step, a value of each that is out of the box's limits in a step of `table()`, and a pattern of
-    what its refusal says of that; all name the step's number."""
+    """For each field of a step: its name, a value outside the box's limits in a step of `table()`, and a pattern
+    of
+    the refusal. Each refusal also names the step's number."""
     words_of_rest: ClassVar[str] = "7"
     """Pattern of the refusal of step 7, which lights the LED of step 6 again; empty if the box allows that."""
     words_of_no_table: ClassVar[str] = "expected"
-    """Pattern of the refusal to start what was not loaded."""
+    """Pattern of the refusal to start a table that was not loaded."""
     words_of_lost_state: ClassVar[str] = "expected"
     """Pattern of the message about a box that does not tell whether it runs."""
     words_of_a_lost_link: ClassVar[str] = "expected"

@@ -78,7 +78,7 @@ def _quality(comparison: Comparison) -> str:
     return (
         f"A distance has a standard uncertainty of {u_mm:.2g} mm (median): "
         f"{int(comparison.moved_points.sum()):,} points "
-        f"changed significantly; those that hang together form {regions}."
+        f"changed significantly; connected points form {regions}."
     )
 
 
@@ -123,7 +123,7 @@ def remarks(comparison: Comparison) -> Iterator[str]:
 
 
 def _in_regions(regions: Sequence[Region], is_changed: NDArray[np.bool_]) -> str:
-    """Say how many of the changed points hang together, and in how many regions; the others are single points."""
+    """Say how many of the changed points are connected, and in how many regions; the others are single points."""
     points_in_regions = sum(region.points for region in regions)
     single = int(is_changed.sum()) - points_in_regions
     if not regions:

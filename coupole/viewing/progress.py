@@ -69,7 +69,7 @@ class ViewExposure:
         self.add_figures(brightest, float(np.mean(raw >= white_dn)))
 
     def add_figures(self, brightest: float, saturated_share: float) -> None:
-        """The same of a frame whose quantile (share of full scale) and share of saturated pixels are known."""
+        """Count one more frame whose quantile (share of full scale) and share of saturated pixels are known."""
         self.pictures += 1
         self.quantiles.append(brightest)
         self.brightest = max(self.brightest, brightest)

@@ -44,9 +44,10 @@ class Figures:
     brightest: float
     """99.9 % quantile, share of the range above black."""
     sharpness: float
-    """Mean squared gradient over mean square, by the product of the two green pixels of each cell, whose noise is
-    independent: noise adds nothing in the mean, and what it may have made alone counts as 0. Comparable only for
-    the same scene under the same light."""
+    """Mean squared gradient over mean square. Both squares are products of the two green pixels of each cell,
+    whose
+    noise is independent, so noise adds nothing in the mean. A value that noise alone may have caused counts as 0.
+    Comparable only for the same scene under the same light."""
 
 
 def develop(

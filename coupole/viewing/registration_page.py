@@ -62,7 +62,7 @@ def write(registration: Registration, merged_mesh: Merged | None, folder: Path, 
 
 
 def _quality(registration: Registration) -> str:
-    surfaces = f"Surfaces lie on each other within {registration.fit.rms_mm:.3g} mm"
+    surfaces = f"Overlapping surfaces agree within {registration.fit.rms_mm:.3g} mm"
     if not registration.loops:
         return f"{surfaces}; no loop of pairs closes, so that a wrong pair would not be noticed."
     return f"{surfaces}; loops of pairs close within {worst_loop_mm(registration):.3g} mm at worst."

@@ -259,7 +259,7 @@ class LedBox:
 
     @property
     def _clears(self) -> bool:
-        """The box knows the device clear, and tables in blocks."""
+        """True if the box's protocol has a device clear, and takes tables in blocks."""
         return self._protocol != _FIRST_PROTOCOL
 
     def _set_up(self) -> int:

@@ -66,8 +66,8 @@ class ScpiSession:
 
     @contextlib.contextmanager
     def call(self) -> Iterator[int]:
-        """The messages within belong to one call of the driver: after `end_calls` no other of them is sent.
-        Gives how often calls had been ended when the outermost call of this thread began."""
+        """The messages in this context belong to one call of the driver: after `end_calls` no more of them are
+        sent. Gives how often calls had been ended when the outermost call of this thread began."""
         outer = getattr(self._calls, "ends", None)
         self._calls.ends = self._ends if outer is None else outer
         try:

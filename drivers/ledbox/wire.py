@@ -65,7 +65,7 @@ def unpack_log(log: bytes, step_table: NDArray[np.void]) -> NDArray[np.void]:
         raise ValueError(f"{len(log)} bytes came, not a multiple of {RECORD_BYTES}")
     raw = np.frombuffer(log, _RECORD)
     if np.any(raw["step"] >= len(step_table)):
-        raise ValueError(f"a record of step {raw['step'].max()} came, of a table of {len(step_table)}")
+        raise ValueError(f"a record of step {raw['step'].max()} came; the table has {len(step_table)} steps")
     records = np.zeros(len(raw), STEP_RECORD_DTYPE)
     status = raw["status"]
     lit = raw["led"] != _NO_LED

@@ -1,7 +1,7 @@
 """Disturbances of a measurement that frames show: lamps, drifting LEDs, bumps, smudges, gain, hands.
 
 The world keeps them in a `Disturber`. Each exposure takes along what disturbs it (`Disturbance`): a picture that
-is rendered later is still that of its moment. Nothing here is shared with what looks for them.
+is rendered later is still that of its moment. This code shares nothing with the code that looks for disturbances.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ def test_a_switch_that_follows_the_person_passes() -> None:
 @pytest.mark.parametrize(
     ("held", "what"),
     [
-        (True, "switches that are held although nobody holds them"),
+        (True, "switches that read as held although nobody holds them"),
         (False, "the switch was not seen to be held within 0.2 s"),
     ],
 )

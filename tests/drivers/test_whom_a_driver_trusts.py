@@ -106,7 +106,7 @@ def test_a_persons_word_is_told_of_a_real_cell_and_never_of_a_simulated_one() ->
     )
     real = cell.rig.model_copy(update={"robot": robot})
     assert trusted_by_name(real) == (
-        "robot: whoever sends first is taken for the controller, by the word of A. Person",
+        "robot: the first sender is taken for the controller, by the word of A. Person",
         "robot: the arm may be answered at normal priority, by the word of B. Person",
     )
     simulated = read_cell(REPO / "configs/rigs/sim.yaml").rig.model_copy(update={"robot": robot})

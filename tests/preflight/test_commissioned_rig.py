@@ -322,6 +322,6 @@ def test_a_record_of_an_earlier_version_is_read_and_says_what_it_lacks(real: Cel
     assert "covers" not in cell.state_folder.joinpath("commissioning.yaml").read_text()
     by_step = {why.split()[3]: why for why in commissioning_refusals(cell)}
     assert "the step geometry was not done; it covers arm, camera, clearances, " in by_step["geometry"]
-    assert "an earlier version did it, which did not cover arm, " in by_step["axes"]
-    assert "an earlier version did it, which did not cover dome, led_limits." in by_step["lamps"]
+    assert "an earlier version did this step, and did not cover arm, " in by_step["axes"]
+    assert "an earlier version did this step, and did not cover dome, led_limits." in by_step["lamps"]
     assert "watchdog" not in by_step, "all that it covers was in the old record"

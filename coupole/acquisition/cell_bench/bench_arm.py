@@ -27,7 +27,7 @@ from coupole.preflight.job import Job
 from coupole.storage.arm_faults import faults_of
 
 HOLD_S = 0.3
-"""A motion by hand ends so long after its last renewal."""
+"""Time from the last renewal of a motion by hand until it ends."""
 _KEPT_PATHS = 16
 _SAME_PLACE_DEG = 0.05
 

@@ -1,4 +1,4 @@
-"""The side of whoever asks a bench."""
+"""The client of a bench."""
 
 from __future__ import annotations
 

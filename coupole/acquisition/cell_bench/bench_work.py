@@ -39,7 +39,8 @@ class Work:
         self._thread.join(seconds)
 
     def figures(self) -> dict[str, Any]:
-        """`kind`, `state` (running, done, stopped, failed), what it is about, what it found, and `why` not."""
+        """`kind`, `state` (running, done, stopped, failed), the work's request, its results, and `why` it ended
+        early."""
         return {"kind": self.kind, "state": self._state, **self._about, **self._found, "why": self._why}
 
     def _run(self) -> None:

@@ -42,8 +42,8 @@ def _described_turn(before: Transform, after: Transform) -> str:
     angle_deg = float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0))))
     senses = {
         2: ("clockwise ↻, seen from behind it", "counter-clockwise ↺, seen from behind it"),
-        1: ("its nose to its right", "its nose to its left"),
-        0: ("its nose up", "its nose down"),
+        1: ("its lens turns to its own right", "its lens turns to its own left"),
+        0: ("its lens turns up", "its lens turns down"),
     }
     main = int(np.argmax(np.abs(rotation)))
     return f"The camera turns in place by {angle_deg:.1f} deg: {senses[main][0 if rotation[main] > 0 else 1]}."

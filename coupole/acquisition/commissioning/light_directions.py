@@ -5,8 +5,8 @@ times its illuminance, b the pixel's normal times its reflectance (Woodham, "Pho
 surface orientation from multiple images", Opt. Eng. 19, 1980). All pictures together give b from the table's
 directions; each picture then gives a direction, to be compared with the table's. No pixel's shape has to be known.
 
-An LED must not vouch for itself, so its direction comes from normals without it. These are not solved for anew:
-taking one light out of a least-squares solution is a change of rank one (`Normals.without`).
+An LED must not vouch for itself, so its direction comes from normals without it. These normals are not solved for
+again: taking one light out of a least-squares solution is a change of rank one (`Normals.without`).
 """
 
 from __future__ import annotations

@@ -140,7 +140,9 @@ def watchdog(bench: Bench) -> None:
     metered_ids = ids[np.unique(np.linspace(0, len(ids) - 1, _METERED).astype(int))].tolist()
     exposure_us, led = good_exposure_us(bench, metered_ids)
     lit_s, dark_s = _last_light_s(bench, led, exposure_us, seconds)
-    findings.remarks.append(f"silent at 0 s; light was last seen at {lit_s:.2f} s, dark first at {dark_s:.2f} s")
+    findings.remarks.append(
+        f"{lit_s:.2f} s after the last command the LEDs were still lit; after {dark_s:.2f} s they were dark"
+    )
     findings.at_most("last light after the host's last command", lit_s, seconds + _DARK_LATE_S, "s")
     findings.at_most("light until the end of the test", int(not np.isfinite(dark_s)), 0, "")
     report = ""

@@ -31,7 +31,7 @@ def presence(bench: Bench) -> None:
         )
         return
     bench.ask_before("Step presence: nothing moves. Do not hold the enabling switch at the cell yet.")
-    findings.at_most("switches that are held although nobody holds them", int(bool(box.presence())), 0, "")
+    findings.at_most("switches that read as held although nobody holds them", int(bool(box.presence())), 0, "")
     for is_held, state in ((True, "held"), (False, "released"), (True, "held"), (False, "released")):
         if not findings.has_passed:
             return

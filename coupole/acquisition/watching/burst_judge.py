@@ -18,12 +18,13 @@ from coupole.plan.shot_id import Led, Sentinel, ShotLabel
 from coupole.plan.watch import SENTINELS, WatchLimits
 
 _OPAQUE = 0.3
-"""Change of brightness in a place beyond which no smudge on the lens makes it: that is far out of focus, and
-covers only a part of the aperture."""
+"""Greatest local change of brightness that a smudge on the lens can cause: it is far out of focus, and covers only
+a
+part of the aperture."""
 _STILL_THERE = 0.5
 """Share of a change in a place that the last frame of its LED must show: noise is below half of what is found."""
 _COMES_BACK_MM = 0.1
-"""Displacement of the picture that is nobody's doing where the arm has left the view and come back: industrial
+"""Displacement of the picture that is normal after the arm has left the view and come back: industrial
 arms state a pose repeatability (ISO 9283) of some 0.02 to 0.06 mm, for each of the two poses."""
 Floats = NDArray[np.float64]
 
@@ -121,7 +122,9 @@ class BurstJudge:
             if over[frame] < over[near].max():  # the neighbour is what differs
                 continue
             share, label = float(shares[frame]), shots[frame].label
-            words = f"{label.light} gives {share:+.0%} beside what its neighbours and the LED table foretell"
+            words = (
+                f"{label.light} differs by {share:+.0%} from the prediction by its neighbours and the LED table"
+            )
             nearest = shots[int(near[np.argmax(weights[frame][near])])].look.mean_dn
             looks = nearest, shots[frame].look.mean_dn
             findings.append(Found("LED", (label,), abs(share), limit, OF_THE_LIGHT, words, *looks))

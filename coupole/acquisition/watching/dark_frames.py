@@ -45,8 +45,8 @@ def ambient_light(
     limits: WatchLimits,
     exposure_us: int,
 ) -> Found | None:
-    """Light that later dark frames have more than the first ones: their median, by tiles. None within the limit:
-    noise, and the rise of dark current of a sensor that warms up."""
+    """Light that later dark frames have more than the first ones: their median, by tiles. None if it is
+    within the limit, which allows for noise and for the dark current of a sensor that warms up."""
     if not later:
         return None
     now_dn = dark_level(later)

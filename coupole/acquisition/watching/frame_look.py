@@ -42,7 +42,7 @@ class LookGrid:
 
     @property
     def _pair_step(self) -> int:
-        """Each of so many pairs of rows is read."""
+        """Step in pairs of rows: one of this number of pairs is read."""
         return max(1, self.bin_px // (2 if self.is_sparse else _ROWS_READ))
 
     @property

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 _NEIGHBOURS = 12
 _FEWEST = 24
-"""LEDs below which neighbours are too far away to foretell anything."""
+"""Least number of LEDs; with fewer, neighbours are too far away for a prediction."""
 _RIDGE = 1e-2
 _LIT = 0.3
 """Share of a place's median brightness below which it counts as if it were so bright."""
@@ -41,7 +41,7 @@ def foretelling(directions: Floats) -> Floats | None:
 
 
 def shares_over_neighbours(tiles_dn: Floats, light: Floats, weights: Floats) -> Floats:
-    """[n] how much more light frames have than their neighbours foretell, a share of it.
+    """[n] excess of the light in frames over the prediction by their neighbours, as a share of the prediction.
 
     Frames are the means of their tiles [n, tiles] under `light` [n] of the LED table. Of the tiles the weighted
     median counts, so that a change of less than half of the picture does not.

@@ -163,7 +163,7 @@ class WatchedRecorder:
             self._recorder.prove(slot, shot, fields)
 
     def see_mark(self, slot: int, burst: Burst, step: int) -> None:
-        """Keep the look at a dark mark: it tells of the room. With a panel marks are not dark."""
+        """Keep the look at a dark mark, which shows the light of the room. With a panel marks are not dark."""
         if slot in self._looks and not burst.panel:
             self._seen[_unkept_mark(burst, step)] = self._looks[slot]
 
@@ -274,8 +274,8 @@ class WatchedRecorder:
         )
 
     def _kept_picture(self, burst: Burst, finding: Found) -> str:
-        """The path of a finding's picture in the run; empty after many, and where it cannot be written: no frame
-        depends on it."""
+        """The path of a finding's picture in the run. It is empty if there are many pictures already, or if the
+        picture cannot be written, because no frame depends on it."""
         if self._pictures >= _MOST_PICTURES:
             return ""
         self._pictures += 1

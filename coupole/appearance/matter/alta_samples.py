@@ -24,9 +24,9 @@ PER_STERADIAN = "INV_STERADIAN"
 _HEAD = re.compile(r"#\s?([A-Za-z]\w*)\s*(.*)")
 _END = "ALTA END HEADER"
 _OPEN = float(np.finfo(np.float32).max)
-"""A bound of this size or more is none."""
+"""A bound of at least this size means that there is no bound."""
 _FEWEST = 8
-"""Samples between which anything can be interpolated."""
+"""Least number of samples between which values can be interpolated."""
 
 
 @dataclass(frozen=True)
@@ -257,7 +257,7 @@ def interpolated_brdf(samples: AltaSamples) -> Brdf:
 
 
 def _merge_points(points: Array, values: Array) -> tuple[Array, Array]:
-    """Points that differ, and the means of the values there."""
+    """The different ones among the points, and the mean of the values at each."""
     _, first, group = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
     total = np.zeros((len(first), values.shape[1]))
     np.add.at(total, group.ravel(), values)

@@ -31,7 +31,7 @@ _DTYPES = {
     9: np.float16, 10: np.float32, 11: np.float64,
 }  # fmt: skip
 _ISOTROPIC = 2
-"""Azimuths of incidence, at most."""
+"""Greatest number of azimuths of incidence."""
 _CHUNK = 1 << 15
 """Directions that are looked up together."""
 _WHAT = "expected a material of RGL's tensor format"

@@ -54,7 +54,8 @@ class Distant(Model):
         if isinstance(self.spectrum, LowSun) and abs(height_deg - self.spectrum.elevation_deg) > _SAME_HEIGHT_DEG:
             raise ValueError(
                 f"light comes from {height_deg:.1f} degrees high, and its spectrum is that of a sun "
-                f"{self.spectrum.elevation_deg:g} degrees high: write the same, or take a light of kind `daylight`"
+                f"{self.spectrum.elevation_deg:g} degrees high: give both the same height, or take a light "
+                "of kind `daylight`"
             )
         return self
 

@@ -317,7 +317,7 @@ def _clear(width: float, length: float, thickness_mm: float, rim_mm: float) -> P
 
 
 def placed_piece(piece: Piece, pose: Pose) -> Piece:
-    """A piece of a thing's own frame, in the scene's."""
+    """Move a piece from its thing's frame into the scene's frame."""
     return _moved_piece(piece, pose.scene_from_thing())
 
 

@@ -128,7 +128,8 @@ def _face(pane: Pane) -> float:
 
 
 def bsdf(pane: Pane, folder: Path) -> Description:
-    """The sheet for Mitsuba, whose own is clear: its parts are multiplied by what colour makes of them."""
+    """The sheet for Mitsuba. Mitsuba's own sheet is clear, so its parts are multiplied by the effect of
+    the colour."""
     face = _face(pane)
     reflectance, through = sheet(passage(pane, folder), face)
     clear_reflectance, clear_through = sheet(np.ones(1), face)

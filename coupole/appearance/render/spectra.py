@@ -62,8 +62,8 @@ class Measured(Model):
     path: Path
     column: int | None = None
     sample: Literal["gloss excluded", "gloss included", "bare"] = "gloss excluded"
-    """Way in which the sample's face was seen; bare: it had none (matt powder), so that the reflectance holds
-    inside a binder as it was seen."""
+    """Part of the gloss of the sample's face in the measurement. `bare`: the sample had no face (matt powder), so
+    the measured reflectance is also valid inside a binder."""
 
 
 class MeasuredPaint(Model):

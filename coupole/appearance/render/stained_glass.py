@@ -30,7 +30,7 @@ class Glazing(Model):
     @model_validator(mode="after")
     def _check_layout(self) -> Glazing:
         if len({len(row) for row in self.layout}) > 1:
-            raise ValueError("the rows of `layout` differ in length: give each as many letters")
+            raise ValueError("the rows of `layout` differ in length: give each the same number of letters")
         if missing := sorted({*"".join(self.layout)} - {*self.panes, OPEN}):
             raise ValueError(f"`layout` has {', '.join(missing)}, which `panes` does not name: add them")
         return self

@@ -43,8 +43,9 @@ def grains(
     wrapping: Wrapping,
     raised_mm: float,
 ) -> Grains:
-    """The body's triangles [m, 3, 3] in `parts` [m] squared grains each, raised by `raised_mm` where the drawing
-    is full. `uv` [m, 3, 2] is needed for that wrapping alone."""
+    """The body's triangles [m, 3, 3], each cut into the square of its number in `parts` [m] grains. Grains are
+    raised
+    by `raised_mm` where the drawing is full. `uv` [m, 3, 2] is needed for that wrapping alone."""
     skin = skin_of(corners_mm)
     middle = 0.5 * (skin.points_mm.min(axis=0) + skin.points_mm.max(axis=0))
     normals = skin.normals[skin.faces]

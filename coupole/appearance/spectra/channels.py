@@ -27,7 +27,7 @@ def channel_weights(power: ArrayLike, sensitivities: ArrayLike) -> Array:
 
 
 def channel_values(spectral: Array, weights: Array, tile: ArrayLike = 1.0) -> Array:
-    """f_c [..., channels] of spectral values [..., 81]; `tile` is the reflectance [81] of the white that the
-    instrument divides by, and whose own value it takes as 1."""
+    """f_c [..., channels] of spectral values [..., 81]. `tile` is the reflectance [81] of the instrument's white
+    reference: the instrument divides by its signal, as if its reflectance were 1."""
     white = np.broadcast_to(np.asarray(tile, dtype=float), weights.shape[-1:]) @ weights.T
     return np.asarray(spectral @ weights.T / white)

@@ -49,7 +49,7 @@ class Spot:
     """[2, 2], px^2."""
     area_px: float
     fill: float
-    """Area over that of the ellipse with the same second moments."""
+    """Area, divided by that of the ellipse with the same second moments."""
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ edge has a blur of its own. Two things are found from all corners of an image to
 
 - noise: the variance a + b v of a pixel of value v, by the squared residuals. It gives each corner a covariance.
 - asymmetry of the blur (coma): its third cumulant across an edge of normal n is K n n n. The four numbers of K are
-  polynomials over the image, fitted to what the residuals of all corners say of them; then the corners are fitted
-  again with it. Found from a corner alone, it would make its noise a fifth larger. So corners are the images of
-  points by the blur's centre of gravity.
+  polynomials over the image, fitted to the residuals of all corners. Then the corners are fitted again with K. If
+  K were found from a single corner, the noise of this corner would be a fifth larger. So a corner's place is that
+  of an image of a point, taken as the centre of gravity of the blur.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ noise that is stated for a poor robot."""
 _AS_GOOD = 1.5
 """Hypotheses whose scatter is within this factor of the best are ranked by how little they change."""
 _DEPTH_WORSE = 5.0
-"""Uncertainty of a board's distance over that of its position across the image."""
+"""Uncertainty of a board's distance, divided by that of its position across the image."""
 _FALSE_ALARMS = 0.01
 _RESAMPLED = 24
 

@@ -41,7 +41,7 @@ def draw_glare(fits: Mapping[str, GlareFit], record: Record, figure: Figure) -> 
     most = 105 * max(float(fit.found_veil.max()) for fit in fits.values())
     axes[0, 1].plot([0, most], [0, most], color=DARK, lw=1)
     axes[0, 1].set(
-        title="Traps of each view, predicted without it (% of the white beside)",
+        title="Traps of each view, predicted from the other views (% of the white beside)",
         xlabel="predicted",
         ylabel="found",
     )

@@ -59,7 +59,7 @@ class TrapView:
 
 @dataclass(frozen=True)
 class TrapLight:
-    """Own light of a trap over that of the white beside it."""
+    """Own light of a trap, divided by that of the white beside it."""
 
     share: float
     u: float

@@ -51,7 +51,7 @@ class GlareTarget(Described):
     certificate: str = ""
     """Name of who measured the traps, and the date."""
     trap_share: Annotated[float, Field(ge=0, le=0.02)] = 0.0003
-    """Light that comes out of a trap over that of the white beside it."""
+    """Light that comes out of a trap, divided by that of the white beside it."""
     u_trap_share: Annotated[float, Field(ge=0, le=0.02)] = 0.0002
 
 

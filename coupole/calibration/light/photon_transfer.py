@@ -22,7 +22,7 @@ _LEVELS = 24
 _LEAST_PIXELS = 400
 """Least number of pixels of one level: fewer do not determine its variance."""
 _COLLAPSED = 0.7
-"""Variance over that of the line, below which a level counts as saturated."""
+"""A level counts as saturated if its variance, divided by that of the line, is below this."""
 _GROSS = 6.0
 
 

@@ -51,7 +51,7 @@ from coupole.plan.shot_id import Light
 
 Progress = Callable[[int, int], None]
 _MOST_PIXELS = 200_000
-"""Number of pixels of a channel that are used for the response, at most."""
+"""Greatest number of pixels of a channel that are used for the response."""
 
 
 def sealed_outcome(

@@ -22,7 +22,7 @@ TURNED = "turned"
 back."""
 PARTS = tuple(WIDTHS)
 _ACROSS = 96
-"""Number of blocks along the picture's width, about."""
+"""Approximate number of blocks along the picture's width."""
 _ROUNDS = 4
 """Terms of the series in the shares: the next is below 1e-7 of white for a veil of 4 %."""
 _REACH = 4.0

@@ -45,7 +45,7 @@ def _draw_frame(ax: Axes, result: MeshFound) -> None:
     middles_px = np.array([s.middle for s in result.images.stickers[result.images.shown_number]])
     ax.plot(middles_px[:, 0], middles_px[:, 1], "o", ms=13, mfc="none", color=BLUE, label="found in the image")
     should = projected_pixels(result, result.scan.targets_mm)
-    ax.plot(should[:, 0], should[:, 1], "+", ms=13, color=RED, label="by the scan, through the result")
+    ax.plot(should[:, 0], should[:, 1], "+", ms=13, color=RED, label="predicted from the scan and the result")
     ax.set(
         xlim=(0, width), ylim=(height, 0), xlabel="x (px)", ylabel="y (px)",
         title=f"Mesh and stickers laid onto {result.images.names[result.images.shown_number]}",

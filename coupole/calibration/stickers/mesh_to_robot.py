@@ -67,7 +67,7 @@ class MeshPose:
     point_rms_mm: float
     """Root mean square distance of the points found in space from the table's, before the adjustment."""
     noise: dict[str, float]
-    """Estimated over stated, by group."""
+    """Estimated noise divided by stated noise, by group."""
     redundancy: dict[str, float]
     degrees: Floats
     """[6] effective degrees of freedom."""

@@ -63,8 +63,9 @@ class Acquisitions:
         self._thread.join()
 
     def tell(self, run: str, command: Command) -> State:
-        """`pause`, `go-on` or `stop` to the run with this name; one that the queue has begun and that does not
-        answer is stopped as by Ctrl-C. Raises InputError: it is not being acquired, or does not answer."""
+        """Send `pause`, `go-on` or `stop` to the run with this name. A run that the queue has begun and that does
+        not answer is stopped as by Ctrl-C. Raises InputError: the run is not being acquired, or does not answer.
+        """
         for state in [self.state] if self.state and Path(self.state["run"]).name == run else running():
             if Path(state["run"]).name == run and self._is_ours(state):
                 return self._send_command(state, command)

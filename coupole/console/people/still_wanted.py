@@ -14,9 +14,9 @@ import time
 from collections.abc import Callable
 
 STOOD_STILL_S = 5.0
-"""A console that stood still for so long begins nothing that it was asked meanwhile."""
+"""A console that stood still for this time begins nothing that it was asked meanwhile."""
 HELD_STOOD_STILL_S = 1.0
-"""The same of a motion by hand, whose button is held."""
+"""The same time for a motion by hand, whose button is held."""
 _NOTED_S, _BACKLOG_S = 0.5, 2.0
 _ENDINGS = ("/stop", "/pause", "/sign-out", "/control/give")
 

@@ -210,8 +210,8 @@ class PlanQueue:
             return changed_entry
 
     def conclude(self, number: str, *, halt: str = "", **fields: object) -> None:
-        """An entry with other fields, and why nothing more begins, in one change. Raises InputError, StorageError:
-        nothing more begins all the same."""
+        """Change fields of an entry, and set the reason why nothing more begins, in one change. Raises InputError
+        and StorageError; even then nothing more begins."""
         with self._lock:
             changed_entry = self.entry(number).model_copy(update=fields)
             entries = tuple(changed_entry if entry.id == number else entry for entry in self.entries)

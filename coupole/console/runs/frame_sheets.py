@@ -21,7 +21,7 @@ from coupole.storage.durable import make_folder
 from coupole.storage.view_reader import View
 
 _MOST_PAIRS = 256
-"""Number of pairs of rows of a frame that its mean is taken of, at most."""
+"""Greatest number of pairs of rows by which the mean of a frame is found."""
 _KEPT_EVERY = 100
 
 

@@ -18,7 +18,7 @@ from coupole.errors import CoupoleError
 _LOOK_EVERY_S, _SOON_DAYS, _NARROW = 5.0, 14.0, 0.1
 """Expires soon, and a margin that is narrow."""
 WORDS_OF = "calibrate"
-"""First of a calibrating command."""
+"""First word of a command that calibrates."""
 
 
 def build(visit: Visit) -> None:

@@ -20,7 +20,8 @@ from coupole.console.screens.visit import Visit, in_thread
 from coupole.errors import CoupoleError
 
 LIVE_S = 60.0
-"""Live pictures end when nobody has touched the page for so long: each is light on the object."""
+"""Live pictures end when nobody has touched the page for this time, because each picture is light on the
+object."""
 _EVERY_S = 0.1
 
 
@@ -173,7 +174,8 @@ class _Screen:
 
     @property
     def _was_stopped(self) -> bool:
-        """Since live pictures began, as far as is known; the bench itself refuses the next one in any case."""
+        """True if a stop since live pictures began is known here; the bench refuses the next picture in any
+        case."""
         state = self._bench.state
         return state is not None and state["stops"] > self._stops
 

@@ -135,7 +135,7 @@ class _Screen:
 
     def _budget(self) -> None:
         with ui.row().classes("bar"):
-            amount = with_name(ui.number("It may receive in its life, lux h", min=0).classes("field"), "budget")
+            amount = with_name(ui.number("Budget of light over its life, lux h", min=0).classes("field"), "budget")
             reason = with_name(ui.input("Why", placeholder="by the conservator, 12 May").classes("field"), "why")
 
             async def enter() -> None:

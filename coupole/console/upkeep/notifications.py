@@ -54,7 +54,7 @@ class Email(Model):
     security: Literal["starttls", "tls", "none"] = "starttls"
     """Protection of the connection; the server's certificate is checked."""
     user: str = ""
-    """Name at the server; empty: it wants none."""
+    """Name of the account at the server; empty if the server needs none."""
     password: str = ""
     """Password of the user."""
     sender: Word

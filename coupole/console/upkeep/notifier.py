@@ -20,7 +20,7 @@ from coupole.storage.line_file import LineFile, utc_now
 
 _LOOK_EVERY_S, _TRIALS, _AGAIN_AFTER_S, _MOST_WAITING = 1.0, 3, 5.0, 100
 _RELIEF = 1.1
-"""Factor on the limit: so many times the limit must be free again before a disk counts as low once more."""
+"""Factor on the limit: this multiple of the limit must be free again before a disk can count as low once more."""
 
 
 class Occurrences:

@@ -1,4 +1,4 @@
-"""Facts that the console tells of machine and rig: room on the disk, what is still to be measured, the log."""
+"""Facts about machine and rig for the console: room on the disk, lines still to be measured, the log."""
 
 from __future__ import annotations
 

@@ -118,8 +118,8 @@ def lay_out_given(places: Floats, corners_mm: Floats, triangles: NDArray[np.inte
     if area_mm2[is_expelled].sum() > _MOST_SHARED * area_mm2.sum():
         share = area_mm2[is_expelled].sum() / area_mm2.sum()
         raise InputError(
-            f"{100.0 * share:.3g} % of the surface lies on other parts of it in the given texture (mirrored or "
-            "stacked charts); unwrap the mesh so that each place has a texel of its own"
+            f"{100.0 * share:.3g} % of the surface shares texels with other parts in the given texture (mirrored "
+            "or stacked charts); unwrap the mesh so that each place has a texel of its own"
         )
     is_inside = triangle_of_texel >= 0
     own_texel_mm = 1.0 / (side_px * _median_by(px_by_mm, area_mm2))
@@ -140,7 +140,7 @@ def _median_by(values: Floats, weights: Floats) -> float:
 
 
 def _charts_by(places: Floats, triangles: NDArray[np.integer]) -> Integers:
-    """[n] charts: parts that hang together on the surface and in the texture, and have the same side up."""
+    """[n] charts: parts that are connected on the surface and in the texture, and have the same side up."""
     keys = np.concatenate([triangles.reshape(-1, 1), np.rint(places.reshape(-1, 2) / _SAME_PLACE)], axis=1)
     _, number = np.unique(keys.astype(np.int64), axis=0, return_inverse=True)
     is_mirrored = _double_areas_in_map(places) > 0.0

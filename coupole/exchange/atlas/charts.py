@@ -86,12 +86,13 @@ def chart_axes(corners_mm: Floats, chart: Integers) -> Floats:
 
 
 def split_off(neighbours: Integers, chart: Integers, is_expelled: NDArray[np.bool_]) -> Integers:
-    """The charts [n] anew, where expelled triangles [n] are charts of their own, as far as they hang together."""
+    """The charts [n] after expelled triangles [n] are moved to charts of their own, one for each connected
+    part."""
     return parts_of(neighbours, np.where(is_expelled, chart + chart.max() + 1, chart).astype(np.int32))
 
 
 def parts_of(neighbours: Integers, kind: Integers) -> Integers:
-    """[n] charts from 0: triangles of one kind [n] that hang together."""
+    """[n] number of each triangle's chart, from 0: a chart is connected triangles of one `kind` [n]."""
     parts: Integers = _numbered_parts(neighbours, kind)
     return parts
 

@@ -23,7 +23,7 @@ from coupole.exchange.bracket.photographs import Photographs
 Array = NDArray[np.float64]
 NODES = 256
 SATURATED, DARK = 0.98, 0.01
-"""Values from which on, and up to which, a pixel says nothing but a bound."""
+"""A pixel gives only a bound if its value is at least the first, or at most the second, of these."""
 _PIXELS = 3000
 _WIDE = 2.6
 """Least factor between exposure times that leaves waves of the response open: 4 does, 2 does not."""
@@ -103,7 +103,7 @@ def found_response(photographs: Photographs) -> Response:
 
 
 def left_open(exposure_s: Array) -> str:
-    """Return, in words, what photographs of these times cannot tell of a response; empty if they can tell all.
+    """Return, in words, which part of a response photographs of these times cannot determine; empty if none.
 
     With all times a factor apart, g(z) may have any wave of that period in ln E, which no pixel contradicts; the
     uncertainty has what waves the smoothness of the response leaves.

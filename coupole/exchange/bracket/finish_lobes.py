@@ -23,7 +23,7 @@ _STARTS = (0.06, 0.2, 0.5)
 """Alphas of the narrow lobe from which the fit begins; the wide one is three times as wide."""
 _FIT_SAMPLES, _STEPS = 1500, 60
 _TOLERATED = 0.1
-"""Difference of log f from which on a sample counts for less."""
+"""Difference of log f above which a sample has less weight."""
 _LEAST_FRESNEL = 0.05
 _CELL_DEG, _CELLS_H = 3.0, 64
 """Samples are drawn evenly over cells of difference and half angle: a peak has few pixels."""

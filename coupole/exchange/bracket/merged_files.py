@@ -65,7 +65,12 @@ def draw_response(path: Path, response: Response, title: str) -> None:
         axes.plot(z[is_finite], np.exp(curve[is_finite]), color=colour, label=name)
         bounds = [np.exp(curve[is_finite] + sign * 1.96 * sigma[is_finite]) for sign in (-1, 1)]
         axes.fill_between(z[is_finite], *bounds, color=colour, alpha=0.2, linewidth=0)
-    axes.set(xlabel="value, over the largest", ylabel="exposure, 1 at half of it", yscale="log", title=title)
+    axes.set(
+        xlabel="value / largest value",
+        ylabel="exposure / exposure at half of the largest value",
+        yscale="log",
+        title=title,
+    )
     axes.grid(alpha=0.3)
     axes.legend()
     try:

@@ -1,6 +1,6 @@
 """A view under any of its LEDs, and between them, from a few pictures: principal components of its frames.
 
-Roots of shares of the camera's range are taken apart: where light is counted, they have the same noise everywhere.
+Roots of shares of the camera's range are decomposed: where light is counted, they have the same noise everywhere.
 Components have a number for each LED and channel; between LEDs these are interpolated by thin plates (as Ponchio
 and others, Compact representation of relightable images for the Web, 2018, do with Gaussians).
 """
@@ -31,7 +31,7 @@ _APART = 8
 
 @dataclass(frozen=True)
 class LightPlanes:
-    """A view's pixels and LEDs, taken apart: root of the share = `means` + sum of `of_leds` times `planes`."""
+    """Decomposition of a view's pixels and LEDs: root of the share = `means` + sum of `of_leds` times `planes`."""
 
     planes: NDArray[np.float32]
     """[planes, h, w]"""

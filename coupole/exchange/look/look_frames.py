@@ -1,4 +1,4 @@
-"""Measured frames of a result of runs, for a page to show beside what the fit makes of the same LED.
+"""Measured frames of a result of runs, for a page to show beside the fit's prediction for the same LED.
 
 A frame lies on the object: the page finds a place's pixel by the polynomial that is fitted here, of what pixels of
 the view see.

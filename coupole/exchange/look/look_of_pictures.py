@@ -49,8 +49,8 @@ def look_of_pictures(folder: Path) -> Look:
             "Pictures": f"{len(result.directions)} of {width} x {height}",
             "Light": "distant, without the shadows that the object casts. Strength 1 is that of the pictures. "
             "`coupole reflectance relight` comes nearer to them: it interpolates between the pictures.",
-            "Seen from afar": "the mean materials of 2 x 2 pixels, of 4 x 4 and so on, which shine as their mean "
-            "does, not as the mean of what they would send back.",
+            "Seen from afar": "the mean materials of 2 x 2 pixels, of 4 x 4 and so on. The gloss of a mean "
+            "material differs from the mean of the glosses.",
         },
     }
     errors = {"normals": "0.004 degrees", "kd, ks, roughness": "0.05 % or 3e-8"}

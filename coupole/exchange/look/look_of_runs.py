@@ -116,7 +116,7 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
         "places": f"{0.5e3 * step_mm:.2g} um in each coordinate"
     }
     if choice.with_samples:
-        errors["samples"] = "2.3 % of their value, and of how far the ends of their intervals are from it"
+        errors["samples"] = "2.3 % of their value, and of the distance from it to each end of its interval"
         samples = samples_of_result(result, support_from_base, source_about["scan_noise_um"], say)
         about["samples"], later = samples[0], later + samples[1]
     if growing := so_far.words(source_about):
@@ -160,7 +160,7 @@ def _texels_of(
 
 _ERRORS_OF_TEXELS = {
     "normals": "0.03 degrees",
-    "kd, ks": "8 bit of the root of what the brightest have, in JPEG",
+    "kd, ks": "8 bit of the root, relative to the brightest, in JPEG",
     "roughness": "0.4 % of the root of alpha",
     "uncertainties": "2.3 % of their value; means over triangles",
     "measured frames": "8 bit, at most 640 pixels wide, as sRGB has it up to their brightest thousandth",
@@ -252,7 +252,8 @@ _BESIDE = "beside-"
 
 
 def _other_state(choice: PageChoice, fit_of_first: str, say: Said) -> _Other:
-    """Read the other state, by the fit of the first if it has that. Raises InputError as `look_of_result` does."""
+    """Read the other state, by the same fit as the first one if it has this fit. Raises InputError as
+    `look_of_result` does."""
     assert choice.beside is not None
     folder, first_from_other = choice.beside.folder, choice.beside.first_from_other
     read_about(folder)

@@ -159,7 +159,8 @@ def _about(scene: PlainScene, folder: Path, powers: dict[str, Array], materials:
         "unit": "1/sr",
         "told": {
             "Object": "a hypothesis: described and computed, never measured",
-            "Colours": f"from 81 bands, 380 to 780 nm, each illuminant's own, CIE {scene.observer} observer",
+            "Colours": "from 81 bands, 380 to 780 nm, with the spectrum of each light; "
+            f"CIE {scene.observer} observer",
             "Light": "straight from lamps and from the upper half of the sky, with shadows of lamps; none from "
             "surface to surface, and no mirror images of other objects."
             + (" Lamps near by are disks far away, as strong as at the camera's target." if lamps else ""),

@@ -1,9 +1,9 @@
 """Residuals that GGX leaves of each triangle, for a page: a few principal components of all residuals of a view.
 
 A result's fit `ggx_rbf` gives each triangle, seen by one view, a share of its GGX and a hundred radial functions
-of the light's direction (`coupole.reflectance.slice_fit`). These are taken apart into components in the metric of
-what a picture shows, f cos_i over the half sphere: planes, which are tables of reflectance by the light's
-direction in the triangle's own frame, and a number for each triangle and plane.
+of the light's direction (`coupole.reflectance.slice_fit`). The components minimise the error of f cos_i over
+the half sphere, which is what a picture shows. Each component is a plane: a table of reflectance by the light's
+direction in the triangle's own frame. Each triangle has a number for each plane.
 """
 
 from __future__ import annotations

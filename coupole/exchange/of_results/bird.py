@@ -109,7 +109,7 @@ def _metadata(surface: MeasuredSurface, triangle: int, channel: str) -> dict[str
             "type": "part of an object's surface",
             "shape": "triangle of the object's mesh",
             "dimensions": {"area": area},
-            "zero_azimuth_location": "where the support's x axis falls on the triangle; y is 90 degrees",
+            "zero_azimuth_location": "along the support's x axis, projected onto the triangle; y is 90 degrees",
         },
         "environment": _NOT_SAID,
         "comments": f"White LEDs of a dome and a colour camera: {channel} is a broad band, not a wavelength.",

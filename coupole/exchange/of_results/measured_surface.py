@@ -110,7 +110,7 @@ def under_a_layer(kd: NDArray[np.floating], ks: NDArray[np.floating]) -> Floats:
 def read_surface(
     folder: Path, fit: str | None = None, options: ExportChoice | None = None, *, takes_texels: bool = False
 ) -> MeasuredSurface:
-    """Read the surface of a whole result, with the material that missed least unless a fit is named;
+    """Read the surface of a whole result, with the material of the smallest error unless a fit is named;
     `takes_texels` if that may be `TEXELS`. Raises InputError if there is no such fit."""
     about = read_about(folder)
     result = RunResult(folder)
@@ -155,7 +155,8 @@ def read_surface(
 
 
 def _best(result: RunResult, *, takes_texels: bool) -> str:
-    """The material that missed least in the check; texels unless they were compared with it there, and missed
+    """The material with the smallest error in the check; texels unless they were compared with it there, and
+    missed
     more."""
     of_triangles = best_fit(result, MATERIALS)
     mae = read_texel_errors(result.folder)

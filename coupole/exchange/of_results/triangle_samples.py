@@ -19,7 +19,7 @@ class SamplesOfTriangle:
     """Samples of one triangle, of all views and LEDs that gave one; n of them."""
 
     towards_light: Floats
-    """[n, 3] unit; z is the mesh's normal, x lies where the support's x axis falls on the triangle."""
+    """[n, 3] unit; z is the mesh's normal, x is the support's x axis, projected onto the triangle."""
     towards_camera: Floats
     """[n, 3]"""
     f: Floats

@@ -1,4 +1,4 @@
-"""Coefficients of each pixel, as planes, from its values under lights, and what viewers make of them.
+"""Coefficients of each pixel, as planes, from its values under lights, and the viewers' pictures from them.
 
 Viewers show the sums as they are, so that values are encoded for displays (sRGB) before anything is fitted.
 """
@@ -27,8 +27,8 @@ _LEAST_SINGULAR = 1e-4
 
 @dataclass(frozen=True)
 class PlaneCode:
-    """A pixel's planes are `weights` times its values, less `offset`; viewers show `base` and
-    `functions` times planes."""
+    """A pixel's planes are `weights` times its values, minus `offset`. Viewers show `base` plus `functions` times
+    the planes."""
 
     weights: Floats
     """[lights, 3, planes]"""
@@ -41,7 +41,7 @@ class PlaneCode:
     about: dict[str, Any]
     """Facts about the functions, for `info.json`."""
     ranges: tuple[float, ...] = ()
-    """[planes] by which tables of functions were multiplied to be of 8 bit; empty without tables."""
+    """[planes] factors that bring the tables of functions to 8 bit; empty without tables."""
 
     def planes_of(self, view: LitView, say: Said) -> Picture:
         """[h, w, planes] of a view."""

@@ -58,7 +58,7 @@ class ClassModel:
         self._weights = self._precision @ self._members
 
     def probabilities(self, reflectance: Array) -> Array:
-        """[q, classes + 1] of spectra [q, bands]; the last is that of none of the classes."""
+        """[q, classes + 1] probability of each class for spectra [q, bands]; the last one is that of no class."""
         near = self._kernel(_squared_distances(features(reflectance), self._rows))
         variance = 1.0 - np.einsum("qr,rs,qs->q", near, self._precision, near)
         return _probabilities(np.column_stack([near @ self._weights, variance]), self._scale)

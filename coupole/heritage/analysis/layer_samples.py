@@ -1,4 +1,4 @@
-"""Spectra of a paint's films and their grounds, as films for `layer_fit`; and its result as a paint file."""
+"""Read spectra of a paint's films and their grounds as films for `layer_fit`; write its result as a paint file."""
 
 from __future__ import annotations
 

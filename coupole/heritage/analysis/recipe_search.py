@@ -32,7 +32,7 @@ _UNTOLD = 6.0
 TOLD_WITHIN = 0.02
 """Accuracy of a share that is asked of a recipe."""
 _EXPLAINED = 1.5
-"""Root mean square residual over its uncertainty up to which a recipe explains the target."""
+"""Greatest root mean square residual, divided by its uncertainty, of a recipe that explains the target."""
 _LEAST_BANDS = 10
 _DARKEST = 1e-4
 
@@ -68,8 +68,9 @@ class Found:
     bands: NDArray[np.bool_]
     noise: float
     rivals: tuple[dict[str, float], ...] = ()
-    """Shares of other paints that the target does not tell from the recipe's: of as many or fewer within noise,
-    and of one more where it is nearer beyond noise, but not enough to be worth it."""
+    """Shares of other mixtures that the target does not distinguish from the recipe. With as many paints or fewer,
+    they agree within noise. With one paint more, they are nearer by more than noise, but not by enough to be
+    preferred."""
 
     def told_within(self, name: str) -> float:
         """Return the bound within which a share of the best recipe is known: by its 95 % interval, and by what
@@ -97,8 +98,9 @@ class Found:
         lacks = "absorbs" if best.worst > 0.0 else "absorbs less, or scatters more,"
         return (
             f"no mixture of this palette matches the target: the best one differs by {best.misfit:.1f} times "
-            "its uncertainty, "
-            f"most about {best.worst_nm:g} nm, where the recipe is {abs(best.worst):.3f} {kind}. A paint is "
+            "its uncertainty. "
+            f"The largest difference is near {best.worst_nm:g} nm, "
+            f"where the recipe is {abs(best.worst):.3f} {kind}. A paint is "
             f"missing that {lacks} there"
         )
 
@@ -175,7 +177,7 @@ def _choose_recipe(recipes: Sequence[Recipe], bands: int) -> int:
 
 
 class _Problem:
-    """The target, and what subsets of the palette make of it."""
+    """The target, and the best recipes from subsets of the palette."""
 
     def __init__(
         self, target: Array, palette: Sequence[Paint], bands: NDArray[np.bool_], face: Face, noise: float

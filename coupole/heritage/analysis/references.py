@@ -81,7 +81,7 @@ class OfBands:
 
     @cached_property
     def rates(self) -> HeldOutRates:
-        """Rates by leaving out each spectrum, and each class; mixtures are not looked for."""
+        """Error rates, found by leaving out each spectrum and each class. Mixtures are not searched for."""
         model, classes = self.model, self.classes
         several = np.bincount(classes)[classes] > 1
         probabilities, none = model.held_out.probabilities, model.held_out.without_class

@@ -68,7 +68,7 @@ class LocalFits:
     scatter: Floats
     """[n, c, c] covariance of a point's values about the quadric, the mean of that here and next to here."""
     leverage: Floats
-    """[n, c] variance of a value over that of one point."""
+    """[n, c] variance of a value, divided by that of one point."""
     is_seen: NDArray[np.bool_]
     """[n] whether the state's points near a place are the surface there, and not that of another wall."""
 

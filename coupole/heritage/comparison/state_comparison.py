@@ -38,7 +38,7 @@ _SMALLEST_SPREAD = 1e-4
 
 @dataclass(frozen=True)
 class Region:
-    """Marked points that hang together."""
+    """A region: marked points that are connected."""
 
     points: int
     middle_mm: Floats
@@ -97,8 +97,9 @@ class Comparison:
 def compare(
     before_path: Path, after_path: Path, unit: str, noise_mm: float | None, *, is_aligned: bool, say: Say
 ) -> Comparison:
-    """Compare two files, or folders of `coupole reflectance`. `noise_mm` is the standard deviation of a point,
-    else found by the scatter; `is_aligned` takes the files' frame as common. Raises InputError, ExtraMissing."""
+    """Compare two files, or folders of `coupole reflectance`. `noise_mm` is the standard deviation of a point;
+    with None it is estimated from the scatter. With `is_aligned`, both files are in one frame already. Raises
+    InputError, ExtraMissing."""
     say("reading", 0, 2)
     before = _load_state(before_path, unit)
     say("reading", 1, 2)
@@ -204,7 +205,8 @@ def _of_result(points_mm: Floats, colours: Colours, places_mm: Floats) -> Floats
 
 
 def _normals(state: State) -> Floats:
-    """[n, 3]: by triangles, else by neighbours, and then which side is out is not known."""
+    """[n, 3] normals from the triangles. Without triangles they come from neighbours, and their sign is
+    unknown."""
     if state.outward is not None and _has_outward(state):
         return state.outward
     cloud = thinned_cloud(state.points_mm, state.spacing_mm, Viewpoint("none"), state.outward)

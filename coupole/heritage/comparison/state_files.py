@@ -24,7 +24,7 @@ class Colours:
     lab: Floats
     """[n, 3]; NaN where a point has none."""
     covariance: Floats | None = None
-    """[n, 3, 3], if it is known; else the scatter from point to point tells."""
+    """[n, 3, 3]; None if it is not known: it is then estimated from the scatter from point to point."""
 
 
 @dataclass(frozen=True)

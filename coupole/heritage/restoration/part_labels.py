@@ -179,8 +179,8 @@ def _by_colour(srgb: NDArray[np.uint8], table: dict[str, str], tolerance: float)
         most = strays[np.argsort(-counts[strays], kind="stable")][:_SHOWN]
         codes = ", ".join(f"#{bytes(colours[k].tolist()).hex()} ({counts[k]})" for k in most)
         remark = (
-            f"{int(counts[strays].sum())} of {len(srgb)} places have colours of no part within {tolerance:g}, "
-            f"most often {codes}"
+            f"{int(counts[strays].sum())} of {len(srgb)} places differ from every part's colour by more than "
+            f"{tolerance:g}, most often {codes}"
         )
     return np.asarray(rows[colour_rows.reshape(-1)], np.int64), remark
 

@@ -110,9 +110,8 @@ def _plot(finding: PigmentFinding) -> Plot:
     words = (
         f"Above: the spectrum (solid), the nearest reference of {best} (long dashes) and of {second} (short "
         "dashes), "
-        "their K/S by the factors that suit best. Below: what each band says, upwards for the first class, "
-        "downwards "
-        "for the second, in units of the spread within classes"
+        "each with K/S scaled to fit the spectrum best. Below: the evidence of each band, upwards for the first "
+        "class, downwards for the second, in units of the spread within classes"
     )
     title = f"{finding.name}: reflectance, and evidence by wavelength for {best} against {second}"
     return Plot(Drawing(title, _WIDTH, _HEIGHT, _shapes(finding.evidence)), words=words)

@@ -47,7 +47,7 @@ def layer_page(
                 "Spectra": str(fit.spectra),
                 "Binder": f"index {description.binder_index:g}, {description.geometry}",
                 "Noise": f"{description.noise:g} of full reflectance, standard uncertainty",
-                "Bands": f"{len(nm)} of {nm[0]:g} to {nm[-1]:g} nm; S is told in {int(sure.sum())} of them",
+                "Bands": f"{len(nm)} of {nm[0]:g} to {nm[-1]:g} nm; S is determined in {int(sure.sum())} of them",
             },
             sections=[
                 Section(

@@ -51,7 +51,8 @@ def _quality(views: Sequence[Mapping[str, Any]]) -> str:
     if not apart:
         return "There is one hypothesis, and nothing to compare it with."
     most, part, names = max(apart, key=lambda difference: float(difference[0]))
-    return f"They differ most in the part {part}: {' and '.join(names)} by dE00 {most:.1f} of mean colours."
+    apart_words = f"the mean colours of {' and '.join(names)} differ by dE00 {most:.1f}"
+    return f"They differ most in the part {part}: {apart_words}."
 
 
 def _hypotheses(view: Mapping[str, Any], result: Mapping[str, Any], folder: Path) -> list[Picture]:

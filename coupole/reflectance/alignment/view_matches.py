@@ -57,7 +57,7 @@ class Matches:
     matched_blocks: Floats
     """[n, 2] block of the other view that shows the spot."""
     expected_blocks: Floats
-    """[n, 2] block of the other view at which it should."""
+    """[n, 2] block of the other view that should show the spot."""
     covariance: Floats
     """[n, 2, 2] of `matched_blocks`, blocks squared, from noise and texture."""
     shifts_mm: Floats

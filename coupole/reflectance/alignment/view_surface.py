@@ -16,7 +16,7 @@ from coupole.reflectance.extraction.seen_surface import directions_of_rows, seen
 
 Floats = NDArray[np.float64]
 _SAME_PLACE = 3.0
-"""Distance of a place from what a view sees there, in blocks on the surface, up to which it is the same."""
+"""Greatest distance of a place from the surface that a view sees there, in blocks, at which both are the same."""
 
 
 def block_lens(lens: Intrinsics) -> Intrinsics:

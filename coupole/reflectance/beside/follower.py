@@ -29,7 +29,7 @@ Say = Callable[[dict[str, Any]], object]
 
 def process_run(folder: Path, result: Path, say: Say) -> bool:
     """Process a run into its result, while it is acquired and after it; True if the result is whole. `say` is
-    given the progress, and `times` at the end. What fails is told, and what is there stays."""
+    given the progress, and `times` at the end. Failures are reported, and existing results stay."""
     teller = _Teller(result, say)
     try:
         with hold_result(result):
@@ -96,7 +96,7 @@ class _Follower:
         self._newest_view, self._begun_view = "", ""
         """View of the newest proven frame; the same if what it sees was not computed yet, else empty."""
         self._tried_views: tuple[str, ...] = ()
-        """Views of which a result was made, or tried, as the newest."""
+        """Views of the last result so far that was made or tried."""
         self._may_give_up = True
         """The newest result of the views so far was not given up: the next one may be."""
 

@@ -52,8 +52,9 @@ def lamp_codes(mesh: PacketMesh, facets: Facets, leds: Positions, pool: Executor
 
 
 def _codes_of_led(mesh: PacketMesh, facets: Facets, leds: Positions, led: int) -> NDArray[np.uint8]:
-    """[triangles]: shadow of the LED's centre, then triangles beside it, which its edge may cross, then ring by
-    ring what only a part of the LED reaches, as long as there is some."""
+    """[triangles] codes, found in three steps: the shadow of the LED's centre; the triangles beside it, which the
+    shadow's edge may cross; then, ring by ring, triangles that only a part of the LED reaches, until there are
+    none."""
     centre_mm, normal = leds.centres_mm[led], leds.normals[led]
     codes = np.empty(len(facets.centres_mm), np.uint8)
     _away(facets.centres_mm, facets.normals, centre_mm, normal, np.cos(np.radians(MOST_INCIDENCE_DEG)), codes)

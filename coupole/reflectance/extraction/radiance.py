@@ -67,7 +67,8 @@ class PixelLists(NamedTuple):
     """Pixels of one view in the order of triangles and channels, for compiled code."""
 
     starts: NDArray[np.int64]
-    """[triangles channels + 1] of a triangle's channel in what follows."""
+    """[triangles channels + 1] first place of each triangle's channel in the arrays below; the last one is their
+    length."""
     places: NDArray[np.int32]
     """[pixels] in a frame, row by row."""
     even: NDArray[np.float32]

@@ -7,7 +7,7 @@ REACHED, AWAY, SHADED, PENUMBRA = range(4)
 BY_CELL = PENUMBRA + 1
 """Arm, camera or tool may hide them from each other."""
 BY_UNKNOWN = BY_CELL + 1
-"""The sample contradicts those beside it (`contradictions`): something shades it that nobody described."""
+"""The sample contradicts those beside it (`contradictions`): a thing that nobody described shades it."""
 CODES = {
     "reached": REACHED,
     "away": AWAY,

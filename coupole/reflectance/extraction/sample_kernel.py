@@ -101,8 +101,8 @@ def fill_pixels(  # type: ignore[no-untyped-def]
     first_entry, entry_ends, lists, response, darks, shots, lamps, places_mm, codes, direct, values, root_share
 ):
     """Fill `values` [pixels, leds], bits of float16, with S / (P E/Phi) of single pixels, 1/sr: f times the cosine
-    of incidence, whatever the normal is; higher by the share `root_share` (float32) of what the mean of their
-    square roots loses by noise.
+    of incidence, whatever the normal is. Noise lowers the mean of their square roots; the share `root_share`
+    (float32) of this loss is added.
 
     The pixels are those of the lists from the `first_entry` on, up to `entry_ends` [b, channels] of each of b
     triangles; `places_mm` [pixels, 3] is what they see, `codes` [b, 8] says where light has reached the triangle,

@@ -58,8 +58,8 @@ def seen_surface(
 ) -> SeenSurface:
     """Pixels and triangles of a view; `normals` [n, 3] are the mesh's.
 
-    `blur` is focal length and focus distance in mm, f-number, and the largest circle of confusion in px; None
-    leaves out nothing for its focus.
+    `blur` is focal length and focus distance in mm, f-number, and the largest circle of confusion in px; with
+    None no pixel is left out because it is out of focus.
     """
     width, height = size_px
     hit = np.full((height, width), -1, np.int32)

@@ -80,7 +80,8 @@ class Environment:
 
 
 def _parts_at(cumulative_sum: Floats, shares: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """Return the parts of a growing sum into which shares of it fall, and how far into the part."""
+    """Return for each share of a cumulative sum the part into which it falls, and the position in this part, 0
+    to 1."""
     at = shares * cumulative_sum[-1]
     part = np.clip(np.searchsorted(cumulative_sum, at, side="right") - 1, 0, len(cumulative_sum) - 2)
     within = (at - cumulative_sum[part]) / np.maximum(cumulative_sum[part + 1] - cumulative_sum[part], 1e-300)

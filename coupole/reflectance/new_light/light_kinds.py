@@ -177,7 +177,7 @@ def area_of(text: str) -> AreaLight:
 
 def turn_light(light: AnyLight, angle_deg: float) -> AnyLight:
     """A light turned about the z axis, from x to y; an environment about its own up. Raises InputError for an LED,
-    which has its place."""
+    because its place is fixed."""
     cosine, sine = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
 
     def turn(vector: Vector) -> Vector:

@@ -65,8 +65,8 @@ def _mirror(  # type: ignore[no-untyped-def]
     halves_mm, radiance, density, ray, lobe_rays, hit_pixels, gains, ways_mm
 ):  # fmt: skip
     """Return how many of the rays of number `ray` from pixels [n, 2] point at a bright part of an emitter. Fill
-    `hit_pixels` with their pixels, `gains` with what they bring if nothing is in their way, `ways_mm` with how
-    they get there."""
+    `hit_pixels` with the pixels of these rays, `gains` with the radiance that each adds to its pixel if nothing is
+    in its way, and `ways_mm` with the vectors to the emitter."""
     way, channels, count = np.empty(3), gains.shape[1], 0
     for pixel in range(len(pixels)):
         row, column = pixels[pixel]

@@ -154,7 +154,9 @@ def _asked_in(codes, cells):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _open_neighbours(codes, open_cells, fresh):  # type: ignore[no-untyped-def]
-    """Open the closed neighbours of cells [n, 2] with a pixel at the common side that differs from them; which."""
+    """Open each closed neighbour of the cells [n, 2] that has a different pixel at the common side; return the
+    opened
+    cells."""
     down, across = open_cells.shape
     opened_cells = np.empty((4 * len(fresh), 2), np.int64)
     count = 0

@@ -14,7 +14,7 @@ LEAST_HIGHLIGHT = 0.1
 """Brightness of the lobe in the mirror direction, as a share of the diffuse part's, below which it is not seen:
 for results that state no uncertainty."""
 LEAST_SHARE = 0.02
-"""Share of the object with a lobe that is told, below which no map of lobes is drawn."""
+"""Least share of the object with a determined lobe for which a map of lobes is drawn."""
 
 
 def is_told_by_uncertainty(ks: NDArray[Any], u_relative: NDArray[Any]) -> NDArray[np.bool_]:

@@ -141,7 +141,7 @@ def _sentence(remark: str) -> str:
 
 
 def _best_fit(about: dict[str, Any]) -> str | None:
-    """Name of the fit that misses least under the LEDs kept for the check; None without a check."""
+    """Name of the fit with the smallest error under the LEDs kept for the check; None without a check."""
     errors = {name: mae for name, mae in about["mae"].items() if mae is not None}
     return min(errors, key=lambda name: errors[name]) if errors else None
 
@@ -305,7 +305,7 @@ def _check_section(view: str, figures: Sequence[Figure]) -> Section:
 
 
 def _reconstruction(result: RunResult, view: ViewSamples, about: dict[str, Any]) -> Iterator[Figure]:
-    """A frame that was kept for the check, and what each fit makes of it; that which shows most."""
+    """A frame that was kept for the check, and the prediction of each fit for it; the frame that shows most."""
     frames = read_check_frames(result, view)
     if not len(frames.leds):
         return

@@ -227,7 +227,7 @@ class _Trial:
         choices = {}
         for count, exposures_us in enumerate(self._exposures, start=1):
             information = self._information(
-                exposures_us, f"what views tell, exposure {count} of {len(self._exposures)}"
+                exposures_us, f"information of the views, exposure {count} of {len(self._exposures)}"
             )
             for leds in range(len(self._numbers)):
                 settings = Settings(exposures_us, leds)
@@ -282,7 +282,7 @@ class _Trial:
     def _with_paths(self, settings: Settings) -> Suggestion | None:
         """The suggestion of these settings, with views to which there are paths; None if none fits the budget.
         Raises PreflightRefused for what no other choice mends."""
-        information = self._information(settings.exposures_us, "what views tell, of the chosen exposure")
+        information = self._information(settings.exposures_us, "information of the views, chosen exposure")
         most = self._most_views(settings)[0]
         for number in range(1, _ROUNDS + 1):
             self._say("paths to the views", number, _ROUNDS)

@@ -1,4 +1,4 @@
-"""Sums of what views tell of an object's materials before anything is measured, to compare views.
+"""Information of views about an object's materials, summed before anything is measured, to compare views.
 
 A fit's covariance is H^-1 M H^-1 (`coupole.reflectance.material_uncertainty`). Both are sums over samples, so each
 view adds its own to them. Here the derivatives are those of a supposed material, and M has what is known

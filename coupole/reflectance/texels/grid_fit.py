@@ -1,7 +1,8 @@
 """Materials of texels of several pixels: one fit for each, to the means of its channels, as triangles are fitted.
 
 Normal, lightness, ks and roughness are fitted to the mean of the channels, about the material of the triangle that
-most of a texel's pixels see, and neighbours have their word on them as on single pixels. All channels of a texel
+most of a texel's pixels see, and neighbouring texels are taken into account as neighbouring pixels are. All
+channels of a texel
 are measured, and give its colour together with those of the texels beside it.
 """
 
@@ -90,8 +91,8 @@ def texels_of_grid(
 
 
 def _wider(colours: Singles) -> Singles:
-    """[n] mean over the channels of the factors of kd's variance, where colours [n, channels] differ: what a lobe
-    of another form makes of kd is as large in a dark channel as in a light one."""
+    """[n] factors of kd's variance for colours [n, channels]: means over the channels. If the lobe has another
+    form, the error of kd is as large in a dark channel as in a light one."""
     factors: Singles = np.clip(np.exp(-2.0 * colours).mean(axis=1), 1.0, _MOST_WIDER)
     return factors
 
@@ -103,9 +104,9 @@ def colours_around(
     standard uncertainty [h, w].
 
     A texel's red and blue pixels are not in the same places, and paint that changes between them looks like a
-    colour. So what a texel's colour has beyond its triangle's is taken from the texels around, too, within some
-    pixels; the spread that this takes away says how uncertain the rest is. Logarithms' means are those of no
-    colour: kd's mean over the channels stays as it was fitted.
+    colour. So the difference of a texel's colour from its triangle's is averaged with those of the texels around,
+    within some pixels. The spread that this removes says how uncertain the mean is. The mean of the logarithms
+    over the channels is 0, so kd's mean over the channels stays as it was fitted.
     """
     width = max(_SPREAD_PX / side_px, _LEAST_SPREAD)
     weight = is_fitted.astype(np.float32)

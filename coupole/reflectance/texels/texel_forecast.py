@@ -1,7 +1,8 @@
 """Forecast of texels of a size, before the work begins: how many, how wide, how much memory and disk they
 take, and how long they take on this machine.
 
-Views are traced coarsely for how many pixels see the object, and how wide these are on it. Time follows from small
+Rays through some pixels of each view tell how many pixels see the object, and how wide these are on it. Time
+follows from small
 trials with the run's own frames and LEDs: reading, fitting, and asking the neighbours.
 """
 
@@ -39,9 +40,9 @@ from coupole.reflectance.texels.texel_size import TexelSize
 from coupole.reflectance.texels.texel_values import texel_bytes
 
 _TRACED = 200_000
-"""Pixels of a view, about, that are traced."""
+"""Approximate number of pixels of a view through which rays are traced."""
 _FITTED, _SIDE_PX = 2048, 192
-"""Texels of the trial of fits, and width of that of neighbours."""
+"""Number of texels for the trial of fits, and width of the trial of neighbours."""
 _ALL_OVER_SETTLE, _CHECK_OVER_FIT = 3.0, 17.0
 """Times that were seen: all that is done with neighbours over the part that is tried; a pixel under an LED of
 the check, with the uncertainties of every second, over a fit's sample."""

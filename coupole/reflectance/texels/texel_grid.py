@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 
 _SAMPLED = 1_000_000
-"""Pixels, about, by which their size on the surface is found."""
+"""Approximate number of pixels by which their size on the surface is found."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class TexelGrid:
 
     side_px: int
     triangle: NDArray[np.int32]
-    """[rows, columns] row of the view's file of what most of a texel's pixels see; -1 for none."""
+    """[rows, columns] row, in the view's file, of the triangle that most of a texel's pixels see; -1 for none."""
     texel_of_pixel: NDArray[np.int32]
     """[h, w] place in the grid, row by row; -1 for none."""
     places_mm: NDArray[np.float32]
@@ -33,8 +33,9 @@ class TexelGrid:
 
 
 def pixel_mm(surface: Surface) -> float:
-    """Return the width of a pixel of a view on the surface, mm: of a square of the area that it sees, median. If
-    the mesh is so coarse that pixels see its triangles' centres, the mean."""
+    """Return the width of a view's pixels on the surface, mm: the root of the area that a pixel sees, median over
+    the
+    pixels. It is the mean if the mesh is so coarse that pixels see the centres of its triangles."""
     step = max(1, math.isqrt(surface.triangle_of_pixel.size // _SAMPLED))
     places_mm = surface.places_mm
     here = places_mm[:-1:step, :-1:step]

@@ -1,7 +1,7 @@
 """Values of a view's texels under all its LEDs: means of their pixels, channel by channel, band by band.
 
 Means are taken of a few LEDs' frames at a time, so that only those of the texels stay in memory, not the pixels'
-own. Of eight LEDs at once the lists of a band's pixels are filled as for single pixels (`pixel_values`).
+own. The lists of a band's pixels are filled for eight LEDs at once, as for single pixels (`pixel_values`).
 """
 
 from __future__ import annotations

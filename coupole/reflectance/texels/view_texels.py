@@ -73,7 +73,7 @@ class Fitted:
         )
 
     def settle(self, view: ViewSamples, centres: Centres, triangle: NDArray[np.int32]) -> Singles:
-        """Let the neighbours have their word, and add what inter-reflection makes uncertain by the `triangle`
+        """Take the neighbours into account, and add what inter-reflection makes uncertain by the `triangle`
         [h, w] of each; return the normals [fitted, 3] of those that are fitted."""
         is_fitted = self.is_fitted
         before = self.deviation[is_fitted][:, :2]

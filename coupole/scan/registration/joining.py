@@ -20,7 +20,9 @@ from coupole.scan.registration.viewpoint import Floats
 AGREEMENT_PITCHES = 3.0
 """Two motions agree if they bring a scan's points to places within so many cells of the coarse grid."""
 _MOST_CROSS_CHECKS, _FEW_CHECKS, _EVERY = 300, 30, 5
-"""Pairs of scans of two groups that are looked at; from how many on only each fifth point of them."""
+"""Greatest number of pairs of scans of two groups that are checked; number of pairs from which on not each point
+is
+checked; step in points then."""
 
 
 @dataclass

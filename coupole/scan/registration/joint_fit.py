@@ -29,9 +29,9 @@ _MOST_ROUNDS, _LEAST_ROUNDS = 20, 2
 _SETTLED_PITCHES = 3e-3
 _SAME_SIDE = 0.7
 _BESIDE_PITCHES = 0.7
-"""Farther beside the nearest point, over the pitch, lies no surface: a rim."""
+"""Greatest distance beside the nearest point, over the pitch: farther away is a rim, where no surface is."""
 _STEEP = 0.5
-"""Cosine of incidence: flatter than 60 degrees to a scanner's rays its errors grow."""
+"""Least cosine of incidence: beyond 60 degrees from a surface's normal, a scanner's errors grow."""
 _HUBER = 2.0
 _CELLS_ACROSS = 12
 """Cells of space along the size of a scan, over each of which errors may have something in common."""
@@ -40,7 +40,7 @@ _LEAST_PAIRS = 30
 
 @dataclass(frozen=True)
 class JointFit:
-    """Poses of scans that hang together, and how well they are known."""
+    """Poses of connected scans, and their uncertainties."""
 
     common_from_scan: list[Floats]
     """4x4 mm; the common frame is that of the fixed scan, or of the control points."""

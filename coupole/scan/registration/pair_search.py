@@ -16,7 +16,7 @@ Task = tuple[int, int, Floats | None]
 """Numbers of two scans, and `first_from_second` if it is known about."""
 Say = Callable[[str, int, int], None]
 _WORTH_PROCESSES = 30
-"""Tasks from which on more processes are worth their start."""
+"""Number of tasks above which more processes save more time than their start takes."""
 _TOGETHER = 8
 
 _scans_there: list[PreparedScan] = []

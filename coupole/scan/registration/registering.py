@@ -25,7 +25,8 @@ from coupole.scan.registration.viewpoint import Floats, Stand, Viewpoint, choose
 
 Say = Callable[[str, int, int], None]
 ALL_PAIRS = 20
-"""Number of scans up to which all pairs are tried; of more only until they hang together."""
+"""Greatest number of scans of which all pairs are tried. With more scans, pairs are tried until all are
+connected."""
 _FINE_PLACES, _COARSE_PLACES = (20_000, 2_500), (8_000, 1_600)
 """Points of a scan's fine and coarse cloud: of few scans, and of many."""
 _PARTNERS = 6
@@ -35,7 +36,7 @@ _ODD_SIZE = 200.0
 _ROUNDED_CELLS = 0.01
 """Largest rounding of a coordinate of the merged mesh, in its cells."""
 _LEAST_JOINT_OVERLAP = 0.04
-"""Share of the smaller scan, from which on a pair counts in the joint fit."""
+"""Least share of the smaller scan that must overlap for a pair to count in the joint fit."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Registration:
     scans: tuple[PreparedScan, ...]
     """Points and normals of each scan in its own frame, mm."""
     placed_numbers: tuple[int, ...]
-    """Numbers of the scans that hang together; the first is the one whose frame is the common one."""
+    """Numbers of the scans that are connected; the first is the one whose frame is the common one."""
     first_from_scan: dict[int, Floats]
     """4x4 mm, to the first placed scan's frame."""
     covariance: dict[int, Floats]

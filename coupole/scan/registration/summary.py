@@ -136,8 +136,8 @@ def remarks(registration: Registration) -> Iterator[str]:
     names = registration.names
     yield (
         f"{len(registration.placed_numbers)} of {len(names)} scans placed by {registration.pairs} overlapping "
-        f"pairs; surfaces lie on "
-        f"each other within {registration.fit.rms_mm:.3g} mm (root mean square along their normals)"
+        f"pairs; surfaces agree "
+        f"within {registration.fit.rms_mm:.3g} mm (root mean square along their normals)"
     )
     if registration.loops:
         middle = float(np.median([loop.error_mm for loop in registration.loops]))
@@ -153,8 +153,8 @@ def remarks(registration: Registration) -> Iterator[str]:
         yield "no loop closes: a wrong pair would not be noticed, and uncertainties are from noise alone"
     if registration.loop_factor > 1.05:
         yield (
-            f"pairs by themselves differ {registration.loop_factor:.1f} times more than noise explains; all "
-            "uncertainties by overlaps are multiplied by this factor"
+            f"pairs adjusted alone differ {registration.loop_factor:.1f} times more than noise explains; all "
+            "uncertainties from overlaps are multiplied by this factor"
         )
     if registration.sliding_pairs:
         yield _sliding(registration)

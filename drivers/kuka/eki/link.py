@@ -31,7 +31,7 @@ def connect(
     """An open connection, and the number of strangers who were turned away; retries for `timeout_s` of machine
     time.
 
-    Where the controller is the client, only one from the address `controller` is let in, if that is not empty.
+    If the controller is the client and `controller` is not empty, only clients at this address are let in.
     Raises OSError.
     """
     host, port = address.rsplit(":", 1)
@@ -100,7 +100,7 @@ class Link:
             self.send(command)
 
     def wait_for(self, outcome: Callable[[], Outcome], patience_s: float | None = None) -> Outcome:
-        """Wait until `outcome` returns anything true, called after every status and every `LOOK_S`; return that.
+        """Call `outcome` after every status and every `LOOK_S`, until it returns a true value; return this value.
 
         After `patience_s` of machine time it returns whatever `outcome` gives then. Without `patience_s` only a
         lost link ends the wait for a silent controller, by latching a fault: `outcome` must check the watch's

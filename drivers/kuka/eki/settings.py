@@ -31,7 +31,7 @@ class Settings(BaseModel):
     controller that is the server is reached at `address`.) It may be left out only where no other machine can
     connect, or by a person's word."""
     any_controller_by: str = Field(default="", max_length=60)
-    """Person who has decided that whoever connects first is taken for the controller."""
+    """Person who has decided that the first client that connects is taken for the controller."""
     status_ms: int = Field(default=20, ge=4)
     """Period of the controller's status messages, in controller time."""
     link_timeout_s: float = Field(default=2.0, gt=0)

@@ -74,7 +74,8 @@ class Watch:
         self.note_command(number)
 
     def note_command(self, number: int) -> None:
-        """A command of any kind is about to be sent: only statuses from after it was taken count."""
+        """Note that a command of any kind is about to be sent: only statuses after the controller has taken it
+        count."""
         self._asked, self.taken_ms = number, None
         self.settled_cycles = self._astray_cycles = 0
 

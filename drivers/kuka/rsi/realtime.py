@@ -31,7 +31,7 @@ def may_be_realtime() -> bool:
 def how_to_give_the_right() -> str:
     """Return how to give the right, for messages; the full text is in docs/how-to/kuka-controller.md."""
     return (
-        f"Say `sudo setcap cap_sys_nice+ep {os.path.realpath(sys.executable)}`, or write "
+        f"Run `sudo setcap cap_sys_nice+ep {os.path.realpath(sys.executable)}`, or write "
         f"`@GROUP - rtprio {PRIORITY}` into /etc/security/limits.d/coupole.conf and log in again, or in a "
         f"systemd unit `LimitRTPRIO={PRIORITY}` (docs/how-to/kuka-controller.md)"
     )

@@ -36,7 +36,7 @@ class Settings(BaseModel):
     out only where no other machine can send (`listen` on loopback), or by a person's word: the first sender of an
     answerable packet then counts as the controller, until the driver is closed."""
     any_controller_by: str = Field(default="", max_length=60)
-    """Person who has decided that whoever sends first is taken for the controller."""
+    """Person who has decided that the first sender is taken for the controller."""
     without_realtime_by: str = Field(default="", max_length=60)
     """Person who has decided that this machine may answer at normal priority. Without this entry, and without the
     right to real-time priority, a controller on the network is not answered."""

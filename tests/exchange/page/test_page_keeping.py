@@ -173,7 +173,7 @@ def test_pictures_that_are_too_large_for_print_are_refused(page: Page, folder: P
         document.getElementById("print-dpi").value = "600";
         document.getElementById("print-button").click();""")
     told = cells.wait_until(lambda: page.browser.text("#status"), "the refusal")
-    assert re.search(r"more than 12 million: at most \d+ dots per inch", told)
+    assert re.search(r"more than 12 million: choose at most \d+ dots per inch", told)
 
 
 NOISE_MM = 0.03

@@ -157,7 +157,7 @@ def test_an_illuminant_has_its_chromaticity_and_an_eye_may_be_used_to_it(page: P
             colour.cctf_encoding(np.clip(colour.XYZ_to_RGB(xyz, "sRGB", apply_cctf_encoding=False), 0, 1)) * 255
         )
         np.testing.assert_allclose(page.run(pixel), shown, atol=1.5)
-    assert "eye used to the chosen light (Bradford)" in page.browser.text("#banner")
+    assert "eye adapted to the chosen light (Bradford)" in page.browser.text("#banner")
 
 
 def test_a_flat_picture_has_the_radiance_of_each_pixel_where_it_lies(page: Page, tmp_path: Path) -> None:

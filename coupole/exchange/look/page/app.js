@@ -364,7 +364,7 @@ class App {
   seenAt(x, y) {
     this.rest();
     const found = this.renderer.seenAt(Math.floor(x * this.scale), Math.floor(y * this.scale));
-    if (!found) this.say("There is nothing of the object at this place.");
+    if (!found) this.say("The object is not at this place.");
     return found;
   }
 
@@ -424,7 +424,7 @@ class App {
     const parts = partsOfEnd(this.about, this.state.camera, Math.min(width, height), found.place, cosine);
     this.ruler = [...this.ruler.slice(this.ruler.length === 2 ? 2 : 0), { place: found.place, parts }];
     if (this.ruler.length === 2) this.keepLength(measuredLength(this.about, this.ruler));
-    else this.say("Now the other end.");
+    else this.say("Now click the other end.");
     this.showMarks();
   }
 
@@ -446,7 +446,7 @@ class App {
 
   keepNote(text) {
     if (!text || !this.pinned) {
-      this.say(text ? "Click a place for the note first." : "A note needs words.");
+      this.say(text ? "Click a place for the note first." : "Write the text of the note first.");
       return;
     }
     const { camera, lights } = structuredClone(this.state);

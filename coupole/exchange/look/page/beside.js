@@ -75,7 +75,7 @@ class Beside {
     byId("beside-split").value = state.split;
     byId("beside-swap").hidden = state.beside !== "light";
     byId("beside-told").textContent = {
-      light: "Left of the line stays the light as it was; right of it is the light that the settings are for.",
+      light: "Left of the line is the light before the change; right of it is the light of the settings.",
       state: about.beside && `Left of the line: ${about.beside.name}. Right of it: ${about.title}. ${about.beside.told}`,
     }[state.beside] ?? "Drag the line in the picture, or use Divide.";
   }

@@ -1,4 +1,4 @@
-// Measured frames, laid on the object: what the camera saw beside what the fit makes of the same LED.
+// Measured frames, laid on the object, beside the prediction of the fit for the same LED.
 
 /** A block that may still lie beside the page; its script is asked for by a tag. */
 async function laterBlock(about, name) {

@@ -57,7 +57,7 @@ function coloursTold(about, state) {
   if (!state.lights.some(isTinted)) {
     return state.sky > 0 || state.environment > 0 ? ["colour of sky and surroundings are hypotheses in RGB"] : [];
   }
-  const eye = state.adapted ? "eye used to the chosen light (Bradford)" : "no adaptation of the eye";
+  const eye = state.adapted ? "eye adapted to the chosen light (Bradford)" : "no adaptation of the eye";
   return [`colours of lights are hypotheses in RGB, ${eye}`];
 }
 
@@ -71,7 +71,7 @@ function bannerOf(about, state, compared, left) {
     if (about.environment && state.environment > 0) told.push(`surroundings ${about.environment.name}`);
     told.push(...coloursTold(about, state));
   }
-  if (isStereo(state)) told.push("for two eyes, the left one's to the left");
+  if (isStereo(state)) told.push("for two eyes: the left eye's picture is on the left");
   if (state.beside === "state") told.push(`left: ${about.beside.name}, ${about.beside.fit}`);
   if (state.beside === "light") told.push("left: another light");
   if (state.mode === "unsharp") told.push("relief exaggerated");

@@ -46,13 +46,13 @@ function toldOf(triangle, place, material, view) {
   const at = ABOUT.picture_px
     ? `Pixel ${Math.floor(place[0])}, ${Math.floor(ABOUT.picture_px[1] - place[1])}`
     : `Triangle ${triangle} at ${place.map((value) => value.toFixed(2)).join(", ")} mm`;
-  if (!material) return `<p>${at}: was seen in too few frames; it has no material.</p>`;
+  if (!material) return `<p>${at}: it was seen in too few frames, so it has no material.</p>`;
   const { kd, ks, normal, roughness } = material.uncertainty;
-  const bounds = kd === null ? "How well it is known was not found out." : "Band: 95 % of their mean.";
+  const bounds = kd === null ? "No uncertainty is known." : "Band: 95 % interval of their mean.";
   const angle = normal === null ? "unknown" : `${degrees(normal).toPrecision(2)}°`;
   const row = (name, value, u) => `<tr><th scope="row">${name}</th><td>${value}</td><td>± ${u}</td></tr>`;
   return `<p>${at}</p>${plotOf(material, view)}
-    <p class="small">${ABOUT.unit}; red, green, blue. ${bounds} Dotted: where the camera is mirrored. Drawn from
+    <p class="small">${ABOUT.unit}; red, green, blue. ${bounds} Dotted: direction of mirror reflection to the camera. Drawn from
     the fitted coefficients${ABOUT.samples ? "" : "; this page holds no samples"}.</p>
     <div id="samples-told" role="status"></div>
     <table><tbody>
@@ -60,7 +60,7 @@ function toldOf(triangle, place, material, view) {
     ${row("Highlight ks", three(material.ks), percent(ks))}
     ${row("Roughness α", material.alpha.toPrecision(3), percent(roughness))}
     ${row("Normal", material.normal.map((value) => value.toFixed(3)).join(", "), angle)}
-    ${material.residual === null ? "" : `<tr><th scope="row">Fit misses</th><td colspan="2">${
+    ${material.residual === null ? "" : `<tr><th scope="row">Residual of the fit</th><td colspan="2">${
       percent(material.residual)} of √kd</td></tr>`}
     </tbody></table>`;
 }

@@ -14,7 +14,7 @@ function printSize(width_mm, dpi, canvas) {
   const width = Math.round(width_mm / MM_PER_INCH * dpi), height = Math.round(width * canvas.height / canvas.width);
   if (width * height > MOST_PRINT_PIXELS) {
     const most = Math.floor(dpi * Math.sqrt(MOST_PRINT_PIXELS / (width * height)));
-    throw new Error(`${width} x ${height} pixels are more than 12 million: at most ${most} dots per inch at this width.`);
+    throw new Error(`${width} x ${height} pixels are more than 12 million: choose at most ${most} dots per inch at this width.`);
   }
   return { width, height };
 }

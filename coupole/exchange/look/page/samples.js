@@ -1,4 +1,4 @@
-// Measured samples of a triangle, beside what its fit makes of the same directions.
+// Measured samples of a triangle, beside the prediction of its fit for the same directions.
 
 /** Where a number stands in numbers that rise; -1 if it does not. */
 function placeIn(numbers, wanted) {
@@ -84,12 +84,13 @@ function samplesPlotOf(samples) {
 /** What bars are, and how long a typical one is. */
 function barsTold(samples) {
   const known = samples.filter(({ below }) => below !== null);
-  if (!known.length) return "How uncertain they are is not known.";
+  if (!known.length) return "Their uncertainty is not known.";
   const ends = ["below", "above"].map((side) => known.map((one) => one[side]).sort((one, other) => one - other));
   const [below, above] = ends.map((sorted) => percent(sorted[sorted.length >> 1]));
-  return `Bars: 95 % intervals by all sources (noise, pixels' responses, inter-reflection taken off, where pixels
-    look, power of each LED and of all, the mesh's vertices, places of LEDs), as if the channels were off together;
-    in the median ${below} below, ${above} above. What samples share moves them together.`;
+  return `Bars: 95 % intervals by all sources (noise, pixels' responses, inter-reflection that was subtracted,
+    places that pixels see, power of each LED and of all, the mesh's vertices, places of LEDs), as if the errors of the
+    channels were fully correlated; in the median ${below} below, ${above} above. Errors that samples share move them
+    together.`;
 }
 
 /** What is told of samples, as markup. */
@@ -99,6 +100,6 @@ function samplesTold(samples) {
   const off = samples.map(({ value, fitted }) => Math.abs(fitted - value)).sort((one, other) => one - other);
   const told = percent(off[off.length >> 1] / mean(samples.map(({ value }) => value)));
   return `${samplesPlotOf(samples)}<p class="small">${samples.length} measured samples of ${views}: f,
-    1/sr, mean of the channels. ${barsTold(samples)} Orange: what the fit makes of the
+    1/sr, mean of the channels. ${barsTold(samples)} Orange: the prediction of the fit for the
     same directions; median difference ${told} of the samples' mean.</p>`;
 }

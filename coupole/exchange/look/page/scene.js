@@ -106,10 +106,10 @@ class SceneRenderer extends Renderer {
       const used = [...new Set(state.lights.filter(({ strength }) => strength > 0).map(({ illuminant }) => illuminant))];
       if (state.sky > 0 && !used.includes(state.skyIlluminant)) used.push(state.skyIlluminant);
       told.push(`reflectance by spectra under ${used.join(", ")}`);
-      told.push(state.adapted ? "eye used to the chosen light (Bradford)" : "no adaptation of the eye");
+      told.push(state.adapted ? "eye adapted to the chosen light (Bradford)" : "no adaptation of the eye");
       told.push("no light from surface to surface");
     }
-    if (isStereo(state)) told.push("for two eyes, the left one's to the left");
+    if (isStereo(state)) told.push("for two eyes: the left eye's picture is on the left");
     return told.join(" · ");
   }
 

@@ -7,7 +7,7 @@ const MODES_OF_SCENES = {
 };
 const MODES_OF_RESULTS = {
   relit: "Relit", diffuse: "Diffuse only", specular: "Highlights only", unsharp: "Relief enhanced",
-  normals: "Normals", roughness: "Roughness", uncertainty: "Uncertainty", residual: "What the fit misses",
+  normals: "Normals", roughness: "Roughness", uncertainty: "Uncertainty", residual: "Residual of the fit",
 };
 if (ABOUT.texels) delete MODES_OF_RESULTS.residual;  // it is of triangles
 const MODES = { run: MODES_OF_RUNS, scene: MODES_OF_SCENES }[ABOUT.kind] ?? MODES_OF_RESULTS;

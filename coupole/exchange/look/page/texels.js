@@ -5,7 +5,7 @@ class Texels {
     Object.assign(this, { gl, about, coming: [...about.texels?.tiles ?? []], textures: null });
     if (this.coming.length && about.texels.side_px > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
       this.coming = [];
-      this.refused = `This browser's graphics take no maps of ${about.texels.side_px} pixels: triangles are shown.`;
+      this.refused = `This browser's graphics cannot hold maps of ${about.texels.side_px} pixels, so triangles are shown.`;
     }
   }
 

@@ -44,7 +44,7 @@ class Parts {
     const used = this.used();
     if (!used.length) return "Nothing is painted yet.";
     const names = used.map((k) => this.names[k - 1]), bad = names.find((name) => !NAME.test(name));
-    if (bad !== undefined) return `The name “${bad}” has other letters than A-Z, a-z, 0-9, blank, ., _ and -, or none.`;
+    if (bad !== undefined) return `The name “${bad}” is empty, or has a letter other than A-Z, a-z, 0-9, blank, ., _ and -.`;
     const twice = names.find((name, k) => names.indexOf(name) !== k);
     return twice === undefined ? "" : `Two parts are named “${twice}”.`;
   }
@@ -67,7 +67,7 @@ class Parts {
   /** Take what a file has. Throws if it is of another mesh, or no such file. */
   read(text) {
     const file = JSON.parse(text);
-    if (file.kind !== "picked parts") throw new Error("this is no file of this page");
+    if (file.kind !== "picked parts") throw new Error("this file was not saved by this page");
     if (file.vertices_mm !== MESH.vertices_mm || file.triangles !== MESH.triangles) {
       throw new Error("this file is of another mesh");
     }

@@ -188,13 +188,17 @@ class DrawnChart:
         )
         return folder / "chart.yaml"
 
+    def true_white(self) -> Array:
+        """[3] signals of the perfect white as the true greys have them: of the least squares over their Y."""
+        grey = slice(ROWS * COLUMNS - len(GREYS), ROWS * COLUMNS)
+        luminance = d50_xyz(self.spectra)[grey, 1]
+        return np.asarray(luminance @ self.signals(self.spectra)[grey] / (luminance @ luminance))
+
     def true_matrix(self) -> Array:
         """[3, 3] of the least sum of squares of CIEDE2000 that keeps white, for the chart's true colours and
         signals under even light, by colour-science and its CIEDE2000."""
-        xyz, signal = d50_xyz(self.spectra), self.signals(self.spectra)
-        grey = slice(ROWS * COLUMNS - len(GREYS), ROWS * COLUMNS)
-        luminance = xyz[grey, 1]
-        balanced = signal * (luminance @ luminance) / (luminance @ signal[grey])
+        xyz = d50_xyz(self.spectra)
+        balanced = self.signals(self.spectra) / self.true_white()
         lab = d50_lab(xyz)
         white = np.array([0.9642, 1.0, 0.8249])
 

@@ -132,7 +132,7 @@ def _refuse_miss(picture: PlainPicture, miss: float, *, is_given: bool) -> None:
     how = (
         f"miss the chart's colours by {miss:.0f} CIEDE2000 in the mean"
         if np.isfinite(miss)
-        else "leave the picture"
+        else "leave the picture or are saturated"
     )
     raise InputError(
         f"{picture.name}: the patches {where} {how}, whichever way round; expected the chart of the "

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.calibration.colour.chart import KnownChart
+from coupole.calibration.colour.chart import Chart, KnownChart
 from coupole.calibration.colour.chart_pictures import (
     PlacedChart,
     PlainPicture,
@@ -36,6 +36,10 @@ _GAMMA = (0.8, 1.25)
 for uneven light and stray light; sRGB's is 0.45."""
 _LEAST_GREYS, _LEAST_RANGE = 3, 3.0
 """Greys, and ratio of their luminances, by which it can be told."""
+_ROUGH = 0.15
+"""Largest departure of a white card's signals from a smooth light, in natural logarithms."""
+_OFFSET_TOLD = 0.004
+"""Signal of a perfect black, of the perfect white's, from which it is told."""
 _TINT_TOLD, _TINT_REFUSED = 0.01, 0.05
 """Differences of the light's colour between pictures, relative."""
 _SHOWN_PX = 1200
@@ -103,6 +107,7 @@ def see_in_pictures(
     else:
         lights, views = _by_white(views, kept_chart, white, remarks)
         sighting = Seen(combined_signals(names, [view.reading for view in views], lights, labels))
+    remarks += _offsets(sighting.signals, kept_chart)
     edges = _edges(views[0], kept_chart, remarks)
     shown_chart = _shown_chart(views[0], kept_chart)
     return SeenInPictures(
@@ -212,6 +217,7 @@ def _by_white(
                 f"--white {white.name}: saturated, dark or uneven where {view.picture.name} has the patches "
                 f"{bad_patches}; expected a white card in the chart's place, exposed less"
             )
+        _refuse_rough(white, card, chart)
         relative = card.u / card.mean
         u = np.sqrt(view.reading.u**2 + (view.reading.mean * relative) ** 2)
         noisy.append(replace(view, plain=replace(view.plain, reading=replace(view.reading, u=u))))
@@ -221,6 +227,19 @@ def _by_white(
         f"light over the chart by {white.name}: from patch to patch it differs by {np.expm1(max(spans)):.1%}"
     )
     return np.stack(lights), noisy
+
+
+def _refuse_rough(white: PlainPicture, card: Reading, chart: Chart) -> None:
+    """Raise InputError if the card's signals are no smooth light."""
+    light = np.log(card.mean)
+    basis = np.column_stack([np.ones(len(light)), light_basis(chart.centres_mm)])
+    smooth, *_ = np.linalg.lstsq(basis, light)
+    worst = float(np.abs(light - basis @ smooth).max())
+    if worst > _ROUGH:
+        raise InputError(
+            f"--white {white.name}: no smooth light: it departs by {worst:.0%} from patch to patch where the "
+            "chart is; expected a white card that covers the chart's place, without shadows"
+        )
 
 
 def _by_found_light(
@@ -255,6 +274,25 @@ def _light_of(reading: Reading, known_chart: KnownChart, basis: Floats, without:
     for patch in np.flatnonzero(~good)[::-1]:
         patch_signals = patch_signals.without(int(patch))
     return find_light(patch_signals, basis[good], basis)
+
+
+def _offsets(signals: Signals, known_chart: KnownChart) -> list[str]:
+    """A sentence if straight lines through the greys do not end at 0: neither profile can follow that."""
+    grey = list(known_chart.neutral)
+    luminance = known_chart.xyz[grey, 1]
+    if len(grey) < _LEAST_GREYS or luminance.max() < _LEAST_RANGE * luminance.min():
+        return []
+    weight = 1.0 / (0.02 + luminance)[:, None]
+    line = np.column_stack([np.ones(len(grey)), luminance])
+    (offset, slope), *_ = np.linalg.lstsq(line * weight, signals.mean[grey] * weight)
+    share = offset / slope
+    if np.abs(share).max() < _OFFSET_TOLD:
+        return []
+    words = ", ".join(f"{value:+.1%}" for value in share)
+    return [
+        f"the greys show an offset of {words} of white in red, green and blue: a black level that was not taken "
+        "off, or stray light. Dark colours are wrong by it, and the uncertainty does not contain it"
+    ]
 
 
 # -- beside the colours ---------------------------------------------------------------------------------------

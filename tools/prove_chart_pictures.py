@@ -5,8 +5,8 @@
 Each drawn chart has its own paints, measured colours with errors, camera, lamp at a finite distance, vignetting,
 noise, perspective and turn; code of the tests' own draws its picture (`tests/calibration/drawn_charts.py`). The
 true matrix is found by colour-science from the true spectra under even light. Exits with 1 unless 93 to 97 % of
-the coefficients are within their intervals of 95 %, with a picture of a white card and without it, and 93 % or more of
-colours that the chart does not have are within the stated bound.
+the coefficients are within their intervals of 95 %, with a picture of a white card and without it, and 93 % or
+more of colours that the chart does not have are within the stated bound.
 """
 
 from __future__ import annotations

@@ -180,6 +180,7 @@ def test_several_pictures_are_one_profile(even: Path, tmp_path: Path) -> None:
     matrix, u = matrix_of(record)
     assert np.abs((matrix - EVEN.true_matrix()) / u).max() < 3.5
     assert "left out: q.png: the chart was not found" in remark_with(record, "q.png")
+    assert "fewer than three" not in " ".join(record.remarks)
     tinted = write_picture(tmp_path / "p3.tif", EVEN.picture() * (1.0, 0.8, 0.6))
     assert "differs in colour" in refusal(even / "chart.tif", tinted, "--chart", even / "chart.yaml")
 
@@ -214,6 +215,18 @@ def test_an_offset_of_the_greys_is_told(even: Path, tmp_path: Path) -> None:
     assert "offset of +" in remark_with(record, "stray light")
     clean = made(tmp_path / "clean", even / "chart.tif", "--chart", even / "chart.yaml")
     assert not any("stray light" in remark for remark in clean.remarks)
+
+
+def test_edges_of_the_chart_give_the_sharpness_or_say_why_not(even: Path, tmp_path: Path) -> None:
+    text = (even / "chart.yaml").read_text().replace("values.csv", str(even / "values.csv"))
+    edges = "edges:\n  - {name: white, centre_mm: [-64.0, -33.0], size_mm: [4.0, 14.0]}\n"
+    (tmp_path / "chart.yaml").write_text(text + edges)
+    record = made(tmp_path / "a", even / "chart.tif", "--chart", tmp_path / "chart.yaml")
+    assert 0.2 < record.fixed["figure.mtf50"] < 1.0
+    (tmp_path / "chart.yaml").write_text(text + edges.replace("-64.0, -33.0", "-55.0, -33.0"))
+    record = made(tmp_path / "b", even / "chart.tif", "--chart", tmp_path / "chart.yaml")
+    assert "sharpness is not stated: " in remark_with(record, "sharpness")
+    assert "figure.mtf50" not in record.fixed
 
 
 @pytest.mark.skipif(not REAL_DNG.is_file(), reason="no raw file beside the project")

@@ -106,7 +106,9 @@ def see_in_pictures(
         sighting = _by_found_light(views, kept_chart, labels, remarks)
     else:
         lights, views = _by_white(views, kept_chart, white, remarks)
-        sighting = Seen(combined_signals(names, [view.reading for view in views], lights, labels))
+        sighting = Seen(
+            combined_signals(names, [view.reading for view in views], lights, labels, are_pictures=True)
+        )
     remarks += _offsets(sighting.signals, kept_chart)
     edges = _edges(views[0], kept_chart, remarks)
     shown_chart = _shown_chart(views[0], kept_chart)
@@ -252,7 +254,7 @@ def _by_found_light(
     def signals_and_lights(without: int | None) -> tuple[Signals, list[FoundLight]]:
         lights = [_light_of(reading, known_chart, basis, without) for reading in readings]
         factors = np.stack([np.repeat(light.factor()[:, None], 3, axis=1) for light in lights])
-        return combined_signals(names, readings, factors, labels), lights
+        return combined_signals(names, readings, factors, labels, are_pictures=True), lights
 
     signals, lights = signals_and_lights(None)
     widest = max((light.span for light in lights), key=lambda span: span[0])

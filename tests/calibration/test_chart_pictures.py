@@ -18,10 +18,14 @@ from judged_charts import judge
 from places import SHARED_DATA
 from typer.testing import CliRunner, Result
 
+from coupole.calibration.colour.chart import read_chart
+from coupole.calibration.colour.chart_pictures import PlainPicture, read_plain_patches
+from coupole.calibration.colour.picture_workflow import see_in_pictures
 from coupole.calibration.record import Record, read_record
 from coupole.commands import calibrate_colour
 from coupole.errors import InputError
 from coupole.exchange.camera_colour import colour_of_record
+from coupole.exchange.chart_photographs import read_chart_photograph
 
 REAL_DNG = SHARED_DATA / "raw/colorchart.dng"
 
@@ -243,6 +247,35 @@ def test_a_telephones_raw_file_of_a_real_chart_is_found_and_its_colours_are_thos
     record = made(tmp_path, REAL_DNG, "--chart", tmp_path / "values.csv")
     assert record.fixed["left_out.matrix.mean_de00"] < 4.0
     assert "black level" in remark_with(record, "offset of")
+
+
+def test_noise_that_neighbours_share_counts_in_full() -> None:
+    random = np.random.default_rng(5)
+    square = np.array([[(10.0, 10.0), (69.0, 10.0), (69.0, 69.0), (10.0, 69.0)]])
+    means, stated = [], []
+    for _ in range(60):
+        noise = cv2.GaussianBlur(random.normal(0.0, 0.1, (80, 80, 3)), (0, 0), 1.5)
+        picture = PlainPicture("p", (0.5 + noise).astype(np.float32), np.zeros((80, 80), np.bool_))
+        plain = read_plain_patches(picture, square, ["A1"])
+        means.append(plain.reading.mean[0])
+        stated.append(plain.reading.u[0])
+    assert np.mean(stated) == pytest.approx(np.std(means), rel=0.2)
+
+
+def test_a_patch_left_out_takes_no_part_in_finding_the_light(even: Path, tmp_path: Path) -> None:
+    values = EVEN.picture()
+    x, y = EVEN.corners_px[0].astype(int)
+    values[y - 30 : y + 30, x - 30 : x + 30] *= 0.8
+    picture = read_chart_photograph(write_picture(tmp_path / "p.tif", values))
+    sighting = see_in_pictures([picture], read_chart(even / "chart.yaml"), None, None, lambda *_: None).sighting
+    assert sighting.signals_without is not None
+    truth = EVEN.signals(EVEN.spectra)
+    relative = [
+        (signals.mean / truth)[0] / np.median(signals.mean / truth, axis=0)
+        for signals in (sighting.signals, sighting.signals_without[0])
+    ]
+    assert relative[1].mean() == pytest.approx(0.8, abs=0.06)
+    assert relative[0].mean() > relative[1].mean() + 0.02
 
 
 # -- what is refused ------------------------------------------------------------------------------------------

@@ -143,8 +143,8 @@ def combined_signals(
     """One signal for each patch, from its readings under all lights.
 
     `lights` [lights, patches] or [lights, patches, 3] are irradiances, `lit` the lights' names. `are_pictures`:
-    each is a picture, of which the caller tells what is saturated. Raises InputError with the names of patches that
-    are dark, or saturated or in shadow under more than half of them.
+    each is a picture, of which the caller tells what is saturated. Raises InputError with the names of patches
+    that are dark, or saturated or in shadow under more than half of them.
     """
     light = lights if lights.ndim == 3 else lights[:, :, None]
     mean, u = (np.stack([getattr(reading, field) for reading in readings]) / light for field in ("mean", "u"))

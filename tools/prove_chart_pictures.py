@@ -1,6 +1,6 @@
 """Proves that intervals of colour profiles from plain pictures of a chart hold as often as stated.
 
-    python tools/prove_chart_pictures.py [--charts 100] [--jobs 2]
+    python tools/prove_chart_pictures.py [--charts 100] [--jobs 2] [--only card]
 
 Each drawn chart has its own paints, measured colours with errors, camera, lamp at a finite distance, vignetting,
 noise, perspective and turn; code of the tests' own draws its picture (`tests/calibration/drawn_charts.py`). The
@@ -43,12 +43,13 @@ def main() -> int:
     parser.add_argument("--charts", type=int, default=100, help="number of drawn charts")
     parser.add_argument("--first", type=int, default=0, help="seed of the first one")
     parser.add_argument("--jobs", type=int, default=2, help="charts at the same time")
+    parser.add_argument("--only", choices=("card", "patches"), help="origin of the light; by default both")
     add_smallest(parser, charts=1, jobs=1)
     options = parser.parse_args()
     seeds = range(options.first, options.first + options.charts)
     is_good = True
     with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
-        for with_white in (True, False):
+        for with_white in {"card": (True,), "patches": (False,)}.get(options.only, (True, False)):
             charts = list(pool.map(partial(judged_chart, with_white), seeds))
             within = float(np.mean([np.abs(chart.errors) <= chart.factor for chart in charts]))
             rms = float(np.sqrt(np.mean([chart.errors**2 for chart in charts])))

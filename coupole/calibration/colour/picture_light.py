@@ -3,7 +3,8 @@
 Light and the lens's fall-off are taken as one smooth factor, exp(sum of t_k f_k(x, y)), of all three channels. Its
 t_k and the matrix's coefficients have together the least sum of squares of CIEDE2000 (after Finlayson, Gong and
 Fisher, Color homography: theory and applications, IEEE Trans. PAMI 41, 2019, who have a factor for each patch).
-What the matrix cannot follow of the patches' colours counts as noise of this adjustment.
+What the matrix cannot follow of the patches' colours counts as noise of this adjustment, of another size for each
+patch and for lightness, chroma and hue.
 """
 
 from __future__ import annotations
@@ -84,7 +85,22 @@ def find_light(patch_signals: Balanced, basis: Floats, at: Floats | None = None)
     bounds = np.full(len(start), np.inf)
     bounds[:count] = _MOST
     fit = least_squares(misses, start, bounds=(-bounds, bounds), x_scale="jac")
-    freedom = len(fit.fun) - len(start)
-    variance = float(fit.fun @ fit.fun) / max(freedom, 1)
-    covariance = variance * np.linalg.inv(fit.jac.T @ fit.jac)
+    covariance = _robust_covariance(fit.jac, fit.fun)
     return FoundLight(fit.x[:count], np.asarray(covariance[:count, :count]), basis if at is None else at)
+
+
+def _robust_covariance(design: Floats, residuals: Floats) -> Floats:
+    """[unknowns, unknowns] of a least-squares solution with the derivatives `design` [3 patches, unknowns].
+
+    The three `residuals` of a patch depend on each other and differ in size: they are clusters, with the
+    correction CR2 (Bell and McCaffrey, Bias reduction in standard errors for linear regression with multi-stage
+    samples, Survey Methodology 28, 2002).
+    """
+    inverse = np.linalg.inv(design.T @ design)
+    by_patch = design.reshape(-1, 3, design.shape[1])
+    remaining = np.eye(3) - by_patch @ inverse @ by_patch.transpose(0, 2, 1)
+    values, directions = np.linalg.eigh(remaining)
+    along = np.einsum("pij,pi->pj", directions, residuals.reshape(-1, 3)) / np.sqrt(np.maximum(values, 1e-6))
+    corrected = np.einsum("pij,pj->pi", directions, along)
+    scores = np.einsum("pij,pi->pj", by_patch, corrected)
+    return np.asarray(inverse @ (scores.T @ scores) @ inverse)

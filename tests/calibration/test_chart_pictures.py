@@ -234,7 +234,7 @@ def test_edges_of_the_chart_give_the_sharpness_or_say_why_not(even: Path, tmp_pa
 
 
 @pytest.mark.skipif(not REAL_DNG.is_file(), reason="no raw file beside the project")
-def test_a_telephones_raw_file_of_a_real_chart_is_found_and_its_colours_are_those_published(
+def test_a_real_chart_in_a_raw_file_has_its_published_colours(
     tmp_path: Path,
 ) -> None:
     published = colour.SDS_COLOURCHECKERS["BabelColor Average"]

@@ -79,6 +79,11 @@ PROOFS = (
         "E_n of independent boards and tiles holds as stated; wrong ones are found",
         "tools/prove_artefacts.py",
     ),
+    Proof(
+        "chart-pictures",
+        "colour profiles from pictures of drawn charts: intervals and the bound for new colours hold",
+        "tools/prove_chart_pictures.py",
+    ),
     Proof("corners", "corners of drawn boards: bias beside peers, u that holds", "tools/prove_corners.py"),
     Proof(
         "reflectance",

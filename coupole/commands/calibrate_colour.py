@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +10,6 @@ import typer
 
 from coupole.calibration.colour.acceptance import COLOUR
 from coupole.commands.calibrate_light import (
-    Runs,
     TargetCalibrations,
     frames_with_poses,
     lens_of,
@@ -24,14 +24,31 @@ if TYPE_CHECKING:
     from coupole.calibration.request import Request
     from coupole.calibration.rotations import Floats
 
-ChartOption = Annotated[Path, typer.Option("--chart", help="The chart's description (YAML).", show_default=False)]
+Pictured = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Runs; or pictures of the chart with linear values (TIFF, PNG, OpenEXR, RAW), or one folder of them.",
+        show_default=False,
+        metavar="RUN_OR_PICTURE...",
+    ),
+]
+ChartOption = Annotated[
+    Path,
+    typer.Option(
+        "--chart",
+        help="The chart's description (YAML); for pictures also its values alone (CxF, CGATS, CSV) with patches "
+        "A1, A2, ..., B1, ..., a letter for each row.",
+        show_default=False,
+    ),
+]
 CornersOption = Annotated[
     str | None,
     typer.Option(
         "--corners",
         metavar='"X,Y X,Y X,Y X,Y"',
-        help="Centres of the chart's top left, top right, bottom right and bottom left patch in the"
-        " first view's frames, px; by default the chart lies as its description says.",
+        help="Centres of the chart's top left, top right, bottom right and bottom left patch, px. Of runs in the "
+        "first view's frames; by default the chart lies as its description says. Of pictures from any corner "
+        "around; by default the chart is searched for.",
         show_default=False,
     ),
 ]
@@ -39,68 +56,150 @@ WhiteOption = Annotated[
     Path | None,
     typer.Option(
         "--white",
-        help="A run of the same plan with a white sheet in the chart's place; it replaces the LEDs' known light.",
+        help="A run of the same plan with a white sheet in the chart's place: it replaces the LEDs' known light; "
+        "or a picture of a white card in the chart's place: it replaces the light that is found from the patches.",
         show_default=False,
     ),
 ]
 WithoutOption = Annotated[
     str | None, typer.Option("--without", help="Names of patches to leave out, as A1,B2.", show_default=False)
 ]
+SrgbOption = Annotated[
+    bool,
+    typer.Option(
+        "--srgb", help="Pictures have the transfer curve of sRGB and no other; by default they are linear."
+    ),
+]
 
 
 @calibration("colour", limits=COLOUR, valid_days=365)
 def colour(
-    runs: Runs,
+    runs: Pictured,
     chart: ChartOption,
     corners: CornersOption = None,
     white: WhiteOption = None,
     without: WithoutOption = None,
+    srgb: SrgbOption = False,
     *,
     known: TargetCalibrations,
 ) -> Work:
-    """Colour profile of the camera under the LEDs, as record and as ICC file, from views of a chart of patches.
+    """Colour profile of a camera, as record and as ICC file, from a chart in runs of the dome, or in plain
+    pictures of any camera under any light.
 
     States CIEDE2000 of patches left out, tone, noise, sharpness and registration of colours.
     """
+    options = _GivenOptions(chart, corners, white, without, known)
+    if any((path / "run.json").is_file() for path in runs):
+        if srgb:
+            raise InputError("--srgb: belongs to pictures; a run's frames are linear")
+        return _by_runs(runs, options)
+    return _by_pictures(runs, options, srgb=srgb)
+
+
+@dataclass(frozen=True)
+class _GivenOptions:
+    """Options of the command, as given."""
+
+    chart: Path
+    corners: str | None
+    white: Path | None
+    without: str | None
+    calibrations: TargetCalibrations
+
+    @property
+    def names_without(self) -> list[str]:
+        return [name.strip() for name in (self.without or "").split(",") if name.strip()]
+
+
+def _by_runs(runs: list[Path], options: _GivenOptions) -> Work:
     from coupole.calibration.colour.chart import read_chart
     from coupole.calibration.colour.chart_views import ChartSetting
-    from coupole.calibration.colour.colour_workflow import colour_outcome, see_in_runs
+    from coupole.calibration.colour.colour_workflow import Origin, colour_outcome, see_in_runs
     from coupole.calibration.light.frames import open_light_frames
     from coupole.calibration.light.led_power_tile import calibrated_positions
     from coupole.calibration.light.tile_views import Positions
     from coupole.plan.cell import read_cell
 
+    calibrations, white = options.calibrations, options.white
+
     def work(console: Console, request: Request) -> Outcome:
-        patches = read_chart(chart, [name.strip() for name in (without or "").split(",") if name.strip()])
-        frames = frames_with_poses(open_light_frames(runs), known.hand_eye, known.rig, runs)
+        patches = read_chart(options.chart, options.names_without)
+        frames = frames_with_poses(open_light_frames(runs), calibrations.hand_eye, calibrations.rig, runs)
         whites = (
             None
             if white is None
-            else frames_with_poses(open_light_frames([white]), known.hand_eye, known.rig, runs)
+            else frames_with_poses(open_light_frames([white]), calibrations.hand_eye, calibrations.rig, runs)
         )
-        rig_path = known.rig or rig_of(runs[0])
+        rig_path = calibrations.rig or rig_of(runs[0])
         cell = read_cell(rig_path)
         by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)
-        files = (*patches.files, rig_path, known.leds or cell.leds_path, known.hand_eye, known.camera)
+        files = (
+            *patches.files,
+            rig_path,
+            calibrations.leds or cell.leds_path,
+            calibrations.hand_eye,
+            calibrations.camera,
+        )
         setting = ChartSetting(
             patches.chart,
             cell.rig.support.base_from_support.matrix(),
-            by_table if known.leds is None else calibrated_positions(known.leds),
-            lens_of(known.camera, frames),
-            corners_of(corners),
-            known.dark_record,
-            known.response_record,
-            known.flat,
-            known.glare,
-            emission_of(known.emission),
+            by_table if calibrations.leds is None else calibrated_positions(calibrations.leds),
+            lens_of(calibrations.camera, frames),
+            corners_of(options.corners),
+            calibrations.dark_record,
+            calibrations.response_record,
+            calibrations.flat,
+            calibrations.glare,
+            emission_of(calibrations.emission),
             tuple(path for path in files if path is not None),
         )
         with bar(console, "frames of the chart") as progress:
             sightings = see_in_runs(frames, setting, whites, progress)
         with bar(console, "patches left out") as progress:
-            return colour_outcome(sightings, patches, setting, frames, request, progress)
+            origin = Origin(frames, frames.size_px, setting.inputs)
+            return colour_outcome(sightings, patches, origin, request, progress)
 
     return work
+
+
+def _by_pictures(paths: list[Path], options: _GivenOptions, *, srgb: bool) -> Work:
+    from coupole.calibration.colour.chart import chart_of_values, is_values_file, read_chart
+    from coupole.calibration.colour.colour_workflow import Origin, colour_outcome
+    from coupole.calibration.colour.picture_workflow import see_in_pictures
+    from coupole.calibration.light.frames import PlainSources
+    from coupole.calibration.light.records import record_input
+    from coupole.calibration.sources import About
+    from coupole.exchange.chart_photographs import pictures_at, read_chart_photograph
+
+    def work(console: Console, request: Request) -> Outcome:
+        _refuse_options_of_runs(options)
+        read_known = chart_of_values if is_values_file(options.chart) else read_chart
+        whole_chart = read_known(options.chart, options.names_without)
+        files = pictures_at(paths, options.white)
+        with console.status("reading pictures"):
+            pictures = [read_chart_photograph(path, srgb=srgb) for path in files]
+            white = None if options.white is None else read_chart_photograph(options.white, srgb=srgb)
+        with bar(console, "looking for the chart") as progress:
+            in_pictures = see_in_pictures(pictures, whole_chart, corners_of(options.corners), white, progress)
+        inputs = tuple(pair for path in (*files, options.white) for pair in record_input(path))
+        chart_inputs = tuple(pair for path in whole_chart.files for pair in record_input(path))
+        size_px = pictures[0].size_px
+        origin = Origin(PlainSources(About(is_simulated=False), inputs), size_px, chart_inputs)
+        with bar(console, "patches left out") as progress:
+            return colour_outcome(in_pictures.sighting, in_pictures.known_chart, origin, request, progress)
+
+    return work
+
+
+def _refuse_options_of_runs(options: _GivenOptions) -> None:
+    """Raise InputError for options that say something of the dome."""
+    usual = TargetCalibrations()
+    flags = {field.name: f"--{field.name.removesuffix('_record').replace('_', '-')}" for field in fields(usual)}
+    wrong_flags = [
+        flag for name, flag in flags.items() if getattr(options.calibrations, name) != getattr(usual, name)
+    ]
+    if wrong_flags:
+        raise InputError(f"{', '.join(wrong_flags)}: belongs to a run of the dome; these are pictures")
 
 
 def corners_of(words: str | None) -> Floats | None:

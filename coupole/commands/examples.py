@@ -39,7 +39,7 @@ EXAMPLES: dict[str, tuple[str, str]] = {
     "queue": ("queue my-cell.yaml first.yaml second.yaml", "queue my-cell.yaml --hold 'turn the object'"),
     "dose": ("dose gilded-frame", 'dose gilded-frame --add 120 --note "a week in the window"'),
     # calibrate
-    "calibrate": ("calibrate camera RUN", "calibrate all --rig sim"),
+    "calibrate": ("calibrate all --rig sim", "calibrate colour PICTURES --chart chart.yaml"),
     "calibrate camera": ("calibrate camera RUN", "calibrate camera PICTURES --board 11x8 --square 20"),
     "calibrate chromatic": ("calibrate chromatic RUN", "calibrate chromatic RUN --out records --name colours"),
     "calibrate hand-eye": (
@@ -74,7 +74,7 @@ EXAMPLES: dict[str, tuple[str, str]] = {
     ),
     "calibrate colour": (
         "calibrate colour RUN --chart chart.yaml",
-        "calibrate colour RUN --chart chart.yaml --white WHITE",
+        "calibrate colour PICTURES --chart chart.yaml --white white.tif",
     ),
     "calibrate check-artefact": (
         "calibrate check-artefact PLACE1 PLACE2 --board second-board.yaml --records records --mpe-um 50+L/20",

@@ -123,7 +123,7 @@ def test_both_parts_of_the_uncertainty_are_those_of_profiles_made_again(seen: Ba
     noise = 0.003 * seen.signal
     stated = Balanced(seen.signal, noise, known.xyz, 0.3, known.neutral)
     profile = fit_profile(stated, "matrix")
-    by_noise, by_chart = covariance_of(stated, profile)
+    by_noise, by_chart, _ = covariance_of(stated, profile)
     random = np.random.default_rng(3)
 
     def spread(again: Any) -> Array:

@@ -75,6 +75,7 @@ RUNS = (
     Run("prove_auto_exposure.py --smallest", r"duration: auto \d.* ratio \d", full=True),
     Run("prove_brackets.py --smallest", r"steps of 8: \d.* within 1\.96 u", full=True),
     Run("prove_calibrations.py --smallest", r"camera_mm.* median \d", full=True),
+    Run("prove_chart_pictures.py --smallest", r"found from the patches: .* of 9 coefficients", full=True),
     Run("prove_clusters.py --smallest", r"1000 clusters for \d+ triangles: .*ratio \d", full=True),
     Run("prove_corners.py --smallest", r"\| sharp \| 0\.00\d\d ", full=True),
     Run("prove_exports.py --smallest", r"`bird` \| \d", full=True),

@@ -6,6 +6,7 @@ face, mm.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from pydantic import Field, model_validator
 
 from coupole.calibration.artefact import Described, read_described
 from coupole.calibration.colour import cxf_values
-from coupole.calibration.colour.chart_values import Unit, read_chart_values
+from coupole.calibration.colour.chart_values import ChartValues, Unit, read_chart_values
 from coupole.calibration.colour.colorimetry import lab_of
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
@@ -27,6 +28,11 @@ _Length = Annotated[float, Field(gt=0)]
 _NEUTRAL_CHROMA = 5.0
 """Largest chroma C* of patches that count as grey."""
 _LEAST_PATCHES = 8
+_LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+_PLACE = re.compile(r"([A-Z])([1-9][0-9]?)")
+_VALUES_ENDINGS = (".txt", ".csv", ".cgats", ".it8", ".tsv")
+_USED_OF_UNKNOWN = 0.5
+"""Share of the pitch that is read of a chart whose patches' size is not known."""
 _LEAST_GREY_LIGHTNESS = 20.0
 """L* of the greys that balance the channels: noise and stray light dominate darker ones."""
 
@@ -140,6 +146,20 @@ class KnownChart:
     def lab(self) -> Floats:
         return lab_of(self.xyz)
 
+    def without(self, names: Sequence[str]) -> KnownChart:
+        """The same without some patches. Raises InputError if too few are left, or no grey one."""
+        chart = self.chart.model_copy(update={"without": (*self.chart.without, *names)})
+        kept_patches = np.array([name not in names for name in self.chart.patch_names])
+        known_chart = KnownChart(chart, self.xyz[kept_patches], self.files)
+        if len(known_chart.xyz) < _LEAST_PATCHES:
+            raise InputError(
+                f"colour: {len(known_chart.xyz)} patches are left without {', '.join(names)}; expected "
+                f"{_LEAST_PATCHES} or more. Expose less, or light the chart more evenly"
+            )
+        if not known_chart.neutral:
+            raise InputError(f"colour: no grey patch is left without {', '.join(names)}; expose anew")
+        return known_chart
+
     @property
     def neutral(self) -> tuple[int, ...]:
         """Numbers of the grey patches, bright enough to balance the channels."""
@@ -165,10 +185,7 @@ def read_chart(path: Path, without: Sequence[str] = ()) -> KnownChart:
     if unknown := sorted(set(chart.neutral or ()) - {*names, *chart.without}):
         raise InputError([document.problem(("neutral",), f"the chart has no patch {', '.join(unknown)}")])
     values_path = document.resolve(chart.values)
-    if values_path.suffix.lower() in cxf_values.ENDINGS:
-        values = cxf_values.read_cxf_values(values_path, chart.unit, chart.cxf_type)
-    else:
-        values = read_chart_values(values_path, chart.unit)
+    values = _values(values_path, chart.unit, chart.cxf_type)
     if missing := [name for name in names if name not in values.xyz]:
         absent = ", ".join(missing[:8]) + (f" and {len(missing) - 8} more" if len(missing) > 8 else "")
         has = ", ".join(list(values.xyz)[:6])
@@ -177,3 +194,52 @@ def read_chart(path: Path, without: Sequence[str] = ()) -> KnownChart:
     if not known_chart.neutral:
         raise InputError(f"{path}: expected a grey patch of L* above {_LEAST_GREY_LIGHTNESS:g}; found none")
     return known_chart
+
+
+def is_values_file(path: Path) -> bool:
+    """True for a file of values alone, without a description, by its name."""
+    return path.suffix.lower() in (*cxf_values.ENDINGS, *_VALUES_ENDINGS)
+
+
+def chart_of_values(path: Path, without: Sequence[str] = ()) -> KnownChart:
+    """A chart of which only the values are given: a full table of patches A1, A2, ..., B1, ..., a letter for each
+    row, of equal pitch along rows and columns; the middle half of each is read.
+
+    Raises InputError: other names, a patch missing, and as `read_chart`.
+    """
+    values = _values(path, "auto", None)
+    places = {name: _PLACE.fullmatch(name) for name in values.xyz}
+    strange = [name for name, place in places.items() if place is None]
+    rows = sorted({place[1] for place in places.values() if place is not None})
+    columns = max((int(place[2]) for place in places.values() if place is not None), default=0)
+    wanted_names = [f"{row}{column + 1}" for row in rows for column in range(columns)]
+    if strange or wanted_names != sorted(values.xyz, key=_by_place) or rows != list(_LETTERS[: len(rows)]):
+        raise InputError(
+            f"{path}: expected patches A1, A2, ..., B1, ... of all rows and columns, found "
+            f"{', '.join(list(values.xyz)[:8])}; describe the chart in YAML with `rows`, `columns`, `names` and "
+            "this file as `values`"
+        )
+    if unknown := sorted(set(without) - set(wanted_names)):
+        raise InputError(f"{path}: the chart has no patch {', '.join(unknown)} to leave out")
+    chart = Chart(
+        name=path.stem,
+        rows=len(rows),
+        columns=columns,
+        pitch_mm=(1.0, 1.0),
+        patch_mm=(0.8, 0.8),
+        used=_USED_OF_UNKNOWN / 0.8,
+        values=Path(path.name),
+    )
+    known_chart = KnownChart(chart, np.stack([values.xyz[name] for name in wanted_names]), (path,))
+    return known_chart.without(list(without))
+
+
+def _by_place(name: str) -> tuple[str, int]:
+    place = _PLACE.fullmatch(name)
+    return (name, 0) if place is None else (place[1], int(place[2]))
+
+
+def _values(path: Path, unit: Unit, cxf_type: str | None) -> ChartValues:
+    if path.suffix.lower() in cxf_values.ENDINGS:
+        return cxf_values.read_cxf_values(path, unit, cxf_type)
+    return read_chart_values(path, unit)

@@ -133,12 +133,18 @@ def read_patches(picture: ChartPicture, names: Sequence[str]) -> Reading:
 
 
 def combined_signals(
-    names: Sequence[str], readings: Sequence[Reading], lights: Floats, lit: Sequence[str]
+    names: Sequence[str],
+    readings: Sequence[Reading],
+    lights: Floats,
+    lit: Sequence[str],
+    *,
+    are_pictures: bool = False,
 ) -> Signals:
     """One signal for each patch, from its readings under all lights.
 
-    `lights` [lights, patches] or [lights, patches, 3] are irradiances, `lit` the lights' names. Raises InputError
-    with the names of patches that are dark, or saturated or in shadow under more than half of them.
+    `lights` [lights, patches] or [lights, patches, 3] are irradiances, `lit` the lights' names. `are_pictures`:
+    each is a picture, of which the caller tells what is saturated. Raises InputError with the names of patches
+    that are dark, or saturated or in shadow under more than half of them.
     """
     light = lights if lights.ndim == 3 else lights[:, :, None]
     mean, u = (np.stack([getattr(reading, field) for reading in readings]) / light for field in ("mean", "u"))
@@ -150,7 +156,8 @@ def combined_signals(
     unlit = [int(n) for n in np.flatnonzero(dark)]
     _refuse(unlit, names, "without light", "see to the lights and the chart's place")
     remarks = []
-    if full := [f"{lit[k]} on {_list([names[int(n)] for n in np.flatnonzero(~good[k])])}" for k in _with(~good)]:
+    full = [f"{lit[k]} on {_list([names[int(n)] for n in np.flatnonzero(~good[k])])}" for k in _with(~good)]
+    if full and not are_pictures:
         remarks.append(f"saturated, and left out: {_list(full)}")
     strength, patch = _split(mean, good)
     if len(readings) >= _LEAST_LIGHTS:
@@ -166,7 +173,8 @@ def combined_signals(
         good &= ~odd
         strength, patch = _split(mean, good)
     else:
-        remarks.append("fewer than three lights: shadows and gloss on the chart cannot be detected")
+        sources = "pictures" if are_pictures else "lights"
+        remarks.append(f"fewer than three {sources}: shadows and gloss on the chart cannot be detected")
     return _averaged_signals(mean / strength[:, None], u / strength[:, None], sd, good, tuple(remarks))
 
 

@@ -45,11 +45,15 @@ class Balanced:
     """Numbers of the grey patches."""
     white: Floats | None = None
     """[3] signal of the perfect white, if it is known otherwise; None: from the grey patches."""
+    light_u: Floats | None = None
+    """[patches, effects] relative changes of signals by one standard uncertainty of each of some independent
+    errors of the light, which all patches share; None: the light is known."""
 
     def without(self, patch: int) -> Balanced:
         keep = np.arange(len(self.signal)) != patch
         grey = tuple(n - (n > patch) for n in self.neutral if n != patch)
-        return Balanced(self.signal[keep], self.u[keep], self.xyz[keep], self.u_lab, grey, self.white)
+        light_u = None if self.light_u is None else self.light_u[keep]
+        return Balanced(self.signal[keep], self.u[keep], self.xyz[keep], self.u_lab, grey, self.white, light_u)
 
     def white_signal(self) -> Floats:
         """[3] signal of the perfect white: that of the greys over their Y, weighted by it."""
@@ -157,16 +161,32 @@ class LeftOut:
     def worst(self) -> float:
         return float(self.de.max())
 
+    def bound(self, share: float) -> tuple[float, float]:
+        """CIEDE2000 that a share of further colours like the patches' does not exceed, and the share it is for:
+        the smallest order statistic k with k / (n + 1) of the share or more (split conformal prediction: Vovk,
+        Gammerman and Shafer, Algorithmic Learning in a Random World, 2005), of n patches the largest at most."""
+        count = len(self.de)
+        place = min(int(np.ceil(share * (count + 1))), count)
+        return float(np.sort(self.de)[place - 1]), min(share, place / (count + 1))
 
-def leave_out(patch_signals: Balanced, form: Form, tell: Callable[[], None] = lambda: None) -> LeftOut:
-    """Each patch by the profile of the others, with their balance. `tell` is called after each. Raises InputError
-    if there is one grey patch only."""
+
+def leave_out(
+    patch_signals: Balanced,
+    form: Form,
+    tell: Callable[[], None] = lambda: None,
+    seen_without: Sequence[Balanced] | None = None,
+) -> LeftOut:
+    """Each patch by the profile of the others, with their balance. `tell` is called after each.
+
+    `seen_without` has for each patch the signals of all patches under a light that was found without it. Raises
+    InputError if there is one grey patch only.
+    """
     de = np.empty(len(patch_signals.signal))
     lab = lab_of(patch_signals.xyz)
     for patch in range(len(de)):
-        rest = patch_signals.without(patch)
-        profile = fit_profile(rest, form)
-        de[patch] = de00(lab_of(profile.xyz(patch_signals.signal[[patch]])), lab[[patch]])[0]
+        all_signals = patch_signals if seen_without is None else seen_without[patch]
+        profile = fit_profile(all_signals.without(patch), form)
+        de[patch] = de00(lab_of(profile.xyz(all_signals.signal[[patch]])), lab[[patch]])[0]
         tell()
     return LeftOut(de)
 
@@ -181,9 +201,9 @@ def better(matrix: LeftOut, roots: LeftOut) -> Form:
 # -- uncertainty ----------------------------------------------------------------------------------------------
 
 
-def covariance_of(patch_signals: Balanced, profile: Profile) -> tuple[Floats, Floats]:
-    """Covariances [3 terms, 3 terms] of the coefficients, row by row: by the noise of signals, and by the patches'
-    own uncertainty.
+def covariance_of(patch_signals: Balanced, profile: Profile) -> tuple[Floats, Floats, Floats]:
+    """Covariances [3 terms, 3 terms] of the coefficients, row by row: by the noise of signals, by the patches' own
+    uncertainty, and by that of the light.
 
     The misses' derivatives J by the coefficients and K by the data give dm = -(J'J)^-1 J'K dd (the implicit
     function theorem on the normal equations, with Gauss and Newton's approximation). What the form itself cannot
@@ -211,7 +231,8 @@ def covariance_of(patch_signals: Balanced, profile: Profile) -> tuple[Floats, Fl
         gain @ column for column in _by_noise(patch_signals, profile, signal, parts, free, lab)
     ]
     by_chart: list[Floats] = [gain @ column for column in _by_chart(patch_signals, signal, parts, free, lab)]
-    return _outer(by_noise, full), _outer(by_chart, full)
+    by_light: list[Floats] = [gain @ column for column in _by_light(patch_signals, signal, parts, free, lab)]
+    return _outer(by_noise, full), _outer(by_chart, full), _outer(by_light, full)
 
 
 Parts = Callable[[Floats, Floats, Floats], Floats]
@@ -263,6 +284,25 @@ def _by_chart(
     return columns
 
 
+def _by_light(
+    patch_signals: Balanced, balanced_channels: Floats, parts: Parts, free: Floats, lab: Floats
+) -> Sequence[Floats]:
+    """The same by each error of the light, with that of the balance it makes."""
+    columns = []
+    grey = list(patch_signals.neutral)
+    luminance = patch_signals.xyz[grey, 1]
+    for change in np.zeros((0, 0)) if patch_signals.light_u is None else patch_signals.light_u.T:
+        step = balanced_channels * change[:, None]
+        if patch_signals.white is None:
+            step -= balanced_channels * (luminance @ step[grey] / (luminance @ luminance))
+        columns.append(
+            0.5 * (parts(balanced_channels + step, free, lab) - parts(balanced_channels - step, free, lab)).ravel()
+        )
+    return columns
+
+
 def _outer(columns: Sequence[Floats], full: Floats) -> Floats:
+    if not columns:
+        return np.zeros((len(full), len(full)))
     matrix = np.column_stack(columns)
     return np.asarray(full @ (matrix @ matrix.T) @ full.T)

@@ -27,7 +27,7 @@ from coupole.calibration.colour.colour_profile import (
     fit_profile,
     leave_out,
 )
-from coupole.calibration.colour.drawing import draw_colour
+from coupole.calibration.colour.drawing import ShownChart, draw_colour
 from coupole.calibration.colour.icc_profile import icc_profile
 from coupole.calibration.colour.image_quality import (
     Figure,
@@ -40,18 +40,21 @@ from coupole.calibration.colour.image_quality import (
     uniformity_figure,
 )
 from coupole.calibration.colour.slanted_edge import SlantedEdge
-from coupole.calibration.light.frames import CHANNELS, LightFrames
+from coupole.calibration.light.frames import CHANNELS, LightFrames, PlainSources
 from coupole.calibration.light.records import Progress, counter, sealed_outcome
 from coupole.calibration.record import Parameter
 from coupole.calibration.report import Outcome
 from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
+from coupole.pages.page_parts import Section, Table
 
 MATRIX = "xyz_d50_from_balanced."
 """Begins the names of the matrix's coefficients: then X, Y or Z, and r, g or b."""
 _TERMS = ("r", "g", "b", "sqrt_rg", "sqrt_rb", "sqrt_gb")
 _MOST_EDGE_PICTURES = 8
+_SHARE = 0.95
+"""Share of further colours for which a bound of the error is stated."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,25 @@ class Seen:
     signals: Signals
     edges: Mapping[str, Sequence[SlantedEdge]] = field(default_factory=dict)
     white: ChartPicture | None = None
+    light_u: Floats | None = None
+    """Errors of the light, as in `Balanced`."""
+    signals_without: Sequence[Signals] | None = None
+    """Signals of all patches, for each patch under a light found without it; None if the light is known."""
+    shown_chart: ShownChart | None = None
+    """The chart in a plain picture."""
+    remarks: tuple[str, ...] = ()
+    """Sentences about plain pictures: what was left out, turned or found of the light."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Sources of the record."""
+
+    sources: LightFrames | PlainSources
+    size_px: tuple[int, int]
+    """Width and height of the pictures."""
+    inputs: tuple[tuple[str, str], ...]
+    """Name and SHA-256 of further files."""
 
 
 def see_in_runs(frames: LightFrames, setting: ChartSetting, white: LightFrames | None, progress: Progress) -> Seen:
@@ -111,25 +133,24 @@ class _Made:
 def colour_outcome(
     measurements: Seen,
     known_chart: KnownChart,
-    setting: ChartSetting,
-    frames: LightFrames,
+    origin: Origin,
     request: Request,
     progress: Progress,
 ) -> Outcome:
     """The record of a profile, with the profile as ICC file and a table of the patches beside it."""
-    forms, balanced_signals = make_profiles(measurements.signals, known_chart, progress)
+    forms, balanced_signals = make_profiles(measurements, known_chart, progress)
     lab = lab_of(forms.chosen_profile.xyz(balanced_signals.signal))
     figures = figures_of(measurements, known_chart, forms, balanced_signals, lab)
-    by_noise, by_chart = covariance_of(balanced_signals, forms.profiles["matrix"])
+    covariances = covariance_of(balanced_signals, forms.profiles["matrix"])
     edges = [(name, colours[1]) for name, colours in measurements.edges.items()]
-    return sealed_outcome(
+    outcome = sealed_outcome(
         "colour",
         request,
-        frames,
-        frames.size_px,
-        _parameters(forms.profiles["matrix"], by_noise, by_chart, len(balanced_signals.signal)),
-        by_noise + by_chart,
-        partial(draw_colour, known_chart, lab, forms.left_out_errors.de, edges),
+        origin.sources,
+        origin.size_px,
+        _parameters(forms.profiles["matrix"], covariances, len(balanced_signals.signal)),
+        np.asarray(sum(covariances)),
+        partial(draw_colour, known_chart, lab, forms.left_out_errors.de, edges, measurements.shown_chart),
         limits=against_limits(
             COLOUR, request.limits, {"mean": forms.left_out_errors.mean, "worst": forms.left_out_errors.worst}
         ),
@@ -144,20 +165,31 @@ def colour_outcome(
             _choice_remark(forms),
             *(sentence_of(figure) for figure in figures),
             *measurements.signals.remarks,
+            *measurements.remarks,
         ),
-        more_inputs=setting.inputs,
+        more_inputs=origin.inputs,
         artefacts=used_as("chart", known_chart.chart.artefact),
     )
+    return replace(outcome, sections=[_patch_section(known_chart, forms, lab)])
 
 
-def make_profiles(signals: Signals, known_chart: KnownChart, progress: Progress) -> tuple[_Made, Balanced]:
+def balanced_of(signals: Signals, known_chart: KnownChart, light_u: Floats | None = None) -> Balanced:
+    """The signals with the colours of their patches."""
+    chart = known_chart.chart
+    return Balanced(signals.mean, signals.u, known_chart.xyz, chart.u_lab, known_chart.neutral, light_u=light_u)
+
+
+def make_profiles(measurements: Seen, known_chart: KnownChart, progress: Progress) -> tuple[_Made, Balanced]:
     """Both forms with their errors on patches left out."""
-    balanced_signals = Balanced(
-        signals.mean, signals.u, known_chart.xyz, known_chart.chart.u_lab, known_chart.neutral
+    balanced_signals = balanced_of(measurements.signals, known_chart, measurements.light_u)
+    seen_without = (
+        None
+        if measurements.signals_without is None
+        else [balanced_of(signals, known_chart) for signals in measurements.signals_without]
     )
     tell: Callable[[], None] = counter(progress, len(FORMS) * len(balanced_signals.signal))
     profiles = {form: fit_profile(balanced_signals, form) for form in FORMS}
-    de00_of = {form: leave_out(balanced_signals, form, tell) for form in FORMS}
+    de00_of = {form: leave_out(balanced_signals, form, tell, seen_without) for form in FORMS}
     return _Made(profiles, de00_of, better(de00_of["matrix"], de00_of["root-polynomial"])), balanced_signals
 
 
@@ -182,21 +214,46 @@ def _choice_remark(profile_choice: _Made) -> str:
         f"{form}: mean {form_de00.mean:.2f}, 95 % {form_de00.quantile(0.95):.2f}, largest {form_de00.worst:.2f}"
         for form, form_de00 in profile_choice.left_out.items()
     )
-    return f"CIEDE2000 of patches left out: {errors}. The ICC profile has the {profile_choice.form}"
+    bound, share = profile_choice.left_out_errors.bound(_SHARE)
+    return (
+        f"CIEDE2000 of patches left out: {errors}. The ICC profile has the {profile_choice.form}; {share:.0%} of "
+        f"colours like the chart's have an error of at most {bound:.2f} by it"
+    )
 
 
-def _parameters(matrix: Profile, by_noise: Floats, by_chart: Floats, patches: int) -> list[Parameter]:
+def _patch_section(known_chart: KnownChart, profile_choice: _Made, lab: Floats) -> Section:
+    de_used = de00(lab, known_chart.lab)
+    rows = [
+        (name, *(f"{value:.1f}" for value in (*true, *seen_lab)), f"{with_it:.2f}", f"{without_it:.2f}")
+        for name, true, seen_lab, with_it, without_it in zip(
+            known_chart.chart.patch_names,
+            known_chart.lab,
+            lab,
+            de_used,
+            profile_choice.left_out_errors.de,
+            strict=True,
+        )
+    ]
+    head = ("patch", "L*", "a*", "b*", "L* found", "a* found", "b* found", "dE00", "dE00, left out")
+    caption = (
+        f"Patches by the {profile_choice.form}, under D50; the last column by a profile made without the patch"
+    )
+    return Section("patches", "Patches", tables=[Table(caption, head, rows)])
+
+
+def _parameters(matrix: Profile, covariances: Sequence[Floats], patches: int) -> list[Parameter]:
     """The matrix's coefficients, row by row."""
     parameters = []
+    origins = ("noise of signals", "patches' own values", "light over the chart")
     for n, (axis, channel) in enumerate((axis, channel) for axis in "XYZ" for channel in "rgb"):
-        noise, chart = by_noise[n, n], by_chart[n, n]
+        variances = [float(covariance[n, n]) for covariance in covariances]
         parameters.append(
             Parameter(
                 name=f"{MATRIX}{axis}{channel}",
                 value=float(matrix.coefficients[n // 3, n % 3]),
-                u=float(np.sqrt(noise + chart)),
+                u=float(np.sqrt(sum(variances))),
                 degrees_of_freedom=float(3 * patches - 6),
-                dominated_by="noise of signals" if noise > chart else "patches' own values",
+                dominated_by=origins[int(np.argmax(variances))],
             )
         )
     return parameters
@@ -225,6 +282,8 @@ def _fixed_figures(profile_choice: _Made, figures: Sequence[Figure]) -> dict[str
             f"left_out.{form}.mean_de00": form_de00.mean,
             f"left_out.{form}.q95_de00": form_de00.quantile(0.95),
             f"left_out.{form}.worst_de00": form_de00.worst,
+            f"left_out.{form}.bound_de00": form_de00.bound(_SHARE)[0],
+            "left_out.bound_share": form_de00.bound(_SHARE)[1],
         }
     return fixed_figures | {f"figure.{figure.name}": figure.value for figure in figures}
 

@@ -78,6 +78,11 @@ class LightFrames:
     """The camera's gain."""
 
     @property
+    def temperature_range_c(self) -> tuple[float, float] | None:
+        """Lowest and highest of the LEDs' boards; None if no frame has one."""
+        return temperatures_of(self.frames)
+
+    @property
     def lit(self) -> tuple[LightFrame, ...]:
         return tuple(frame for frame in self.frames if frame.shot.is_shot)
 
@@ -133,6 +138,16 @@ class LightFrames:
         distinct, pose_of_frame = np.unique(rows, axis=0, return_inverse=True)  # a view's frames share a pose
         poses = corrected_poses(distinct[:, :16].reshape(-1, 4, 4), distinct[:, 16:], arm)
         return list(poses[pose_of_frame.reshape(-1)])
+
+
+@dataclass(frozen=True)
+class PlainSources:
+    """Sources of a record that are plain pictures; frames have the same in `LightFrames`."""
+
+    about: About
+    inputs: tuple[tuple[str, str], ...]
+    """Name and SHA-256 of every picture."""
+    temperature_range_c: tuple[float, float] | None = None
 
 
 def open_light_frames(paths: Sequence[Path]) -> LightFrames:

@@ -26,9 +26,9 @@ from coupole.calibration.light.dark import Dark, DarkFrame, calibrate_dark, warm
 from coupole.calibration.light.frames import (
     LightFrame,
     LightFrames,
+    PlainSources,
     channel_mask,
     channels_of,
-    temperatures_of,
 )
 from coupole.calibration.light.linearity import Linearity, linearity
 from coupole.calibration.light.pairs import Pair
@@ -57,7 +57,7 @@ _MOST_PIXELS = 200_000
 def sealed_outcome(
     kind: str,
     request: Request,
-    frames: LightFrames,
+    frames: LightFrames | PlainSources,
     size_px: tuple[int, int],
     parameters: Sequence[Parameter],
     covariance: Floats,
@@ -77,7 +77,7 @@ def sealed_outcome(
         kind=kind,
         **request.head(),
         simulated=frames.about.is_simulated,
-        validity=request.validity(frames.about, size_px, temperatures_of(frames.frames)),
+        validity=request.validity(frames.about, size_px, frames.temperature_range_c),
         transforms={},
         parameters=tuple(parameters),
         fixed=dict(fixed_figures or {}),
@@ -160,7 +160,7 @@ def dark_signal(frames: LightFrames, record_path: Path | None) -> Callable[[Ligh
         offset = map_beside(record_path, "dark", "offset_dn", frames)
         current = map_beside(record_path, "dark", "current_dn_per_s", frames)
         record = read_accepted(record_path, "dark")
-        warm, reference_c = temperatures_of(frames.frames), record.fixed.get("reference_c")
+        warm, reference_c = frames.temperature_range_c, record.fixed.get("reference_c")
         # LED boards are warmed by their own light: the coolest has nearly the temperature of the camera.
         warmth = 1.0 if warm is None else warmth_of(warm[0], reference_c, record.value("doubling_k"))
         return lambda frame: offset + current * np.float32(warmth * frame.exposure_us * 1e-6)

@@ -74,7 +74,7 @@ def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None =
 def read_photograph(path: Path) -> tuple[NDArray[np.float32], int]:
     """[h, w, 3] as stored, over the largest value, and how many levels. Raises InputError."""
     if path.suffix.lower() not in PLAIN:
-        return _raw(path), 65536
+        return read_raw(path), 65536
     import cv2
 
     try:
@@ -88,8 +88,9 @@ def read_photograph(path: Path) -> tuple[NDArray[np.float32], int]:
     return (picture[..., ::-1] / np.float32(most)).astype(np.float32), most + 1
 
 
-def _raw(path: Path) -> NDArray[np.float32]:
-    """The sensor's values less black, over white less black, of each cell; greens are averaged."""
+def read_raw(path: Path) -> NDArray[np.float32]:
+    """[h, w, 3] the sensor's values less black, over white less black, of each cell of 2 x 2 pixels; greens are
+    averaged. Raises InputError."""
     import rawpy
 
     try:

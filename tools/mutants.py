@@ -174,6 +174,7 @@ class Bench:
             # numba does not look into the files of functions that a compiled function calls
             cache = fresh if has_numba else str(self._scratch / ".numba")
             env = {**os.environ, "NUMBA_CACHE_DIR": cache, "PYTHONDONTWRITEBYTECODE": "1"}
+            env["PYTHONPATH"] = str(self._scratch)  # also for the scripts that tests begin
             try:
                 process = subprocess.run(
                     [*command, *mutant.tests],

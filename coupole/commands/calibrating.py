@@ -155,7 +155,6 @@ def _calibrate(
 
     `limit` are the operator's settings of the calibration's `limits`.
     """
-    from coupole.calibration.report import write_outcome
     from coupole.calibration.request import Request
     from coupole.viewing.terminal import make_console
 
@@ -171,6 +170,8 @@ def _calibrate(
             if path.exists():
                 raise InputError(f"{path}: exists already. Choose another --name or --out.")
         outcome = work(console, request)
+        from coupole.calibration.report import write_outcome  # imports much: not before options are refused
+
         page, picture = write_outcome(record_path, outcome)
     except CoupoleError as error:
         fail(error, as_json=as_json)

@@ -11,7 +11,16 @@ import typer
 from coupole.calibration.check.acceptance import CHECK
 from coupole.commands.calibrate_lens import Warmth, look_for_board
 from coupole.commands.calibrate_light import TargetCalibrations, frames_with_poses, setting_of
-from coupole.commands.calibrating import EmissionOption, Paths, Work, arm_of, bar, calibration, rig_of
+from coupole.commands.calibrating import (
+    EmissionOption,
+    Paths,
+    Work,
+    arm_of,
+    bar,
+    calibration,
+    emission_of,
+    rig_of,
+)
 from coupole.errors import InputError
 
 if TYPE_CHECKING:
@@ -80,18 +89,48 @@ def check_artefact(
 
     Each run, or folder of pictures with poses, is one position of the artefact.
     """
-    from coupole.calibration.check.workflow import records_in_force
-    from coupole.calibration.record import records_named
 
     def work(console: Console, request: Request) -> Outcome:
-        if (independent.board is None) == (independent.tile is None):
-            raise InputError("check-artefact: give one of --board and --tile, the artefact's description")
+        _refuse_wrong(paths, independent, emission)
+        from coupole.calibration.check.workflow import records_in_force
+        from coupole.calibration.record import records_named
+
         records = records_in_force(records_named(independent.records or []))
         if independent.board is not None:
             return _check_board(paths, independent, warmth, records, request, console)
         return _check_tile(paths, independent, emission, records, request, console)
 
     return work
+
+
+def _refuse_wrong(paths: Sequence[Path], independent: IndependentArtefact, emission: str) -> None:
+    """Raise InputError for options that do not go together, and for files that are not there: before anything is
+    read, and before what takes seconds to import."""
+    from coupole.calibration.check.permissible import parse_permissible
+
+    tiles = independent.tile or []
+    if (independent.board is None) != bool(tiles):
+        raise InputError("check-artefact: give one of --board and --tile, the artefact's description")
+    if tiles and (independent.mpe is not None or independent.poses is not None):
+        raise InputError(f"--{'mpe-um' if independent.mpe is not None else 'poses'}: is for --board")
+    if independent.mpe is not None:
+        parse_permissible(independent.mpe)
+    emission_of(emission)
+    if len(tiles) not in (0, 1, len(paths)):
+        raise InputError(
+            f"--tile: expected one description, or one for each of {len(paths)} runs; got {len(tiles)}"
+        )
+    for path in paths:
+        if not path.is_dir():
+            raise InputError(f"{path}: no such folder; expected a run, or a folder of pictures")
+    file_of_option = {"--board": independent.board, "--rig": independent.rig, "--poses": independent.poses}
+    options = [*file_of_option.items(), *(("--tile", tile) for tile in tiles)]
+    for option, file in (*options, *(("--records", record) for record in independent.records or [])):
+        if file is not None and not file.exists():
+            raise InputError(f"{option}: {file}: no such file")
+    if not independent.records:
+        kind = "hand-eye" if independent.board is not None else "led-power"
+        raise InputError(f"--records: expected a record of the kind `{kind}`; none is named")
 
 
 # -- a board ----------------------------------------------------------------------------------------------------
@@ -106,12 +145,12 @@ def _check_board(
     console: Console,
 ) -> Outcome:
     from coupole.calibration.check.board_lengths import Noise, lengths_of
+    from coupole.calibration.check.permissible import parse_permissible
     from coupole.calibration.check.workflow import (
         Pictures,
         check_outcome,
         compare_lengths,
         needed_record,
-        parse_permissible,
         records_by_kind,
         refuse_dependent,
         refuse_used_images,
@@ -196,10 +235,6 @@ def _check_tile(
     from coupole.calibration.light.spectralon import read_tile
 
     tiles = independent.tile or []
-    if len(tiles) not in (1, len(runs)):
-        raise InputError(
-            f"--tile: expected one description, or one for each of {len(runs)} runs; got {len(tiles)}"
-        )
     record_of_kind = records_by_kind(records, OF_TILE)
     record = needed_record(record_of_kind, "led-power")
     artefacts = [refuse_dependent(read_tile(tile).artefact, tile, records) for tile in tiles]

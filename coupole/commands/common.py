@@ -21,6 +21,7 @@ RigOption = Annotated[
     typer.Option("--rig", help="A rig other than the one that the plan names: a file, or a name such as sim."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Overwrite existing files.")]
 ResultArgument = Annotated[Path, typer.Argument(help="Folder of a result.", show_default=False)]
 MeshOption = Annotated[
     Path | None, typer.Option("--mesh", help="Mesh of the object; by default the mesh that the run names.")

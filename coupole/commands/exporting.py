@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coupole.commands.common import JsonOption, fail
+from coupole.commands.common import JsonOption, OverwriteOption, fail
 from coupole.commands.export_options import ExportOptions, ToOption
 from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError
@@ -84,7 +84,7 @@ def export(
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the files; by default SOURCE/export.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite existing files.")] = False,
+    overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write a run's proven frames, its views, or a result of reflectance, as other programs read them."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from coupole.commands.common import JsonOption, fail
+from coupole.commands.common import JsonOption, OverwriteOption, fail
 from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError, StorageError, reason
 
@@ -97,6 +97,22 @@ class Wishes:
     """Another grinding of the pigment."""
     out: Path | None
     """Folder for the files."""
+    overwrite: bool = False
+    """True if files that are there may be replaced."""
+
+    def files_of(self, paint_name: str) -> tuple[Path, Path] | None:
+        """Return paint file and report of a paint; None if none are wanted. Raises InputError if they are there
+        already and may not be replaced."""
+        from coupole.appearance.matter.paint_file import ENDING
+        from coupole.exchange.target_folder import refuse_standing
+
+        if self.out is None:
+            return None
+        stem = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in paint_name)
+        files = self.out / f"{stem}{ENDING}", self.out / f"{stem}.html"
+        if not self.overwrite:
+            refuse_standing(files)
+        return files
 
 
 @flatten_options
@@ -118,7 +134,7 @@ def layer(
     other_grinding: Annotated[
         Path | None,
         typer.Option(
-            help=("Paint file of another grinding of the pigment, to compute the ratio of their grain sizes.")
+            help="Paint file of another grinding of the pigment, to compute the ratio of their grain sizes."
         ),
     ] = None,
     at_um: Annotated[
@@ -131,6 +147,7 @@ def layer(
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for paint file and report.")] = None,
+    overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compute K and S of a paint, with 95 % intervals, from films over grounds, from an opaque and a thin film, or
@@ -143,15 +160,14 @@ def layer(
     console = make_console(quiet=as_json)
     try:
         if samples is None:
-            description, folder = (
-                _layer_description(films.film_descriptions(), name or "paint", noise, instrument, bare_grounds),
-                Path(),
-            )
+            descriptions, folder = films.film_descriptions(), Path()
+            description = _layer_description(descriptions, name or "paint", noise, instrument, bare_grounds)
         else:
             if films.are_named():
                 raise InputError(f"{samples}: names the films; leave out --over-black and the like")
             description, folder = read_films(samples)
-        document = _coefficients_document(description, folder, Wishes(tuple(at_um or ()), other_grinding, out))
+        wishes = Wishes(tuple(at_um or ()), other_grinding, out, overwrite)
+        document = _coefficients_document(description, folder, wishes)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -194,6 +210,7 @@ def _coefficients_document(layer: LayerGiven, folder: Path, wishes: Wishes) -> d
     from coupole.heritage.analysis import four_flux_fit, layer_fit, layer_model, other_thickness
     from coupole.heritage.analysis.layer_samples import paint_file, read_samples
 
+    files = wishes.files_of(layer.name)
     samples = read_samples(layer, folder)
     if wishes.at_um and not samples.is_per_mm:
         raise InputError("--at-um: needs the thickness of the measured films: give --thickness-um")
@@ -236,16 +253,12 @@ def _coefficients_document(layer: LayerGiven, folder: Path, wishes: Wishes) -> d
         document["at"] = [_film_document(film) for film in predicted_films]
     if wishes.other_paint is not None:
         document["grains"] = _grains(paint, wishes.other_paint)
-    if wishes.out is not None:
-        from coupole.appearance.matter.paint_file import ENDING, encode
+    if files is not None:
+        from coupole.appearance.matter.paint_file import encode
         from coupole.heritage.result_pages.layer_page import layer_page
 
-        stem = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in layer.name)
-        files = {
-            f"{stem}{ENDING}": encode(paint),
-            f"{stem}.html": layer_page(layer, samples, fit, model, four, predicted_films),
-        }
-        document["files"] = _write_files(wishes.out, files)
+        texts = encode(paint), layer_page(layer, samples, fit, model, four, predicted_films)
+        document["files"] = _write_files(dict(zip(files, texts, strict=True)))
     return document
 
 
@@ -308,14 +321,15 @@ def _grains(paint: Any, other_path: Path) -> dict[str, Any]:
     }
 
 
-def _write_files(folder: Path, files: dict[str, str]) -> list[str]:
+def _write_files(text_of_file: dict[Path, str]) -> list[str]:
+    folder = next(iter(text_of_file)).parent
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, words in files.items():
-            (folder / name).write_text(words, encoding="utf-8")
+        for path, text in text_of_file.items():
+            path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise StorageError(f"{folder}: {reason(error)}. Choose another folder, or free space.") from error
-    return [str(folder / name) for name in files]
+    return [str(path) for path in text_of_file]
 
 
 def _say(document: dict[str, Any], console: Console) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from coupole.commands.common import JsonOption, fail
+from coupole.commands.common import JsonOption, OverwriteOption, fail
 from coupole.commands.layer import Instrument
 from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError, StorageError, reason
@@ -61,12 +61,14 @@ def recipe(
     observer: Annotated[str, typer.Option(help="Standard observer: 10 deg or 2 deg.")] = "10 deg",
     out: Annotated[Path | None, typer.Option("--out", help="Write this page (HTML).")] = None,
     paint: PaintOption = None,
+    overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Find paints of a palette whose opaque mixture has a colour: shares, match under several lights, error with
     one paint less.
     """
     from coupole.appearance.matter.glossy_face import face
+    from coupole.exchange.target_folder import refuse_standing
     from coupole.heritage.analysis.mixed_paint import expect_paint_name, write_mixture
     from coupole.viewing.terminal import make_console
 
@@ -74,6 +76,8 @@ def recipe(
     try:
         if paint is not None:
             expect_paint_name(paint)
+        if not overwrite:
+            refuse_standing([path for path in (out, paint) if path is not None])
         names = [name.strip() for name in light.split(",") if name.strip()]
         if not names:
             raise InputError("--light: expected names of lights, such as D65,A; found none")

@@ -32,7 +32,7 @@ from coupole.errors import CoupoleError, InputError
 if TYPE_CHECKING:
     from coupole.reflectance.run_job import RunRequest
     from coupole.reflectance.texels.texel_forecast import TexelForecast
-    from coupole.reflectance.texels.texel_grid import TexelSize
+    from coupole.reflectance.texels.texel_size import TexelSize
 
 Said = Callable[[str, int, int], None]
 Made = tuple[dict[str, Any], list[str], Path]
@@ -87,14 +87,14 @@ def from_runs_or_pictures(
             raise InputError("--out: expected the folder of the result")
         _refuse_mixed(runs or [], samples, without)
         size = _texel_size(texels, runs or [], without)
-        left_out = _numbers(leave_out)
+        left_out, memory_bytes = _numbers(leave_out), workers.memory_bytes
         with step_bars(console) as say:
             if without.is_uncalibrated and runs:
                 outcome = _of_uncalibrated(runs[0], without.view, left_out, out, say)
             elif without.pictures is not None:
                 outcome = _of_pictures(without.pictures, without, left_out, out, say)
             else:
-                request = replace(samples.request(runs or [], left_out), memory_bytes=workers.memory_bytes)
+                request = replace(samples.request(runs or [], left_out), memory_bytes=memory_bytes)
                 outcome = _of_runs(request, out, workers.scheduler, say, Texels(size, console.print))
     except CoupoleError as error:
         fail_with(error, as_json=as_json)

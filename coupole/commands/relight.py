@@ -14,7 +14,7 @@ from coupole.commands.common import JsonOption, ResultArgument, fail
 from coupole.commands.completion import fits
 from coupole.commands.option_groups import flatten_options
 from coupole.commands.relight_for_the_eye import PEAK_QUANTILE, EyeColours, bright, write_relit_for_the_eye
-from coupole.errors import CoupoleError, InputError
+from coupole.errors import CoupoleError, InputError, StorageError, reason
 from coupole.scripting.relit_result import Relit, open_result
 
 if TYPE_CHECKING:
@@ -198,14 +198,13 @@ def relight(
             relit = open_result(
                 folder, viewpoint.view, viewpoint.fit, camera, lighting.samples, uncertain=uncertain
             )
+            companions = _companions(relit, lights, more, bars)
             if colour is not None:
-                document = write_relit_for_the_eye(relit, lights, to, colour, more.white, bars)
+                document = write_relit_for_the_eye(relit, lights, to, colour, more.white, bars, companions.clear)
             else:
-                document = _write(relit, lights, to, more.turn, more.white, bars)
-            if more.uncertainty is not None:
-                document |= _write_uncertainty(relit, lights, more.uncertainty, bars)
-            if more.interval is not None:
-                document |= _write_interval(relit, lights, _low_and_high(more.interval), bars)
+                document = _write(relit, lights, to, more.turn, more.white, bars, companions.clear)
+            companions.write()
+            document |= companions.document
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -220,10 +219,13 @@ def relight(
 def _refuse_target(to: Path, more: MoreOutput, *, for_the_eye: bool) -> None:
     from coupole.exchange import picture_files, picture_for_the_eye, video_files
 
+    files = [to, *([] if more.uncertainty is None else [more.uncertainty])]
     if more.interval is not None:
-        _low_and_high(more.interval)
+        files += _low_and_high(more.interval)
         if more.turn is not None:
             raise InputError("--interval: belongs to a picture, not to a video (--turn)")
+    if len({file.resolve() for file in files}) < len(files):
+        raise InputError("--to, --uncertainty, --interval: expected different files; one is named twice")
     if more.uncertainty is not None:
         picture_files.refuse_unknown(more.uncertainty)
         if more.turn is not None:
@@ -290,12 +292,15 @@ def _write(
     turn: int | None,
     white: float | None,
     bars: Callable[[str, int, int], None],
+    before_writing: Callable[[], None],
 ) -> dict[str, Any]:
     """Make and write the picture or the video; what `--json` says."""
     if turn is None:
         from coupole.exchange.picture_files import write_picture
 
-        write_picture(to, relit.picture(lights, lambda count, of: bars("light", count, of)))
+        picture = relit.picture(lights, lambda count, of: bars("light", count, of))
+        before_writing()
+        write_picture(to, picture)
         return {"picture": str(to.resolve()), **relit.about}
     import numpy as np
 
@@ -326,28 +331,50 @@ def _write(
     return {"video": str(to.resolve()), "frames": turn, "white": white, **relit.about}
 
 
-def _write_uncertainty(
-    relit: Relit, lights: Sequence[AnyLight], to: Path, bars: Callable[[str, int, int], None]
-) -> dict[str, Any]:
-    """Make and write the uncertainty of the picture; what `--json` says of it."""
-    from coupole.exchange.picture_files import write_picture
+@dataclass(frozen=True)
+class Companions:
+    """Pictures that belong to the one of `--to`, such as its uncertainty. They are written after it, and what an
+    earlier call has left in their places is removed before it: a call that is interrupted leaves no picture beside
+    the uncertainty of another one."""
 
-    assert relit.uncertainty is not None
-    write_picture(to, relit.uncertainty(lights, lambda count, of: bars("uncertainty", count, of)))
-    return {"uncertainty": str(to.resolve())}
+    pictures: dict[Path, NDArray[np.float32]]
+    document: dict[str, Any]
+    """Their part of what `--json` says."""
+
+    def clear(self) -> None:
+        """Remove what is in their places. Raises StorageError."""
+        for path in self.pictures:
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                raise StorageError(f"{path}: {reason(error)}") from error
+
+    def write(self) -> None:
+        """Raises StorageError."""
+        from coupole.exchange.picture_files import write_picture
+
+        for path, picture in self.pictures.items():
+            write_picture(path, picture)
 
 
-def _write_interval(
-    relit: Relit, lights: Sequence[AnyLight], bounds: tuple[Path, Path], bars: Callable[[str, int, int], None]
-) -> dict[str, Any]:
-    """Make and write the bounds of the picture's 95 % interval, not below 0; what `--json` says of them."""
+def _companions(
+    relit: Relit, lights: Sequence[AnyLight], more: MoreOutput, bars: Callable[[str, int, int], None]
+) -> Companions:
+    """Make the picture's uncertainty, and the bounds of its 95 % interval, not below 0, where they are wanted."""
     import numpy as np
 
-    from coupole.exchange.picture_files import write_picture
-
-    assert relit.half_width_95 is not None
-    picture = relit.picture(lights, lambda count, of: bars("light", count, of))
-    half_width = relit.half_width_95(lights, lambda count, of: bars("interval", count, of))
-    write_picture(bounds[0], np.maximum(picture - half_width, np.float32(0.0)))
-    write_picture(bounds[1], picture + half_width)
-    return {"interval": [str(path.resolve()) for path in bounds]}
+    companions = Companions({}, {})
+    if more.uncertainty is not None:
+        assert relit.uncertainty is not None
+        u = relit.uncertainty(lights, lambda count, of: bars("uncertainty", count, of))
+        companions.pictures[more.uncertainty] = u
+        companions.document["uncertainty"] = str(more.uncertainty.resolve())
+    if more.interval is not None:
+        assert relit.half_width_95 is not None
+        low, high = _low_and_high(more.interval)
+        picture = relit.picture(lights, lambda count, of: bars("light", count, of))
+        half_width = relit.half_width_95(lights, lambda count, of: bars("interval", count, of))
+        companions.pictures[low] = np.maximum(picture - half_width, np.float32(0.0))
+        companions.pictures[high] = picture + half_width
+        companions.document["interval"] = [str(path.resolve()) for path in (low, high)]
+    return companions

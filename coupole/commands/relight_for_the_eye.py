@@ -85,6 +85,7 @@ def write_relit_for_the_eye(
     colour: CameraColour,
     white: float | None,
     bars: Callable[[str, int, int], None],
+    before_writing: Callable[[], None],
 ) -> dict[str, Any]:
     """Make and write the picture as sRGB; what `--json` says."""
     import numpy as np
@@ -101,6 +102,7 @@ def write_relit_for_the_eye(
     linear = linear_colours(relit.picture(lights, lambda count, of: bars("light", count, of)), colour)
     white = white or float(np.quantile(bright(linear), PEAK_QUANTILE)) or 1.0
     about = {**relit.about, "colour": colour.origin.partition("; white")[0], "white": white}
+    before_writing()
     write_for_the_eye(to, linear, white, about)
     return {"picture": str(to.resolve()), **about}
 

@@ -20,6 +20,7 @@ from coupole.plan.shipped_files import SIMULATED_CELL, file_of
 if TYPE_CHECKING:
     from coupole.reflectance.suggestion.plan_suggestion import SuggestionRequest
 
+_READING = "reading mesh and cell"
 _SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
@@ -88,21 +89,17 @@ class Wishes:
         return self.name or re.sub(r"[^A-Za-z0-9._-]", "-", mesh.stem).lstrip("._-")[:64] or "object"
 
     def request(self, mesh: Path) -> SuggestionRequest:
-        """The request for a plan. Raises InputError for the first wish that cannot be."""
-        from coupole.calibration.record import records_named
+        """The request for a plan. Raises InputError for the first wish that cannot be, before the mesh is read and
+        what takes seconds is imported."""
         from coupole.plan.base_model import NAME_PATTERN
-        from coupole.preflight.object_shape import MM_PER_UNIT
-        from coupole.reflectance.suggestion.plan_suggestion import Budget, SuggestionRequest
-        from coupole.reflectance.suggestion.plan_text import PlanText
         from coupole.reflectance.suggestion.supposed_materials import SUPPOSED, UNKNOWN
 
         name, rig = self.file_stem(mesh), self.rig or SIMULATED_CELL
         if self.material not in (*SUPPOSED, UNKNOWN):
             raise InputError(f"--material: expected {', '.join(SUPPOSED)} or {UNKNOWN}; found {self.material!r}")
-        if self.unit not in MM_PER_UNIT:
-            raise InputError(f"--unit: expected {', '.join(MM_PER_UNIT)}; found {self.unit!r}")
         if self.dose is not None and not math.isfinite(self.dose):
             raise InputError(f"--dose: expected a number of lux h; found {self.dose}; leave it out for no bound")
+        seconds = seconds_of(self.budget)
         if not re.fullmatch(NAME_PATTERN, name):
             raise InputError(f"--name: expected letters, digits, dots, hyphens and underscores; found {name!r}")
         for path in (Path(f"{name}.yaml"), Path(f"{name}.html")):
@@ -112,10 +109,18 @@ class Wishes:
             raise InputError(f"{mesh}: no such file; expected the object's mesh, PLY, STL or OBJ")
         if not file_of(rig, "rigs").is_file():
             raise InputError(f"{rig}: no such file; name a rig with --rig")
+        from coupole.preflight.object_shape import MM_PER_UNIT
+
+        if self.unit not in MM_PER_UNIT:
+            raise InputError(f"--unit: expected {', '.join(MM_PER_UNIT)}; found {self.unit!r}")
+        from coupole.calibration.record import records_named
+        from coupole.reflectance.suggestion.plan_suggestion import Budget, SuggestionRequest
+        from coupole.reflectance.suggestion.plan_text import PlanText
+
         records = tuple(map(str, records_named(self.calibrations or [])))
         translation_mm = to_middle_mm(mesh, MM_PER_UNIT[self.unit]) if self.centre else None
         text = PlanText(name, str(rig), name, str(mesh), self.unit, records, translation_mm)
-        budget = Budget(seconds_of(self.budget), self.dose, self.views)
+        budget = Budget(seconds, self.dose, self.views)
         return SuggestionRequest(text, Path(f"{name}.yaml"), self.material, budget, self.scan_noise_um)
 
 
@@ -135,16 +140,18 @@ def plan_suggest(
 
     console = make_console(quiet=as_json)
     try:
-        from coupole.reflectance.result_pages import suggestion_page
-        from coupole.reflectance.suggestion.plan_suggestion import suggest_plan
-        from coupole.storage.durable import write_synced
-
-        request = wishes.request(mesh)
         with step_bars(console) as say:
+            say(_READING, 0, 1)  # the first seconds go into it and into what it imports
+            request = wishes.request(mesh)
+            from coupole.reflectance.result_pages import suggestion_page
+            from coupole.reflectance.suggestion.plan_suggestion import suggest_plan
+            from coupole.storage.durable import write_synced
+
             suggestion = suggest_plan(request, say)
-        page_path = request.path.with_suffix(".html")
-        suggestion_page.write(page_path, request.text.name, suggestion)
-        write_synced(request.path, suggestion.text)
+            say("page", 0, 1)
+            page_path = request.path.with_suffix(".html")
+            suggestion_page.write(page_path, request.text.name, suggestion)
+            write_synced(request.path, suggestion.text)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from coupole.reflectance.texels.texel_grid import TexelSize, size_refused
+from coupole.reflectance.texels.texel_size import TexelSize, size_refused
 from coupole.viewing.terminal import bytes_text, duration_text
 
 if TYPE_CHECKING:

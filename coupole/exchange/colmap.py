@@ -18,6 +18,7 @@ import coupole
 from coupole.calibration.optics import Intrinsics, project
 from coupole.calibration.rotations import Floats
 from coupole.exchange.demosaiced import demosaiced
+from coupole.exchange.kept_frames import refuse_discarded_lights
 from coupole.exchange.srgb import srgb
 from coupole.exchange.target_folder import refuse_standing, writing_into
 from coupole.geometry import Transform, apply, inverse
@@ -26,6 +27,7 @@ from coupole.reflectance.alignment.refined_geometry import read_refined
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView, read_measured_run
 from coupole.reflectance.extraction.seen_surface import seen_surface
 from coupole.storage.durable import write_synced
+from coupole.storage.run import Run
 
 MODEL, PICTURES = "sparse/0", "images"
 MOST_POINTS = 50_000
@@ -66,8 +68,11 @@ def export_colmap(
     lens are of the run's records, or of those that are named, or of `refined_folder`, a folder of `coupole
     reflectance refine`.
 
-    Raises InputError: records or mesh are missing, files stand there already (unless `overwrite`); StorageError.
+    Raises InputError: records or mesh are missing, frames were discarded, files stand there already (unless
+    `overwrite`); StorageError.
     """
+    run = Run(folder)
+    refuse_discarded_lights(run, run.about["views"], "colmap")
     measured_run = read_measured_run(folder, records=records)
     if refined_folder is not None:
         measured_run = read_refined(refined_folder).of(measured_run)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from coupole.errors import FrameDiscarded, InputError
+from coupole.errors import InputError
 from coupole.exchange import dng, tiff_for_the_eye
 from coupole.exchange.exported_frame import Picture
 from coupole.exchange.formats import Source, Writer, format_named
+from coupole.exchange.kept_frames import refuse_discarded
 from coupole.exchange.run_colour import ColourWanted, colour_of_run
 from coupole.exchange.target_folder import refuse_standing, writing_into
-from coupole.storage.discarding import discarded_views
+from coupole.plan.shot_id import ShotId
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
 from coupole.storage.step_fields import STORED_NO_LED, board_temperature_c
@@ -60,7 +61,7 @@ def export_run(
     ]
     if not frames:
         raise InputError(f"{run.folder}: no proven frame matches; see `coupole status` for its views")
-    _refuse_discarded(run, frames)
+    refuse_discarded(run, [frame.shot for frame in frames], _words_of_kept)
     paths = {str(frame.shot): folder / f"{str(frame.shot).replace('/', '_')}.{to}" for frame in frames}
     if not overwrite:
         refuse_standing(list(paths.values()))
@@ -72,18 +73,9 @@ def export_run(
     return Exported(len(frames), total_bytes)
 
 
-def _refuse_discarded(run: Run, frames: list[FrameProven]) -> None:
-    """Raise FrameDiscarded, before anything is written, if some of the frames were discarded."""
-    gone_shots = {shot for event in discarded_views(run).values() for shot, _ in event.frames}
-    matching_frames = [frame.shot for frame in frames if frame.shot in gone_shots]
-    if matching_frames:
-        kept_label = next((str(frame.shot.label) for frame in frames if frame.shot not in gone_shots), "dark*")
-        raise FrameDiscarded(
-            f"{run.folder}: {len(matching_frames)} of the {len(frames)} frames that match, such as "
-            f"{matching_frames[0]}, were discarded when their samples were safe, as the plan said (`discard: "
-            f"after_fit`). Name frames that are kept with --shots, such as `{kept_label}`; `coupole export "
-            "RESULT` exports the result that was made of the samples"
-        )
+def _words_of_kept(kept_shots: Sequence[ShotId]) -> str:
+    label = str(kept_shots[0].label) if kept_shots else "dark*"
+    return f"Name frames that are kept with --shots, such as `{label}`; "
 
 
 def _encoder(to: str, run: Run, colour: ColourWanted | None, *, linear: bool) -> Callable[[Picture], bytes]:

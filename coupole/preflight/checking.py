@@ -162,6 +162,7 @@ def _check_discarding(job: Job, report: Report, storage: StorageFacts, proven: C
     room, folder = discard_room(job), storage.folder or job.cell.storage_folder
     remaining = job.schedule.without_proven(proven) if proven else job.schedule
     report.peak_bytes = room.peak_bytes(storage.occupied_space, {view.name for view in remaining.views})
+    report.staying_bytes = room.staying_bytes
     if storage.no_holes:
         problem = job.document.problem(
             ("discard",), f"expected a disk that can give back a part of a file; {folder}: {storage.no_holes}"

@@ -76,6 +76,11 @@ class DiscardRoom:
         )
         return max(samples, all_samples + kept_bytes + max(largest, self.fit_bytes), 0)
 
+    @property
+    def staying_bytes(self) -> int:
+        """Most bytes that the whole run leaves: what is kept of its frames, samples and fits."""
+        return sum(view.kept_bytes + view.sample_bytes for view in self.views.values()) + self.fit_bytes
+
     def needed_bytes(self, view: str, waiting: Collection[str]) -> int:
         """Bytes that must be free when a view begins, while samples of the `waiting` ones are to come."""
         samples = sum(self.views[name].sample_bytes for name in waiting if name in self.views)

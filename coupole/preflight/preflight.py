@@ -99,6 +99,9 @@ class Report:
     peak_bytes: int | None = None
     """Most that the run needs on the disk at a time, samples and fits included, if frames are discarded; None if
     all are kept."""
+    staying_bytes: int | None = None
+    """Most that the whole run leaves on the disk, samples and fits included, if frames are discarded; None if all
+    are kept."""
     duration_s: float = 0.0
     """Expected duration, s."""
     ideal_s: float = 0.0

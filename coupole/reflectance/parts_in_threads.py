@@ -3,27 +3,39 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from types import CodeType
+from typing import Any, TypeVar
 
+Done = TypeVar("Done")
+
+_begun: dict[CodeType, threading.Lock] = {}
 _ready: set[CodeType] = set()
-"""Work that was done once in this process: its kernels are loaded."""
+"""Functions that were called once in this process: their kernels are loaded."""
+
+
+def first_alone(work: Callable[..., Done]) -> Callable[..., Done]:
+    """Return a function for threads. The first call in this process ends before any other begins, because it loads
+    or compiles the kernels that it calls. Several threads that did so together failed now and then (numba 0.68:
+    "dictionary changed size during iteration")."""
+    kind: CodeType = work.__code__
+
+    def call(*arguments: Any) -> Done:
+        if kind not in _ready:
+            with _begun.setdefault(kind, threading.Lock()):
+                if kind not in _ready:
+                    done = work(*arguments)
+                    _ready.add(kind)
+                    return done
+        return work(*arguments)
+
+    return call
 
 
 def in_threads(work: Callable[[int], object], count: int, *, part: int = 1, threads: int | None = None) -> None:
-    """Do `work(first)` for the first of each `part` of `count`, by so many threads, or as many as there are cores.
-
-    The first part of a kind of work is done before the others begin: it loads or compiles what it calls, which
-    failed once in several threads at a time (numba 0.68: "dictionary changed size during iteration").
-    """
-    firsts = range(0, count, part)
-    kind = work.__code__
-    if kind not in _ready and firsts:
-        work(firsts[0])
-        _ready.add(kind)
-        firsts = firsts[1:]
-    if not firsts:
-        return
+    """Do `work(first)` for the first of each `part` of `count`, by so many threads, or as many as there are cores;
+    the very first of its kind alone."""
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(work, firsts))
+        list(pool.map(first_alone(work), range(0, count, part)))

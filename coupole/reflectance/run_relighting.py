@@ -47,6 +47,7 @@ from coupole.reflectance.new_light.shading import (
 )
 from coupole.reflectance.new_light.shadow_edges import trace_beam
 from coupole.reflectance.pair_harmonics import pair_values
+from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.run_result import RunResult, ViewSamples, read_about
 from coupole.reflectance.texels.gathered import gather, open_views
 from coupole.reflectance.texels.pixel_file import read_texel_errors, read_view_texels
@@ -205,7 +206,7 @@ class RelitScene:
             values[part] = np.nan_to_num(_values_of(reflecting, light, part)[:, 0])
 
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            list(pool.map(of, range(0, len(centres_mm), _TRIANGLES)))
+            list(pool.map(first_alone(of), range(0, len(centres_mm), _TRIANGLES)))
         return values
 
 

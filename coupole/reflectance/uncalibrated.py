@@ -95,10 +95,11 @@ def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> Pict
 
 
 def lights_of_view(folder: Path, view: str | None) -> PicturedView:
-    """Return what the pictures of a view of a run are taken with, without writing them. Raises as
-    `write_pictures`."""
+    """Return what the pictures of a view of a run are taken with, without writing them or reading a frame. Raises
+    InputError: no such view, too few LEDs."""
     run = Run(folder)
-    frame_of_led = frames_of_leds(folder, open_light_frames([folder]), view)
+    exposures_of_led = _exposures_of_leds(folder, open_light_frames([folder]), view)
+    frame_of_led = {led: exposures[0] for led, exposures in exposures_of_led.items()}
     return _nominal(read_plan(run.plan_path, run.rig_path), frame_of_led, run.is_simulated)
 
 
@@ -128,24 +129,33 @@ def _refuse_others(path: Path, text: str) -> None:
 
 def frames_of_leds(folder: Path, frames: LightFrames, view: str | None) -> dict[int, LightFrame]:
     """Return for each LED the frame of the longest exposure that is hardly clipped, else of the shortest."""
+    frame_of_led: dict[int, LightFrame] = {}
+    for led, exposures in _exposures_of_leds(folder, frames, view).items():
+        frame_of_led[led] = exposures[0]
+        for shorter_exposure in exposures[1:]:
+            if _clipped_share(frame_of_led[led], frames.white_dn) > _MOST_CLIPPED:
+                frame_of_led[led] = shorter_exposure
+    return frame_of_led
+
+
+def _exposures_of_leds(folder: Path, frames: LightFrames, view: str | None) -> dict[int, list[LightFrame]]:
+    """Return the frames of each LED in a view, the longest exposure first. Raises InputError: no such view, too
+    few LEDs."""
     views = list(dict.fromkeys(frame.view for frame in frames.lit if frame.led is not None))
     if not views:
         raise InputError(f"{folder}: no proven frame under a single LED; acquire the plan first")
     name = views[0] if view is None else view
     if name not in views:
         raise InputError(f"--view: expected one of {', '.join(views)}, got {name!r}")
-    frame_of_led: dict[int, LightFrame] = {}
+    exposures_of_led: dict[int, list[LightFrame]] = {}
     for frame in sorted(frames.lit, key=lambda frame: -frame.exposure_us):
-        if frame.view != name or frame.led is None:
-            continue
-        earlier_frame = frame_of_led.get(frame.led)
-        if earlier_frame is None or _clipped_share(earlier_frame, frames.white_dn) > _MOST_CLIPPED:
-            frame_of_led[frame.led] = frame
-    if len(frame_of_led) < FEWEST_LIGHTS:
+        if frame.view == name and frame.led is not None:
+            exposures_of_led.setdefault(frame.led, []).append(frame)
+    if len(exposures_of_led) < FEWEST_LIGHTS:
         raise InputError(
-            f"{folder}: {len(frame_of_led)} LEDs lit the view {name}; at least {FEWEST_LIGHTS} are needed"
+            f"{folder}: {len(exposures_of_led)} LEDs lit the view {name}; at least {FEWEST_LIGHTS} are needed"
         )
-    return frame_of_led
+    return exposures_of_led
 
 
 def _clipped_share(frame: LightFrame, white_dn: int) -> float:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from coupole.heritage.analysis.references import References
     from coupole.reflectance.run_job import RunRequest
     from coupole.reflectance.texels.texel_forecast import TexelForecast
-    from coupole.reflectance.texels.texel_grid import TexelSize
+    from coupole.reflectance.texels.texel_size import TexelSize
 
 CalibrationRecord = Record
 AnyPath = str | os.PathLike[str]
@@ -57,7 +57,7 @@ def fit_reflectance(
     from coupole.calibration.record import records_named
     from coupole.reflectance.result_pages import run_reflectance_page
     from coupole.reflectance.run_job import RunRequest
-    from coupole.reflectance.texels.texel_grid import TexelSize
+    from coupole.reflectance.texels.texel_size import TexelSize
     from coupole.scripting.opened_result import open_result
 
     request = RunRequest(

@@ -109,7 +109,10 @@ def remarks(comparison: Comparison) -> Iterator[str]:
             f"{np.nanmedian(comparison.de00):.2f} in the median, with noise"
         )
     if (~is_finite).any():
-        yield f"{int((~is_finite).sum()):,} points have no surface of the other state near them: not compared"
+        yield (
+            f"{int((~is_finite).sum()):,} points have no surface of the other state near them that faces as they "
+            "do, as in hollows that were not seen: not compared"
+        )
     if comparison.noise_factor > 1.5 or comparison.colour_factor > 1.5:
         yield (
             f"differences scatter {max(comparison.noise_factor, comparison.colour_factor):.1f} times more than "

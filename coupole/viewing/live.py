@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -17,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from coupole.errors import InputError
+from coupole.errors import FrameDiscarded, InputError
 from coupole.plan.shot_id import Led
 from coupole.storage import journal
+from coupole.storage.discarding import discarded_views, place_of_result
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
 from coupole.storage.run_status import CREATED, PAUSED, RUNNING, Status, status
@@ -132,18 +134,21 @@ class RunSource:
         self._run = Run(folder)
         self._status = Status()
         self._next_status_s = 0.0
+        self._last_frame = "its last frame"
 
     def frames(self, studio: Studio) -> None:
         pace, number = FrameRate(), 0
         newest: FrameProven | None = None
         while not studio.closing.is_set():
+            display = studio.shown_frame
+            last = self._newest_kept() if display is None and self._run.discards else self._newest()
             is_changed = self._ask_status(studio)
-            last, display = self._newest(), studio.shown_frame
             if last is not None and last != newest:
                 newest = last
-                number += 1
-                display = replace(self._read_frame(last, number), frames_per_s=pace.beat())
-                studio.show(self._with_status(display))
+                with suppress(FrameDiscarded):  # since its line was read: what is shown stays
+                    display = replace(self._read_frame(last, number + 1), frames_per_s=pace.beat())
+                    number += 1
+                    studio.show(self._with_status(display))
             elif is_changed and display is not None:
                 number += 1
                 studio.show(self._with_status(replace(display, number=number)))
@@ -158,7 +163,7 @@ class RunSource:
         took_s = time.monotonic() - begun_s
         self._next_status_s = begun_s + max(_STATUS_S, _STATUS_REST * took_s)
         if self._status.state not in (CREATED, RUNNING, PAUSED):
-            studio.remark = f"the run is not being acquired ({self._status.state}): this is its last frame"
+            studio.remark = f"the run is not being acquired ({self._status.state}): this is {self._last_frame}"
         elif studio.remark:
             studio.remark = "the run goes on"
         return self._status != before
@@ -167,6 +172,25 @@ class RunSource:
         now = self._status
         progress = f"{now.state}, {now.proven} of {now.shots} shots proven"
         return replace(frame, run=progress, dose_lux_h=now.dose_lux_h)
+
+    def _newest_kept(self) -> FrameProven | None:
+        """The newest frame whose pixels were not discarded; None if none is proven yet. Raises FrameDiscarded with
+        what to look at instead if none is kept."""
+        proven_frames = [frame for shot, frame in self._run.proven().items() if isinstance(shot.light, Led)]
+        discards = discarded_views(self._run)
+        gone_shots = {shot for event in discards.values() for shot, _ in event.frames}
+        if proven_frames and proven_frames[-1].shot not in gone_shots:
+            return proven_frames[-1]
+        self._last_frame = "its newest frame that was not discarded"
+        kept_frames = [frame for frame in proven_frames if frame.shot not in gone_shots]
+        if proven_frames and not kept_frames:
+            result = place_of_result(self._run, discards[proven_frames[-1].shot.view])
+            raise FrameDiscarded(
+                f"{self._run.folder}: all its frames under LEDs were discarded when their samples were safe, as "
+                f"its plan said (`discard: after_fit`). `coupole show {result} --out FILE.html` shows what the "
+                "samples have become"
+            )
+        return kept_frames[-1] if kept_frames else None
 
     def _newest(self) -> FrameProven | None:
         frame = None

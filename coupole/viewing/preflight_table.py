@@ -32,9 +32,14 @@ def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> 
         duration += f" left of {duration_text(whole.duration_s)}"
     at_most = ", at most" if report.is_bound else ""
     table.add_row(f"views, shots, frames{at_most}", counts)
-    table.add_row(f"on disk{at_most}", size + (_speeds(report) if report.frames else ""))
-    if report.peak_bytes is not None:
-        table.add_row("on disk at a time, at most", f"{bytes_text(report.peak_bytes)}: frames are discarded")
+    size_name = "on disk" if report.peak_bytes is None else "all frames, added up"
+    table.add_row(f"{size_name}{at_most}", size + (_speeds(report) if report.frames else ""))
+    if report.peak_bytes is not None and report.staying_bytes is not None:
+        beside = "" if whole is None else " beside what is there"
+        at_a_time = "frames of one view, what is kept of all, samples and fits"
+        table.add_row(f"on disk at a time{beside}, at most", f"{bytes_text(report.peak_bytes)}: {at_a_time}")
+        stays = "frames that are not discarded, samples and fits"
+        table.add_row("stays on disk, at most", f"{bytes_text(report.staying_bytes)}: {stays}")
     if report.timings:
         table.add_row("a frame every", "; ".join(map(_pace, report.timings)))
     table.add_row(f"duration{at_most}", f"{duration} (at best {duration_text(report.ideal_s)})")
@@ -78,6 +83,7 @@ def document_of(report: Report) -> dict[str, Any]:
         "frames": report.frames,
         "bytes": report.bytes,
         "peak_bytes": report.peak_bytes,
+        "staying_bytes": report.staying_bytes,
         "duration_s": report.duration_s,
         "ideal_s": report.ideal_s,
         "dose_lux_h": report.dose_lux_h,

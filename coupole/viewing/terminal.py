@@ -80,7 +80,8 @@ class _Terminal:
 @contextmanager
 def step_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
     """Bars, one for each step of a job, with the time left; call what this gives with a step, how much of it is
-    done, and of how much. A step is over when the next one begins."""
+    done, and of how much. A step is over when the next one begins. Where there is no terminal, which shows no bars
+    before the end, each step has a line when it begins."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as bars:
         tasks: dict[str, TaskID] = {}
@@ -90,6 +91,8 @@ def step_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
                 for task in bars.tasks:
                     bars.update(task.id, completed=task.total)
                 tasks[step] = bars.add_task(step)
+                if not console.is_terminal:
+                    console.print(f"{step} ...", markup=False)
             bars.update(tasks[step], completed=count, total=of)
 
         yield say

@@ -13,7 +13,8 @@ from photographed import BOARD_YAML, shoot, write_folder
 from typer import Typer
 from typer.testing import CliRunner, Result
 
-from coupole.calibration.check.workflow import limits_of, parse_permissible
+from coupole.calibration.check.permissible import parse_permissible
+from coupole.calibration.check.workflow import limits_of
 from coupole.calibration.record import Comparison, read_record
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.certificate import certificate

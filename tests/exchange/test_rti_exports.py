@@ -335,7 +335,11 @@ def test_pictures_for_rti_are_counted_with_their_linear_ones(
         files = tuple(sorted(out.glob("*.png")))
         return PicturedView(tuple(range(4)), files, 500.0 * lights(4), 60.0, is_simulated=True)
 
+    def lights_of_view(run: Path, view: str) -> PicturedView:
+        return PicturedView(tuple(range(4)), (), 500.0 * lights(4), 60.0, is_simulated=True)
+
     monkeypatch.setattr("coupole.exchange.rti.rti_pictures.write_pictures", write_pictures)
+    monkeypatch.setattr("coupole.exchange.rti.export_views.lights_of_view", lights_of_view)
     run = make_run(tmp_path / "runs").run.folder
     said = export(run, tmp_path / "out", "--to", "lp", "--views", "top")
     written = [path for path in (tmp_path / "out").rglob("*") if path.is_file()]

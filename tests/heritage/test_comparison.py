@@ -206,3 +206,53 @@ def test_other_objects_and_units_are_refused(head: Head, before: Path, tmp_path:
     for name, said in (("inches.ply", "another unit"), ("box.ply", "no motion brings")):
         with pytest.raises(InputError, match=said):
             compare(before, tmp_path / name, "mm", None, is_aligned=False, say=silent)
+
+
+# -- hollows ----------------------------------------------------------------------------------------------------
+
+DEEP_MM, SEEN_TO_MM = 5.0, 3.0
+
+
+def grooved_plate(
+    path: Path, seed: int, *, half_mm: float = 1.5, seen_to_mm: float = 99.0, lower_mm: float = 0.0
+) -> Path:
+    """A plate of 40 mm, whose points are 0.5 mm apart, with a groove of twice `half_mm`. Of its walls and its
+    ground only what is less deep than `seen_to_mm` was seen. A part of the ground is lower by `lower_mm`."""
+    down = np.arange(0.5, DEEP_MM, 0.5)
+    along = np.arange(-20.0, 20.1, 0.5)
+    left = [*((x, 0.0) for x in np.arange(-20.0, 0.1 - half_mm, 0.5)), *((-half_mm, -z) for z in down)]
+    ground = [(x, -DEEP_MM) for x in np.arange(-half_mm, half_mm + 0.1, 0.5)]
+    profile = np.array([*left, *ground, *((-x, z) for x, z in left[::-1])])
+    points = np.stack(
+        [np.repeat(profile[:, 0], len(along)), np.tile(along, len(profile)), np.repeat(profile[:, 1], len(along))],
+        axis=1,
+    )
+    points[(points[:, 2] == -DEEP_MM) & (np.abs(points[:, 1]) < 4.0), 2] -= lower_mm
+    points += np.random.default_rng(seed).normal(0, NOISE_MM, points.shape)
+    corner = (np.arange(len(profile) - 1)[:, None] * len(along) + np.arange(len(along) - 1)).ravel()
+    other = corner + len(along)
+    faces = np.concatenate([np.stack(f, 1) for f in ((corner, other, other + 1), (corner, other + 1, corner + 1))])
+    mesh = trimesh.Trimesh(points, faces[(points[faces, 2] > -seen_to_mm).all(axis=1)], process=False)
+    mesh.remove_unreferenced_vertices()
+    mesh.export(path)
+    return path
+
+
+def test_the_ground_of_a_groove_that_one_scan_has_not_seen_is_not_compared(tmp_path: Path) -> None:
+    before = grooved_plate(tmp_path / "before.ply", 1)
+    after = grooved_plate(tmp_path / "after.ply", 2, seen_to_mm=SEEN_TO_MM)
+    compared = compare(before, after, "mm", None, is_aligned=True, say=silent)
+    assert compared.shape_regions == ()
+    is_ground = np.abs(compared.before.points_mm[:, 2] + DEEP_MM) < 0.2
+    assert np.isnan(compared.distance_mm[is_ground]).all()
+    assert np.isfinite(compared.distance_mm[np.abs(compared.before.points_mm[:, 0]) > 3.0]).mean() > 0.99
+    assert any("as in hollows that were not seen: not compared" in words for words in remarks(compared))
+
+
+def test_a_change_of_the_ground_of_a_groove_that_both_scans_have_seen_is_found(tmp_path: Path) -> None:
+    before = grooved_plate(tmp_path / "before.ply", 1, half_mm=4.0)
+    after = grooved_plate(tmp_path / "after.ply", 2, half_mm=4.0, lower_mm=0.5)
+    compared = compare(before, after, "mm", None, is_aligned=True, say=silent)
+    region = compared.shape_regions[0]
+    assert abs(region.middle_mm[2] + DEEP_MM) < 0.5
+    assert region.distance_mm == pytest.approx(-0.5, abs=0.2)

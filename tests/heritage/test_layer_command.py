@@ -66,6 +66,14 @@ def test_a_drawdown_card_gives_k_and_s_in_their_intervals_a_paint_file_and_a_pag
     assert paint.absorption == pytest.approx(told["K"], rel=1e-4)
     page = (tmp_path / "out" / "ochre.html").read_text()
     assert (page.count("<polygon"), page.count("<script")) == (2, 0)
+    (tmp_path / "out" / "ochre.html").unlink()
+    (tmp_path / "out" / "ochre.paint.csv").write_text("mine")
+    code, _, err = run(monkeypatch, capsys, "layer", *asked, "--out", str(tmp_path / "out"))
+    assert (code, (tmp_path / "out" / "ochre.paint.csv").read_text()) == (2, "mine")
+    assert "ochre.paint.csv: exists already" in err
+    assert not (tmp_path / "out" / "ochre.html").exists()
+    code, _, _ = run(monkeypatch, capsys, "layer", *asked, "--out", str(tmp_path / "out"), "--overwrite")
+    assert (code, read_paint(tmp_path / "out" / "ochre.paint.csv").name) == (0, "ochre")
 
 
 def test_a_film_is_predicted_at_another_thickness_with_its_interval_in_text_json_and_page(

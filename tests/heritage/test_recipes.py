@@ -243,10 +243,15 @@ def test_the_command_tells_shares_lights_costs_and_draws_them(
     assert set(best["delta_e00"]) == {"D65", "A", "LED-B3"}
     page = (tmp_path / "sleeve.html").read_text()
     assert (page.count("<rect"), page.count("<script")) == (6, 0)
-    assert run()[2].count("dE00") >= 5
-    code, _, err = run("--light", "moonlight")
+    (tmp_path / "sleeve.html").write_text("mine")
+    code, _, err = run()
+    assert (code, (tmp_path / "sleeve.html").read_text()) == (2, "mine")
+    assert "sleeve.html: exists already" in err
+    assert run("--overwrite")[2].count("dE00") >= 5
+    assert (tmp_path / "sleeve.html").read_text() == page
+    code, _, err = run("--overwrite", "--light", "moonlight")
     assert (code, "moonlight" in err) == (2, True)
-    code, _, err = run("--geometry", "d:8")
+    code, _, err = run("--overwrite", "--geometry", "d:8")
     assert (code, "--geometry: expected" in err) == (2, True)
 
 
@@ -277,6 +282,9 @@ def test_the_mixture_is_a_paint_that_looks_as_the_recipe(tmp_path: Path) -> None
     at = np.searchsorted(mixture.wavelengths_nm, NM)
     seen = opaque_in_air(mixture.absorption[at], mixture.scattering[at])
     assert np.abs(seen - target(SHARES)).max() < 4.0 * NOISE
+    standing = cells.here(*arguments, "--paint", tmp_path / "mixed/sleeve.paint.csv")
+    assert standing.code == 2
+    assert "sleeve.paint.csv: exists already" in standing.err
     refused = cells.here(*arguments, "--paint", tmp_path / "sleeve.txt")
     assert refused.code == 2
     assert ".paint.csv" in refused.out + refused.err

@@ -107,8 +107,9 @@ def test_the_report_has_all_in_one_file(restored: Restored) -> None:
     page = (restored.out / "report.html").read_text(encoding="utf-8")
     assert page.count('src="data:image/png;base64,') == 3
     assert "http" not in page
-    for words in (LETTER, "It was dark", "red_shape", "dE00 of mean colours"):
+    for words in (LETTER, "It was dark", "red_shape", "index 1.5, roughness 0.25", "dE00 of mean colours"):
         assert words in page
+    assert "scattering_per_mm" not in page  # the paint is opaque
 
 
 def test_pictures_that_are_there_are_not_rendered_again(restored: Restored, tmp_path: Path) -> None:

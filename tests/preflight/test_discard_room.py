@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
+from rich.console import Console
+
 from coupole.preflight.discard_room import DiscardRoom, ViewRoom
+from coupole.preflight.preflight import Report
 from coupole.storage.run import Occupied
+from coupole.viewing.preflight_table import show_preflight
 
 VIEW = ViewRoom(frame_bytes=1000, kept_bytes=100, sample_bytes=80)
 ROOM = DiscardRoom({"a": VIEW, "b": VIEW, "c": VIEW}, fit_bytes=500, reserve_bytes=7)
@@ -36,3 +42,23 @@ def test_a_view_that_is_begun_has_its_file_already() -> None:
 
 def test_a_view_needs_room_for_itself_and_for_samples_that_are_to_come() -> None:
     assert ROOM.needed_bytes("c", {"a", "b"}) == 1000 + 80 + 2 * 80 + 7
+
+
+def test_what_stays_is_what_is_kept_of_all_views_with_samples_and_fits() -> None:
+    assert ROOM.staying_bytes == 3 * 100 + 3 * 80 + 500
+
+
+def test_each_size_says_what_it_includes() -> None:
+    words = shown(Report(bytes=9_000_000, peak_bytes=5_000_000, staying_bytes=2_000_000))
+    assert re.search(r"all frames, added up +9.0 MB", words), words
+    at_a_time = "5.0 MB: frames of one view, what is kept of all, samples and fits"
+    assert re.search(rf"on disk at a time, at most +{at_a_time}", words), words
+    assert re.search(r"stays on disk, at most +2.0 MB: frames that are not discarded, samples and fits", words)
+    assert re.search(r"on disk +9.0 MB", shown(Report(bytes=9_000_000)))
+
+
+def shown(report: Report) -> str:
+    console = Console(width=200, record=True, quiet=False)
+    with console.capture() as captured:
+        show_preflight(console, report, name="plan", rig="rig")
+    return captured.get()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import cells
@@ -10,6 +11,9 @@ import numpy as np
 import OpenEXR
 import pytest
 from picture_cases import LEFT_OUT, Made, interval_of
+
+from coupole.acquisition.signals import SignalReceived
+from coupole.exchange import picture_files
 
 
 def test_intervals_hold_what_left_out_lights_show(made: Made, tmp_path: Path) -> None:
@@ -68,6 +72,46 @@ def test_half_widths_of_lights_together_are_added(made: Made, tmp_path: Path) ->
         assert ended.code == 0, ended.err
     one, other, both = (np.load(tmp_path / f"{name}h.npy") - np.load(tmp_path / f"{name}.npy") for name in "abc")
     np.testing.assert_allclose(both, one + other, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("written", [0, 1, 2, 3])
+def test_an_interrupted_call_leaves_no_bounds_of_another_light_beside_its_picture(
+    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
+) -> None:
+    names = [tmp_path / f"{name}.npy" for name in ("picture", "u", "low", "high")]
+    to = ("--to", names[0], "--uncertainty", names[1], "--interval", f"{names[2]},{names[3]}")
+
+    def relit(light: str) -> int:
+        (tmp_path / "lights.yaml").write_text(f"lights:\n  - {{kind: direction, towards: [{light}]}}\n")
+        return cells.here("reflectance", "relight", made[1], "--lights", tmp_path / "lights.yaml", *to).code
+
+    assert relit("0, 0, 1") == 0
+    earlier = {name: name.read_bytes() for name in names}
+    left = written
+
+    def interrupted(path: Path, picture: np.ndarray) -> None:
+        nonlocal left
+        if left == 0:
+            raise SignalReceived(signal.SIGINT)
+        left -= 1
+        write_picture(path, picture)
+
+    write_picture = picture_files.write_picture
+    monkeypatch.setattr(picture_files, "write_picture", interrupted)
+    assert relit("1, 0, 2") == 130
+    standing = [name for name in names if name.exists()]
+    assert len(standing) == max(written, 1)
+    assert all((name.read_bytes() == earlier[name]) == (written == 0) for name in standing)
+
+
+def test_one_file_for_two_pictures_is_refused(made: Made, tmp_path: Path) -> None:
+    same = tmp_path / "a.npy"
+    ended = cells.here(
+        "reflectance", "relight", made[1], "--direction", "0,0,1", "--to", same, "--uncertainty", same
+    )
+    assert ended.code == 2
+    assert "expected different files" in ended.err
+    assert not same.exists()
 
 
 def test_nothing_is_known_far_from_all_lights(made: Made, tmp_path: Path) -> None:

@@ -86,6 +86,15 @@ def test_wrong_options_are_told(options: tuple[str, ...], words: str, tmp_path: 
     assert not list(tmp_path.iterdir())
 
 
+def test_what_takes_seconds_is_told_when_it_begins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    ended = cells.here("plan", "suggest", RELIEF, "--calibrations", RECORDS, "--budget", "1s")
+    assert ended.code == 3
+    lines = ended.err.splitlines()
+    assert lines[:2] == ["reading mesh and cell ...", "views that the arm can take ..."]
+    assert "reading" not in cells.here("plan", "suggest", RELIEF, "--json").err
+
+
 def test_a_budget_for_not_one_view_is_refused(tmp_path: Path) -> None:
     ended = suggest(tmp_path, "--calibrations", RECORDS, "--budget", "1s")
     assert ended.code == 3

@@ -7,7 +7,8 @@ import pytest
 
 from coupole.errors import InputError
 from coupole.reflectance.new_light.pictured_surface import Surface
-from coupole.reflectance.texels.texel_grid import TexelSize, pixel_mm, texel_grid
+from coupole.reflectance.texels.texel_grid import pixel_mm, texel_grid
+from coupole.reflectance.texels.texel_size import TexelSize
 from coupole.reflectance.texels.texel_values import _mean
 
 STEP_MM = 0.1

@@ -135,7 +135,14 @@ def test_frames_are_discarded_when_their_samples_are_safe_and_all_commands_under
     refused = cells.here("export", run, "--to", "tiff", "--out", tmp_path / "tiffs")
     assert refused.code == 2
     assert "were discarded when their samples were safe" in refused.err
+    assert "Name frames that are kept with --shots, such as `dark" in refused.err
     assert not (tmp_path / "tiffs").exists()
+    for to in ("colmap", "iiif", "lp", "relight"):
+        late = cells.here("export", run, "--to", to, "--out", tmp_path / "views" / to)
+        assert late.code == 2
+        assert f"--to {to} needs the frames of all LEDs. `coupole export {result}`" in late.err
+        assert not (tmp_path / "views").exists()
+    assert cells.here("export", run, "--to", "dome", "--out", tmp_path / "domes").code == 0
     shots = [word for led in KEPT_LEDS for word in ("--shots", f"led{led:04d}/e0")]
     assert cells.here("export", run, "--to", "tiff", "--out", tmp_path / "tiffs", *shots).code == 0
     assert len(list((tmp_path / "tiffs").iterdir())) == 3 * len(KEPT_LEDS)

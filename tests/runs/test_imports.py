@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import cells
+import pytest
 from cells import CellFolder
 from places import REPO
 
@@ -16,6 +17,9 @@ from coupole.commands import cli
 
 OURS = ("coupole", "drivers", "sim")
 HEAVY = {"PIL", "cv2", "embreex", "h5py", "matplotlib", "numba", "numpy", "rich", "ruamel", "scipy", "trimesh"}
+OF_PLANS = {"rich", "numpy", "ruamel"}
+OF_RECORDS = {"rich", "numpy", "h5py", "ruamel"}
+"""What describes a calibration's record: some tenths of a second."""
 LATE = {"pwd", "encodings.ascii"}
 """Python's own, that tell who acquires and spell a name: nothing that a stop or a safe end waits for."""
 REPORT = {"PIL", "jinja2", "markupsafe", "encodings"}
@@ -49,6 +53,32 @@ def test_help_imports_the_commands_alone(tmp_path: Path) -> None:
     names = modules(tmp_path / "seen", "end")
     assert heavy(names) == {"rich"}
     assert ours(names) <= 82
+
+
+@pytest.mark.parametrize(
+    ("words", "said", "libraries"),
+    [
+        ("reflectance nosuch --out x --texels 0", "--texels: expected auto", {"rich"}),
+        ("reflectance nosuch --out x --memory much", "--memory: expected a size", {"rich"}),
+        ("plan suggest nosuch.ply", "nosuch.ply: no such file", OF_PLANS),
+        ("plan suggest README.md --budget soon", "--budget: expected a time", OF_PLANS),
+        ("calibrate check-artefact nosuch", "give one of --board and --tile", OF_RECORDS),
+        ("calibrate check-artefact nosuch --board b", "nosuch: no such folder", OF_RECORDS),
+        ("calibrate check-artefact . --board b --mpe-um x", "--mpe-um x: expected A+L/K", OF_RECORDS),
+        ("calibrate check-artefact . --tile t --mpe-um 5", "--mpe-um: is for --board", OF_RECORDS),
+        ("calibrate check-artefact . --tile t --tile u", "expected one description, or one for each", OF_RECORDS),
+        ("calibrate check-artefact . --tile nosuch", "--tile: nosuch: no such file", OF_RECORDS),
+        ("calibrate check-artefact . --tile README.md", "a record of the kind `led-power`", OF_RECORDS),
+        ("calibrate check-artefact . --tile t --emission x", "--emission: expected lambertian", OF_RECORDS),
+    ],
+)
+def test_wrong_options_are_refused_before_what_takes_seconds_to_import(
+    tmp_path: Path, words: str, said: str, libraries: set[str]
+) -> None:
+    ended = cells.finish(watched(tmp_path / "seen", *words.split()))
+    assert ended.code == 2, ended.err
+    assert said in ended.err
+    assert heavy(modules(tmp_path / "seen", "end")) <= libraries
 
 
 def test_each_command_is_found_where_the_table_has_it() -> None:

@@ -22,8 +22,8 @@ from coupole.reflectance.run_job import RunRequest
 from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.texels.pixel_file import read_view_texels, size_of_texels, texel_uncertainty
 from coupole.reflectance.texels.texel_forecast import TexelForecast, ViewForecast
-from coupole.reflectance.texels.texel_grid import TexelSize
 from coupole.reflectance.texels.texel_job import add_texels
+from coupole.reflectance.texels.texel_size import TexelSize
 
 SIZE_MM = 0.8
 

@@ -14,6 +14,7 @@ from coupole.calibration.artefact import Artefact, UsedArtefact
 from coupole.calibration.check.acceptance import CHECK
 from coupole.calibration.check.board_lengths import Lengths
 from coupole.calibration.check.drawing import comparison_section, draw_comparisons
+from coupole.calibration.check.permissible import Permissible
 from coupole.calibration.check.tile_reflectance import MeasuredTile
 from coupole.calibration.in_force import InForce, read_in_force
 from coupole.calibration.light.records import limit_of, record_input
@@ -28,18 +29,6 @@ K = 2.0
 """Coverage factor of all expanded uncertainties here."""
 _MANY = 1e6
 """Degrees of freedom of figures whose uncertainty is stated."""
-
-
-@dataclass(frozen=True)
-class Permissible:
-    """Largest permissible error of a length L: A + L / K, as ISO 10360-2 states it."""
-
-    constant_mm: float
-    per_mm: float
-
-    def at(self, length_mm: float) -> float:
-        """The limit of that length, mm."""
-        return self.constant_mm + length_mm * self.per_mm
 
 
 @dataclass(frozen=True)
@@ -108,18 +97,6 @@ def refuse_used_images(items: Sequence[InForce], inputs: Sequence[tuple[str, str
             raise InputError(
                 f"{item.path}: was made from the same images ({common[0]}), which check nothing. Acquire others"
             )
-
-
-def parse_permissible(words: str) -> Permissible:
-    """`A+L/K` or `A`, A in um, K in mm per um. Raises InputError."""
-    constant, _, part = words.replace(" ", "").partition("+L/")
-    try:
-        a, k = float(constant), float(part) if part else np.inf
-    except ValueError:
-        a, k = np.nan, np.nan
-    if not (0 < a < np.inf and k > 0):
-        raise InputError(f"--mpe-um {words}: expected A+L/K with A in um and L in mm, as 50+L/20, or A alone")
-    return Permissible(1e-3 * a, 1e-3 / k)
 
 
 # -- a board ----------------------------------------------------------------------------------------------------

@@ -10,9 +10,11 @@ from threadpoolctl import threadpool_limits
 
 from coupole.errors import InputError
 from coupole.exchange.formats import Source, Writer, format_named, source_of
+from coupole.exchange.kept_frames import refuse_discarded_lights
 from coupole.exchange.rti import iiif, relight_web, rti_files, rti_pictures
-from coupole.exchange.rti.lit_views import LitView, Said, chosen_views, lit_views
+from coupole.exchange.rti.lit_views import LitView, Said, chosen_views, lit_views, refuse_few_lights
 from coupole.exchange.target_folder import refuse_standing, writing_into
+from coupole.reflectance.uncalibrated import lights_of_view
 from coupole.storage.run import Run
 
 
@@ -45,8 +47,9 @@ def export_views(
 ) -> Written:
     """Write the views of a run that match one of the patterns, or a result of pictures, into `out`.
 
-    Raises InputError for a format or options that do not fit the source, no such view, too few lights, files that
-    stand there (unless `overwrite`); StorageError for damaged frames or a disk that cannot be written.
+    Raises InputError, before anything is written, for a format or options that do not fit the source, no such
+    view, discarded frames, too few lights, files that stand there (unless `overwrite`); StorageError for damaged
+    frames or a disk that cannot be written.
     """
     kind = source_of(source)
     of_result = kind is Source.PICTURES
@@ -55,11 +58,13 @@ def export_views(
         raise InputError("--views: are for runs; a result of pictures has one view")
     if to == "iiif":
         iiif.checked_base(how.base_url)
-    if to == "lp":
-        return Written(rti_pictures.export_rti(source, out, views, overwrite=overwrite, say=say))
     names = [source.resolve().name] if of_result else chosen_views(Run(source), views)
     if not overwrite:
         refuse_standing([_first_file(out, to, name) for name in names])
+    if not of_result:
+        _refuse_incomplete(Run(source), names, to)
+    if to == "lp":
+        return Written(rti_pictures.export_rti(source, out, names, say))
     export = Written()
     with writing_into(out), threadpool_limits(1, "blas"):  # its threads only wait for each other here
         if to == "dome":
@@ -74,12 +79,25 @@ def export_views(
     return export
 
 
+def _refuse_incomplete(run: Run, views: Sequence[str], to: str) -> None:
+    """Raise InputError if one of these views cannot be written: frames of it were discarded (a `dome` needs none),
+    or too few LEDs are before its camera."""
+    if to != "dome":
+        refuse_discarded_lights(run, views, to)
+    for view in views:
+        lights_mm = lights_of_view(run.folder, view).lights_mm
+        if to not in ("dome", "lp"):  # these two have the lights behind the picture's plane too
+            refuse_few_lights(view, lights_mm)
+
+
 def _first_file(out: Path, to: str, name: str) -> Path:
     match to:
         case "relight":
             return out / name / "info.json"
         case "iiif":
             return out / iiif.MANIFEST
+        case "lp":
+            return out / name / f"{name}.lp"
         case _:
             return out / f"{name}.{to}"
 

@@ -152,15 +152,22 @@ def view_of_result(result: PictureResult, say: Said) -> LitView:
     )
 
 
-def _lit_view(
-    *, linear: Callable[[int], Picture], directions: Floats, name: str, say: Said, **about: Any
-) -> LitView:
-    """Return the view with the lights that viewers can have, those above the picture's plane, and white 1."""
-    above = np.flatnonzero(directions[:, 2] > 0.0)
+def refuse_few_lights(name: str, lights: Floats) -> NDArray[np.int64]:
+    """Return the numbers of the lights [n, 3] (directions or places) that are before the picture's plane. Raises
+    InputError if they are too few."""
+    above = np.flatnonzero(lights[:, 2] > 0.0)
     if len(above) < FEWEST_LIGHTS:
         raise InputError(
             f"{name}: {len(above)} lights are before the picture's plane; at least {FEWEST_LIGHTS} are needed"
         )
+    return above
+
+
+def _lit_view(
+    *, linear: Callable[[int], Picture], directions: Floats, name: str, say: Said, **about: Any
+) -> LitView:
+    """Return the view with the lights that viewers can have, those above the picture's plane, and white 1."""
+    above = refuse_few_lights(name, directions)
     brightest = linear(int(above[0])).max(axis=2)
     for count, number in enumerate(above):
         brightest = np.maximum(brightest, linear(int(number)).max(axis=2))

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.exchange.rti.lit_views import WHITE_QUANTILE, chosen_views
+from coupole.exchange.rti.lit_views import WHITE_QUANTILE
 from coupole.exchange.srgb import srgb
-from coupole.exchange.target_folder import refuse_standing, writing_into
+from coupole.exchange.target_folder import writing_into
 from coupole.reflectance.uncalibrated import PicturedView, lights_of_view, write_pictures
 from coupole.storage.durable import write_synced
 from coupole.storage.run import Run
@@ -22,21 +22,16 @@ LINEAR = "linear"
 _JPEG_QUALITY = 95
 
 
-def export_rti(
-    folder: Path, out: Path, views: Sequence[str], *, overwrite: bool, say: Callable[[str, int, int], None]
-) -> list[Path]:
-    """Write `VIEW/` for each view of a run that matches one of the patterns: `led0417.jpg` and so on (8 bit, sRGB,
+def export_rti(folder: Path, out: Path, views: Sequence[str], say: Callable[[str, int, int], None]) -> list[Path]:
+    """Write `VIEW/` for each of these views of a run: `led0417.jpg` and so on (8 bit, sRGB,
     one white for all), `VIEW.lp`, `VIEW.dome`, and `linear/`. Nominal places of the LEDs; no calibration is used.
 
-    Raises InputError: no such view, too few LEDs, a folder with other pictures, or with these (unless
-    `overwrite`); StorageError for damaged frames or a disk that cannot be written.
+    Raises InputError: too few LEDs, a folder with other pictures; StorageError for damaged frames
+    or a disk that cannot be written.
     """
     run = Run(folder)
-    names = chosen_views(run, views)
-    if not overwrite:
-        refuse_standing([out / view / f"{view}.lp" for view in names])
     paths: list[Path] = []
-    for view in names:
+    for view in views:
         with writing_into(out / view):
             paths += _export_view(run, view, out / view, say)
     return paths

@@ -7,9 +7,10 @@ colours are fitted with the shape.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from coupole.heritage.comparison.state_files import Floats
@@ -22,7 +23,39 @@ FREEDOM = 3 * _FREEDOM_ALONE
 _BATCH = 50_000
 _MOST_BESIDE = 0.6
 """Middle of the neighbours beside the place, over their extent: more is a rim, where the surface ends."""
+_LEAST_COSINE, _BESIDE_LINE, _NEXT_TO_LINE = 0.5, 2.0, 6
+"""A surface is seen at a place if a point that faces as the place does lies within so many spacings of the line
+along the normal, and the next points to this line do so in the mean."""
 _RIDGE = 1e-9
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points of a state."""
+
+    points_mm: Floats
+    """[m, 3]"""
+    normals: Floats
+    """[m, 3] unit."""
+    is_outward: bool
+    """False if it is not known to which side of the surface the normals point."""
+    spacing_mm: float
+    """Distance of neighbours."""
+
+    def only(self, point_mask: NDArray[np.bool_]) -> SurfacePoints:
+        """Return some of the points, [m] True."""
+        return replace(self, points_mm=self.points_mm[point_mask], normals=self.normals[point_mask])
+
+    def is_seen(self, near: NDArray[np.int64], from_line_mm: Floats, normals: Floats) -> NDArray[np.bool_]:
+        """[n] tell whether the points `near` [n, k] places with normals [n, 3], so far from the lines along these
+        [n, k], are the surface there: in a hollow whose ground was not seen they are those of another wall."""
+        cosines = np.einsum("nka,na->nk", self.normals[near], normals)
+        if not self.is_outward:
+            cosines = np.abs(cosines)
+        facing_mm = np.where(cosines > _LEAST_COSINE, from_line_mm, np.inf).min(axis=1)
+        next_points = np.argsort(from_line_mm, axis=1)[:, :_NEXT_TO_LINE]
+        mean_cosines = np.take_along_axis(cosines, next_points, axis=1).mean(axis=1)
+        return np.asarray((facing_mm < _BESIDE_LINE * self.spacing_mm) & (mean_cosines > _LEAST_COSINE))
 
 
 @dataclass(frozen=True)
@@ -36,6 +69,8 @@ class LocalFits:
     """[n, c, c] covariance of a point's values about the quadric, the mean of that here and next to here."""
     leverage: Floats
     """[n, c] variance of a value, divided by that of one point."""
+    is_seen: NDArray[np.bool_]
+    """[n] whether the state's points near a place are the surface there, and not that of another wall."""
 
     @property
     def covariance(self) -> Floats:
@@ -45,18 +80,20 @@ class LocalFits:
 
 
 def fit_locally(
-    tree: cKDTree, values: Floats | None, places_mm: Floats, normals: Floats, reach_mm: float
+    surface: SurfacePoints, values: Floats | None, places_mm: Floats, normals: Floats, reach_mm: float
 ) -> LocalFits:
-    """Fit the points of a tree, with values [m, c - 1] of their own, near places [n, 3] with normals [n, 3]."""
+    """Fit the points of a state, with values [m, c - 1] of their own, near places [n, 3] with normals [n, 3]."""
+    tree = cKDTree(surface.points_mm)
     count = 1 + (0 if values is None else values.shape[1])
     fits = LocalFits(
         np.full((len(places_mm), count), np.nan),
         np.full((len(places_mm), count, count), np.nan),
         np.full((len(places_mm), count), np.nan),
+        np.zeros(len(places_mm), np.bool_),
     )
     for first in range(0, len(places_mm), _BATCH):
         part = slice(first, first + _BATCH)
-        _fit_batch(tree, values, places_mm[part], normals[part], reach_mm, part, fits)
+        _fit_batch(tree, surface, values, places_mm[part], normals[part], reach_mm, part, fits)
     around = cKDTree(places_mm)
     alone = fits.scatter.copy()
     for first in range(0, len(places_mm), _BATCH):
@@ -70,6 +107,7 @@ def fit_locally(
 
 def _fit_batch(
     tree: cKDTree,
+    surface: SurfacePoints,
     values: Floats | None,
     places: Floats,
     normals: Floats,
@@ -85,6 +123,7 @@ def _fit_batch(
     there = (away[:, 0] < reach_mm) & (extent > 0)
     beside = np.hypot(x.mean(axis=1), y.mean(axis=1)) / np.where(extent > 0, extent, 1.0)
     there &= beside < _MOST_BESIDE
+    local_fits.is_seen[part] = surface.is_seen(near, np.hypot(x, y), normals)
     scale = np.where(extent > 0, extent, 1.0)[:, None]
     x, y = x / scale, y / scale
     design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=2)

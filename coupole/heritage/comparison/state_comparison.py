@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from coupole.errors import InputError
-from coupole.heritage.comparison.local_surface import FREEDOM, LocalFits, fit_locally
+from coupole.heritage.comparison.local_surface import (
+    FREEDOM,
+    LocalFits,
+    SurfacePoints,
+    fit_locally,
+)
 from coupole.heritage.comparison.result_state import read_result_state
 from coupole.heritage.comparison.significance import discoveries, of_lengths, of_vectors
 from coupole.heritage.comparison.state_files import Colours, Floats, State, colour_library, read_state
@@ -61,7 +66,8 @@ class Comparison:
     normals: Floats
     """[n, 3] outward unit normals of the first state."""
     distance_mm: Floats
-    """[n] along the normals, outwards positive; NaN where the other state has no surface."""
+    """[n] along the normals, outwards positive; NaN where the other state has no surface that faces as this one,
+    such as the ground of a hollow that was not seen."""
     u_mm: Floats
     """[n] standard uncertainty."""
     moved_points: NDArray[np.bool_]
@@ -121,15 +127,16 @@ def _compare_states(
 ) -> Comparison:
     spacing_mm = max(before.spacing_mm, after.spacing_mm)
     reach_mm = max(_REACH_SHARE * before.size_mm, _REACH_SPACINGS * spacing_mm)
-    normals = _normals(before)
-    after_mm = moved_points(alignment.before_from_after, after.points_mm)
+    surface = _surface_points(before, np.eye(4))
+    other_surface = _surface_points(after, alignment.before_from_after)
+    normals, after_mm = surface.normals, other_surface.points_mm
     colours = None
     if before.colours is not None and after.colours is not None:
         colours = before.colours, after.colours
     say("fitting surfaces", 0, 2)
-    before_fits = _fits(before.points_mm, colours and colours[0], before.points_mm, normals, reach_mm)
+    before_fits = _fits(surface, colours and colours[0], before.points_mm, normals, reach_mm)
     say("fitting surfaces", 1, 2)
-    after_fits = _fits(after_mm, colours and colours[1], before.points_mm, normals, reach_mm)
+    after_fits = _fits(other_surface, colours and colours[1], before.points_mm, normals, reach_mm)
     say("fitting surfaces", 2, 2)
     differences = after_fits.values - before_fits.values
     covariance = before_fits.covariance + after_fits.covariance
@@ -141,39 +148,50 @@ def _compare_states(
     least_mm = 1e-6 * before.size_mm  # what float32 coordinates tell
     u_mm = np.sqrt(variance + alignment.uncertainty_mm(before.points_mm, normals) ** 2 + least_mm**2)
     p, factor = of_lengths(differences[:, 0], u_mm, 2 * FREEDOM if noise_mm is None else 1e9)
-    is_moved = discoveries(p)
+    is_seen = before_fits.is_seen & after_fits.is_seen
+    is_moved = discoveries(np.where(is_seen, p, np.nan))
     de00, is_recoloured, colour_factor = None, None, 1.0
     if colours is not None:
         colour_covariance = covariance[:, 1:, 1:] + np.eye(3) * _SMALLEST_SPREAD
         for points_mm, of_state in zip((before.points_mm, after_mm), colours, strict=True):
             colour_covariance = colour_covariance + _of_result(points_mm, of_state, before.points_mm)
         p, colour_factor = of_vectors(differences[:, 1:], colour_covariance, 2 * FREEDOM)
-        is_recoloured = discoveries(p)
-        de00 = de00_of(before_fits.values[:, 1:], after_fits.values[:, 1:])
+        is_recoloured = discoveries(np.where(is_seen, p, np.nan))
+        de00 = np.where(is_seen, de00_of(before_fits.values[:, 1:], after_fits.values[:, 1:]), np.nan)
     comparison = Comparison(
-        before, after, alignment, normals, differences[:, 0], u_mm * factor, is_moved, factor, de00, is_recoloured,
-        colour_factor, (), (),
+        before, after, alignment, normals, np.where(is_seen, differences[:, 0], np.nan),
+        np.where(is_seen, u_mm * factor, np.nan), is_moved, factor, de00, is_recoloured, colour_factor, (), (),
     )  # fmt: skip
     shape = _regions(comparison, is_moved)
     colour = () if is_recoloured is None else _regions(comparison, is_recoloured)
     return Comparison(**{**comparison.__dict__, "shape_regions": shape, "colour_regions": colour})
 
 
+def _surface_points(state: State, motion: Floats) -> SurfacePoints:
+    """A state's points and normals, moved by `motion` [4, 4]."""
+    points_mm, normals = moved_points(motion, state.points_mm), _normals(state) @ motion[:3, :3].T
+    return SurfacePoints(points_mm, normals, _has_outward(state), state.spacing_mm)
+
+
+def _has_outward(state: State) -> bool:
+    return state.outward is not None and bool(np.linalg.norm(state.outward, axis=1).min() > 0)
+
+
 def _fits(
-    points_mm: Floats, colours: Colours | None, places_mm: Floats, normals: Floats, reach_mm: float
+    surface: SurfacePoints, colours: Colours | None, places_mm: Floats, normals: Floats, reach_mm: float
 ) -> LocalFits:
     """Local fits of shape by all points of a state, and of colour by those that have one."""
     if colours is None:
-        return fit_locally(cKDTree(points_mm), None, places_mm, normals, reach_mm)
-    there = np.isfinite(colours.lab).all(axis=1)
+        return fit_locally(surface, None, places_mm, normals, reach_mm)
+    there = np.asarray(np.isfinite(colours.lab).all(axis=1))
     if there.all():
-        return fit_locally(cKDTree(points_mm), colours.lab, places_mm, normals, reach_mm)
-    shape = fit_locally(cKDTree(points_mm), None, places_mm, normals, reach_mm)
-    fits = fit_locally(cKDTree(points_mm[there]), colours.lab[there], places_mm, normals, reach_mm)
+        return fit_locally(surface, colours.lab, places_mm, normals, reach_mm)
+    shape = fit_locally(surface, None, places_mm, normals, reach_mm)
+    fits = fit_locally(surface.only(there), colours.lab[there], places_mm, normals, reach_mm)
     for fit_array, of_shape in ((fits.values, shape.values), (fits.leverage, shape.leverage)):
         fit_array[:, 0] = of_shape[:, 0]
     fits.scatter[:, 0, 0] = shape.scatter[:, 0, 0]
-    return fits
+    return replace(fits, is_seen=shape.is_seen)
 
 
 def _of_result(points_mm: Floats, colours: Colours, places_mm: Floats) -> Floats:
@@ -189,7 +207,7 @@ def _of_result(points_mm: Floats, colours: Colours, places_mm: Floats) -> Floats
 def _normals(state: State) -> Floats:
     """[n, 3] normals from the triangles. Without triangles they come from neighbours, and their sign is
     unknown."""
-    if state.outward is not None and np.linalg.norm(state.outward, axis=1).min() > 0:
+    if state.outward is not None and _has_outward(state):
         return state.outward
     cloud = thinned_cloud(state.points_mm, state.spacing_mm, Viewpoint("none"), state.outward)
     return np.asarray(cloud.normals[cloud.tree.query(state.points_mm)[1]])

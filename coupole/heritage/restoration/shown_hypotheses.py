@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import coupole
 from coupole.appearance.render import colour, pictures
 from coupole.appearance.render.denoising import DENOISED, denoised_xyz
+from coupole.appearance.render.materials import used_values
 from coupole.errors import InputError, StorageError, reason
 from coupole.heritage.restoration import hypotheses_compared, labelled_pictures
 from coupole.heritage.restoration.labelled_pictures import (
@@ -24,6 +25,7 @@ from coupole.heritage.restoration.labelled_pictures import (
     metadata_texts,
     with_strip,
 )
+from coupole.heritage.restoration.restoration_file import Hypothesis
 from coupole.heritage.restoration.restoring import Made, Restoration, Say, common_white
 from coupole.intake.plain_data import read_json
 
@@ -146,6 +148,12 @@ def _write_difference(de00: NDArray[np.float64], pair: tuple[Made, Made], path: 
     pictures.write_png(path, picture, words, for_png(metadata_texts([rendering.hypothesis for rendering in pair])))
 
 
+def _facts(hypothesis: Hypothesis, folder: Path) -> dict[str, Any]:
+    """Return a hypothesis with what its materials are computed from: defaults too, where they have an effect."""
+    materials = {part: used_values(material, folder) for part, material in hypothesis.materials.items()}
+    return {**hypothesis.model_dump(mode="json", exclude={"materials"}), "materials": materials}
+
+
 def _result(
     restoration: Restoration,
     made_pictures: Sequence[Made],
@@ -184,7 +192,7 @@ def _result(
         "mesh": {"name": restoration.mesh.path.name, "sha256_of_shape": restoration.mesh.digest()},
         "parts": restoration.parts.counts(),
         "remarks": list(restoration.parts.remarks),
-        "hypotheses": [hypothesis.model_dump(mode="json") for hypothesis in restoration.hypotheses],
+        "hypotheses": [_facts(hypothesis, restoration.folder) for hypothesis in restoration.hypotheses],
         "lights": restoration.lights_name,
         "observer": f"CIE {restoration.restoration_file.observer}",
         "bands": len(range(380, 781, restoration.restoration_file.bands.step_nm)),

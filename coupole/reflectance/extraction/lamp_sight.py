@@ -18,6 +18,7 @@ from coupole.calibration.light.tile_views import Positions
 from coupole.motion.occlusion import RAY_START_MM
 from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.extraction.sample_codes import AWAY, PENUMBRA, REACHED, SHADED
+from coupole.reflectance.parts_in_threads import first_alone
 
 Floats = NDArray[np.float64]
 
@@ -46,7 +47,7 @@ class Facets:
 def lamp_codes(mesh: PacketMesh, facets: Facets, leds: Positions, pool: Executor) -> NDArray[np.uint8]:
     """[leds, triangles] codes, LED by LED in the threads of a pool; `mesh` is what throws shadows."""
     facets.ray_starts_mm  # noqa: B018  made once, before threads want it
-    rows = pool.map(lambda led: _codes_of_led(mesh, facets, leds, led), range(len(leds.ids)))
+    rows = pool.map(first_alone(lambda led: _codes_of_led(mesh, facets, leds, led)), range(len(leds.ids)))
     return np.stack(list(rows))
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from coupole.calibration.multi_view import unproject
 from coupole.calibration.optics import Intrinsics
 from coupole.motion.packet_rays import PacketMesh
+from coupole.reflectance.parts_in_threads import first_alone
 
 Floats = NDArray[np.float64]
 
@@ -72,14 +73,16 @@ def seen_surface(
         triangle, distance = mesh.first_met(eye_mm, ways[rows].reshape(-1, 3))
         hit[rows], far[rows] = triangle.reshape(-1, width), distance.reshape(-1, width)
 
-    optics = _circle(lens, *blur) if blur is not None else (0.0, 1.0, np.inf)
+    infinite_mm, focus_mm, most_mm = _circle(lens, *blur) if blur is not None else (0.0, 1.0, np.inf)
     pixel_in_use = np.zeros((height, width), np.bool_)
+
+    def judge(row: int) -> None:
+        _judge(hit, far, ways, normals, axis, lens.fx, infinite_mm, focus_mm, most_mm, row, pixel_in_use)
+
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(trace, range(0, height, _ROWS)))
+        list(pool.map(first_alone(trace), range(0, height, _ROWS)))
         bands = range(1, height - 1, _ROWS)
-        list(
-            pool.map(lambda row: _judge(hit, far, ways, normals, axis, lens.fx, *optics, row, pixel_in_use), bands)
-        )
+        list(pool.map(first_alone(judge), bands))
     triangle_in_view = np.zeros(len(normals), np.bool_)
     triangle_in_view[hit[pixel_in_use]] = True
     place = np.cumsum(triangle_in_view, dtype=np.int32) - 1

@@ -27,6 +27,7 @@ from coupole.reflectance.extraction.radiance import SignalReader
 from coupole.reflectance.extraction.sample_codes import AWAY
 from coupole.reflectance.extraction.sample_kernel import NO_VALUE, Lamps, Shots, fill_samples
 from coupole.reflectance.lanes import LANES
+from coupole.reflectance.parts_in_threads import first_alone
 
 BLOCK = 4096
 """Triangles."""
@@ -74,12 +75,12 @@ class ViewPass:
         """All samples; `codes_of` gives the codes of some LEDs [leds, triangles], with the threads of a pool."""
         count = len(self.facets.centres_mm)
         blocks = [slice(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
-        batches = self.batches()
+        batches, block = self.batches(), first_alone(self._block)
         with ThreadPoolExecutor(threads) as pool, closing(batches):
             for part in self.parts:
                 codes = codes_of(part, pool)
                 shots, lamps = next(batches)
-                work = (pool.submit(self._block, part, rows, shots, lamps, codes[:, rows]) for rows in blocks)
+                work = (pool.submit(block, part, rows, shots, lamps, codes[:, rows]) for rows in blocks)
                 yield from _in_order(work, _AHEAD * threads)
 
     @property

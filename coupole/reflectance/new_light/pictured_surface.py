@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.geometry import apply
 from coupole.motion.packet_rays import PacketMesh
+from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.run_result import RunResult, ViewSamples
 
 Floats = NDArray[np.float64]
@@ -147,7 +148,8 @@ def in_strips(height: int, work: Callable[[slice], None]) -> None:
     threads = len(os.sched_getaffinity(0))
     step = max(1, math.ceil(height / (8 * threads)))
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(work, [slice(first, min(first + step, height)) for first in range(0, height, step)]))
+        strips = [slice(first, min(first + step, height)) for first in range(0, height, step)]
+        list(pool.map(first_alone(work), strips))
 
 
 def _aim_camera(result: RunResult, camera: FreeCamera) -> tuple[Floats, float]:

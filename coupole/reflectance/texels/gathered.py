@@ -7,9 +7,7 @@ A place is looked up in each view by its direction. Between the four pixels arou
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numba
@@ -17,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.reflectance.new_light.pictured_surface import Surface, pixels_of_places, surface_of_view
+from coupole.reflectance.parts_in_threads import in_threads
 from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples
 from coupole.reflectance.texels.pixel_file import (
     ViewTexels,
@@ -119,8 +118,7 @@ def _add_view(
             information[part],
         )  # fmt: skip
 
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(look, range(0, len(places_mm), _PART)))
+    in_threads(look, len(places_mm), part=_PART)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.intake.plain_data import read_json
 from coupole.reflectance.run_result import RunResult, ViewSamples
-from coupole.reflectance.texels.texel_grid import TexelSize
+from coupole.reflectance.texels.texel_size import TexelSize
 
 FOLDER, ABOUT = "texels", "texels.json"
 Singles = NDArray[np.float32]

@@ -23,6 +23,7 @@ from coupole.reflectance.extraction.seen_surface import SeenSurface
 from coupole.reflectance.extraction.view_samples import ViewPass
 from coupole.reflectance.lanes import LANES
 from coupole.reflectance.new_light.pictured_surface import Surface
+from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.run_result import INTER_REFLECTION, ViewSamples
 
 _TRIANGLES = 512
@@ -136,7 +137,8 @@ def fill_rows(
         )  # fmt: skip
 
     starts = range(rows.start, rows.stop, _TRIANGLES)
-    list(pool.map(fill, [slice(first_row, min(first_row + _TRIANGLES, rows.stop)) for first_row in starts]))
+    parts = [slice(first_row, min(first_row + _TRIANGLES, rows.stop)) for first_row in starts]
+    list(pool.map(first_alone(fill), parts))
 
 
 def light_of(

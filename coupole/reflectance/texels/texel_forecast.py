@@ -36,7 +36,7 @@ from coupole.reflectance.texels.neighbours import settle
 from coupole.reflectance.texels.pixel_file import FOLDER, refuse_other_size
 from coupole.reflectance.texels.pixel_fit import Lights, Prior, fit_pixels
 from coupole.reflectance.texels.pixel_values import fill_rows
-from coupole.reflectance.texels.texel_grid import TexelSize
+from coupole.reflectance.texels.texel_size import TexelSize
 from coupole.reflectance.texels.texel_values import texel_bytes
 
 _TRACED = 200_000

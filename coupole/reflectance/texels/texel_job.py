@@ -40,7 +40,8 @@ from coupole.reflectance.texels.pixel_file import (
 )
 from coupole.reflectance.texels.pixel_values import PixelReader
 from coupole.reflectance.texels.texel_check import check_texels
-from coupole.reflectance.texels.texel_grid import TexelSize, pixel_mm, texel_grid
+from coupole.reflectance.texels.texel_grid import pixel_mm, texel_grid
+from coupole.reflectance.texels.texel_size import TexelSize
 from coupole.reflectance.texels.texel_values import TexelReader
 from coupole.reflectance.texels.view_texels import texels_of_view
 from coupole.storage.disk_errors import disk_error

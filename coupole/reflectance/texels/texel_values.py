@@ -24,6 +24,7 @@ from coupole.reflectance.extraction.seen_surface import SeenSurface
 from coupole.reflectance.extraction.view_samples import ViewPass
 from coupole.reflectance.lanes import LANES
 from coupole.reflectance.new_light.pictured_surface import Surface
+from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.run_result import ViewSamples
 from coupole.reflectance.texels.pixel_values import fill_rows, light_of
 from coupole.reflectance.texels.texel_grid import TexelGrid
@@ -115,7 +116,7 @@ class TexelReader:
                     some = slice(first, min(first + _TEXELS, len(values)))
                     values[some, :, part] = entries.means(some, of_leds, is_reached, channels)
 
-                list(pool.map(mean, range(0, len(values), _TEXELS)))
+                list(pool.map(first_alone(mean), range(0, len(values), _TEXELS)))
         return TexelBlock(band.texels, self.grid.places_mm.reshape(-1, 3)[band.texels], values)
 
 

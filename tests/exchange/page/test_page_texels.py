@@ -22,7 +22,7 @@ from coupole.reflectance.new_light.pictured_surface import surface_of_view
 from coupole.reflectance.run_relighting import scene_from
 from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.texels.pixel_file import TexelFileHead, ViewTexels, texels_path, write_view_texels
-from coupole.reflectance.texels.texel_grid import TexelSize
+from coupole.reflectance.texels.texel_size import TexelSize
 
 pytestmark = needs_chromium
 LIGHT = (-0.4, -0.3, 0.8)

@@ -30,6 +30,7 @@ from coupole.appearance.render.materials.plain import (
     plain_bsdf,
     under_face,
 )
+from coupole.appearance.render.materials.used_values import used_values
 from coupole.appearance.render.materials.weathering import Dusty, Weathered, Worn, blended_bsdf
 from coupole.appearance.render.spectra import matt
 
@@ -57,6 +58,7 @@ __all__ = [
     "metal_of",
     "paint_inside",
     "under_face",
+    "used_values",
 ]
 
 Material = Annotated[Plain | Coating | MeasuredMaterial | Weathered | Glass, Field(discriminator="kind")]

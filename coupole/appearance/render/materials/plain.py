@@ -44,6 +44,8 @@ Facets = Literal["ggx", "beckmann", "cook_torrance"]
 """`beckmann`: its slopes under Smith's shadowing; `cook_torrance`: the same in V-shaped grooves (seed 001)."""
 _LEAST_SHARE = 0.1
 """Least share of the paths for each part of a sum."""
+_LEAST_THROUGH = 1e-5
+"""Share of the light that comes back through a leaf, below which it hides its bole."""
 
 
 class Diffuse(Model):
@@ -262,16 +264,37 @@ def _metal(material: Metal, folder: Path) -> Description:
     return metal(index / indices.URUSHI, material.roughness, (inward * transmittance) ** 2, material.distribution)
 
 
+def seen_of_gilt(material: Gilt, folder: Path) -> tuple[bool, bool, bool]:
+    """Tell whether its leaf is seen, its bole is seen (bare, or through the leaf), and its bole is seen bare."""
+    if not _has_leaf(material):
+        return False, True, True
+    is_bare = material.uncovered > 0.0
+    return True, is_bare or _is_lit_through(_light_through(gilt_of(material, folder)[0])), is_bare
+
+
+def _has_leaf(material: Gilt) -> bool:
+    return material.thickness_nm >= THINNEST_NM and material.uncovered < 1.0
+
+
+def _light_through(gilt: gilding.Gilt) -> Array:
+    """[81] share of the light that goes through the leaf to the bole and back."""
+    return np.asarray(gilt.leaf.transmittance[-1] * layered.emerging(gilt.leaf, gilt.bole))
+
+
+def _is_lit_through(through: Array) -> bool:
+    return bool(through.max() > _LEAST_THROUGH)
+
+
 def _gilt(material: Gilt, folder: Path) -> Description:
-    gilding, index = gilt_of(material, folder)
-    bare = coated_body(gilding.bole, np.full(BANDS, indices.EGG_WHITE), material.bole_roughness)
-    if material.thickness_nm < THINNEST_NM or material.uncovered == 1.0:
+    gilt, index = gilt_of(material, folder)
+    bare = coated_body(gilt.bole, np.full(BANDS, indices.EGG_WHITE), material.bole_roughness)
+    if not _has_leaf(material):
         return bare
     films = [Film(index, material.thickness_nm)]
     leaf = metal(_equivalent(films, indices.constant(indices.EGG_WHITE)), material.roughness)
-    through = gilding.leaf.transmittance[-1] * layered.emerging(gilding.leaf, gilding.bole)
-    if through.max() > 1e-5:
-        leaf = _sum(leaf, gilding.leaf.normal_reflectance, through)
+    through = _light_through(gilt)
+    if _is_lit_through(through):
+        leaf = _sum(leaf, gilt.leaf.normal_reflectance, through)
     if material.uncovered == 0.0:
         return leaf
     return {"type": "blendbsdf", "weight": material.uncovered, "leaf": leaf, "bare": bare}

@@ -119,7 +119,7 @@ def huge_pages() -> HostNeed:
     except OSError:
         words = "unknown"
     chosen = words[words.find("[") + 1 : words.find("]")] if "[" in words else words.strip()
-    remedy = f"Say `echo madvise | sudo tee {_HUGE_PAGES}`."
+    remedy = f"Run `echo madvise | sudo tee {_HUGE_PAGES}`."
     return HostNeed("transparent huge pages", chosen in ("madvise", "always"), chosen, remedy, is_vital=False)
 
 

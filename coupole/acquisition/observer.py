@@ -68,7 +68,7 @@ class Control:
     standing: threading.Event = field(default_factory=threading.Event)
     """Set while the session stands: lights off, the arm at rest."""
     can_stand: bool = False
-    """True if the session can stand and go on; one that cannot is stopped by a hold."""
+    """True if the session can stand and go on. A hold stops a session that cannot."""
     hold_pending: threading.Event = field(default_factory=threading.Event)
     """Set from a hold until the session stands."""
     halting: threading.Event = field(default_factory=threading.Event)

@@ -25,7 +25,7 @@ def refuse_discarded(run: Run, shots: Collection[ShotId], remedy: Remedy) -> Non
         f"{run.folder}: {len(matching_shots)} of the {len(shots)} frames that are needed, such as "
         f"{matching_shots[0]}, were discarded when their samples were safe, as the plan said (`discard: "
         f"after_fit`). Nothing was written. {remedy([shot for shot in shots if shot not in gone_shots])}"
-        f"`coupole export {result}` writes what the samples have become"
+        f"`coupole export {result}` exports the result that was made of the samples"
     )
 
 

@@ -115,8 +115,8 @@ def _ledbox_settings(rig: Rig) -> BaseModel:
 
 
 def longest_light_s(rig: Rig, on_us: int) -> float:
-    """Longest time that the rig's LED box leaves a light of `on_us` on, should the host die: by its driver's
-    settings, or else that time."""
+    """Longest time for which the rig's LED box leaves a light of `on_us` on if the host dies. It follows from the
+    settings of its driver; without such settings it is `on_us`."""
     settings = _ledbox_settings(rig)
     return float(settings.longest_light_s(on_us)) if hasattr(settings, "longest_light_s") else on_us * 1e-6
 

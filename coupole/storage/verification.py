@@ -101,7 +101,7 @@ def _check_discarded(run: Run, result: Verification, proven: Mapping[ShotId, Fra
         if event.view != view or any(
             shot not in proven or proven[shot].xxh3 != xxh3 for shot, xxh3 in event.frames
         ):
-            result.bad.append(f"{view}: the journal has frames discarded that it has not proven")
+            result.bad.append(f"{view}: the journal names discarded frames that it has not proven")
         frames |= {shot for shot, _ in event.frames}
         result.discarded_counts[view] = len(event.frames)
         folder = place_of_result(run, event)

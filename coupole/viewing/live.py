@@ -187,8 +187,8 @@ class RunSource:
             result = place_of_result(self._run, discards[proven_frames[-1].shot.view])
             raise FrameDiscarded(
                 f"{self._run.folder}: all its frames under LEDs were discarded when their samples were safe, as "
-                f"its plan said (`discard: after_fit`). `coupole show {result} --out FILE.html` shows what the "
-                "samples have become"
+                f"its plan said (`discard: after_fit`). `coupole show {result} --out FILE.html` shows the "
+                "result that was made of the samples"
             )
         return kept_frames[-1] if kept_frames else None
 

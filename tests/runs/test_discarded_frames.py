@@ -352,4 +352,4 @@ def test_a_frame_that_was_discarded_cannot_be_claimed_by_another_hash(pending: t
     journal.write_text("".join(lines))
     ended = cells.here("verify", run)
     assert ended.code == 6
-    assert "frames discarded that it has not proven" in ended.err
+    assert "discarded frames that it has not proven" in ended.err

@@ -141,7 +141,8 @@ Power = Annotated[
 def internal(spectrum: Reflectance, folder: Path, index: ArrayLike) -> InternalReflectance:
     """[81], under a face of real index `index`, where a measured spectrum was seen through such a face.
 
-    Constants, shapes and the bole hold inside as they are. Paths are relative to `folder`. Raises InputError.
+    Constants, shapes and the bole are internal reflectances already. Paths are relative to `folder`. Raises
+    InputError.
     """
     if isinstance(spectrum, Constant):
         return InternalReflectance(np.full(BANDS, spectrum.value))

@@ -23,7 +23,7 @@ NOTIFICATIONS = "notifications.yaml"
 
 @dataclass(frozen=True)
 class Disk:
-    """Disk where the runs are; in bytes."""
+    """Disk where the runs are; all sizes in bytes."""
 
     total: int
     free: int

@@ -246,7 +246,7 @@ def _shelves(sizes_px, side_px):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model="numpy")
 def _rasterise(corners_px, triangle_of_texel, is_expelled):  # type: ignore[no-untyped-def]
-    """Write each triangle into the texels whose centres it has; mark those that meet others there."""
+    """Write each triangle into the texels whose centres it contains; mark triangles that meet others there."""
     side = len(triangle_of_texel)
     for triangle in range(len(corners_px)):
         a, b, c = corners_px[triangle, 0], corners_px[triangle, 1], corners_px[triangle, 2]

@@ -23,11 +23,12 @@ Floats = NDArray[np.float64]
 
 SUFFIXES = (".obj", ".ply", ".glb", ".gltf")
 _OFF, _OFF_OF_SIZE = 1e-2, 3e-6
-"""Distance of corners up to which they are the same, as a share of the median edge and of the object's size: files
-have six digits, or single precision."""
+"""Greatest distance of corners that are the same, as a share of the median edge and of the object's size: files
+have
+six digits, or single precision."""
 _NEAR = 0.1
-"""The same for middles, before corners are compared; and how much nearer the like of a triangle has to be than any
-other if it is to count."""
+"""Greatest distance of the middles of triangles that are the same, before corners are compared. It is also the
+greatest ratio of the distance to the matching triangle and the distance to the next one."""
 _LEAST_ALONE, _MOST_ALONE = 16, 4000
 _ROUNDS = 8
 _LEAST_SHARE = 0.5

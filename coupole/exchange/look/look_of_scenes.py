@@ -187,7 +187,7 @@ def _makie(thing: MakieTile, materials: _Materials) -> list[_Part]:
     black = Lacquer(kind="lacquer")
     layers = (*layers_of(metal, materials.folder), *layers_of(black, materials.folder))
     drawing = materials.add(
-        [layers], f"{describe_material(metal)}, by its share, over {describe_material(black)}", is_drawn=True
+        [layers], f"a share of {describe_material(metal)} over {describe_material(black)}", is_drawn=True
     )
     face = objects.placed_piece(Piece(tile.face, black), thing).corners_mm
     body = objects.placed_piece(Piece(tile.body, black), thing).corners_mm

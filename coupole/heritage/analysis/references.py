@@ -57,13 +57,13 @@ class HeldOutRates:
     """Rates of verdicts on the library's own spectra, each identified as if the library lacked it."""
 
     right: Rate
-    """First candidate of the right class; of those with others of their class."""
+    """The first candidate has the right class; of spectra with others of their class in the library."""
     matches: Rate
-    """Verdict `match`, right class; of the same."""
+    """Verdict `match` with the right class; of the same spectra."""
     false_matches: Rate
-    """Verdict `match`, wrong class; of the same."""
+    """Verdict `match` with a wrong class; of the same spectra."""
     unknown: Rate
-    """Verdict `unknown` with the whole class left out; of all."""
+    """Verdict `unknown` after the whole class is left out; of all spectra."""
 
 
 @dataclass

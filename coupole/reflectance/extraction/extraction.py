@@ -220,7 +220,13 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface, digest: A
     _dataset(file, "led_positions_mm", centres_mm, "mm, base frame", digest)
     _dataset(file, "led_normals", normals, "unit, base frame", digest)
     powers = measured_run.powers.of(leds)
-    _dataset(file, "led_u_own", powers.u_own, "relative standard uncertainty of an LED's power, its own", digest)
+    _dataset(
+        file,
+        "led_u_own",
+        powers.u_own,
+        "relative standard uncertainty of an LED's power, not shared with other LEDs",
+        digest,
+    )
     u_shared = np.hypot(powers.u_shared, measured_run.u_signal)
     _dataset(
         file,

@@ -1,8 +1,8 @@
 """Lights that a user names: on the command line, or in a file of several.
 
 Places are in mm and directions without length, in the support frame for results of runs (z up), in that of the
-pictures for results of pictures. A strength is one number or three (r, g, b). Strength 1 is, in a picture whose 1
-is a white diffuser in full light:
+pictures for results of pictures. A strength is one number or three (r, g, b). The value 1 of a picture is a white
+diffuser in full light. Strength 1 then means:
 
 =============  ====================================================================================
 `direction`    a white diffuser that faces the light is 1

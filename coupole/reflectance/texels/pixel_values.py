@@ -61,7 +61,7 @@ class PixelReader:
     ) -> None:
         self._samples = samples
         self.triangle_of_pixel = surface.triangle_of_pixel
-        """[h, w] row of the view's file of what a pixel sees; -1 for none."""
+        """[h, w] row, in the view's file, of the triangle that a pixel sees; -1 for none."""
         self.mesh_normals = surface.normals
         """[triangles, 3]"""
         self._places_mm = surface.places_mm.reshape(-1, 3)

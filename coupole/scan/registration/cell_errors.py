@@ -34,7 +34,7 @@ class Overlap:
 
     @property
     def columns(self) -> NDArray[np.intp]:
-        """[12] places of both scans' steps among those of all."""
+        """[12] columns of both scans' steps among the steps of all scans."""
         return np.concatenate([6 * scan + np.arange(6) for scan in (self.first, self.second)])
 
 

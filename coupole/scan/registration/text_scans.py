@@ -136,7 +136,7 @@ def _pose(source: ScanSource, matrix: Floats) -> Floats:
 
 
 def _table(path: Path, lines: Iterator[bytes] | BinaryIO, first_line: int) -> Floats:
-    """[n, columns] of lines with as many numbers each. Raises InputError with the line."""
+    """[n, columns] of lines with the same count of numbers each. Raises InputError with the line."""
     reader = _Decoded(lines)
     try:
         with warnings.catch_warnings():
@@ -145,8 +145,8 @@ def _table(path: Path, lines: Iterator[bytes] | BinaryIO, first_line: int) -> Fl
     except ValueError as error:
         line = first_line + reader.count - 1
         raise InputError(
-            f"{path}:{line}: expected lines with the same count of numbers, separated by blanks, of which "
-            f"the first three are x, y and z; found `{reader.last.strip()[:60]}`"
+            f"{path}:{line}: expected x, y and z first in each line, and the same count of numbers in all "
+            f"lines, separated by blanks; found `{reader.last.strip()[:60]}`"
         ) from error
     if len(table) and table.shape[1] < 3:
         raise InputError(f"{path}:{first_line}: expected x, y and z in each line, found {table.shape[1]} numbers")

@@ -161,12 +161,12 @@ def _fit_twice(result: PictureResult, lights: NDArray[np.int64], say: Said) -> N
 
 def _fit(result: PictureResult, lights: NDArray[np.int64], path: Path, step: str, say: Said) -> None:
     """Block by block; those that an earlier job made are kept."""
-    part = path.with_suffix(".part")
-    if part.exists() and not h5py.is_hdf5(part):  # killed before its first block was on disk
-        part.unlink()
+    begun = path.with_suffix(".begun")  # no `.part`, which the next job would remove
+    if begun.exists() and not _can_go_on(begun):
+        begun.unlink()
     pixels = int(np.count_nonzero(result.mask))
     directions = result.directions[lights]
-    with h5py.File(part, "a") as file:
+    with h5py.File(begun, "a") as file:
         for name, width in _FIELDS.items():
             file.require_dataset(name, (pixels, width)[: 1 + (width > 1)], np.float32, fillvalue=np.nan)
         file["normal"].attrs["axes"], file.attrs["lights"] = AXES, lights
@@ -181,7 +181,16 @@ def _fit(result: PictureResult, lights: NDArray[np.int64], path: Path, step: str
                 file[name][block] = content
             file.attrs["fitted"] = block.stop
             file.flush()
-    part.replace(path)
+    begun.replace(path)
+
+
+def _can_go_on(begun: Path) -> bool:
+    """Tell whether a fit that was killed can be read: its first block may not be on the disk."""
+    try:
+        with h5py.File(begun, "r") as file:
+            return "fitted" in file.attrs
+    except OSError:
+        return False
 
 
 def read_materials(path: Path) -> PointMaterials:

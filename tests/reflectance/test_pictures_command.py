@@ -16,6 +16,7 @@ from picture_cases import LEFT_OUT, Made, interval_of
 from places import SHARED_DATA
 
 import coupole
+from coupole.reflectance import picture_job
 from coupole.reflectance.light_interpolation import weights
 
 
@@ -102,6 +103,39 @@ def test_a_job_that_was_killed_goes_on_where_it_was(made: Made) -> None:
     assert ended.code == 0, ended.err
     assert (out / "fits" / "materials.h5").stat().st_mtime_ns == before
     assert ended.document["held_out_psnr_db"] == pytest.approx(document["held_out_psnr_db"], abs=0.5)
+
+
+@pytest.mark.parametrize("left", ["blocks", "nothing that can be read"])
+def test_a_fit_that_was_killed_keeps_its_blocks(
+    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: str
+) -> None:
+    case, whole, _ = made
+    fitted_pixels: list[int] = []
+    fit, may_fit = picture_job.fit_materials, 2
+
+    class KilledError(BaseException):
+        pass
+
+    def fit_some(values: Any, *arguments: Any) -> Any:
+        if len(fitted_pixels) == may_fit:
+            raise KilledError
+        fitted_pixels.append(len(values))
+        return fit(values, *arguments)
+
+    monkeypatch.setattr(picture_job, "BLOCK", 1000)
+    monkeypatch.setattr(picture_job, "fit_materials", fit_some)
+    words = ["reflectance", *case.arguments(), "--leave-out", ",".join(map(str, LEFT_OUT)), "--out", tmp_path]
+    with pytest.raises(KilledError):
+        cells.here(*words)
+    if left != "blocks":
+        (begun,) = (tmp_path / "fits").glob("*.begun")
+        begun.write_bytes(begun.read_bytes()[:100])
+    may_fit = 100
+    assert cells.here(*words).code == 0
+    assert fitted_pixels[:2] == [1000, 1000]
+    assert sum(fitted_pixels[2:]) == (64 * 64 - 2000 if left == "blocks" else 64 * 64)
+    with h5py.File(whole / "fits/materials.h5") as one, h5py.File(tmp_path / "fits/materials.h5") as other:
+        assert np.array_equal(one["kd"][:], other["kd"][:], equal_nan=True)
 
 
 def test_other_pictures_are_not_mixed_into_a_result(made: Made) -> None:

@@ -124,13 +124,16 @@ class LedBoxConformance:
         assert box.end_flash().led == 5
 
     def test_a_flash_lasts_as_long_as_was_asked_if_it_is_let(self, box: LedBox, world: LedBoxWorld) -> None:
+        begun_ns = world.clock.now_ns()
         box.flash(5, FLASH_US)
         world.wait_until_dark()
+        dark_ns = world.clock.now_ns()
         assert world.lit_us(0) >= FLASH_US * 0.999
         world.clock.sleep(FLASH_US * 1e-6)
         on_us = box.end_flash().on_us
         assert on_us >= world.lit_us(0) * 0.999
-        assert on_us <= self.most_on_us, "a light that the box has ended does not go on"
+        late_us = (dark_ns - begun_ns) / 1e3 - FLASH_US  # of a busy machine
+        assert on_us <= self.most_on_us + max(0.0, late_us), "a light that the box has ended does not go on"
 
     def test_a_flash_without_light_is_dark_all_through(self, box: LedBox, world: LedBoxWorld) -> None:
         box.flash(NO_LED, self.long_us)

@@ -165,7 +165,10 @@ class TestFrames:
         (still.folder / "IMG_0042.JPG").write_bytes(b"not wanted")
         assert camera.next_frame(3 * STILL_S) is None
 
-    def test_a_file_is_not_taken_while_it_grows(self, still: StillCamera, camera: RawFiles) -> None:
+    def test_a_file_is_not_taken_while_it_grows(self, still: StillCamera) -> None:
+        camera = opened(still, still_s=20 * STILL_S)  # longer than a busy machine pauses between two parts
+        camera.configure(EXPOSURE)
+        camera.arm(16)
         whole = still.picture(42).read_bytes()
         path = still.folder / "IMG_0042.DNG"
         for share in (4, 3, 2):

@@ -220,7 +220,7 @@ def test_a_key_holds_as_the_pointer_does_and_a_hidden_page_lets_go(room: Room) -
     rested = room.at_rest()
     ada.sees("[data-name=hand-said]", "the page was hidden")
     ActionChains(ada.driver).key_up(Keys.SPACE).perform()
-    assert np.allclose(room.joints_deg(), rested["joints_deg"], atol=0.01)
+    assert np.allclose(room.joints_deg(), rested["joints_deg"], atol=0.05)
 
 
 def test_nobody_else_holds_the_arm(room: Room) -> None:

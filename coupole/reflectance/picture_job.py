@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import resource
 import sys
 import time
@@ -179,6 +180,8 @@ def _fit(result: PictureResult, lights: NDArray[np.int64], path: Path, step: str
             contents = (materials.normals, kd, ks, materials.alpha, materials.residual, materials.kd, materials.ks)
             for name, content in zip(_FIELDS, contents, strict=True):
                 file[name][block] = content
+            file.flush()
+            os.fsync(file.id.get_vfd_handle())  # the block is on the disk before it counts as fitted
             file.attrs["fitted"] = block.stop
             file.flush()
     begun.replace(path)

@@ -13,7 +13,7 @@ from coupole.storage.disk_errors import disk_error
 from coupole.storage.view_writer import WRITERS
 
 _BLOCK_BYTES, _RANDOM_BYTES = 8 * 2**20, 2**20
-"""Bytes that are written by a call: random ones, repeated. No file system compresses more than those at once."""
+"""A block consists of random bytes, repeated: no file system compresses more than those at once."""
 _LEAST_BLOCKS, _MOST_BLOCKS, _FRAMES = 8, 16, 20
 
 
@@ -29,9 +29,8 @@ def measure_write_speed(folder: Path, *, frame_bytes: int = 0, room_bytes: int) 
     if total_bytes > room_bytes:
         return 0.0
     path = folder / f".speed-{os.getpid()}"
-    random = mmap.mmap(-1, _RANDOM_BYTES)  # as O_DIRECT wants it: at the begin of a page
-    random.write(os.urandom(_RANDOM_BYTES))
-    block = [random] * (_BLOCK_BYTES // _RANDOM_BYTES)
+    block = mmap.mmap(-1, _BLOCK_BYTES)
+    block.write(os.urandom(_RANDOM_BYTES) * (_BLOCK_BYTES // _RANDOM_BYTES))
     try:
         try:
             fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_DIRECT, 0o600)
@@ -43,7 +42,7 @@ def measure_write_speed(folder: Path, *, frame_bytes: int = 0, room_bytes: int) 
             with ThreadPoolExecutor(WRITERS) as pool:
                 start = time.perf_counter()
                 for written_bytes in pool.map(
-                    lambda offset: os.pwritev(fd, block, offset), range(0, total_bytes, _BLOCK_BYTES)
+                    lambda offset: os.pwrite(fd, block, offset), range(0, total_bytes, _BLOCK_BYTES)
                 ):
                     if written_bytes < _BLOCK_BYTES:
                         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -48,6 +48,21 @@ def test_a_mutant_is_killed_by_a_failing_test_and_survives_passing_ones(project:
     assert "1 of 2 killed (50.0%), 1 equivalent" in table(verdicts, given)
 
 
+def test_a_script_that_a_test_begins_sees_the_mutant(project: Path, tmp_path: Path) -> None:
+    """Also elsewhere than in the project's folder, which alone is on the path of a script."""
+    (project / "scripts").mkdir()
+    (project / "scripts/ask.py").write_text("from small import largest\n\nprint(largest(1, 2))\n")
+    (project / "test_small.py").write_text(
+        "import subprocess, sys\n\n\ndef test_largest() -> None:\n"
+        "    asked = subprocess.run([sys.executable, 'scripts/ask.py'], capture_output=True, text=True)\n"
+        "    assert asked.stdout == '2\\n', asked\n"
+    )
+    (verdict,), troubles = judge_all([REVERSED], project, tmp_path / "results", again=False)
+    assert troubles == []
+    assert verdict.outcome == KILLED
+    assert verdict.noticed_by == "test_small.py::test_largest"
+
+
 def test_verdicts_are_used_again_until_code_or_tests_change(project: Path, tmp_path: Path) -> None:
     results = tmp_path / "results"
     judge_all([REVERSED], project, results, again=False)

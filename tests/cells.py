@@ -37,6 +37,8 @@ from coupole.preflight.simulated_world import world_config
 from sim.world.client import World
 
 BLACK_DN = 64
+FILES_LEFT = 100
+"""Open files more than after the last collection before the next."""
 PATIENCE_S = 120.0
 """How long a test waits for what must come; only a broken program lets it run out."""
 
@@ -216,8 +218,30 @@ def here(*arguments: str | Path, typed: str = "") -> Ended:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-            gc.freeze()  # a session has unfrozen what `conftest` froze: half a million objects for each collection
+            _FREEZER.freeze()
     return Ended(code, out.getvalue(), err.getvalue())
+
+
+class _Freezer:
+    """A session has unfrozen what `conftest` froze: half a million objects for each collection. What it leaves in
+    cycles is frozen too, with its open files; these are collected from time to time, as `select` takes no number
+    above 1023."""
+
+    most_files = FILES_LEFT
+
+    def freeze(self) -> None:
+        if _open_files() > self.most_files:
+            gc.unfreeze()
+            gc.collect()
+            self.most_files = _open_files() + FILES_LEFT
+        gc.freeze()
+
+
+_FREEZER = _Freezer()
+
+
+def _open_files() -> int:
+    return sum(1 for _ in Path("/proc/self/fd").iterdir())
 
 
 def start(*arguments: str | Path, anew: bool = False, **popen: Any) -> subprocess.Popen[str]:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import gc
 import os
-import re
 import signal
-from collections import Counter
 from collections.abc import Callable, Generator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -118,30 +115,6 @@ class _Scopes(LoadScopeScheduling):
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadScopeScheduling | None:
     return _Scopes(config, log) if config.getoption("dist") == "loadscope" else None
-
-
-MOST_FILES, SELECTED = 200, 1000
-"""Open files of a worker from which those that sessions have left are collected, and with which `select` fails."""
-
-
-@pytest.hookimpl(trylast=True)
-def pytest_runtest_teardown() -> None:
-    """Close files of sessions that are over: `cells.here` freezes what each leaves, where no collector looks."""
-    if len(open_files()) > MOST_FILES:
-        gc.unfreeze()
-        gc.collect()
-        gc.freeze()
-        if len(names := open_files()) > SELECTED:
-            pytest.fail(f"{len(names)} files are open: {Counter(names).most_common(5)}")
-
-
-def open_files() -> list[str]:
-    """What this process has open, without numbers."""
-    names = []
-    for path in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):  # closed since
-            names.append(re.sub(r"[0-9]+", "", str(path.readlink())))
-    return names
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

@@ -53,7 +53,9 @@ class Reactor:
         self._order = itertools.count()
         self._selector = selectors.DefaultSelector()
         self._calls: deque[Callable[[], None]] = deque()
+        self._waking = threading.RLock()  # a signal's handler may come within
         self._wake_read, self._wake_write = os.pipe()
+        self._has_ended = False
         os.set_blocking(self._wake_read, False)
         self._selector.register(self._wake_read, selectors.EVENT_READ, self._run_calls)
         self._stopped = threading.Event()
@@ -83,7 +85,7 @@ class Reactor:
     def call_threadsafe(self, callback: Callable[[], None]) -> None:
         """Have the reactor's thread call back soon; for worker threads."""
         self._calls.append(callback)
-        os.write(self._wake_write, b"!")
+        self._wake()
 
     @staticmethod
     def hold_for(readable: Readable, machine_s: float) -> bool:
@@ -96,10 +98,15 @@ class Reactor:
     def stop(self) -> None:
         """End `run()`; safe from any thread and from signal handlers."""
         self._stopped.set()
-        os.write(self._wake_write, b"!")
+        self._wake()
+
+    def _wake(self) -> None:
+        with self._waking:
+            if not self._has_ended:
+                os.write(self._wake_write, b"!")
 
     def run(self) -> None:
-        """Process events until stopped."""
+        """Process events until stopped; then it is over for good."""
         while not self._stopped.is_set():
             next_ns = self._next_ns()
             wait_s = self.clock.machine_s_until(next_ns)
@@ -111,6 +118,11 @@ class Reactor:
             self._run_due_timers()
             self._publish()
         self.clock.close()
+        with self._waking:
+            self._has_ended = True
+            self._selector.unregister(self._wake_read)
+            os.close(self._wake_read)
+            os.close(self._wake_write)
 
     def _next_ns(self) -> int:
         while self._timers and self._timers[0].callback is None:

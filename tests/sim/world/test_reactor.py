@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from pathlib import Path
+
+import pytest
 
 from sim.world.clock import ClockWriter
 from sim.world.reactor import Reactor
@@ -26,3 +29,29 @@ def test_a_line_that_is_closed_by_another_event_of_the_same_moment_is_not_read_a
         os.write(theirs, b"x")
     reactor.run()
     assert read == [b"x"]
+
+
+def open_files() -> set[str]:
+    """Numbers of the files that this process has open; that of the listing is closed again."""
+    return {path.name for path in Path("/proc/self/fd").iterdir() if path.is_symlink()}
+
+
+def test_one_that_has_ended_has_closed_its_pipe_and_is_woken_by_nobody(tmp_path: Path) -> None:
+    """A worker of tests has hundreds of them; a number that is free again belongs to another file."""
+    before = open_files()
+    reactor = Reactor(ClockWriter(tmp_path / "clock", speed=1.0))
+    reactor.at(0, reactor.stop)
+    reactor.run()
+    reactor._selector.close()
+    assert open_files() == before
+    others = [os.pipe() for _ in range(4)]  # they have its numbers now
+    try:
+        reactor.stop()
+        reactor.call_threadsafe(lambda: None)
+        for reader, _ in others:
+            os.set_blocking(reader, False)
+            with pytest.raises(BlockingIOError):
+                os.read(reader, 1)
+    finally:
+        for end in itertools.chain(*others):
+            os.close(end)

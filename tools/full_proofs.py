@@ -115,6 +115,11 @@ PROOFS = (
         "tools/prove_watching.py",
     ),
     Proof("exports", "pixels lit anew from each export are the result's", "tools/prove_exports.py"),
+    Proof(
+        "blender",
+        "exports look in Blender as relight shows them (`--install` makes its environment first)",
+        "tools/prove_in_blender.py",
+    ),
     Proof("brackets", "intervals of merged photographs hold for random cameras", "tools/prove_brackets.py"),
     Proof(
         "finishes",

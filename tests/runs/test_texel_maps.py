@@ -33,6 +33,7 @@ from coupole.reflectance.run_result import RunResult
 MaterialX: Any = lazily("MaterialX")
 Usd: Any = lazily("pxr.Usd")
 UsdGeom: Any = lazily("pxr.UsdGeom")
+UsdShade: Any = lazily("pxr.UsdShade")
 UsdValidation: Any = lazily("pxr.UsdValidation")
 
 
@@ -111,6 +112,9 @@ def test_usd_with_maps_is_valid_to_its_own_validators(detailed: Made, tmp_path: 
         assert {Path(name).name for name in archive.namelist()} == {
             "surface.usdc", "base_color.png", "specular.png", "roughness.png", "occlusion.png", "normal.png",
         }  # fmt: skip
+    material, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()
+    (surface,) = material.ComputeSurfaceSource()[:1]
+    assert surface.GetIdAttr().Get() == "UsdPreviewSurface"
     width_mm = 1e3 * np.ptp(np.asarray(mesh.GetPointsAttr().Get()), axis=0)
     assert 20.0 < width_mm[0] < 120.0
     assert "simulated" in stage.GetRootLayer().comment

@@ -36,7 +36,7 @@ class Run:
     full: bool = False
     """It takes more than some 3 s of CPU."""
     needs: Path | None = None
-    """Data beside the project."""
+    """Data beside the project, or another program's environment."""
 
 
 BENCHED = {
@@ -79,6 +79,7 @@ RUNS = (
     Run("prove_clusters.py --smallest", r"1000 clusters for \d+ triangles: .*ratio \d", full=True),
     Run("prove_corners.py --smallest", r"\| sharp \| 0\.00\d\d ", full=True),
     Run("prove_exports.py --smallest", r"`bird` \| \d", full=True),
+    Run("prove_in_blender.py --smallest", r"\| `gltf` \| \d\.\d\d \|", full=True, needs=REPO / ".tools/blender"),
     Run("prove_finishes.py --smallest", r"peaks up to 60 degrees .*: off by up to \d", full=True),
     Run("prove_watching.py --smallest", r"\d of 8 faults found and named; \d false alarms in 2", full=True),
     Run(f"prove_identification.py {PIGMENTS} --smallest", r"\(its class|its class left out: \d", True, PIGMENTS),
@@ -102,6 +103,7 @@ TESTED_ELSEWHERE = {
     "check_sizes.py": "tests/tools/test_check_sizes.py",
     "check_words.py": "tests/tools/test_check_words.py",
     "draw_sentences.py": "tests/tools/test_draw_sentences.py",
+    "in_blender.py": "tests/tools/test_smallest.py",
     "list_public_names.py": "tests/scripting/test_public_names.py",
     "make_architecture.py": "tests/docs/test_architecture.py",
     "make_dome.py": "tests/tools/test_make_assets.py",
@@ -110,7 +112,7 @@ TESTED_ELSEWHERE = {
     "make_relief.py": "tests/tools/test_make_assets.py",
     "make_site.py": "tests/docs/test_site.py",
 }
-"""Tools that another test runs, and that test; the last of `bench_console.py` is a bench's own process."""
+"""Tools that another test runs, and that test; `bench_console.py` and `in_blender.py` are processes of another."""
 
 MAKE_PICTURES = {
     "make_bust.py",

@@ -33,11 +33,16 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
         maps = write_maps(flat, Path(aside), most_ks)
         stage = pxr.Usd.Stage.CreateNew(str(Path(aside) / "surface.usdc"))
         _describe(pxr, stage, surface)
-        _add_mesh(pxr, stage, flat.mesh)
-        _add_material(pxr, stage, {path.stem: path.name for path in maps}, most_ks)
+        mesh = _add_mesh(pxr, stage, flat.mesh)
+        material = _add_material(pxr, stage, {path.stem: path.name for path in maps}, most_ks)
+        pxr.UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
         stage.GetRootLayer().Save()
         package = Path(aside) / path.name
-        if not pxr.UsdUtils.CreateNewUsdzPackage(stage.GetRootLayer().realPath, str(package)):
+        archives = pxr.Sdf if hasattr(pxr.Sdf, "ZipFileWriter") else pxr.Usd  # Usd until 25.5
+        writer = archives.ZipFileWriter.CreateNew(str(package))
+        for file in (Path(stage.GetRootLayer().realPath), *maps):  # the layer first, as the format wants it
+            writer.AddFile(str(file), file.name)
+        if not writer.Save():
             raise StorageError(f"{path}: USD could not pack its files")
         package.replace(path)
     sync_folder(folder)
@@ -47,7 +52,7 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
 def _library() -> Any:
     """The package `pxr`, with its modules that are used."""
     try:
-        names = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "UsdUtils", "Vt")
+        names = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "Vt")
         return SimpleNamespace(**{name: importlib.import_module(f"pxr.{name}") for name in names})
     except ImportError as error:
         raise InputError("--to usd: needs the package usd-core: `pip install 'coupole[usd]'`") from error
@@ -61,7 +66,7 @@ def _describe(pxr: Any, stage: Any, surface: MeasuredSurface) -> None:
     stage.GetRootLayer().comment = surface.remark
 
 
-def _add_mesh(pxr: Any, stage: Any, flat: FlatMesh) -> None:
+def _add_mesh(pxr: Any, stage: Any, flat: FlatMesh) -> Any:
     mesh = pxr.UsdGeom.Mesh.Define(stage, f"{_ROOT}/surface")
     places = ((flat.places_mm @ Y_UP_FROM_SUPPORT.T) * 1e-3).astype(np.float32)
     mesh.CreateSubdivisionSchemeAttr(pxr.UsdGeom.Tokens.none)
@@ -76,9 +81,10 @@ def _add_mesh(pxr: Any, stage: Any, flat: FlatMesh) -> None:
         "st", pxr.Sdf.ValueTypeNames.TexCoord2fArray, pxr.UsdGeom.Tokens.vertex
     )
     places_in_maps.Set(pxr.Vt.Vec2fArray.FromNumpy(upwards))
+    return mesh
 
 
-def _add_material(pxr: Any, stage: Any, names: dict[str, str], most_ks: float) -> None:
+def _add_material(pxr: Any, stage: Any, names: dict[str, str], most_ks: float) -> Any:
     types = pxr.Sdf.ValueTypeNames
     material = pxr.UsdShade.Material.Define(stage, f"{_ROOT}/{MATERIAL}")
     shader = pxr.UsdShade.Shader.Define(stage, f"{_ROOT}/{MATERIAL}/preview")
@@ -98,7 +104,7 @@ def _add_material(pxr: Any, stage: Any, names: dict[str, str], most_ks: float) -
     for name, (picture, kind, output, space, scale, bias) in inputs.items():
         texture = pxr.UsdShade.Shader.Define(stage, f"{_ROOT}/{MATERIAL}/{picture}")
         texture.CreateIdAttr("UsdUVTexture")
-        texture.CreateInput("file", types.Asset).Set(names[picture])
+        texture.CreateInput("file", types.Asset).Set(f"./{names[picture]}")
         texture.CreateInput("sourceColorSpace", types.Token).Set(space)
         texture.CreateInput("scale", types.Float4).Set(pxr.Gf.Vec4f(scale, scale, scale, 1.0))
         texture.CreateInput("bias", types.Float4).Set(pxr.Gf.Vec4f(bias, bias, bias, 0.0))
@@ -106,3 +112,4 @@ def _add_material(pxr: Any, stage: Any, names: dict[str, str], most_ks: float) -
             texture.CreateInput(axis, types.Token).Set("clamp")
         texture.CreateInput("st", types.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
         shader.CreateInput(name, kind).ConnectToSource(texture.ConnectableAPI(), output)
+    return material

@@ -1,0 +1,279 @@
+"""Opens exports of a result in Blender, and compares its pictures with those of `relight --from`.
+
+    python tools/prove_in_blender.py [RESULT] [--to gltf usd obj] [--install [WHEEL]] [--blender PYTHON]
+        [--pictures FOLDER]
+
+Without a result one is made: the relief with paint and bumps that its mesh does not have (`detailed_result` of the
+tests), in the simulated cell. Blender's importers open the files, Cycles renders them on the CPU (`in_blender.py`,
+in a process of its own) under five distant lights, with light that comes straight from the lamp only. White is as
+bright as the brightest hundredth, as in `tests/runs/test_texel_maps.py`; compared is what both show lit. What
+the importers of OBJ and USD leave out is then linked by hand, and compared once more. Blender does not read
+MaterialX's documents.
+
+Blender's Principled BSDF is another model than the fit. It is written anew in `export_models.py`, held to a sphere
+of Blender's own, and put on the pixels of our picture: so a table tells what the model makes (`ours - model`) and
+what is left for file and importer (`model - Blender`). Last, the green of the normal map is turned round, which
+must be seen.
+
+`--install` makes an environment with the package bpy 5.0.1 under `.tools/blender` (1 GB; it needs Python 3.11), of
+a wheel if one is named. `--blender` names another Python that has the package. Exits with 1 if glTF differs by
+more than 1.5 (CIEDE2000, mean of the lights), Blender's sphere from the model by more than 0.1, or if a turned
+normal map is not seen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import OpenEXR
+from rich.console import Console
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests/runs")]
+
+from relief_cells import detailed_result  # noqa: E402
+
+from coupole.errors import InputError  # noqa: E402
+from coupole.exchange.of_results.export_result import export_result  # noqa: E402
+from coupole.exchange.of_results.measured_surface import under_a_layer  # noqa: E402
+from coupole.exchange.srgb import srgb  # noqa: E402
+from coupole.reflectance.fits import TEXELS  # noqa: E402
+from coupole.reflectance.new_light.light_kinds import DistantLight  # noqa: E402
+from coupole.reflectance.new_light.pictured_surface import FreeCamera  # noqa: E402
+from coupole.reflectance.run_relighting import RelitScene, Texels, scene_from  # noqa: E402
+from coupole.reflectance.run_result import RunResult  # noqa: E402
+from export_models import Lit, Materials, lab_differences, principled  # noqa: E402
+from smallest import add_smallest  # noqa: E402
+
+HOME = ROOT / ".tools/blender"
+PACKAGE = "bpy==5.0.1"
+MOST = 1.5
+"""Largest mean CIEDE2000 of glTF over the lights."""
+MOST_OF_SPHERE = 0.1
+"""The same of Blender's sphere and Blender's model as it is written here."""
+LEAST_TURNED = 1.5
+"""A turned normal map differs by so many times as much, or the comparison sees nothing."""
+LIGHTS = ((-1.0, 0.0, 0.5), (1.0, 0.3, 0.7), (0.0, 1.0, 0.6), (0.2, -1.0, 1.0), (0.0, 0.1, 1.0))
+CAMERA = FreeCamera(np.array([60.0, -120.0, 280.0]), np.array([30.0, 0.0, 5.0]), (240, 180), 20.0)
+MENDED = ("usd", "obj")
+"""Formats of which Blender's importers leave out something that can be linked by hand."""
+FILES = {"gltf": "surface.glb", "usd": "surface.usdz", "obj": "surface.obj"}
+Array = np.ndarray
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("result", type=Path, nargs="?")
+    parser.add_argument("--to", nargs="+", choices=list(FILES), default=list(FILES))
+    parser.add_argument("--blender", type=Path, default=HOME / "bin/python", help="a Python that has bpy")
+    parser.add_argument("--install", nargs="?", const=PACKAGE, metavar="WHEEL", help="make .tools/blender first")
+    parser.add_argument("--samples", type=int, default=16, help="of a pixel")
+    parser.add_argument("--pictures", type=Path, help="folder for pictures, ours beside Blender's")
+    parser.add_argument("--lights", type=int, default=len(LIGHTS), help="of the five, from the first")
+    add_smallest(parser, to=["gltf"], samples=4, lights=1)
+    arguments = parser.parse_args()
+    if arguments.install:
+        _install(arguments.install)
+    if not arguments.blender.exists():
+        print(f"{arguments.blender}: is not there; give --install once, or --blender", file=sys.stderr)
+        return 2
+    with tempfile.TemporaryDirectory(prefix="coupole-blender-") as name:
+        result = arguments.result or detailed_result(Path(name))[1]
+        return _prove(arguments, result, Path(name))
+
+
+def _install(package: str) -> None:
+    python = shutil.which("python3.11")
+    if python is None:
+        raise SystemExit("--install: needs python3.11 on the PATH, the only one that the package bpy 5.0.1 is for")
+    subprocess.run([python, "-m", "venv", "--clear", str(HOME)], check=True)
+    subprocess.run([str(HOME / "bin/python"), "-m", "pip", "install", "--progress-bar", "on", package], check=True)
+
+
+def _prove(arguments: argparse.Namespace, result: Path, folder: Path) -> int:
+    console, lights = Console(stderr=True), LIGHTS[: arguments.lights]
+    with console.status("our pictures"):
+        scene = scene_from(RunResult(result), replace(CAMERA, size_px=(2 * 240, 2 * 180)), TEXELS)
+        ours = [_halved(scene.picture([DistantLight(towards=towards)])) for towards in lights]
+        expected = [_halved(_by_blenders_model(scene, towards)) for towards in lights]
+    jobs = [_job(folder / "sphere", lights, arguments.samples, **SPHERE)]
+    for to in arguments.to:
+        with console.status(f"--to {to}"):
+            export_result(result, to, folder / to)
+        file = str(folder / to / FILES[to])
+        jobs.append(_job(folder / f"{to}-pictures", lights, arguments.samples, file=file))
+        if to in MENDED:
+            file_words = {"file": file, "specular_times": _specular_times(Path(file))}
+            jobs.append(_job(folder / f"{to}, mended by hand", lights, arguments.samples, **file_words))
+    turned = {"file": str(folder / arguments.to[0] / FILES[arguments.to[0]]), "turns_green": True}
+    jobs.append(_job(folder / "turned", lights, arguments.samples, **turned))
+    _run_blender(arguments.blender, jobs, folder, console)
+    sphere = _sphere_difference(folder / "sphere", lights)
+    print(f"sphere: Blender - model {sphere:.3f}")
+    print("| `--to` | dE00, mean, by light | mean | `ours - model` | `model - Blender` | dark in Blender alone |")
+    print("|---|---|---|---|---|---|")
+    means = {}
+    for name in [Path(job["out"]).name for job in jobs[1:]]:
+        theirs = [_picture(folder / name / f"{number}.exr")[..., :3] for number in range(len(lights))]
+        found, lost = zip(*map(_difference, theirs, ours), strict=True)
+        by_model = np.mean([_difference(model, own)[0] for model, own in zip(expected, ours, strict=True)])
+        left = np.mean([_difference(other, model)[0] for other, model in zip(theirs, expected, strict=True)])
+        means[name] = float(np.mean(found))
+        words = ", ".join(f"{value:.2f}" for value in found)
+        title = name.removesuffix("-pictures")
+        print(f"| `{title}` | {words} | {means[name]:.2f} | {by_model:.2f} | {left:.2f} | {np.mean(lost):.1%} |")
+        if arguments.pictures:
+            _keep(arguments.pictures / f"{title}.png", ours, theirs, expected)
+            shutil.copy(folder / name / "imported.json", arguments.pictures / f"{title}.json")
+    first = means[f"{arguments.to[0]}-pictures"]
+    is_seen = means["turned"] > LEAST_TURNED * first
+    return int(means.get("gltf-pictures", 0.0) > MOST or sphere > MOST_OF_SPHERE or not is_seen)
+
+
+# -- Blender --------------------------------------------------------------------------------------------------
+
+SPHERE: dict[str, Any] = {"base_color": [0.5, 0.35, 0.2], "roughness": 0.55, "specular_tint": [1.25, 1.25, 1.25]}
+_DISTANCE_M, _FIELD_DEG = 100.0, 1.2
+"""Of the camera from the sphere of 1 m radius: the rays are nearly parallel."""
+
+
+def _job(out: Path, lights: Sequence[Sequence[float]], samples: int, **words: Any) -> dict[str, Any]:
+    """A picture of the result, or of the sphere if no file is named."""
+    job = {"out": str(out), "towards": lights, "samples": samples, **words}
+    if "file" not in words:
+        place = {"at_m": [0.0, 0.0, _DISTANCE_M], "look_at_m": [0.0, 0.0, 0.0], "field_of_view_deg": _FIELD_DEG}
+        return job | place | {"size_px": [120, 120]}
+    assert CAMERA.look_at_mm is not None
+    return job | {
+        "at_m": (CAMERA.at_mm / 1e3).tolist(),
+        "look_at_m": (CAMERA.look_at_mm / 1e3).tolist(),
+        "field_of_view_deg": CAMERA.field_of_view_deg,
+        "size_px": CAMERA.size_px,
+    }
+
+
+def _specular_times(path: Path) -> float:
+    """Factor from the codes of `specular.png` to tints of an index of 1.5."""
+    if path.suffix == ".usdz":
+        from pxr import Usd
+
+        picture = Usd.Stage.Open(str(path)).GetPrimAtPath("/measured/measured_surface/specular")
+        return float(picture.GetAttribute("inputs:scale").Get()[0]) / 0.04
+    lines = path.with_suffix(".mtl").read_text().splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith("Ks ")) / 0.04
+
+
+def _run_blender(python: Path, jobs: list[dict[str, Any]], folder: Path, console: Console) -> None:
+    """Render, and hand on what Blender says, its importers' warnings too."""
+    (folder / "job.json").write_text(json.dumps(jobs))
+    words = [str(python), "-u", str(ROOT / "tools/in_blender.py"), str(folder / "job.json")]
+    count, total = 0, sum(len(job["towards"]) for job in jobs)
+    with (
+        console.status(f"Blender: 0 of {total} pictures") as status,
+        subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as blender,
+    ):
+        assert blender.stdout is not None
+        for line in blender.stdout:
+            if " | Saved: " not in line:
+                print(line, end="", file=sys.stderr)
+                continue
+            count += 1
+            status.update(f"Blender: {count} of {total} pictures")
+    if blender.returncode:
+        raise SystemExit(f"{python}: Blender ended with {blender.returncode}")
+
+
+def _picture(path: Path) -> Array:
+    """[h, w, 4]"""
+    return np.asarray(OpenEXR.File(str(path)).channels()["RGBA"].pixels, np.float64)
+
+
+# -- comparison -----------------------------------------------------------------------------------------------
+
+
+def _halved(picture: Array) -> Array:
+    height, width, channels = picture.shape
+    return np.asarray(picture.reshape(height // 2, 2, width // 2, 2, channels).mean(axis=(1, 3)))
+
+
+def _difference(theirs: Array, ours: Array) -> tuple[float, float]:
+    """Mean CIEDE2000 where both are lit, and the share of what is lit in ours that is dark in theirs."""
+    is_lit, is_lit_there = (ours > 0.0).any(axis=2), (theirs > 0.0).any(axis=2)
+    white, both = np.percentile(ours[is_lit], 99), is_lit & is_lit_there
+    differences = lab_differences(theirs[both] / white, ours[both] / white)
+    return float(np.mean(differences)), float((is_lit & ~is_lit_there).sum() / is_lit.sum())
+
+
+def _by_blenders_model(scene: RelitScene, towards: Sequence[float]) -> Array:
+    """[h, w, 3] our picture, with Blender's model on the materials of its lit pixels."""
+    picture = scene.picture([DistantLight(towards=towards)])
+    if not isinstance(scene.reflecting, Texels):
+        raise InputError("the result has no texels")
+    is_lit = (picture > 0.0).any(axis=2)
+    materials, rows = scene.reflecting.materials, scene.reflecting.of_pixel[is_lit]
+    ways = scene.surface.camera_mm - scene.surface.places_mm[is_lit]
+    light = scene.result.base_from_support[:3, :3] @ np.array(towards)
+    base = under_a_layer(materials.kd[rows], materials.ks[rows])
+    of = Materials(materials.normals[rows], base, np.minimum(materials.ks[rows], 1.0), materials.alpha[rows])
+    made = np.zeros_like(picture)
+    made[is_lit] = principled(of, _lit(light, ways))
+    return made
+
+
+def _lit(light: Array, ways: Array) -> Lit:
+    nothing = np.zeros(len(ways), np.int64)
+    ways = ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    lights = np.tile(light / np.linalg.norm(light), (len(ways), 1))
+    return Lit(nothing, lights, ways, nothing, nothing, nothing)
+
+
+def _sphere_difference(folder: Path, lights: Sequence[Sequence[float]]) -> float:
+    """Mean CIEDE2000 of Blender's sphere and the model, where camera and light are within 75 degrees."""
+    differences = []
+    for number, towards in enumerate(lights):
+        theirs = _picture(folder / f"{number}.exr")[..., :3]
+        side = len(theirs)
+        step = (2.0 * np.arange(side) + 1.0 - side) / side * np.tan(np.radians(_FIELD_DEG / 2.0))
+        x, y = np.meshgrid(step, -step)
+        ways = np.stack([x, y, -np.ones_like(x)], axis=-1)
+        ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+        near = -_DISTANCE_M * ways[..., 2]
+        root = near**2 - (_DISTANCE_M**2 - 1.0)
+        places = [0.0, 0.0, _DISTANCE_M] + (near - np.sqrt(np.maximum(root, 0.0)))[..., None] * ways
+        light = np.array(towards) / np.linalg.norm(towards)
+        least = np.cos(np.radians(75.0))
+        is_compared = (root > 0.0) & (places @ light > least) & (-(places * ways).sum(axis=2) > least)
+        normals = places[is_compared]
+        base, f0 = (
+            np.tile(values, (len(normals), 1))
+            for values in (SPHERE["base_color"], 0.04 * np.array(SPHERE["specular_tint"]))
+        )
+        of = Materials(normals, base, f0, np.full(len(normals), float(SPHERE["roughness"]) ** 2))
+        differences.append(lab_differences(theirs[is_compared], principled(of, _lit(light, -ways[is_compared]))))
+    return float(np.mean(np.concatenate(differences)))
+
+
+def _keep(path: Path, ours: list[Array], theirs: list[Array], expected: list[Array]) -> None:
+    """A row for each light: ours, Blender's, its model on our pixels; and ten times Blender's less its model's."""
+    rows = []
+    for own, other, model in zip(ours, theirs, expected, strict=True):
+        white = np.percentile(own[(own > 0.0).any(axis=2)], 99)
+        panels = [own / white, other / white, model / white, 0.2 + 5.0 * (other - model) / white]
+        rows.append(np.concatenate([srgb(np.clip(panel, 0.0, 1.0)) for panel in panels], axis=1))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.rint(255.0 * np.concatenate(rows)[..., ::-1]).astype(np.uint8))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

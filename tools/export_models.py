@@ -75,7 +75,7 @@ def openpbr(of: Materials, lit: Lit, f0: Array) -> Array:
     return radiance
 
 
-def principled(of: Materials, lit: Lit) -> Array:
+def principled_bsdf(of: Materials, lit: Lit) -> Array:
     """Blender 5.0's Principled BSDF, by the kernels in its package: `specular` is F0, which Blender makes of an
     index of 1.5 and a tint. Fresnel's curve of that index leads from F0 to 1, light that is scattered more than
     once is added (Kulla and Conty 2017), and the base colour `diffuse` gets what the lobe's albedo leaves."""
@@ -85,7 +85,7 @@ def principled(of: Materials, lit: Lit) -> Array:
     def towards_one(fresnel: Array) -> Array:
         return (fresnel - _F0_OF_PRINCIPLED) / (1.0 - _F0_OF_PRINCIPLED)
 
-    def mixed(share: Array | float) -> Array:
+    def between_f0_and_one(share: Array | float) -> Array:
         column = np.reshape(share, (-1, 1))
         return np.asarray(of.specular + (1.0 - of.specular) * column)
 
@@ -95,12 +95,14 @@ def principled(of: Materials, lit: Lit) -> Array:
     white = _albedo(at, np.stack([table] * _F0S))[:, None]
     mean = np.interp(of.alpha, np.linspace(0.02, 1.0, _ALPHAS), of_all)[:, None]
     once = _albedo(at, np.stack([_albedos(_F0_OF_PRINCIPLED)] * _F0S)) / white[:, 0]
-    of_one_bounce = mixed(towards_one(np.array(0.5 / (4.08567 + 1.00071 * 1.5))))
+    of_one_bounce = between_f0_and_one(towards_one(np.array(0.5 / (4.08567 + 1.00071 * 1.5))))
     of_more = of_one_bounce * mean / (1.0 - of_one_bounce * (1.0 - mean))
     more = 1.0 + of_more * (1.0 - white) / white
-    lobe = (_d(nh, of.alpha) * _v(nl, nv, of.alpha))[:, None] * mixed(towards_one(_fresnel(vh, _F0_OF_PRINCIPLED)))
-    kept = (mixed(towards_one(once)) * more * white).max(axis=1, keepdims=True)
-    radiance: Array = np.pi * nl[:, None] * (lobe * more + (1.0 - kept) * of.diffuse / np.pi)
+    lobe = (_d(nh, of.alpha) * _v(nl, nv, of.alpha))[:, None] * between_f0_and_one(
+        towards_one(_fresnel(vh, _F0_OF_PRINCIPLED))
+    )
+    largest_albedo = (between_f0_and_one(towards_one(once)) * more * white).max(axis=1, keepdims=True)
+    radiance: Array = np.pi * nl[:, None] * (lobe * more + (1.0 - largest_albedo) * of.diffuse / np.pi)
     return radiance
 
 

@@ -33,13 +33,13 @@ def main() -> int:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         if "file" in picture:
             _open(Path(picture["file"]))
-            if picture.get("turns_green"):
-                _turn_green()
             if "specular_times" in picture:
                 _mend(Path(picture["file"]).parent, picture["specular_times"])
+            if picture.get("turns_green"):
+                _turn_green()
         else:
             _add_sphere(picture)
-        (out / "imported.json").write_text(json.dumps(_imported(), indent=1))
+        (out / "imported.json").write_text(json.dumps(_describe_imports(), indent=1))
         scene = bpy.context.scene
         _set_up(scene, picture)
         for number, towards in enumerate(picture["towards"]):
@@ -63,7 +63,7 @@ def _open(path: Path) -> None:
 
 def _turn_green() -> None:
     """Turn the green of all normal maps round, as if it pointed down in the map."""
-    for material in (one for one in bpy.data.materials if one.node_tree is not None):
+    for material in _materials():
         tree = material.node_tree
         for node in [node for node in tree.nodes if node.type == "NORMAL_MAP"]:
             turn = tree.nodes.new("ShaderNodeVectorMath")
@@ -76,7 +76,7 @@ def _turn_green() -> None:
 def _mend(folder: Path, specular_times: float) -> None:
     """Do by hand what Blender's importers of OBJ and USD leave out: `specular_times` makes tints of the specular
     picture, which is no level; roughness is no colour; and OBJ's normal map is linked."""
-    for material in (one for one in bpy.data.materials if one.node_tree is not None):
+    for material in _materials():
         tree = material.node_tree
         surface = next(node for node in tree.nodes if node.type == "BSDF_PRINCIPLED")
         pictures = {node.image.name: node for node in tree.nodes if node.type == "TEX_IMAGE"}
@@ -123,35 +123,40 @@ def _add_sphere(picture: dict[str, Any]) -> None:
     bpy.context.scene.collection.objects.link(bpy.data.objects.new("sphere", mesh))
 
 
-def _imported() -> dict[str, Any]:
-    """What there is of the file: size and place of the meshes, links and values of their materials."""
+def _materials() -> list[Any]:
+    """Materials that have nodes."""
+    return [material for material in bpy.data.materials if material.node_tree is not None]
+
+
+def _describe_imports() -> dict[str, Any]:
+    """Return place and size of the meshes, and links and values of their materials."""
     meshes = []
-    for one in (one for one in bpy.data.objects if one.type == "MESH"):
-        corners = [one.matrix_world @ Vector(corner) for corner in one.bound_box]
+    for solid in (solid for solid in bpy.data.objects if solid.type == "MESH"):
+        corners = [solid.matrix_world @ Vector(corner) for corner in solid.bound_box]
         meshes.append(
             {
-                "name": one.name,
+                "name": solid.name,
                 "low_m": [min(corner[k] for corner in corners) for k in range(3)],
                 "high_m": [max(corner[k] for corner in corners) for k in range(3)],
-                "triangles": len(one.data.polygons),
-                "has_normals": one.data.has_custom_normals,
+                "triangles": len(solid.data.polygons),
+                "has_normals": solid.data.has_custom_normals,
             }
         )
-    materials = {one.name: _inputs(one) for one in bpy.data.materials if one.node_tree is not None}
+    materials = {material.name: _inputs(material) for material in _materials()}
     return {"blender": bpy.app.version_string, "meshes": meshes, "materials": materials}
 
 
 def _inputs(material: Any) -> dict[str, str]:
     """Inputs of the material's surface: a value, or the pictures that are behind it."""
-    told = {}
+    value_of_input = {}
     for node in (node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED"):
         for socket in node.inputs:
             if socket.is_linked:
-                told[socket.name] = " ".join(_behind(socket.links[0].from_node))
+                value_of_input[socket.name] = " ".join(_behind(socket.links[0].from_node))
             elif hasattr(socket, "default_value"):
                 value = socket.default_value
-                told[socket.name] = f"{value:.4g}" if isinstance(value, float) else str(list(value))
-    return told
+                value_of_input[socket.name] = f"{value:.4g}" if isinstance(value, float) else str(list(value))
+    return value_of_input
 
 
 def _behind(node: Any) -> list[str]:

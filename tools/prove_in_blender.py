@@ -24,6 +24,7 @@ normal map is not seen.
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import shutil
 import subprocess
@@ -53,7 +54,7 @@ from coupole.reflectance.new_light.light_kinds import DistantLight  # noqa: E402
 from coupole.reflectance.new_light.pictured_surface import FreeCamera  # noqa: E402
 from coupole.reflectance.run_relighting import RelitScene, Texels, scene_from  # noqa: E402
 from coupole.reflectance.run_result import RunResult  # noqa: E402
-from export_models import Lit, Materials, lab_differences, principled  # noqa: E402
+from export_models import Lit, Materials, lab_differences, principled_bsdf  # noqa: E402
 from smallest import add_smallest  # noqa: E402
 
 HOME = ROOT / ".tools/blender"
@@ -70,6 +71,7 @@ MENDED = ("usd", "obj")
 """Formats of which Blender's importers leave out something that can be linked by hand."""
 FILES = {"gltf": "surface.glb", "usd": "surface.usdz", "obj": "surface.obj"}
 Array = np.ndarray
+Vector = tuple[float, float, float]
 
 
 def main() -> int:
@@ -105,47 +107,47 @@ def _prove(arguments: argparse.Namespace, result: Path, folder: Path) -> int:
     console, lights = Console(stderr=True), LIGHTS[: arguments.lights]
     with console.status("our pictures"):
         scene = scene_from(RunResult(result), replace(CAMERA, size_px=(2 * 240, 2 * 180)), TEXELS)
-        ours = [_halved(scene.picture([DistantLight(towards=towards)])) for towards in lights]
-        expected = [_halved(_by_blenders_model(scene, towards)) for towards in lights]
+        our_rgb = [_halve(scene.picture([DistantLight(towards=towards)])) for towards in lights]
+        model_rgb = [_halve(_by_blenders_model(scene, towards)) for towards in lights]
     jobs = [_job(folder / "sphere", lights, arguments.samples, **SPHERE)]
+    complete_words: dict[str, dict[str, Any]] = {}
     for to in arguments.to:
         with console.status(f"--to {to}"):
             export_result(result, to, folder / to)
-        file = str(folder / to / FILES[to])
-        jobs.append(_job(folder / f"{to}-pictures", lights, arguments.samples, file=file))
+        words: dict[str, Any] = {"file": str(folder / to / FILES[to])}
+        jobs.append(_job(folder / f"{to} as imported", lights, arguments.samples, **words))
         if to in MENDED:
-            file_words = {"file": file, "specular_times": _specular_times(Path(file))}
-            jobs.append(_job(folder / f"{to}, mended by hand", lights, arguments.samples, **file_words))
-    turned = {"file": str(folder / arguments.to[0] / FILES[arguments.to[0]]), "turns_green": True}
-    jobs.append(_job(folder / "turned", lights, arguments.samples, **turned))
+            words = words | {"specular_times": _specular_times(folder / to / FILES[to])}
+            jobs.append(_job(folder / f"{to} completed", lights, arguments.samples, **words))
+        complete_words.setdefault(Path(jobs[-1]["out"]).name, words)
+    turned_name, words = next(iter(complete_words.items()))
+    jobs.append(_job(folder / "turned", lights, arguments.samples, **words, turns_green=True))
     _run_blender(arguments.blender, jobs, folder, console)
     sphere = _sphere_difference(folder / "sphere", lights)
     print(f"sphere: Blender - model {sphere:.3f}")
-    print("| `--to` | dE00, mean, by light | mean | `ours - model` | `model - Blender` | dark in Blender alone |")
+    print("| file | dE00, mean, by light | mean | `ours - model` | `model - Blender` | dark in Blender alone |")
     print("|---|---|---|---|---|---|")
     means = {}
     for name in [Path(job["out"]).name for job in jobs[1:]]:
-        theirs = [_picture(folder / name / f"{number}.exr")[..., :3] for number in range(len(lights))]
-        found, lost = zip(*map(_difference, theirs, ours), strict=True)
-        by_model = np.mean([_difference(model, own)[0] for model, own in zip(expected, ours, strict=True)])
-        left = np.mean([_difference(other, model)[0] for other, model in zip(theirs, expected, strict=True)])
-        means[name] = float(np.mean(found))
-        words = ", ".join(f"{value:.2f}" for value in found)
-        title = name.removesuffix("-pictures")
-        print(f"| `{title}` | {words} | {means[name]:.2f} | {by_model:.2f} | {left:.2f} | {np.mean(lost):.1%} |")
+        blender_rgb = [_picture(folder / name / f"{number}.exr")[..., :3] for number in range(len(lights))]
+        by_light, dark_shares = zip(*map(_difference, blender_rgb, our_rgb), strict=True)
+        by_model, by_file = _mean_difference(model_rgb, our_rgb), _mean_difference(blender_rgb, model_rgb)
+        means[name] = float(np.mean(by_light))
+        values = ", ".join(f"{value:.2f}" for value in by_light)
+        figures = f"{means[name]:.2f} | {by_model:.2f} | {by_file:.2f} | {np.mean(dark_shares):.1%}"
+        print(f"| {name} | {values} | {figures} |")
         if arguments.pictures:
-            _keep(arguments.pictures / f"{title}.png", ours, theirs, expected)
-            shutil.copy(folder / name / "imported.json", arguments.pictures / f"{title}.json")
-    first = means[f"{arguments.to[0]}-pictures"]
-    is_seen = means["turned"] > LEAST_TURNED * first
-    return int(means.get("gltf-pictures", 0.0) > MOST or sphere > MOST_OF_SPHERE or not is_seen)
+            _keep(arguments.pictures / f"{name}.png", our_rgb, blender_rgb, model_rgb)
+            shutil.copy(folder / name / "imported.json", arguments.pictures / f"{name}.json")
+    is_seen = means["turned"] > LEAST_TURNED * means[turned_name]
+    return int(means.get("gltf as imported", 0.0) > MOST or sphere > MOST_OF_SPHERE or not is_seen)
 
 
 # -- Blender --------------------------------------------------------------------------------------------------
 
 SPHERE: dict[str, Any] = {"base_color": [0.5, 0.35, 0.2], "roughness": 0.55, "specular_tint": [1.25, 1.25, 1.25]}
 _DISTANCE_M, _FIELD_DEG = 100.0, 1.2
-"""Of the camera from the sphere of 1 m radius: the rays are nearly parallel."""
+"""Distance of the camera from the sphere of 1 m radius: the rays are nearly parallel."""
 
 
 def _job(out: Path, lights: Sequence[Sequence[float]], samples: int, **words: Any) -> dict[str, Any]:
@@ -166,9 +168,8 @@ def _job(out: Path, lights: Sequence[Sequence[float]], samples: int, **words: An
 def _specular_times(path: Path) -> float:
     """Factor from the codes of `specular.png` to tints of an index of 1.5."""
     if path.suffix == ".usdz":
-        from pxr import Usd
-
-        picture = Usd.Stage.Open(str(path)).GetPrimAtPath("/measured/measured_surface/specular")
+        stage = importlib.import_module("pxr.Usd").Stage.Open(str(path))
+        picture = stage.GetPrimAtPath("/measured/measured_surface/specular")
         return float(picture.GetAttribute("inputs:scale").Get()[0]) / 0.04
     lines = path.with_suffix(".mtl").read_text().splitlines()
     return next(float(line.split()[1]) for line in lines if line.startswith("Ks ")) / 0.04
@@ -202,20 +203,24 @@ def _picture(path: Path) -> Array:
 # -- comparison -----------------------------------------------------------------------------------------------
 
 
-def _halved(picture: Array) -> Array:
+def _halve(picture: Array) -> Array:
     height, width, channels = picture.shape
     return np.asarray(picture.reshape(height // 2, 2, width // 2, 2, channels).mean(axis=(1, 3)))
 
 
-def _difference(theirs: Array, ours: Array) -> tuple[float, float]:
+def _difference(blender_rgb: Array, our_rgb: Array) -> tuple[float, float]:
     """Mean CIEDE2000 where both are lit, and the share of what is lit in ours that is dark in theirs."""
-    is_lit, is_lit_there = (ours > 0.0).any(axis=2), (theirs > 0.0).any(axis=2)
-    white, both = np.percentile(ours[is_lit], 99), is_lit & is_lit_there
-    differences = lab_differences(theirs[both] / white, ours[both] / white)
+    is_lit, is_lit_there = (our_rgb > 0.0).any(axis=2), (blender_rgb > 0.0).any(axis=2)
+    white, lit_in_both = np.percentile(our_rgb[is_lit], 99), is_lit & is_lit_there
+    differences = lab_differences(blender_rgb[lit_in_both] / white, our_rgb[lit_in_both] / white)
     return float(np.mean(differences)), float((is_lit & ~is_lit_there).sum() / is_lit.sum())
 
 
-def _by_blenders_model(scene: RelitScene, towards: Sequence[float]) -> Array:
+def _mean_difference(pictures: list[Array], references: list[Array]) -> float:
+    return float(np.mean([_difference(*pair)[0] for pair in zip(pictures, references, strict=True)]))
+
+
+def _by_blenders_model(scene: RelitScene, towards: Vector) -> Array:
     """[h, w, 3] our picture, with Blender's model on the materials of its lit pixels."""
     picture = scene.picture([DistantLight(towards=towards)])
     if not isinstance(scene.reflecting, Texels):
@@ -226,9 +231,9 @@ def _by_blenders_model(scene: RelitScene, towards: Sequence[float]) -> Array:
     light = scene.result.base_from_support[:3, :3] @ np.array(towards)
     base = under_a_layer(materials.kd[rows], materials.ks[rows])
     of = Materials(materials.normals[rows], base, np.minimum(materials.ks[rows], 1.0), materials.alpha[rows])
-    made = np.zeros_like(picture)
-    made[is_lit] = principled(of, _lit(light, ways))
-    return made
+    radiance = np.zeros_like(picture)
+    radiance[is_lit] = principled_bsdf(of, _lit(light, ways))
+    return radiance
 
 
 def _lit(light: Array, ways: Array) -> Lit:
@@ -242,8 +247,8 @@ def _sphere_difference(folder: Path, lights: Sequence[Sequence[float]]) -> float
     """Mean CIEDE2000 of Blender's sphere and the model, where camera and light are within 75 degrees."""
     differences = []
     for number, towards in enumerate(lights):
-        theirs = _picture(folder / f"{number}.exr")[..., :3]
-        side = len(theirs)
+        blender_rgb = _picture(folder / f"{number}.exr")[..., :3]
+        side = len(blender_rgb)
         step = (2.0 * np.arange(side) + 1.0 - side) / side * np.tan(np.radians(_FIELD_DEG / 2.0))
         x, y = np.meshgrid(step, -step)
         ways = np.stack([x, y, -np.ones_like(x)], axis=-1)
@@ -260,16 +265,23 @@ def _sphere_difference(folder: Path, lights: Sequence[Sequence[float]]) -> float
             for values in (SPHERE["base_color"], 0.04 * np.array(SPHERE["specular_tint"]))
         )
         of = Materials(normals, base, f0, np.full(len(normals), float(SPHERE["roughness"]) ** 2))
-        differences.append(lab_differences(theirs[is_compared], principled(of, _lit(light, -ways[is_compared]))))
+        differences.append(
+            lab_differences(blender_rgb[is_compared], principled_bsdf(of, _lit(light, -ways[is_compared])))
+        )
     return float(np.mean(np.concatenate(differences)))
 
 
-def _keep(path: Path, ours: list[Array], theirs: list[Array], expected: list[Array]) -> None:
+def _keep(path: Path, our_rgb: list[Array], blender_rgb: list[Array], model_rgb: list[Array]) -> None:
     """A row for each light: ours, Blender's, its model on our pixels; and ten times Blender's less its model's."""
     rows = []
-    for own, other, model in zip(ours, theirs, expected, strict=True):
-        white = np.percentile(own[(own > 0.0).any(axis=2)], 99)
-        panels = [own / white, other / white, model / white, 0.2 + 5.0 * (other - model) / white]
+    for our_picture, blender_picture, model in zip(our_rgb, blender_rgb, model_rgb, strict=True):
+        white = np.percentile(our_picture[(our_picture > 0.0).any(axis=2)], 99)
+        panels = [
+            our_picture / white,
+            blender_picture / white,
+            model / white,
+            0.2 + 5.0 * (blender_picture - model) / white,
+        ]
         rows.append(np.concatenate([srgb(np.clip(panel, 0.0, 1.0)) for panel in panels], axis=1))
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), np.rint(255.0 * np.concatenate(rows)[..., ::-1]).astype(np.uint8))

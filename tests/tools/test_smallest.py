@@ -79,7 +79,12 @@ RUNS = (
     Run("prove_clusters.py --smallest", r"1000 clusters for \d+ triangles: .*ratio \d", full=True),
     Run("prove_corners.py --smallest", r"\| sharp \| 0\.00\d\d ", full=True),
     Run("prove_exports.py --smallest", r"`bird` \| \d", full=True),
-    Run("prove_in_blender.py --smallest", r"\| `gltf` \| \d\.\d\d \|", full=True, needs=REPO / ".tools/blender"),
+    Run(
+        "prove_in_blender.py --smallest",
+        r"\| gltf as imported \| \d\.\d\d \|",
+        full=True,
+        needs=REPO / ".tools/blender",
+    ),
     Run("prove_finishes.py --smallest", r"peaks up to 60 degrees .*: off by up to \d", full=True),
     Run("prove_watching.py --smallest", r"\d of 8 faults found and named; \d false alarms in 2", full=True),
     Run(f"prove_identification.py {PIGMENTS} --smallest", r"\(its class|its class left out: \d", True, PIGMENTS),

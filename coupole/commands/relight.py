@@ -15,6 +15,7 @@ from coupole.commands.completion import fits
 from coupole.commands.option_groups import flatten_options
 from coupole.commands.relight_for_the_eye import PEAK_QUANTILE, EyeColours, bright, write_relit_for_the_eye
 from coupole.errors import CoupoleError, InputError, StorageError, reason
+from coupole.reflectance.fits import MATERIALS, RELIT, TEXELS
 from coupole.scripting.relit_result import Relit, open_result
 
 if TYPE_CHECKING:
@@ -88,9 +89,8 @@ FitOption = Annotated[
     typer.Option(
         "--fit",
         autocompletion=fits,
-        help="Fit of a result of runs: ggx, ggx_normal, sh, rbf, ggx_rbf, clusters, harmonics or texels; by"
-        " default the fit with the smallest error in the check (with --uncertainty: of ggx,"
-        " ggx_normal and texels).",
+        help=f"Fit of a result of runs: {', '.join(RELIT[:-1])} or {RELIT[-1]}; by default the fit with the "
+        f"smallest error in the check (with --uncertainty: of {', '.join(MATERIALS)} and {TEXELS}).",
     ),
 ]
 UncertaintyOption = Annotated[

@@ -2,7 +2,8 @@
 
 A format of frames is a module of this folder with `encode(picture)`, which gives the file's bytes. A format of
 results is a module of `of_results` with `write(surface, folder)`, which gives the files that it has written.
-Formats of views are in `rti`.
+A format of views is a module of `rti` with `write(view, path, say)`, which writes one file for each view and gives
+the rms error of its pictures; those with other files are in `rti/export_views.py`.
 """
 
 from __future__ import annotations

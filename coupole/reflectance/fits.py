@@ -1,6 +1,7 @@
 """The fits of a result of runs: an object for each, and one registry that all who name fits read.
 
-A new fit is an object in `MATERIALS` or `SLICES`, and the kernel that it calls.
+A new fit is an object in `MATERIALS` or `SLICES`, and the kernel that it calls. Kernels are imported where they
+are called: the command line reads the registry for its help, without numpy.
 """
 
 from __future__ import annotations
@@ -8,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-from coupole.reflectance.material_uncertainty import MaterialUncertainty, covariances
-from coupole.reflectance.slice_basis import COUNT, HARMONICS, RADIAL, RESIDUAL, Basis
-from coupole.reflectance.slice_fit import slice_values
-from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, fit_triangles, model_values
+    from coupole.reflectance.material_uncertainty import MaterialUncertainty
+    from coupole.reflectance.slice_basis import Basis
+    from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,10 @@ class Fit:
 
 @dataclass(frozen=True)
 class MaterialFit(Fit):
-    """A material for each triangle, fitted to the samples of all views; holds from everywhere."""
+    """A material for each triangle, fitted to the samples of all views; holds from everywhere.
+
+    Pictures under new light, exports and pages take its `kd`, `ks` and `alpha` as GGX's: a material without a lobe
+    has a `ks` of 0."""
 
     fits_normals: bool
 
@@ -40,6 +44,8 @@ class MaterialFit(Fit):
         self, samples: TriangleSamples, sample_mask: NDArray[np.bool_], noise_um: float, threads: int | None
     ) -> TriangleMaterials:
         """Fit materials to the samples `sample_mask` [samples]; `noise_um` is that of the mesh's vertices."""
+        from coupole.reflectance.triangle_fit import fit_triangles
+
         return fit_triangles(samples, sample_mask, noise_um if self.fits_normals else None, threads=threads)
 
     def uncertainty(
@@ -53,6 +59,8 @@ class MaterialFit(Fit):
     ) -> MaterialUncertainty:
         """Compute covariances of the materials fitted to the samples `sample_mask` [samples]; `middle_mm` is the
         middle of the object. A fit of another form than GGX's needs covariances of its own here."""
+        from coupole.reflectance.material_uncertainty import covariances
+
         return covariances(
             samples,
             sample_mask,
@@ -65,6 +73,8 @@ class MaterialFit(Fit):
 
     def values(self, samples: TriangleSamples, materials: TriangleMaterials) -> NDArray[np.float32]:
         """[b, samples, channels] f cos_i, 1/sr, that materials give."""
+        from coupole.reflectance.triangle_fit import model_values
+
         return model_values(samples, materials)
 
 
@@ -72,19 +82,31 @@ class MaterialFit(Fit):
 class ViewFit(Fit):
     """Coefficients for each triangle, fitted to the samples of one view; holds for that view."""
 
-    basis: Basis
+    basis_name: str
+    """Name of its functions in `slice_basis.BASES`."""
     over: MaterialFit | None = None
     """Material fit that this fit is added to; this one was fitted to what that leaves."""
 
     @property
+    def basis(self) -> Basis:
+        """Functions of the fit."""
+        from coupole.reflectance.slice_basis import BASES
+
+        return BASES[self.basis_name]
+
+    @property
     def coefficients(self) -> int:
         """Number of coefficients of each channel; the last one is the share of `over`, if there is one."""
+        from coupole.reflectance.slice_basis import COUNT
+
         return COUNT + (self.over is not None)
 
     def values(
         self, samples: TriangleSamples, coefficients: NDArray[np.float32], under: NDArray[np.float32] | None
     ) -> NDArray[np.float32]:
         """[b, samples, channels] f cos_i, 1/sr, with the values of `over` if there is one."""
+        from coupole.reflectance.slice_fit import slice_values
+
         return slice_values(samples, coefficients, self.basis, under)
 
 
@@ -100,10 +122,10 @@ GGX_NORMAL = MaterialFit("ggx_normal", "GGX, normals fitted", "#cc79a7", fits_no
 MATERIALS = _fits_by_name(GGX, GGX_NORMAL)
 """Material fits by name, in the order in which they are made."""
 SLICES = _fits_by_name(
-    ViewFit("sh", "spherical harmonics", "#0072b2", HARMONICS),
-    ViewFit("rbf", "radial functions", "#d55e00", RADIAL),
+    ViewFit("sh", "spherical harmonics", "#0072b2", "harmonics"),
+    ViewFit("rbf", "radial functions", "#d55e00", "radial"),
     ViewFit(
-        "ggx_rbf", "GGX, normals fitted, with radial functions of the residual", "#009e73", RESIDUAL, GGX_NORMAL
+        "ggx_rbf", "GGX, normals fitted, with radial functions of the residual", "#009e73", "residual", GGX_NORMAL
     ),
 )
 FITS: dict[str, MaterialFit | ViewFit] = {**MATERIALS, **SLICES}

@@ -73,6 +73,8 @@ HARMONICS = Basis(True, 1e-6 + TIKHONOV * _roll_off())
 RADIAL = Basis(False, _ridge(_RADIAL))
 """-r of the distance r to each centre, then 1, x, y, z."""
 RESIDUAL = Basis(False, _ridge(_RESIDUAL))
+BASES = {"harmonics": HARMONICS, "radial": RADIAL, "residual": RESIDUAL}
+"""Bases by the names that fits have for them."""
 
 
 def fewer(basis: Basis, count: int) -> Basis:

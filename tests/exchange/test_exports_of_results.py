@@ -17,6 +17,8 @@ import OpenEXR
 import pytest
 import trimesh
 from checkers import gltf_messages, needs_checkers
+from export_readers import readers_with
+from export_readers.lit_models import lit_pixels, relative_errors, true_light
 from lazily import lazily
 from relight_cases import BASE_FROM_SUPPORT, Coat, moved, unit, waves, write_result
 
@@ -25,8 +27,10 @@ from coupole.exchange.of_results import adaptive_table
 from coupole.exchange.of_results.adaptive_table import encode_adaptive
 from coupole.exchange.of_results.bsdf import encode as encode_bsdf
 from coupole.exchange.of_results.material_tables import Material
+from coupole.exchange.of_results.measured_surface import read_surface
 from coupole.exchange.of_results.merl import SCALES
 from coupole.exchange.of_results.merl import encode as encode_merl
+from coupole.reflectance.fits import MATERIALS
 from coupole.reflectance.run_result import RunResult
 
 MaterialX: Any = lazily("MaterialX")
@@ -86,6 +90,19 @@ def test_ply_has_the_mesh_and_each_triangles_material(result: RunResult, tmp_pat
     np.testing.assert_allclose(np.ravel(faces["ks_b"])[seen], 0.04, rtol=1e-6)
     assert np.isfinite(np.ravel(faces["alpha"])).sum() == len(seen)
     assert b"comment simulated with Coupole" in path.read_bytes()[:200]
+
+
+@pytest.mark.parametrize("to", readers_with("relit"))
+def test_light_on_an_export_is_that_on_the_result(result: RunResult, tmp_path: Path, to: str) -> None:
+    reader = readers_with("relit")[to]
+    exported(result, "ply", tmp_path / "ply")
+    if to != "ply":
+        exported(result, to, tmp_path / to)
+    surface = read_surface(result.folder)
+    lit = lit_pixels(surface, 200, np.random.default_rng(1))
+    errors = relative_errors(reader.relit(tmp_path / to, lit), true_light(surface, lit))
+    assert len(errors) > 3 * 200
+    assert np.quantile(errors, 0.95) < reader.MOST_LOST
 
 
 @needs_checkers
@@ -304,7 +321,7 @@ def test_a_merl_table_is_read_as_its_reader_does() -> None:
     ("options", "why"),
     [
         (("--to", "dng"), f"expected one of {', '.join(formats_of(Source.RESULT))} for a result; found dng"),
-        (("--to", "ply", "--fit", "sh"), "expected ggx or ggx_normal"),
+        (("--to", "ply", "--fit", "sh"), f"expected {' or '.join(MATERIALS)}"),
         (
             ("--to", "ply", "--views", "top"),
             "--views: is for --to dng, tiff, lp, dome, relight",

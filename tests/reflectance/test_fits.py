@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 from pathlib import Path
 from unittest import mock
 
@@ -9,6 +12,7 @@ import cells
 import h5py
 import numpy as np
 import pytest
+from places import REPO
 from relight_cases import waves
 from residual_cases import write_backscatter
 
@@ -30,11 +34,11 @@ from coupole.reflectance.result_pages import ablation_page
 from coupole.reflectance.run_fits import predict_samples
 from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.run_result_files import begin_slices
-from coupole.reflectance.slice_basis import HARMONICS, fewer
+from coupole.reflectance.slice_basis import BASES, HARMONICS, fewer
 from coupole.reflectance.slice_fit import fit_slices, slice_values
 from coupole.reflectance.triangle_fit import model_values
 
-LOW = ViewFit("low", "harmonics of few degrees", "#000000", fewer(HARMONICS, 16))
+LOW = ViewFit("low", "harmonics of few degrees", "#000000", "low")
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +62,12 @@ def test_a_new_fit_is_made_and_foretells_by_its_place_in_the_registry_alone(resu
     (view,) = result.views
     samples, rows = result.view_samples(view, slice(None)), slice(None)
     used = np.ones(len(view.leds), np.bool_)
-    (found,) = fit_slices(samples, used, (LOW.basis, None))
-    with mock.patch.dict(SLICES, {LOW.name: LOW}), mock.patch.dict(FITS, {LOW.name: LOW}):
+    with (
+        mock.patch.dict(BASES, low=fewer(HARMONICS, 16)),
+        mock.patch.dict(SLICES, {LOW.name: LOW}),
+        mock.patch.dict(FITS, {LOW.name: LOW}),
+    ):
+        (found,) = fit_slices(samples, used, (LOW.basis, None))
         assert LOW in [fit for group in fitted_together() for fit in group]
         path = result.slices_path(LOW.name, view)
         path.parent.mkdir()
@@ -68,7 +76,7 @@ def test_a_new_fit_is_made_and_foretells_by_its_place_in_the_registry_alone(resu
         made = predict_samples(result, LOW.name, view, rows, samples)
         mae = {key: [[1.0, dict.fromkeys(FITS, 0.01)]] for key in ("LEDs", "coefficients")}
         page = render(ablation_page._page("x", {"triangles": 1, "mae": mae}))
-    np.testing.assert_array_equal(made, slice_values(samples, found, LOW.basis))
+        np.testing.assert_array_equal(made, slice_values(samples, found, LOW.basis))
     assert LOW.title in page
 
 
@@ -112,6 +120,23 @@ def test_help_and_shell_know_all_fits(tmp_path: Path) -> None:
     assert [name for name, _ in completion.fits("")] == list(RELIT)
     assert completion.fits("ggx_r") == [("ggx_rbf", FITS["ggx_rbf"].title)]
     assert [name for name, _ in completion.materials("")] == [*MATERIALS, TEXELS]
-    told = cells.here("export", "--help").out
-    assert [name for name in MATERIALS if name not in told] == []
+    for command in ("export", "show"):
+        told = cells.here(command, "--help").out
+        assert [name for name in (*MATERIALS, TEXELS) if name not in told] == []
     assert GGX.name in MATERIALS
+
+
+def test_the_table_of_fits_has_a_row_for_each_and_no_other() -> None:
+    page = (REPO / "docs/reference/result-folder.md").read_text(encoding="utf-8")
+    table = page.partition("### Fits of runs\n")[2].partition("\n#")[0]
+    assert re.findall(r"^\| `(\w+)` ", table, re.MULTILINE) == list(FITS)
+
+
+def test_the_command_line_knows_the_fits_without_their_kernels() -> None:
+    """Help of one command is no reason to wait for numba."""
+    imports = "coupole.commands.relight, coupole.commands.export_options, coupole.commands.show"
+    lists = "print({'numpy', 'numba', 'h5py'} & set(sys.modules))"
+    ended = subprocess.run(
+        [sys.executable, "-c", f"import sys, {imports}; {lists}"], capture_output=True, text=True, check=False
+    )
+    assert ended.stdout == "set()\n", ended.stderr

@@ -18,6 +18,7 @@ from dask_cluster import cluster
 from relief_cells import DIFFUSE, F0, RECORDS, ROUGHNESS, SIDE, Made, glossy_result, shipped_cell, unit, walter
 
 from coupole.calibration.light.frames import open_light_frames
+from coupole.reflectance.fits import FITS, MATERIALS
 from coupole.reflectance.light_files import read_lights
 from coupole.reflectance.normal_fit import fit_materials
 from coupole.reflectance.picture_set import read_pictures
@@ -63,7 +64,7 @@ def test_the_material_is_found_and_makes_the_pictures_under_leds_kept_for_the_ch
     np.testing.assert_allclose(np.nanmedian(ks, axis=0), F0, rtol=0.25)
     assert len(document["left_out"]) == 4
     assert document["simulated"]
-    assert set(document["mae"]) == {"ggx", "ggx_normal", "sh", "rbf", "ggx_rbf"}
+    assert set(document["mae"]) == set(FITS)
     for name in ("ggx", "ggx_normal", "ggx_rbf"):
         assert document["mae"][name] < 0.008  # of range; the noise of some four pixels is 0.005
         assert document["held_out_psnr_db"][name] > 35
@@ -348,9 +349,7 @@ def test_ablation_tells_what_fewer_leds_angles_and_coefficients_cost(made: Made)
     assert set(mae["share of the LEDs"][0.125].values()) == {None}  # 5 of 41 LEDs are too few
     assert set(mae["most incidence, degrees"][60].values()) == {None}
     few, many = mae["coefficients"][16], mae["coefficients"][100]
-    assert {name: few[name] == many[name] for name in few} == {
-        "ggx": True, "ggx_normal": True, "sh": False, "rbf": False, "ggx_rbf": False
-    }  # fmt: skip
+    assert {name: few[name] == many[name] for name in few} == {name: name in MATERIALS for name in FITS}
     page = (out / "ablation.html").read_text()
     assert "Share of the LEDs" in page
     assert "At 60 there were not enough samples" in page

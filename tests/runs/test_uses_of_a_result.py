@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from coupole.appearance.matter.alta_samples import read_alta
 from coupole.kinematics import forward
 from coupole.reflectance import ggx
+from coupole.reflectance.fits import MATERIALS, RELIT
 from coupole.reflectance.new_light.light_kinds import DistantLight
 from coupole.reflectance.new_light.shading import coats_of
 from coupole.reflectance.relit_uncertainty import uncertainty_of_picture
@@ -125,7 +126,7 @@ def test_a_view_is_relit_with_its_shadows(made: Made) -> None:
     assert "expected one of side, top" in wrong.err
     wrong = cells.here("reflectance", "relight", out, "--direction", "0,0,1", "--fit", "none", "--to", to)
     assert wrong.code == 2
-    assert "expected one of ggx, ggx_normal, sh, rbf, ggx_rbf, clusters, harmonics" in " ".join(wrong.err.split())
+    assert f"expected one of {', '.join(RELIT)}" in " ".join(wrong.err.split())
 
 
 def test_a_relit_picture_holds_the_truth_within_its_uncertainty(made: Made, tmp_path: Path) -> None:
@@ -189,7 +190,10 @@ def test_uncertainty_of_a_relit_picture_is_the_spread_of_pictures_of_drawn_mater
 
 @pytest.mark.parametrize(
     ("words", "why"),
-    [(("--fit", "sh"), "sh has none; choose --fit ggx or ggx_normal"), (("--turn", "4"), "not to a video")],
+    [
+        (("--fit", "sh"), f"sh has none; choose --fit {' or '.join(MATERIALS)}"),
+        (("--turn", "4"), "not to a video"),
+    ],
 )
 def test_uncertainty_that_cannot_be_stated_is_refused(
     made: Made, tmp_path: Path, words: tuple[str, ...], why: str

@@ -16,6 +16,7 @@ from coupole.appearance.matter.brdf import Brdf
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
+_CLUSTERS = "clusters"
 _LOBES = 12
 """Number of groups into which the roughnesses of triangles are sorted."""
 
@@ -26,14 +27,17 @@ def read_result(
     """[..., 3] of one cluster, or of the mean over triangles by their numbers in the mesh (all if not given).
 
     A mean is that of the triangles' f, each about its own normal, with the lobes in `_LOBES` groups of alike
-    roughness. Raises InputError.
+    roughness. `fit` is a fit of the result that has a material for each triangle. Raises InputError.
     """
     if cluster is not None:
-        kd, ks, alpha = _read_materials(folder, "clusters")[1:]
+        kd, ks, alpha = _read_materials(folder, _CLUSTERS)[1:]
         if not 0 <= cluster < len(kd):
             raise InputError(f"{folder}: cluster: expected 0 to {len(kd) - 1}, found {cluster}")
         rows = np.array([cluster])
     else:
+        fits = sorted(path.stem for path in (folder / "fits").glob("*.h5") if path.stem != _CLUSTERS)
+        if fits and fit not in fits:
+            raise InputError(f"{folder}: fit: expected one of {', '.join(fits)}; found {fit}")
         numbers, kd, ks, alpha = _read_materials(folder, fit)
         is_known = np.isfinite(alpha) & np.isfinite(kd).all(axis=1) & np.isfinite(ks).all(axis=1)
         rows = np.flatnonzero(is_known if triangles is None else is_known & np.isin(numbers, triangles))
@@ -58,12 +62,12 @@ def _read_materials(folder: Path, name: str) -> tuple[Array, Array, Array, Array
     """Numbers [n] of triangles (of `clusters`: of themselves), kd and ks [n, 3], alpha [n]."""
     path = folder / "fits" / f"{name}.h5"
     if not path.is_file():
-        does = "cluster" if name == "clusters" else "fit"
+        does = "cluster" if name == _CLUSTERS else "fit"
         raise InputError(f"{path}: is not there; `coupole reflectance {does} {folder}` makes it")
     try:
         with h5py.File(path, "r") as file:
             kd, ks, alpha = (file[key][()].astype(float) for key in ("kd", "ks", "alpha"))
-            numbers = np.asarray(file["triangles"][()] if name != "clusters" else range(len(alpha)), float)
+            numbers = np.asarray(file["triangles"][()] if name != _CLUSTERS else range(len(alpha)), float)
     except (OSError, KeyError) as error:
         raise InputError(f"{path}: expected kd, ks and alpha of a fit: {error}; make it anew") from error
     if kd.ndim != 2 or kd.shape[1] not in (1, 3):

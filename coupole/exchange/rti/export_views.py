@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,11 +12,13 @@ from threadpoolctl import threadpool_limits
 from coupole.errors import InputError
 from coupole.exchange.formats import Source, Writer, format_named, source_of
 from coupole.exchange.kept_frames import refuse_discarded_lights
-from coupole.exchange.rti import iiif, relight_web, rti_files, rti_pictures
+from coupole.exchange.rti import iiif, relight_web, rti_pictures
 from coupole.exchange.rti.lit_views import LitView, Said, chosen_views, lit_views, refuse_few_lights
 from coupole.exchange.target_folder import refuse_standing, writing_into
 from coupole.reflectance.uncalibrated import lights_of_view
 from coupole.storage.run import Run
+
+_HERE = "coupole.exchange.rti"
 
 
 @dataclass(frozen=True)
@@ -103,13 +106,11 @@ def _first_file(out: Path, to: str, name: str) -> Path:
 
 
 def _write(view: LitView, to: str, out: Path, how: HowShown, say: Said) -> tuple[list[Path], float]:
-    match to:
-        case "relight":
-            folder = out / view.name
-            folder.mkdir(exist_ok=True)
-            return relight_web.write(view, folder, how.basis, how.planes, say)
-        case "ptm":
-            path, write = out / f"{view.name}.ptm", rti_files.write_ptm
-        case _:
-            path, write = out / f"{view.name}.rti", rti_files.write_hsh
-    return [path], write(view, path, say)
+    """Files of one view, and what they miss. A format of one file for each view is the module of its name."""
+    if to == "relight":
+        folder = out / view.name
+        folder.mkdir(exist_ok=True)
+        return relight_web.write(view, folder, how.basis, how.planes, say)
+    path = out / f"{view.name}.{to}"
+    misses_dn: float = importlib.import_module(f"{_HERE}.{to}").write(view, path, say)
+    return [path], misses_dn

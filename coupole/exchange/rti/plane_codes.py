@@ -22,6 +22,8 @@ RESOLUTION = 20
 """Nodes of the bilinear grid a side; docs/decisions/0037-rti-exports.md tells why not 8."""
 SIGMA = 0.125
 """Width of Gaussians between lights, in unit vectors: relight's own default."""
+CHECKED_PIXELS = 10_000
+"""Pixels by which a file is compared with its view's pictures."""
 _LEAST_SINGULAR = 1e-4
 
 

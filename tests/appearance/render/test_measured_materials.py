@@ -137,6 +137,7 @@ def test_what_is_no_measured_material_is_refused(tmp_path: Path) -> None:
         ({"path": tmp_path / "short.binary", "cluster": 1}, "of a result's folder"),
         ({"path": tmp_path / "none"}, "ggx.h5: is not there"),
         ({"path": result(tmp_path), "triangles": [3]}, "expected triangles with a material"),
+        ({"path": tmp_path, "fit": "phong"}, "fit: expected one of ggx; found phong"),
     ):
         with pytest.raises(InputError, match=words):
             measured_table(MeasuredMaterial.model_validate({"kind": "measured", **wanted}), HERE)

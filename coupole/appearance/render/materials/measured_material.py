@@ -35,8 +35,8 @@ class MeasuredMaterial(Model):
 
     kind: Literal["measured"]
     path: Path
-    fit: Literal["ggx", "ggx_normal"] = "ggx"
-    """Fit that is taken of a result."""
+    fit: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")] = "ggx"
+    """Fit that is taken of a result: one with a material for each triangle."""
     cluster: Annotated[int, Field(ge=0)] | None = None
     """Cluster of a result; if not given, the mean of its triangles."""
     triangles: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] | None = None

@@ -1,12 +1,20 @@
-"""Models of materials by which `tools/prove_exports.py` reads exports: pi f cos_i, 1 for white from above."""
+"""Pixels of a result under lights, and the models of materials by which readers light them: pi f cos_i, 1 for
+white from above."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import h5py
 import numpy as np
 
+from coupole.exchange.of_results.measured_surface import MeasuredSurface
+
 Array = np.ndarray
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""z up from y up, for rows on its left."""
+LIGHTS = 12
+"""Lights of each pixel."""
 _F0S, _ALPHAS, _COSINES, _STEPS = 12, 16, 16, 48
 """Nodes of a table of albedos, and steps of its integrals."""
 _F0_OF_PRINCIPLED = 0.04
@@ -37,6 +45,48 @@ class Materials:
     diffuse: Array
     specular: Array
     alpha: Array
+
+
+def unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def lit_pixels(surface: MeasuredSurface, count: int, random: np.random.Generator) -> Lit:
+    """`count` pixels of all views, with `LIGHTS` each, of which those within 80 degrees of their normals stay."""
+    parts = []
+    support_from_base = np.linalg.inv(surface.result.base_from_support)
+    for view in surface.result.views:
+        with h5py.File(view.path, "r") as file:
+            triangle_of_pixel = file["seen"][()]
+        number = np.where(triangle_of_pixel >= 0, view.triangles[triangle_of_pixel], 0)
+        row, column = np.nonzero((triangle_of_pixel >= 0) & surface.has_material[number])
+        subset = random.choice(len(row), count // len(surface.result.views), replace=False)
+        row, column = row[subset], column[subset]
+        triangles = number[row, column]
+        camera = support_from_base[:3, :3] @ view.camera_mm + support_from_base[:3, 3]
+        centres = surface.vertices_mm[surface.triangles[triangles]].mean(axis=1)
+        parts.append((triangles, camera - centres, np.full(len(row), view.view, object), row, column))
+    triangles, ways, views, rows, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
+    columns_per_light = [np.repeat(part, LIGHTS, axis=0) for part in (triangles, ways, views, rows, columns)]
+    lights = random.normal(size=(len(columns_per_light[0]), 3))
+    normals = surface.normals[columns_per_light[0]]
+    lights += 1.5 * normals * np.linalg.norm(lights, axis=1, keepdims=True)
+    lights, cameras = (unit(part) for part in (lights, columns_per_light[1]))
+    cosines = np.stack([np.sum(part * normals, axis=1) for part in (lights, cameras)])
+    in_range = (cosines > np.cos(np.radians(80.0))).all(axis=0)
+    return Lit(*(part[in_range] for part in (columns_per_light[0], lights, cameras, *columns_per_light[2:])))
+
+
+def true_light(surface: MeasuredSurface, lit: Lit) -> Array:
+    """[n, 3] of the result itself."""
+    columns = (surface.normals, surface.kd, surface.ks, surface.alpha)
+    return ggx(Materials(*(column[lit.triangles] for column in columns)), lit)
+
+
+def relative_errors(exported_values: Array, true_values: Array) -> Array:
+    """Of values that are known and above nearly nothing."""
+    usable = (true_values > 1e-6) & np.isfinite(exported_values)
+    return np.asarray(np.abs(exported_values[usable] / true_values[usable] - 1.0))
 
 
 def ggx(of: Materials, lit: Lit) -> Array:

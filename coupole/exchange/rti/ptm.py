@@ -1,4 +1,4 @@
-"""Files of one view for viewers of RTI: `.ptm` (PTM 1.2, LRGB) and `.rti` (HSH 1.2)."""
+"""PTM: a polynomial texture map (PTM 1.2, LRGB) of one view, for viewers of RTI."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ from numpy.typing import NDArray
 
 from coupole.exchange.rti import light_functions
 from coupole.exchange.rti.lit_views import LitView, Picture, Said
-from coupole.exchange.rti.plane_codes import eight_bits, of_terms
+from coupole.exchange.rti.plane_codes import CHECKED_PIXELS, eight_bits, of_terms
 from coupole.storage.durable import write_synced
 
 Floats = NDArray[np.float64]
 
 _PTM_ORDER = (3, 5, 4, 1, 2, 0)
 """x2, y2, xy, x, y, 1 among the terms of `light_functions.ptm`."""
-_CHECKED_PIXELS = 10_000
 _BLOCK = 1 << 16
 """Pixels whose colours are found at a time."""
 
 
-def write_ptm(view: LitView, path: Path, say: Said) -> float:
+def write(view: LitView, path: Path, say: Said) -> float:
     """Write polynomials of luminance and a colour for each pixel, the bottom row first (Malzbender and others, PTM
     file format, 1.2); the rms error against the view's own pictures, in steps of 8 bits.
 
@@ -41,29 +40,11 @@ def write_ptm(view: LitView, path: Path, say: Said) -> float:
     header += [" ".join(f"{value:.9g}" for value in scale), " ".join(map(str, bias))]
     bottom_first = (plane.reshape(height, width, -1)[::-1].tobytes() for plane in (codes, colours))
     write_synced(path, "\n".join([*header, ""]).encode("ascii") + b"".join(bottom_first))
-    some = view.some_pixels(_CHECKED_PIXELS)
+    some = view.some_pixels(CHECKED_PIXELS)
     decoding = np.empty(codes[some].shape)
     decoding[:, _PTM_ORDER] = (codes[some] - bias.astype(np.float64)) * scale / 255.0
     planes = decoding[..., None] * (colours[some] / 255.0)[:, None]
     return code.misses_dn(view.samples(some, say), planes.reshape(len(planes), -1))
-
-
-def write_hsh(view: LitView, path: Path, say: Said) -> float:
-    """The same with nine hemispherical harmonics for each channel, the top row first. The layout is that of
-    RTIBuilder's fitter: lines of header, scales and biases in float32, nine bytes a channel for each pixel."""
-    width, height = view.size_px
-    code = of_terms(light_functions.hsh(view.directions), "hsh")
-    planes = code.planes_of(view, say).reshape(-1, 9, 3)
-    bias = planes.min(axis=(0, 2)).astype("<f4")
-    scale = np.maximum(planes.max(axis=(0, 2)) - bias, 1e-6).astype("<f4")
-    codes = np.empty((len(planes), 3, 9), np.uint8)
-    for term in range(9):
-        codes[..., term] = eight_bits(planes[:, term], bias[term], scale[term])
-    header = f"#HSH1.2\r\n3\r\n{width} {height} 3\r\n9 2 1\r\n".encode("ascii")
-    write_synced(path, header + scale.tobytes() + bias.tobytes() + codes.tobytes())
-    some = view.some_pixels(_CHECKED_PIXELS)
-    decoding = (codes[some] / 255.0 * scale + bias).transpose(0, 2, 1)
-    return code.misses_dn(view.samples(some, say), decoding.reshape(len(decoding), -1))
 
 
 def _one_colour(term_planes: Picture, triangular: Floats) -> tuple[Floats, Floats]:

@@ -114,7 +114,7 @@ def rewrite(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def discard_complete(run: Run, out: Path, say: Callable[[str, int, int], object]) -> None:
-    """After a run's last session, discard the frames that its plan names, for all views whose samples in its
+    """Discard the frames that a run's plan names, after its last session, for all views whose samples in its
     result are safe. Finish also a discard that a crash interrupted. Waits while a session holds the run. Raises
     StorageError."""
     if not is_complete(run.folder):

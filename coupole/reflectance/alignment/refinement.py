@@ -33,7 +33,7 @@ Said = Callable[[str, int, int], None]
 
 ROUNDS = 4
 SETTLED_MM = 0.005
-"""If the median disagreement changes by less than this from round to round, the matches are not made again."""
+"""Change of the median disagreement from round to round below which the matches are not made again."""
 SEARCH_SHRINKS = 3.0
 LEAST_SEARCH_MM = 0.3
 """A search is not narrowed below this."""

@@ -77,7 +77,7 @@ class Matches:
 
 
 def match_views(views: Sequence[ViewSurface], search_mm: float, threads: int, say: Said) -> Matches:
-    """At each place, compare all views with the view that sees it in the greatest detail, over shifts of up to
+    """Compare, at each place, all views with the view that sees it in the greatest detail, over shifts of up to
     `search_mm`. The windows of a view do not overlap."""
     half = int(np.clip(views[0].picture.shape[1] / WINDOWS_ACROSS, SMALLEST_HALF, LARGEST_HALF))
     places = [_places(number, views, half) for number in range(len(views))]

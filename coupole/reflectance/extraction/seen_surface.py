@@ -1,8 +1,8 @@
 """Triangle that each pixel of a view sees, and pixels that must not be used.
 
 A ray goes through the centre of each pixel, by the lens of the camera's record, to the first triangle that it
-meets (Embree). Left out: pixels at a silhouette, where a neighbour sees another surface or none, and what is out
-of focus.
+meets (Embree). Pixels out of focus are left out, and pixels at a silhouette, where a neighbour sees another
+surface or none.
 """
 
 from __future__ import annotations

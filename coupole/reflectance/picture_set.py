@@ -48,9 +48,9 @@ class PictureSet:
         return int(np.count_nonzero(self.mask))
 
     def raw_values(self, number: int) -> NDArray[Any]:
-        """[pixels, 3] of one picture, those of the mask in the order of rows, linear.
+        """[pixels, 3] linear values of one picture inside the mask, row by row.
 
-        Raises InputError if it differs from the first picture in size or depth.
+        Raises InputError if the picture differs from the first one in size or depth.
         """
         picture = read_picture(self.files[number])
         if self.srgb:

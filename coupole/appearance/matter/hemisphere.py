@@ -39,6 +39,6 @@ def albedo(brdf: Brdf, cosines: Array, *, nodes: int = 64) -> Array:
 
 
 def _about(axis: Array, local: Array) -> Array:
-    """`local` vectors turned so that their z is along `axis`, a unit vector of the plane y = 0."""
+    """Return `local` vectors turned so that their z axis becomes `axis`, a unit vector in the plane y = 0."""
     x, z = local[..., 0], local[..., 2]
     return np.stack([axis[2] * x + axis[0] * z, local[..., 1], axis[2] * z - axis[0] * x], axis=-1)

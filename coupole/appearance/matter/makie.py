@@ -6,8 +6,8 @@ weight of the metallic BRDF. The residual T - p m becomes the colour channels: t
 
 With three lacquers there are four unknowns and three channels. Eq. 4 takes the largest p that leaves no lacquer
 negative, which is exact where at least one lacquer whose m' is positive is absent, and too large elsewhere. Where
-the weights are known to sum to 1 (inside the drawing), p follows without that assumption. With one or two lacquers
-the system is determined, and is solved by least squares.
+the weights are known to sum to 1 (inside the drawing), p is found without this assumption. With one or two
+lacquers the system is determined, and is solved by least squares.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from coupole.errors import InputError
 
 _SINGULAR = 1e-9
 _SUM_IS_ONE = 1e-3
-"""Largest departure of a sum from 1: if the metal's weights m' sum to 1 within this, the sum does not determine
+"""Largest deviation of a sum from 1. If the metal's weights m' sum to 1 within this, the sum does not determine
 p."""
 
 
@@ -37,7 +37,7 @@ class Makie:
     residual: Array
     """[..., 3], the lacquers' part of the picture, in its unit."""
     clamped_share: float
-    """Share of the pixels whose p was beyond 0 or 1 by more than rounding: noise, shadow or a wrong sample
+    """Share of the pixels with p outside 0 to 1 by more than rounding, because of noise, shadow or a wrong sample
     colour."""
 
 

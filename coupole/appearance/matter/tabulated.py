@@ -3,8 +3,8 @@
 For light from wi, the polar axis is its mirror direction s'; theta is the angle of wo to s', phi the angle about
 s' from the plane of incidence, upward side. The peak of a metallic finish is then always at theta = 0, and the
 grid of theta can be dense there and sparse elsewhere: nodes are placed so that the error of linear interpolation
-is the same everywhere. The surface is isotropic: phi goes from 0 to pi only, and of wi only the angle of incidence
-matters. The logarithm is interpolated, which keeps values positive; over phi, where it is even and periodic, by
+is the same everywhere. The surface is isotropic: phi goes from 0 to pi only, and wi enters only by its angle of
+incidence. The logarithm is interpolated, which keeps values positive; over phi, where it is even and periodic, by
 cosines, so that a few nodes are enough.
 """
 
@@ -25,14 +25,15 @@ _PROFILE = 2001
 _FLOOR = 1e-9
 """Zeros are replaced by this share of the peak, because they have no logarithm."""
 _HORIZON_Z = 0.01
-"""Lower values are ignored when nodes are placed: the bend at the horizon is an artefact of the table."""
+"""Lower values are ignored when nodes are placed, because the bend at the horizon is an artefact of the table."""
 _LOWEST_Z = 1e-3
-"""Directions of the grid below the horizon take the value just above it, for interpolation."""
+"""Grid directions below the horizon take the value just above it, for interpolation."""
 
 
 @dataclass(frozen=True)
 class SpecularTable:
-    """A BRDF on a grid of incidence and theta (radians, increasing) and of as many phi as there are cosines."""
+    """A BRDF on a grid of incidence and theta (radians, increasing), and of phi, with as many values as
+    cosines."""
 
     incidence: Array
     theta: Array
@@ -69,7 +70,7 @@ def tabulated_brdf(wi: Array, wo: Array, *, table: SpecularTable) -> Array:
 
 
 def specular_coordinates(wi: Array, wo: Array) -> tuple[Array, Array, Array]:
-    """Angle of incidence, theta and phi [...] of two directions; inverse: `from_specular`."""
+    """Return the angle of incidence, theta and phi [...] of two directions; the inverse is `from_specular`."""
     mirror, upward, _ = _frame(wi)
     along, up = np.sum(wo * mirror, axis=-1), np.sum(wo * upward, axis=-1)
     across = np.linalg.norm(np.cross(mirror, wo), axis=-1)
@@ -93,7 +94,8 @@ def from_specular(incidence: Array, theta: Array, phi: Array) -> tuple[Array, Ar
 
 
 def _frame(wi: Array) -> tuple[Array, Array, Array]:
-    """Mirror direction, the perpendicular to it in the plane of incidence on the upper side, and their cross."""
+    """Return the mirror direction, the perpendicular to it in the plane of incidence on the upper side, and their
+    cross product."""
     mirror = wi * np.array([-1.0, -1.0, 1.0])
     sine = np.hypot(wi[..., 0], wi[..., 1])
     # At normal incidence the azimuth is arbitrary, and f does not depend on it.
@@ -135,8 +137,8 @@ def _adapt(theta: Array, profiles: Array, cosines: Array, nodes: int) -> Array:
 
 
 def look_up(incidence: Array, theta: Array, phi: Array, table: SpecularTable) -> Array:
-    """The table [..., bands] at coordinates [...], for one order of the directions: not reciprocal between its
-    nodes."""
+    """The table [..., bands] at coordinates [...], for one order of the directions. It is not reciprocal between
+    its nodes."""
     cosines = np.cos(phi[..., None] * np.arange(table.log_cosines.shape[2]))
     first, second = _place(table.incidence, incidence), _place(table.theta, theta)
     total: Array = np.zeros(1)
@@ -147,7 +149,7 @@ def look_up(incidence: Array, theta: Array, phi: Array, table: SpecularTable) ->
 
 
 def _place(nodes: Array, at: Array) -> tuple[Indices, Indices, Array]:
-    """Nodes below and above, and the share of the latter; beyond the last node its value holds."""
+    """Return the nodes below and above, and the weight of the latter. Beyond the last node, its value is used."""
     last = len(nodes) - 1
     high = np.clip(np.searchsorted(nodes, at), min(1, last), last)
     low = np.maximum(high - 1, 0)

@@ -16,8 +16,8 @@ from coupole.appearance.spectra.grid import Array, Complex, within
 def depolarisation_short(flatness: ArrayLike) -> Array:
     """A, the depolarisation factor along the short axis c of an oblate spheroid a = b = `flatness` c (Eqs 2, 3).
 
-    1/3 for a sphere (flatness 1), towards 1 for a disk. Below e = 1e-3 the formula loses its digits and the series
-    1/3 + 2 e^2/15 stands in.
+    It is 1/3 for a sphere (flatness 1), and tends to 1 for a disk. Below e = 1e-3 the formula loses its digits,
+    and the series 1/3 + 2 e^2/15 is used.
     """
     e2 = within("flatness a/c", flatness, 1.0, 1e6) ** 2 - 1.0
     e = np.sqrt(np.maximum(e2, 1e-6))
@@ -35,7 +35,8 @@ def depolarisation_in_plane(flatness: ArrayLike) -> Array:
 def maxwell_garnett(
     host: ArrayLike, inclusions: ArrayLike, share: ArrayLike, depolarisation: ArrayLike
 ) -> Complex:
-    """Effective complex index (Eqs 4, 5) from those of host and inclusions, which have `share` of the volume."""
+    """Return the effective complex index (Eqs 4, 5) from the indices of host and inclusions; inclusions have the
+    `share` of the volume."""
     e_m, e_i = (np.asarray(n, dtype=complex) ** 2 for n in (host, inclusions))
     p, a = within("share of the inclusions", share, 0.0, 1.0), within("depolarisation", depolarisation, 0.0, 1.0)
     effective = (

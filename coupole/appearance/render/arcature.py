@@ -49,7 +49,7 @@ def arcature(radius_mm: float, height_mm: float, depth_mm: float) -> Niche:
 
 
 def _at(outline: Array, y_mm: float) -> Array:
-    """Points [n, 3] of an outline [n, 2] of x and z."""
+    """Return points [n, 3] from an outline [n, 2] of x and z."""
     return np.stack([outline[:, 0], np.full(len(outline), y_mm), outline[:, 1]], axis=1)
 
 
@@ -64,6 +64,7 @@ def _between(low: Array, high: Array) -> Array:
 
 
 def _fan(rim: Array, middle: Array) -> Array:
-    """Triangles from a closed rim, clockwise as the viewer sees it, to a point inside; they face the viewer."""
+    """Return triangles from a closed rim, clockwise as seen by the viewer, to a point inside it; they face the
+    viewer."""
     after = np.roll(rim, -1, axis=0)
     return np.stack([after, rim, np.broadcast_to(middle, rim.shape)], axis=1)

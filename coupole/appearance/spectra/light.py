@@ -66,7 +66,7 @@ def led(name: str) -> Array:
 def camera(name: str = "Nikon 5100 (NPL)") -> Array:
     """Relative sensitivities [3, 81] (red, green, blue) of a camera that colour-science knows.
 
-    Measured by the NPL; used in place of a sensor whose curves have not been measured.
+    They were measured by the NPL, and replace the curves of a sensor that has not been measured.
     """
     sensitivities = _on_grid(_choose(_colour().MSDS_CAMERA_SENSITIVITIES, "camera", name)).T.copy()
     sensitivities.setflags(write=False)

@@ -25,8 +25,8 @@ _SEPARATORS = (("tab", "\t"), ("semicolon", ";"), ("comma", ","), ("blank", None
 _LEAST_ROWS = 3
 _NM = (150.0, 3000.0)
 _FRACTION_AT_MOST = 1.05
-"""A white tile may read a little above 1. Percent values all below this would be read as fractions: give `unit`
-for black samples of such instruments."""
+"""A white tile may read a little above 1. Values in percent that are all below this would be read as fractions.
+Give `unit` for black samples of such instruments."""
 _PERCENT_AT_LEAST = 2.5
 _REFLECTANCE = (-0.02, 1.5)
 """Noise goes below 0, fluorescence and gloss above 1; values beyond these limits are not reflectances."""
@@ -38,7 +38,7 @@ class Measured:
 
     name: str
     wavelengths_nm: Array
-    """[n], rising."""
+    """[n], in rising order."""
     values: Array
     """[n]; reflectance as a fraction, or power."""
     remarks: tuple[str, ...]
@@ -60,7 +60,7 @@ class _Table:
 
 
 def read_spectrum(path: Path, *, unit: Unit = "auto", column: int | None = None) -> Measured:
-    """The spectrum in a file. `column` (from 1, after the wavelength) is needed where there are several."""
+    """Read the spectrum in a file. `column` (from 1, after the wavelength) is needed if there are several."""
     return parse_spectrum(decode_text(path.read_bytes()), str(path), name=path.stem, unit=unit, column=column)
 
 
@@ -89,7 +89,7 @@ def parse_spectrum(
 
 
 def decode_text(raw: bytes) -> str:
-    """Text of an instrument: UTF-16 or UTF-8 by its mark, otherwise UTF-8, otherwise Latin-1."""
+    """Return an instrument's text: UTF-16 or UTF-8 by its byte order mark, otherwise UTF-8, otherwise Latin-1."""
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         return raw.decode("utf-16")
     try:
@@ -100,7 +100,7 @@ def decode_text(raw: bytes) -> str:
 
 
 def _table(text: str, file: str) -> _Table:
-    """Rows of numbers with the separator that gives the most rows, and the file's other information."""
+    """Return rows of numbers, by the separator that gives the most rows, and the file's other information."""
     lines = [(number, line.strip(" \r")) for number, line in enumerate(text.split("\n"), start=1) if line.strip()]
     counts = {name: sum(_is_row(_fields(line, mark)) for _, line in lines) for name, mark in _SEPARATORS}
     separator = max(counts, key=lambda name: counts[name])

@@ -89,9 +89,9 @@ def flakes(slab: Slab) -> Flakes:
 
 
 def triangulate(all_flakes: Flakes, *, around: int = 24, along: int = 6) -> tuple[Array, NDArray[np.int64]]:
-    """Corners [n * m, 3] in mm and triangles [n * k, 3] of all flakes, normals outwards, each flake closed.
+    """Return corners [n * m, 3] in mm and triangles [n * k, 3] of all flakes, normals outwards, each flake closed.
 
-    `around` corners about the normal on each of `along` - 1 rings between two poles.
+    There are `around` corners about the normal on each of the `along` - 1 rings between two poles.
     """
     e1, e2 = all_flakes.slab.roundness
     eta = np.linspace(-0.5 * np.pi, 0.5 * np.pi, along + 1)[1:-1]

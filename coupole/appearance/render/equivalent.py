@@ -22,9 +22,10 @@ MOST_OFF = 0.05
 
 
 def equivalent_index(reflectance: Callable[[Array], Array]) -> Complex:
-    """n + i k [81] of bulk whose unpolarised reflectance comes nearest `reflectance`(cosines) -> [angles, 81].
+    """Return n + i k [81] of bulk with the unpolarised reflectance nearest to `reflectance`(cosines) -> [angles,
+    81].
 
-    Raises InputError where they differ by more than `MOST_OFF` at some wavelength and angle up to 78 degrees.
+    Raises InputError if they differ by more than `MOST_OFF` at some wavelength and angle up to 78 degrees.
     """
     target = reflectance(_COSINES)
     normal = np.clip(target[0], 1e-6, 1.0 - 1e-6)

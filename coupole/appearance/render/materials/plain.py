@@ -307,10 +307,10 @@ def _gilt(material: Gilt, folder: Path) -> Description:
 
 
 def _sum(mirror: Description, mirror_share: Array, through: Array) -> Description:
-    """A metal and a Lambertian part together.
+    """Return the sum of a metal and a Lambertian part.
 
-    Mitsuba blends, w of one and 1 - w of the other; each is divided by its weight first. The weight is the same
-    for all bands, so that they share their paths.
+    Mitsuba blends with the weight w for one part and 1 - w for the other, so each part is divided by its weight
+    first. The weight is the same for all bands, so that they share their paths.
     """
     weight = float(np.clip(through.mean() / (through + mirror_share).mean(), _LEAST_SHARE, 1.0 - _LEAST_SHARE))
     stronger = {**mirror, "specular_reflectance": mirror["specular_reflectance"] / (1.0 - weight)}

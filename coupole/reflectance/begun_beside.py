@@ -1,4 +1,4 @@
-"""Samples of views that were taken beside an acquisition, before the rest of the run was known.
+"""Samples of views, taken during an acquisition, before the rest of the run was known.
 
 A result is begun with the frames of all its views (`result_folder.begin`). For samples that were taken before, a
 note for each view names the frames that they depend on, and the LEDs kept for the check. When the run is complete,
@@ -48,7 +48,7 @@ def frames_basis(frames: LightFrames, view: str) -> str:
 
 
 def is_of_run(out: Path, run: str) -> bool:
-    """Tell whether the result in a folder belongs to this run, found by its name, and to no other run. Raises
+    """Tell, by the run's name, whether the result in a folder belongs to this run and to no other. Raises
     InputError for a folder whose files cannot be read."""
     if (out / SETTINGS).exists():
         return list(read_settings(out)["runs"]) == [run]
@@ -57,8 +57,8 @@ def is_of_run(out: Path, run: str) -> bool:
 
 
 def note_view(out: Path, run: str, settings: Mapping[str, Any], file_name: str, basis: ViewBasis) -> None:
-    """Note the inputs of the samples of a view, before they are taken. Raises InputError if the folder has samples
-    of another run or with other settings, and OSError."""
+    """Note the inputs of a view's samples, before the samples are taken. Raises InputError if the folder has
+    samples of another run or with other settings, and OSError."""
     notes = _read_notes(out)
     decisive = _decisive(settings)
     if notes is None:

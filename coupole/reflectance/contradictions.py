@@ -30,14 +30,13 @@ from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples,
 Floats = NDArray[np.float64]
 
 BESIDE = 6
-"""Number of LEDs beside an LED with which it is compared."""
+"""Number of neighbouring LEDs with which an LED is compared."""
 _FEWEST_BESIDE = 4
 """Least number of these LEDs that must have a sample."""
 _MOST_LEFT = 0.8
 """A contradicted sample has kept less than this share of its light."""
 _AGREE = (0.9, 1.15)
-"""Range of the ratio of the LEDs beside it (their median) to the material, in which these LEDs agree with the
-material."""
+"""Range in which the median ratio of neighbouring LEDs to the material counts as agreement."""
 _LEAST_DIFFUSE = 0.5
 """Least diffuse share of the material's value."""
 _SIGMA = 5.0
@@ -111,7 +110,7 @@ def _mark(values, whole, u_noise, led_mm, centres_mm, normals, kd, places_beside
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _compare(values, whole, u_noise, kd, cosine):  # type: ignore[no-untyped-def]
     """Tell whether a sample is darker than the material in all its channels, by more than its noise. Return also
-    the mean of its channels over the mean of the material's, NaN if there is none."""
+    the ratio of the sample's mean over the channels to the material's; NaN if there is none."""
     count, low_count, total = 0, 0, 0.0
     for channel in range(len(values)):
         ratio = values[channel] / whole[channel]

@@ -148,8 +148,8 @@ def refuse_stale(discarded_names: Collection[str], view: str, out: Path) -> None
 
 
 def is_for_discarding(run: Run, out: Path) -> bool:
-    """Tell whether frames of a run are discarded once this result has their samples. This is so if the plan says
-    it and the run was acquired for this result."""
+    """Tell whether frames of a run are discarded once this result has their samples. This is true if the plan says
+    so and the run was acquired for this result."""
     asked_result = run.asked_result or default_result(run.folder)
     if not asked_result.is_dir():  # both may have been moved together
         asked_result = run.folder.with_name(asked_result.name)
@@ -176,7 +176,7 @@ def _forget(run: Run, view: str) -> None:
 
 
 def _enter_finished(run: Run) -> None:
-    """Enter the files that will not change any more in the manifest, unless they are too large."""
+    """Add files to the manifest, if they will not change any more and are not too large."""
     paths = [run.journal_path, *map(run.view_path, run.about["views"])]
     listed_names = manifest.read_checksums(run.folder)
     names = {str(path.relative_to(run.folder)): path.stat().st_size for path in paths if path.is_file()}

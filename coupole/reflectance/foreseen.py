@@ -1,4 +1,4 @@
-"""Prediction of a picture, and quantities known beforehand that make its error large or small.
+"""Prediction of a picture, and quantities, known beforehand, from which its error is predicted.
 
 Each column is one number for each pixel and channel. Brightness, incidence, highlight, material and nearness to
 edges come from the prediction and the materials; the differences among kernels and near pictures, and the kernel's

@@ -99,7 +99,7 @@ for _function, _in_place, _name in (
 
 @_compiled_function
 def lanes(_context, number):  # type: ignore[no-untyped-def]
-    """Return lanes that all hold a number, in its precision."""
+    """Return lanes that all have the value `number`, in its precision."""
     kind = _KINDS[types.float32 if number == types.float32 else types.float64]
     return kind(number), _made_of(lambda builder, value: value)
 
@@ -172,8 +172,8 @@ def load_row(_context, array, row):  # type: ignore[no-untyped-def]
 
 @_compiled_function
 def store(_context, numbers, array, row):  # type: ignore[no-untyped-def]
-    """Store lanes as the first eight numbers of a row of an array [n, 8 or more] in C order, of the lanes'
-    precision."""
+    """Store lanes as the first eight numbers of a row of an array [n, 8 or more]. The array is in C order and has
+    the lanes' precision."""
     if array.layout != "C" or array.dtype != numbers.number:
         raise errors.TypingError(f"expected an array of {numbers.number} in C order, got {array}")
 
@@ -271,8 +271,8 @@ def four_gathered(_context, arrays, rows, first):  # type: ignore[no-untyped-def
 
 @_compiled_function
 def in_turns(_context, array, row):  # type: ignore[no-untyped-def]
-    """Return three lanes whose numbers alternate in a row of 24 of an array [n, 24] in C order and single
-    precision."""
+    """Return three lanes from a row of 24 numbers in which the lanes' numbers alternate. The array [n, 24] is in C
+    order and single precision."""
     _refuse_but_singles(array)
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]

@@ -3,7 +3,7 @@
 Shadows and highlights move as the light moves, but a weighted sum of pictures fades one picture into the next. If
 a light is left out, the difference between its picture and the sum is known. A small network is trained on these
 differences, from the kernels' values and from the nearest pictures at the pixel and around it. Each light is left
-out together with its nearest neighbour: a new light is farther from the measured ones than they are from each
+out together with its nearest neighbour: a new light is farther from the measured lights than these are from each
 other.
 
 The network sees values as shares of the pixel's mean, so its answer does not depend on exposure or albedo. The
@@ -38,7 +38,8 @@ _BATCH = 4096
 MOST_SAMPLES = 4_000_000
 """Largest number of samples that are kept for training."""
 _MOST_STEPS, _LOOKS = 2500, 8
-"""Training ends after so many steps, or when each sample has been used so often."""
+"""Training ends after the first number of steps, or when each sample has been used as often as the second
+number."""
 _RATE = 3e-3
 _CLIPPED = 1.0
 """Differences beyond this multiple of the usual difference have no more weight than this."""

@@ -20,7 +20,7 @@ SUSPECT = 0.05
 _LIT = 0.2
 """Least cosine of incidence at pixels that are used."""
 GAIN_NEIGHBOURS = 3
-"""A new picture has the median gain of so many nearest pictures."""
+"""Number of nearest pictures whose median gain a new picture gets."""
 
 
 def gains(

@@ -1,4 +1,4 @@
-"""Values of a point under a light between measured ones: a weighted sum of the measured values.
+"""Values of a point under a light between the measured lights: a weighted sum of the measured values.
 
 Radial basis functions of the lights' directions with a linear tail (seed 003, 5.2): the weights of the measured
 lights depend on directions alone, so one solution serves all pixels. The best kernel depends on the object and is
@@ -66,6 +66,7 @@ def nearest(light_directions: Floats, direction: Floats, count: int) -> NDArray[
 
 
 def left_without(light_directions: Floats, number: int, neighbours: int) -> NDArray[np.int64]:
-    """Return the indices of the lights that remain when one is removed with so many of its nearest neighbours."""
+    """Return the indices of the lights that remain when one light and some of its nearest neighbours are
+    removed."""
     near_lights = nearest(light_directions, light_directions[number], neighbours + 1)
     return np.setdiff1d(np.arange(len(light_directions)), np.append(near_lights, number))

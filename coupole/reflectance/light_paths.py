@@ -1,8 +1,8 @@
 """Paths of light from LEDs to an object, and from one part of the object to another. They are found by rays in its
 mesh and need no frame.
 
-The object is cut into patches. A few triangles represent each patch: rays from them find the share of the half
-space above that other patches fill, and the light that comes directly from LEDs.
+The object is cut into patches. A few triangles represent each patch. Rays from them find the share of the half
+space that other patches fill, and the light that comes directly from LEDs.
 """
 
 from __future__ import annotations

@@ -344,7 +344,7 @@ def _equations(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _solve(matrix, right, damping):  # type: ignore[no-untyped-def]
-    """Return the damped step, by Cholesky factors; the matrix holds its lower half."""
+    """Return the damped step, by Cholesky factors. Only the lower half of the matrix is filled."""
     factor, step = np.zeros((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     for i in range(UNKNOWNS):
         for j in range(i + 1):

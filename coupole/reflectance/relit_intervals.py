@@ -3,8 +3,8 @@
 The lights are divided into three folds. Each light's picture is predicted from all other lights, with a correction
 that was learnt without its fold, and compared with the measured picture. The scale of the error is predicted
 log-linearly from quantities known beforehand (`foreseen`; locally weighted conformal prediction: Lei et al. 2018).
-Quantiles of error over scale are fitted by strata (`strata`). Last, all intervals are widened until they hold in
-each fold if they are fitted without it (cross-conformal prediction: Vovk 2015).
+Quantiles of error over scale are fitted by strata (`strata`). Last, intervals are fitted without each fold in
+turn, and all intervals are widened until those hold in the left-out folds (cross-conformal prediction: Vovk 2015).
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def _pixels(result: PictureResult, top: int, bottom: int) -> slice:
 
 @dataclass(frozen=True)
 class Residuals:
-    """Errors of left-out lights at n pixels and channels, and the quantities known of them beforehand."""
+    """Errors of left-out lights at n pixels and channels, with the quantities that were known beforehand."""
 
     sizes: Floats
     """[n] absolute errors."""

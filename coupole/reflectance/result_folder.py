@@ -66,8 +66,9 @@ def clear_remains(out: Path) -> None:
 
 
 def complete(path: Path, write: Callable[[Path], Any], *, unless: Path | None = None) -> None:
-    """Let a file be written beside its place, then move it there. The file is complete or missing, also after a
-    crash. It is not moved if `unless` exists by then, because another process has made the file meanwhile."""
+    """Call `write` for a file beside `path`, then move this file to `path`. The file is complete or missing, also
+    after a crash. It is not moved if `unless` exists by then, because another process has made the file
+    meanwhile."""
     with in_the_making(path, unless) as part:
         write(part)
 

@@ -114,9 +114,10 @@ def reflectance_of(
     """Make the result, or its missing parts, in the workers of a `scheduler` if one is named. Return the content
     of `result.json`. `ahead` has values that were computed before for the same object.
 
-    Raises InputError for runs without calibrations or of different objects or cameras, for records that do not
-    belong to the runs, for a folder with another result, and for a scheduler that does not answer or whose workers
-    do not see the folder. Raises StorageError if a frame is damaged or the disk cannot be written.
+    Raises InputError for runs without calibrations, for runs of different objects or cameras, and for records that
+    do not belong to the runs. Raises it also for a folder with another result, for a scheduler that does not
+    answer, and for workers that do not see the folder. Raises StorageError if a frame is damaged or the disk
+    cannot be written.
     """
     begun_s = time.monotonic()
     extract_runs(request, out, scheduler=scheduler, say=say, ahead=ahead)

@@ -34,7 +34,7 @@ def write_materials(
     triangles: NDArray[np.int64],
 ) -> None:
     """Write a fit of all triangles, joined from blocks. `u_triangle` [n] and `u_shared` are relative standard
-    uncertainties of kd and ks that each triangle has, and that all share."""
+    uncertainties of kd and ks: `u_triangle` belongs to each triangle alone, `u_shared` to all together."""
     with h5py.File(path, "w") as file:
         file.create_dataset("triangles", data=triangles, track_times=False).attrs["told"] = "numbers in the mesh"
         for field, description in FIELDS.items():

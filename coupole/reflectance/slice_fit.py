@@ -4,7 +4,7 @@ A sample's error is weighted as it appears in a picture, multiplied by the cosin
 are never below 0. A slice is valid for the view to which it was fitted (seed 003, 6.3).
 
 A fit to the residual of a model is stacked with a fit to the samples themselves (Breiman, Stacked regressions,
-Machine Learning 24, 1996): the share of the model is the one with the smallest error for left-out samples.
+Machine Learning 24, 1996): the chosen share of the model has the smallest error for left-out samples.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from coupole.reflectance.triangle_fit import FEWEST, TriangleSamples
 _PART = 64
 _FLAT = 1e-9
 _LEFT_OUT = 64
-"""Least number of samples by which the share of a model is chosen, if there are so many."""
+"""Least number of samples from which the share of a model is chosen; fewer if there are not enough."""
 
 
 def fit_slices(
@@ -115,7 +115,7 @@ def _frame(normal, centre_mm, camera_mm, frame):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def _directions(frame, centre_mm, led_mm, led_numbers, x, y, z):  # type: ignore[no-untyped-def]
     """Fill `x`, `y` and `z` with the directions of the LEDs `led_numbers` [n] in a slice's frame; LEDs below the
-    surface get z = 0. Return how many are above it."""
+    surface get z = 0. Return the number of LEDs above the surface."""
     above = 0
     for n in range(len(led_numbers)):
         led = led_mm[led_numbers[n]]

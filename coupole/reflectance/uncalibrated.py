@@ -1,4 +1,4 @@
-"""Pictures of one view of a run without calibrations, for the methods for pictures under known lights.
+"""Pictures of one view of a run without calibrations, to be used as pictures under known lights.
 
 Only nominal places of rig and LED table are used. The directions to the LEDs, and their light by the table, are
 those at the point in focus. Values are relative, and each pixel is treated alone.

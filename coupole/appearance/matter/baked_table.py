@@ -37,7 +37,7 @@ _FLOOR = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class BakedTable:
-    """Fields of a tensor file, whose channels are converted to bands."""
+    """Fields of a tensor file with channels, and the conversion of these channels to bands."""
 
     fields: Mapping[str, NDArray[Any]]
     """All fields except the values and their wavelengths."""

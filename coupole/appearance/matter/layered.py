@@ -3,8 +3,8 @@
 The sheet is the interface between air and the body's medium: a bare surface, or thin films. Part of the light is
 reflected by the sheet's facets (GGX); the rest enters, is scattered by the body and leaves again, partly after
 reflection at the sheet's inner side. Energy is conserved by construction: light that is not reflected at an angle
-enters or is absorbed there, and the emerging light has the angular distribution of the sheet's transmittance, so
-that the result is reciprocal.
+enters or is absorbed there. The emerging light has the angular distribution of the sheet's transmittance, so that
+the result is reciprocal.
 """
 
 from __future__ import annotations

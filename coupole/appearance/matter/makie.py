@@ -1,13 +1,14 @@
 """Makie: decomposition of a photograph of metal powder on lacquer (seed 002, section 4).
 
-A pixel of the picture is T = p m + sum of q_l c_l: m is the colour of the metallic finish alone, c_l those of up
-to three lacquers, photographed under the same light, all linear and not negative. p becomes the alpha channel: the
-weight of the metallic BRDF. The residual T - p m becomes the colour channels: the lacquers' diffuse light.
+A pixel of the picture is T = p m + sum of q_l c_l: m is the colour of the metallic finish alone, and c_l are the
+colours of up to three lacquers. All are photographed under the same light, linear and not negative. p becomes the
+alpha channel: the weight of the metallic BRDF. The residual T - p m becomes the colour channels: the lacquers'
+diffuse light.
 
 With three lacquers there are four unknowns and three channels. Eq. 4 takes the largest p that leaves no lacquer
-negative, which is exact where at least one lacquer whose m' is positive is absent, and too large elsewhere. Where
-the weights are known to sum to 1 (inside the drawing), p is found without this assumption. With one or two
-lacquers the system is determined, and is solved by least squares.
+negative. This is exact where at least one lacquer with positive m' is absent, and too large elsewhere. Where the
+weights are known to sum to 1 (inside the drawing), p is found without this assumption. With one or two lacquers
+the system is determined, and is solved by least squares.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Nashiji: metal flakes at random depths in clear lacquer (seed 002, section 5).
 
 A flake is a superquadric (Barr 1981), |x/a|^(2/e2) + |y/b|^(2/e2) to the power e2/e1, plus |z/c|^(2/e1), equal to
-1: a, b, c are its half axes. Flakes lie in a slab of lacquer whose surface is z = 0 and whose substrate is at z =
--depth; x and y go from 0 to the slab's size. The same slab and seed give the same flakes. Flakes may intersect.
+1: a, b, c are its half axes. Flakes lie in a slab of lacquer with its surface at z = 0 and its substrate at z =
+-depth; x and y go from 0 to the slab's size. The same slab with the same seed has the same flakes. Flakes may
+intersect.
 """
 
 from __future__ import annotations

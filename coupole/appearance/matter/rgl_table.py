@@ -115,7 +115,7 @@ class RglTable:
         return wi * signs, wo * signs
 
     def _slices(self, phi_i: Array, theta_i: Array) -> Weighted:
-        """Return the numbers of slices [P, T], flat, with their weights."""
+        """Return the numbers of slices, as flat indices of [P, T], with their weights."""
         slices: Weighted = []
         for row, share_of_row in _neighbours(self.phi_i, phi_i):
             for column, share in _neighbours(self.theta_i, theta_i):

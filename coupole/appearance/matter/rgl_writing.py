@@ -50,8 +50,8 @@ def cosine_weighted(
 
 
 def nodes_for_linear_reading(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Nodes [1, theta_i, channels, phi, theta_m] whose linear interpolation has the smallest error, from values
-    there.
+    """Return nodes [1, theta_i, channels, phi, theta_m] with the smallest error of linear interpolation, from the
+    values at the nodes.
 
     Between nodes at a distance h, the interpolation differs from f by f'' h^2 t (1 - t) / 2, on average by f'' h^2
     / 12, on each axis. This amount is subtracted from the nodes, with h before and after them, but not where f

@@ -1,11 +1,11 @@
 """A tabulated BRDF in coordinates about the specular direction (seed 002, section 3.1).
 
-For light from wi, the polar axis is its mirror direction s'; theta is the angle of wo to s', phi the angle about
-s' from the plane of incidence, upward side. The peak of a metallic finish is then always at theta = 0, and the
-grid of theta can be dense there and sparse elsewhere: nodes are placed so that the error of linear interpolation
-is the same everywhere. The surface is isotropic: phi goes from 0 to pi only, and wi enters only by its angle of
-incidence. The logarithm is interpolated, which keeps values positive; over phi, where it is even and periodic, by
-cosines, so that a few nodes are enough.
+For light from wi, the polar axis is its mirror direction s'; theta is the angle between wo and s', and phi is the
+angle about s' from the upper side of the plane of incidence. The peak of a metallic finish is then always at theta
+= 0, and the grid of theta can be dense there and sparse elsewhere: nodes are placed so that the error of linear
+interpolation is the same everywhere. The surface is isotropic: phi goes from 0 to pi only, and wi enters only by
+its angle of incidence. The logarithm is interpolated, which keeps values positive; over phi, where it is even and
+periodic, by cosines, so that a few nodes are enough.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ def depolarisation_short(flatness: ArrayLike) -> Array:
 def depolarisation_in_plane(flatness: ArrayLike) -> Array:
     """The factor along a long axis: (1 - A)/2, since the three factors sum to 1.
 
-    It applies to light along the leaf's normal, whose electric field is in the leaf's plane.
+    It applies to light along the leaf's normal, which has its electric field in the leaf's plane.
     """
     return 0.5 * (1.0 - depolarisation_short(flatness))
 

@@ -27,7 +27,7 @@ class Niche:
 
 
 def arcature(radius_mm: float, height_mm: float, depth_mm: float) -> Niche:
-    """A niche of half width `radius_mm` whose arch begins `height_mm` above the sill."""
+    """Return a niche of half width `radius_mm` with an arch that begins `height_mm` above the sill."""
     angle = np.linspace(np.pi, 0.0, _SEGMENTS + 1)
     arch = np.stack([radius_mm * np.cos(angle), height_mm + radius_mm * np.sin(angle)], axis=1)
     outline = np.concatenate([[[-radius_mm, 0.0]], arch, [[radius_mm, 0.0]]])

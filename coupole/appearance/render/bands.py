@@ -1,9 +1,9 @@
 """Rendering of 81 bands with a renderer that carries four wavelengths along a path.
 
-Mitsuba's spectral variants draw one wavelength from each quarter of what the film is sensitive to, for every path.
-If a film is sensitive to four neighbouring bands, each quarter has one of them. Spectra that are constant over
-each band are then rendered without noise from the choice of wavelengths. Spectra that Mitsuba makes itself (a map
-of the surroundings) have their mean over the band. With the same seed every group of four has the same random
+For every path, Mitsuba's spectral variants draw one wavelength from each quarter of the film's sensitivity. If a
+film is sensitive to four neighbouring bands, each quarter has one of them. Spectra that are constant over each
+band are then rendered without noise from the choice of wavelengths. Spectra that Mitsuba makes itself (a map of
+the surroundings) have their mean over the band. With the same seed every group of four has the same random
 numbers. So there is luminance noise, but hardly any colour noise. (A film of 81 channels and full spectra took 5.6
 times as long here for three times the noise.)
 

@@ -1,8 +1,8 @@
 """A candle: a flame that emits, on a stem of wax.
 
 The flame is a body of revolution, r proportional to sqrt(t) (1 - t) of its height, that emits the same radiance
-everywhere: its intensity in a direction is this radiance times its area as seen from there. The candela was once
-the intensity of such a flame from the side.
+everywhere. Its intensity in a direction is this radiance times its area as seen from this direction. The candela
+was once the intensity of such a flame from the side.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _WAX = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.75)
 
 
 class Candle(Model):
-    """A burning candle that stands upright; without `wax_height_mm`, a flame alone."""
+    """A burning candle that stands upright; it has no wax without `wax_height_mm`."""
 
     kind: Literal["candle"]
     position_mm: Vector

@@ -26,7 +26,7 @@ Filter = float | Literal["circular"]
 right-handed circular light."""
 _BLACK = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.0))
 _BALL_PARTS = 64
-"""Number of parts of an edge of a ball. A weathered ball has 20 times its square of triangles."""
+"""Number of parts n into which edges of a weathered ball are divided; the ball has 20 n^2 triangles."""
 _FILTER_MM = 1.0
 """Distance from the projection centre to the polariser."""
 

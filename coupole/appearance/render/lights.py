@@ -1,4 +1,5 @@
-"""Lights of a scene file, in photometric units: spectra give the shape, lm, lux or cd/m^2 the scale."""
+"""Lights of a scene file, in photometric units: the spectrum has any scale, and lm, lux or cd/m^2 give the
+amount."""
 
 from __future__ import annotations
 

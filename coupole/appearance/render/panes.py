@@ -1,6 +1,6 @@
 """Coloured glass of windows: thin sheets that filter light and let it pass straight on.
 
-Transmittance along the normal is exact, with all reflections between the two faces; at other angles the faces
+Transmittance along the normal is exact, with all reflections between the two faces. At other angles the faces
 follow Fresnel, and the absorption stays as along the normal (at 45 degrees the path in glass is 1.13 times as
 long).
 """

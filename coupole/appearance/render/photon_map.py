@@ -57,7 +57,7 @@ class Hits:
 
 @dataclass(frozen=True)
 class Kept:
-    """Photons at matt surfaces, after gold."""
+    """Photons that reached matt surfaces after a reflection at gold."""
 
     places_mm: Array
     """[n, 3]."""
@@ -112,8 +112,8 @@ class Room:
 
 
 def photons(room: Room, sun: Sun, bands: Sequence[int], count: int, seed: tuple[int, ...]) -> Iterator[Kept]:
-    """Yield, in parts, `count` photons from the sun onto the mirrors and their surroundings; powers are for all
-    `count`."""
+    """Yield, in parts, `count` photons from the sun onto the mirrors and their surroundings. The photons of all
+    parts together have the full power."""
     random = np.random.default_rng(seed)
     middle = room.box_mm.mean(axis=0)
     radius_mm = 0.75 * float(np.linalg.norm(room.box_mm[1] - room.box_mm[0]))

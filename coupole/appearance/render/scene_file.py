@@ -203,7 +203,7 @@ class Scene(Model):
         return self.model_copy(update={"lights": moved_lights})
 
     def turned_about_z(self, angle_deg: float) -> Scene:
-        """The scene with all objects but planes turned about its z axis, anticlockwise from above."""
+        """Return the scene with all objects except planes turned about its z axis, anticlockwise from above."""
         about_z = transform(abc_deg=(angle_deg, 0.0, 0.0))
 
         def turn_object(thing: Object) -> Object:

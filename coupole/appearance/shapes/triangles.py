@@ -20,7 +20,7 @@ def flat_normals(corners_mm: Array) -> Array:
 
 
 def grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
-    """[2 rows columns, 3] corners of a grid of `rows` by `columns` cells, whose points are numbered row by row.
+    """[2 rows columns, 3] corners of a grid of `rows` by `columns` cells, with points numbered row by row.
 
     The two triangles of a cell follow each other. Rows go along y and columns along x: seen from above they are
     counter-clockwise.

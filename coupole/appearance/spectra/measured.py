@@ -1,9 +1,9 @@
 """Spectra from the exports of spectrophotometers.
 
-Accepted are lines of numbers, the wavelength in nm first, separated by tabs, semicolons, commas or blanks, with
-decimal points or decimal commas, ascending or descending; as percent, as fraction, or as power of a light. Lines
-without a number among their fields are comments anywhere; so are lines that begin with `#`, and all text before
-the first row. Ambiguous input is refused, with the line.
+The reader accepts lines of numbers, the wavelength in nm first, separated by tabs, semicolons, commas or blanks.
+Numbers have decimal points or decimal commas; wavelengths ascend or descend. Values are in percent, fractions, or
+the power of a light. Lines without a number among their fields are comments anywhere; so are lines that begin with
+`#`, and all text before the first row. Ambiguous input is refused, with the line.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ _FRACTION_AT_MOST = 1.05
 Give `unit` for black samples of such instruments."""
 _PERCENT_AT_LEAST = 2.5
 _REFLECTANCE = (-0.02, 1.5)
-"""Noise goes below 0, fluorescence and gloss above 1; values beyond these limits are not reflectances."""
+"""Limits of reflectance. Noise can give values below 0, fluorescence and gloss can give values above 1; values
+beyond the limits are not reflectances."""
 
 
 @dataclass(frozen=True)

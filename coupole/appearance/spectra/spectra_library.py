@@ -129,7 +129,7 @@ Row = tuple[int, str, list[str]]
 
 
 def _wavelengths(path: Path, rows: list[Row]) -> tuple[Array, list[Row]]:
-    """Wavelengths [n] from the first line or the file beside, and the rows of spectra."""
+    """Return the wavelengths [n] from the first line or from the file `spectra.txt`, and the rows of spectra."""
     number, _, fields = rows[0]
     beside = path.parent / WAVELENGTHS
     first = np.array([_value(field) for field in fields]) if _are_numbers(fields) else np.zeros(0)

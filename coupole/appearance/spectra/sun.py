@@ -22,7 +22,7 @@ WIDTH_DEG = 0.533
 
 @dataclass(frozen=True)
 class SunPlace:
-    """Place of the sun for an observer. Azimuths count from north by east."""
+    """Place of the sun for an observer. Azimuths are counted from north towards east."""
 
     refracted_elevation_deg: float
     """Elevation of the disk's centre as seen through the air, from which the light comes."""

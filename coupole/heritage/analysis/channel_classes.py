@@ -1,5 +1,5 @@
-"""Classes that are possible by about three numbers of a camera. Few classes can be distinguished, and the answer
-says so.
+"""Classes of pigments that agree with the few channel values of a camera. Few classes can be distinguished, and
+the answer says so.
 
 A camera's channel is the mean of reflectance over its sensitivity and the light (`spectra.channels`). Every
 reference is tried at many concentrations, with factors of 1/4 to 16 on K/S. Classes that agree with the channels

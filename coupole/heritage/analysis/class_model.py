@@ -72,7 +72,7 @@ class ClassModel:
         return nearest
 
     def is_known(self, probabilities: Array) -> NDArray[np.bool_]:
-        """Tell whether the library has the class, for rows [q, classes + 1]."""
+        """Tell, for rows of probabilities [q, classes + 1], whether the library has the class."""
         is_known: NDArray[np.bool_] = 1.0 - probabilities[:, -1] >= self.threshold
         return is_known
 

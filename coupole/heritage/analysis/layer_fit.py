@@ -6,8 +6,8 @@ h, sigma = S h, x^2 = alpha^2 - sigma^2 and beta = x coth x, a film over a groun
 
     R = (sigma - g (alpha - beta))/(alpha + beta - g sigma)
 
-inside the binder, and (sigma)/(alpha + x) if it is opaque. The formula also holds for K a little below 0, which
-noise gives for a white. Such estimates are not clipped, so that intervals hold.
+inside the binder, and (sigma)/(alpha + x) if it is opaque. The formula also holds for K a little below 0, as noise
+can give for a white paint. Such estimates are not clipped, so that intervals hold.
 
 Uncertainties are propagated linearly (JCGM 100): noise of each spectrum, of each ground, and the thicknesses,
 which are common to all bands and to all films of the same thickness.
@@ -31,7 +31,7 @@ LEAST_DETERMINED = 0.2
 """Relative standard uncertainty of S above which a band's S counts as undetermined, because the film hides its
 ground."""
 _LEAST_UNLIKE = 40.0
-"""Least difference of films, in squared standard uncertainties, that is more than noise."""
+"""Least difference of films that is more than noise, in squared standard uncertainties."""
 _STEPS = 60
 _LEAST_S = 1e-6
 

@@ -27,8 +27,8 @@ from coupole.heritage.analysis.palette import Paint
 _EXHAUSTIVE = 5000
 _REFINED = 6
 _WORTH = 16.0
-"""Improvement, in squared standard uncertainties, by which a further paint must improve a recipe to be worth
-it."""
+"""Least improvement of a recipe by a further paint, in squared standard uncertainties, that is worth this
+paint."""
 _UNTOLD = 6.0
 """Difference, in squared standard uncertainties, up to which two recipes are not distinguished: 95 % of a
 chi-square of two."""

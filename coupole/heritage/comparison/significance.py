@@ -1,4 +1,4 @@
-"""Significance of many differences: p-values with a noise that is estimated from the data themselves, and false
+"""Significance of many differences: p-values with a noise estimated from the data, and a limit on false
 discoveries.
 
 If noise is correlated from point to point, or surfaces are sampled unevenly, differences scatter more than local

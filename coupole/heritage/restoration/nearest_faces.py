@@ -1,4 +1,4 @@
-"""Assignment of triangles to the triangles of another mesh of the same surface on which they lie."""
+"""Assignment of a mesh's triangles to the triangles of another mesh of the same surface."""
 
 from __future__ import annotations
 

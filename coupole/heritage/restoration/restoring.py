@@ -48,7 +48,7 @@ class Restoration:
     restoration_file: RestorationFile
     hypotheses: tuple[Hypothesis, ...]
     lights_name: str | None = None
-    """Name of the set of the file's `other_lights` that is used, if any."""
+    """Name of the set of `other_lights` that is used; None for `lights`."""
 
     @property
     def folder(self) -> Path:

@@ -1,7 +1,7 @@
 """Each hypothesis as a scene for `coupole show` and `coupole render`, with all files that the scene names.
 
-`parts/PART.ply` holds the triangles of a part in the mesh's frame, `files/` copies of spectra, paints and maps,
-and `HYPOTHESIS/scene.yaml` names them by relative paths: the folder can be moved and sent.
+`parts/PART.ply` has the triangles of a part in the mesh's frame, and `files/` has copies of spectra, paints and
+maps. `HYPOTHESIS/scene.yaml` names them by relative paths, so that the folder can be moved and sent.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from coupole.heritage.restoration.painted_mesh import Floats
 
 NOTHING = -1
 _BALL = 12
-"""Number of parts of an edge of a ball; a ball has 20 times its square of triangles."""
+"""Number of parts n into which edges of a ball are divided; the ball has 20 n^2 triangles."""
 
 
 class SeenParts:

@@ -46,7 +46,7 @@ def matt_picture(
 ) -> NDArray[np.float32]:
     """[h / 2, w / 2] mean of green DN per microsecond over the flat field, in blocks of 2 x 2 pixels. Each block
     is from the longest exposure that does not clip it. If all exposures of an LED clip a block, the block counts
-    as brighter than under the other LEDs. It is NaN if such LEDs reach the ranks that are used. Raises
+    as brighter than under the other LEDs. The mean is NaN if such LEDs are among the ranks that are used. Raises
     StorageError for a damaged frame."""
     green = radiometry.channel == measured_run.channels.index(GREEN)
     height, width = green.shape

@@ -52,7 +52,8 @@ def refine_runs(request: RefineRequest, out: Path, say: Said) -> dict[str, Any]:
     """Refine, write the folder, and return the content of `refined.json`.
 
     Raises InputError for fewer than two views, records of different cameras, views without common LEDs or texture,
-    and an `out` that is a file or not empty; StorageError if a frame is damaged or the disk cannot be written.
+    and an `out` that is a file or not empty. Raises StorageError if a frame is damaged or the disk cannot be
+    written.
     """
     begun_s = time.monotonic()
     if out.exists() and not out.is_dir():

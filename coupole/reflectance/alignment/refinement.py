@@ -50,7 +50,7 @@ class Refined:
 
     unknowns: Unknowns
     steps: Floats
-    """[count] from the values that records and scan state."""
+    """[count] steps from the values of records and scan."""
     covariance: Floats
     """[count, count]"""
     before: Matches

@@ -94,7 +94,7 @@ class Unknowns:
 
     @cached_property
     def covariance(self) -> Floats:
-        """[count, count] from records and doubts."""
+        """[count, count] covariance from records and doubts."""
         mesh = self.doubts.mesh_covariance
         return np.asarray(block_diag(self.prior_geometry.camera_covariance, mesh, self._shape_covariance))
 

@@ -16,7 +16,8 @@ from coupole.reflectance.extraction.seen_surface import directions_of_rows, seen
 
 Floats = NDArray[np.float64]
 _SAME_PLACE = 3.0
-"""Greatest distance, in blocks, at which a place counts as on the surface that a view sees there."""
+"""Largest distance, in blocks, between a place and the surface that a view sees there. Up to this distance, the
+view sees the place."""
 
 
 def block_lens(lens: Intrinsics) -> Intrinsics:

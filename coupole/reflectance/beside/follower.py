@@ -95,8 +95,8 @@ class _Follower:
         self._looks = True
         """True if a view may have become complete since the last look."""
         self._newest_view, self._begun_view = "", ""
-        """View of the newest proven frame; and the same view if its visible surface was not computed yet, else
-        empty."""
+        """View of the newest proven frame; and the view whose visible surface is to be computed next, or an empty
+        text."""
         self._tried_views: tuple[str, ...] = ()
         """Views of the last result so far that was made or tried."""
         self._may_give_up = True
@@ -141,7 +141,7 @@ class _Follower:
                     pass
 
     def _take_samples(self) -> bool:
-        """Take the samples of the first complete view that has none; False if there is no such view."""
+        """Take the samples of the first complete view without samples; False if there is no such view."""
         remaining_views = self._remaining_views()
         if not remaining_views:
             return False
@@ -197,7 +197,7 @@ class _Follower:
         return True
 
     def _has_samples(self, view: str) -> bool:
-        """Tell whether the view has samples; False also for a view of dark frames or panels alone."""
+        """Tell whether the view has samples; False also for a view that has only dark frames or panels."""
         return view in self._taken and (self._result / "samples" / f"{view}.json").exists()
 
     def _part_of_growth(self, detail: str, done_count: int, of: int) -> None:

@@ -1,6 +1,6 @@
 """Frames in the order in which they are needed, read ahead into memory that is reused.
 
-Memory holds only the frames that are worked on and a few that are being read, however many frames there are.
+However many frames there are, memory holds only those that are worked on and a few that are being read.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from coupole.calibration.light.frames import LightFrame
 
 READERS = 2
-"""Number of threads that read, and of slots besides those of the frames that are worked on."""
+"""Number of threads that read; also the number of slots in addition to those of the frames that are worked on."""
 _SECTOR = 512
 """Bytes. Memory for a direct read begins at a multiple of this."""
 

@@ -142,8 +142,8 @@ def _dark_in_view(
 
 def _response(measured_run: MeasuredRun) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """[channels, 3] c2, c3 and range of the response, [channels, 2] variance in the dark (DN^2) and gain (DN/e),
-    [channels] relative spread of pixels' own responses (0 where the scene did not allow its measurement). Without
-    a record the response is a straight line, and the other values are NaN."""
+    [channels] relative spread of pixels' own responses (0 if the scene did not allow its measurement). Without a
+    record the response is a straight line, and the other values are NaN."""
     path, channels = measured_run.records.get("response"), measured_run.channels
     curve, noise = np.zeros((len(channels), 3)), np.full((len(channels), 2), np.nan)
     u_pixel = np.full(len(channels), np.nan)

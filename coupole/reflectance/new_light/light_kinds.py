@@ -101,7 +101,7 @@ class AreaLight(Light):
 
 
 class EnvironmentLight(Light):
-    """A picture of all directions; coupole.reflectance.new_light.environment tells how they lie in it."""
+    """A picture of all directions; coupole.reflectance.new_light.environment describes its layout."""
 
     kind: Literal["environment"] = "environment"
     file: FilePath
@@ -117,7 +117,7 @@ AnyLight = Annotated[
 
 
 class LightsFile(Model):
-    """A file of lights whose effects are added."""
+    """A file of lights that shine together."""
 
     lights: Annotated[tuple[AnyLight, ...], Field(min_length=1, max_length=1000)]
     """The lights."""
@@ -136,8 +136,7 @@ def read_lights(path: Path) -> list[AnyLight]:
 
 
 def numbers_of(text: str, counts: Sequence[int], option: str, form: str) -> list[float]:
-    """Return numbers separated by commas. Raises InputError for another count of numbers, or for text that is no
-    number."""
+    """Return numbers separated by commas. Raises InputError if their count is wrong, or if a text is no number."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:

@@ -48,7 +48,7 @@ Coats = NDArray[np.float32]
 the last channel are 0."""
 KD, KS = 4, 8
 MIRROR_SHARE = 4
-"""One ray is drawn from a lobe for so many beams of an emitter."""
+"""Number of an emitter's beams for each ray that is drawn from a lobe."""
 
 
 def coats_of(materials: TriangleMaterials) -> Coats:

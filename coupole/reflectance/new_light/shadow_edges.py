@@ -175,7 +175,7 @@ def _open_neighbours(codes, open_cells, fresh):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _differs(codes, row, column, down, across, expected_code):  # type: ignore[no-untyped-def]
-    """Tell whether one of the pixels at a side of a cell has the opposite code of `expected_code`."""
+    """Tell whether a pixel at the side of a cell is shaded although `expected_code` is lit, or the reverse."""
     height, width = codes.shape
     opposite = SHADED if expected_code == LIT else LIT
     for step in range(CELL_PX):

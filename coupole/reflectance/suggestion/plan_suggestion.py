@@ -152,7 +152,7 @@ def suggest_plan(request: SuggestionRequest, say: Said = lambda step, count, tot
 
 
 def _job_of(request: SuggestionRequest, text: str) -> Job:
-    """Read a plan that is not written yet. Raises InputError, with places only in files that exist."""
+    """Read a plan that is not written yet. Raises InputError; its places name only files that exist."""
     try:
         return read_job(request.path, text=text)
     except InputError as error:

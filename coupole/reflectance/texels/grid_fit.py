@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 _TOGETHER = 1 << 16
-"""Texels that are fitted together."""
+"""Number of texels that are fitted together."""
 _PART = 1 << 12
 _MOST_WIDER = 4.0
 """Largest factor of kd's variance."""
@@ -104,8 +104,8 @@ def colours_around(
 
     A texel's red and blue pixels are not in the same places, and paint that changes between them looks like a
     colour. So the difference of a texel's colour from its triangle's is averaged with those of the texels around,
-    within some pixels. The spread that this removes gives the uncertainty of the mean. The mean of the logarithms
-    over the channels is 0, so kd's mean over the channels stays as it was fitted.
+    within some pixels. The spread that the mean removes gives its uncertainty. The mean of the logarithms over the
+    channels is 0, so kd's mean over the channels stays as it was fitted.
     """
     width = max(_SPREAD_PX / side_px, _LEAST_SPREAD)
     weight = is_fitted.astype(np.float32)

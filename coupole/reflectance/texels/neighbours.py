@@ -1,5 +1,5 @@
-"""Shrinkage of a pixel's material towards that of its triangle, and of a triangle's towards the triangles around
-it, as far as the neighbours agree.
+"""Shrinkage of materials, as far as neighbours agree: a pixel's material moves towards that of its triangle, and a
+triangle's material towards those of the triangles around it.
 
 In a window the spread of materials comes from the surface and from the fits. The part that the fits' covariances
 do not explain is the surface's (empirical Bayes: Morris, Parametric empirical Bayes inference, 1983). Where the
@@ -49,9 +49,9 @@ def settle(
     deviation: Singles, covariance: Singles, is_fitted: NDArray[np.bool_], centre_covariance: Singles
 ) -> None:
     """Shrink, in place, the deviations [h, w, 5] of a view's pixels from their triangles (tilts, logarithms)
-    towards 0, as far as their neighbours agree. Set their covariances [h, w, 15, lower half row by row] to the
-    remaining ones. Only pixels with `is_fitted` [h, w] are used and changed. `centre_covariance` [h, w, 15] is the
-    covariance of the triangles' materials.
+    towards 0, as far as their neighbours agree. Replace their covariances [h, w, 15, lower half row by row] by
+    those after the shrinkage. Only pixels with `is_fitted` [h, w] are used and changed. `centre_covariance` [h, w,
+    15] is the covariance of the triangles' materials.
     """
     covariance[...] = mean_around(covariance, is_fitted, _ALIKE_PX)
     square = deviation**2
@@ -62,8 +62,8 @@ def settle(
 
 def settle_triangles(logs: Singles, covariance: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:
     """Shrink ks and roughness of triangles (`logs` [h, w, 2], seen pixel by pixel) towards their means in a
-    window, as far as the neighbours agree. Return the steps [h, w, 5] by which the materials change. Set the
-    covariances [h, w, 15] to the remaining ones, in place.
+    window, as far as the neighbours agree. Return the steps [h, w, 5] by which the materials change. Replace the
+    covariances [h, w, 15], in place, by those after the shrinkage.
     """
     weight = (1.0 / np.maximum(covariance[..., VARIANCES[3:]], _LEAST)).astype(np.float32)
     middle = mean_around(weight * logs, is_fitted, side_px) / np.maximum(
@@ -166,8 +166,7 @@ def _draw(deviation, covariance, surface, is_fitted, centre):  # type: ignore[no
 
 @numba.njit(cache=True, nogil=True)
 def tilts_from(normals, prior, tilts):  # type: ignore[no-untyped-def]
-    """Fill `tilts` [n, 2] with the tilts of normals [n, 3] from the `prior` ones, along the tangents of the
-    former."""
+    """Fill `tilts` [n, 2] with the tilts of `normals` [n, 3] against `prior`, along the tangents of `normals`."""
     for n in range(len(normals)):
         t1, t2 = tangents(normals[n, 0], normals[n, 1], normals[n, 2])
         first, second = 0.0, 0.0

@@ -183,6 +183,6 @@ def read_texel_widening(folder: Path) -> dict[str, Any] | None:
 
 def texel_uncertainty(result: RunResult, view: ViewSamples) -> tuple[float, float]:
     """Return relative standard uncertainties of kd and ks, as means of channels: from a pixel's own response, and
-    the part that all share."""
+    the part that all pixels share."""
     with h5py.File(texels_path(result, view), "r") as file:
         return float(np.mean(file["u_pixel"][()])), float(file["u_shared"][()])

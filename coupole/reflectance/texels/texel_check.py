@@ -29,7 +29,7 @@ from coupole.storage.durable import write_synced
 
 SCHEMA = "coupole-texels/1"
 WIDENED_BY_EVERY = 2
-"""The widths of intervals are found in the pictures of one in so many left-out LEDs."""
+"""Step between the left-out LEDs whose pictures are used to find the widths of intervals."""
 _MOST_SAMPLES = 200_000
 """Number of pixels and channels of a picture from which the widths are found."""
 _BLOCK_BYTES = 500_000_000

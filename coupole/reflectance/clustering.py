@@ -24,7 +24,7 @@ from coupole.reflectance.triangle_fit import FEWEST, HELD, MOST_KS, USUAL, Trian
 Floats = NDArray[np.float64]
 
 MOST_POOLED = 4096
-"""Samples of a cluster that are kept for its fit."""
+"""Number of samples of a cluster that are kept for its fit."""
 _LEAST_EACH = 8
 _SLANT_COS = math.cos(math.radians(30.0))
 _OFF_DEG = (0.0, 4.0, 8.0, 16.0, 32.0, 64.0)
@@ -142,7 +142,7 @@ def _looks(kd, ks, alpha, off_cos, root_reflectances):  # type: ignore[no-untype
 
 @numba.njit(cache=True, nogil=True)
 def axes_about(normal, axes):  # type: ignore[no-untyped-def]
-    """Rows x, y, z of a frame about a normal (Duff et al. 2017)."""
+    """Return rows x, y, z of a frame about a normal (Duff et al. 2017)."""
     x, y, z = normal
     sign = 1.0 if z >= 0.0 else -1.0
     a = -1.0 / (sign + z)

@@ -1,10 +1,10 @@
 """Samples that are shaded by a thing which nobody described, for example a cable. They contradict the samples
 beside them.
 
-A cable's full shadow is too dark to give samples. At its edge a triangle is lit in part, and its sample is too low
-by any amount. A contradicted sample is darker than the triangle's material in all channels, by more than its noise
-allows. The material there is mostly diffuse, so the form of a lobe is not the cause. The neighbouring LEDs agree
-with the material, so neither the triangle nor the model is wrong.
+A cable's full shadow is too dark to give samples. At the shadow's edge a triangle is partly lit, and its sample
+can be too low by any amount. A contradicted sample is darker than the triangle's material in all channels, by more
+than its noise allows. The material there is mostly diffuse, so the form of a lobe is not the cause. The
+neighbouring LEDs agree with the material, so neither the triangle nor the model is wrong.
 """
 
 from __future__ import annotations

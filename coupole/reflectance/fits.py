@@ -1,6 +1,6 @@
 """The fits of a result of runs: one object for each fit, in one registry.
 
-A new fit is an object in `MATERIALS` or `SLICES`, and the kernel that it calls.
+To add a fit, add an object to `MATERIALS` or `SLICES`, and the kernel that it calls.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ _DISTANCE_SCALE = 5.0
 
 @dataclass(frozen=True)
 class Strip:
-    """Values of a picture's rows under some lights."""
+    """Values in some rows of a picture, under some lights."""
 
     mask: NDArray[np.bool_]
     """[rows, w]"""
@@ -165,7 +165,7 @@ def initial_network(features: int, generator: np.random.Generator) -> Network:
 
 
 class _Adam:
-    """Steps of Kingma and Ba (2015)."""
+    """Optimiser with the steps of Kingma and Ba (2015)."""
 
     def __init__(self, network: Network) -> None:
         self._parts = [part for layer in network.layers for part in layer]

@@ -39,7 +39,7 @@ _dtrsm = _routine("blas", "dtrsm", _CHAR, _CHAR, _CHAR, _CHAR, _INT, _INT, _DOUB
 
 
 def one_thread() -> Any:
-    """Limit BLAS to one thread for each call, while this is entered."""
+    """Context in which BLAS uses one thread for each call."""
     return _libraries().limit(limits=1, user_api="blas")
 
 
@@ -105,9 +105,9 @@ def solve_by_samples(rows, penalty, values, memory, factor, right):  # type: ign
     samples] and `values` [m, samples], with less work if there are fewer samples than rows. Return whether there
     is a solution.
 
-    x = P^-1 R (R^T P^-1 R + 1)^-1 y has a matrix of the samples (Golub and Van Loan, Matrix Computations, 2.1.4:
-    the Sherman-Morrison-Woodbury formula). The Cholesky factor of this matrix is left in `factor` [samples,
-    samples], and its inverse times y in `values`. `memory` has room for 2 n^2.
+    x = P^-1 R (R^T P^-1 R + 1)^-1 y uses a matrix with the size of the samples (Golub and Van Loan, Matrix
+    Computations, 2.1.4: the Sherman-Morrison-Woodbury formula). The Cholesky factor of this matrix is left in
+    `factor` [samples, samples], and its inverse times y in `values`. `memory` has room for 2 n^2.
     """
     count, samples = rows.shape
     weighted_rows = memory[: samples * count].reshape(samples, count)

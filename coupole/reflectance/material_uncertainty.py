@@ -1,12 +1,13 @@
 """Covariance of normals and materials of triangles, and the resulting uncertainty of values in any direction.
 
-The fit solves equations of scores: sums over samples of weight times derivative times residual, and the priors.
-Its covariance is H^-1 M H^-1, where H is the derivatives of the scores and M their variance (Huber 1967). M comes
-from the residuals, which are summed by groups of neighbouring LEDs before they are squared (Liang and Zeger 1986).
-Within a group, the errors of the material's form, of an LED's power and of a shadow's edge are alike. So M
-contains noise, each LED's own power, and the error of the model. Two parts are added: the scanner's noise, for
-normals that are held to the mesh; and the spread of the prior, where only the usual roughness and ks hold them.
-The uncertainty that all LEDs share is a factor of kd and ks, and is kept separately.
+The fit solves equations of scores. A score is the sum, over the samples, of weight times derivative times
+residual, plus the priors. Its covariance is H^-1 M H^-1, where H is the derivatives of the scores and M their
+variance (Huber 1967). M comes from the residuals, which are summed by groups of neighbouring LEDs before they are
+squared (Liang and Zeger 1986). Within a group, the errors of the material's form, of an LED's power and of a
+shadow's edge are alike. So M contains noise, each LED's own power, and the error of the model. Two parts are
+added: the scanner's noise, for normals that are held to the mesh; and the spread of the prior, where only the
+usual roughness and ks hold them. The uncertainty that all LEDs share is a factor of kd and ks, and is kept
+separately.
 """
 
 from __future__ import annotations

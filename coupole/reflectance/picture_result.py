@@ -52,7 +52,7 @@ class PictureResult:
 
     @cached_property
     def about(self) -> dict[str, Any]:
-        """Content of result.json. Raises InputError if the folder has none, or one of another kind."""
+        """Content of result.json. Raises InputError if the folder has no such file, or one of another kind."""
         path = self.folder / ABOUT
         try:
             about = read_json(path, allow_nan=True)

@@ -94,7 +94,7 @@ def _mean(off: list[Floats]) -> float | None:
 
 
 def _blocks(result: RunResult) -> list[slice]:
-    """Return blocks of places in `triangles`."""
+    """Return blocks of places in the result's `triangles`."""
     count = len(result.triangles)
     firsts = np.unique(np.linspace(0, max(0, count - _TRIANGLES), _BLOCKS).astype(int))
     return [slice(int(first), min(int(first) + _TRIANGLES, count)) for first in firsts]

@@ -207,7 +207,7 @@ def _alike(*values: NDArray[np.floating]) -> dict[str, NDArray[np.floating]]:
 
 
 def _add(sums: list[float], off: NDArray[np.floating]) -> None:
-    """Add to the sum of magnitudes, and to their number."""
+    """Add the differences' magnitudes to a sum, and their number to a count."""
     is_finite = np.isfinite(off)
     sums[0] += float(np.abs(off[is_finite]).sum())
     sums[1] += int(np.count_nonzero(is_finite))

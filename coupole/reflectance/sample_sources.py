@@ -26,7 +26,7 @@ _SIDES = 8
 _SMALL_BYTES = 64 * 2**20
 """Greatest size of a table that is read at once."""
 _BESIDE = 1.2
-"""Least distance of a neighbour, divided by the square root of a triangle's area."""
+"""Least distance of a searched neighbour, divided by the square root of the triangle's area."""
 
 
 @dataclass(frozen=True)

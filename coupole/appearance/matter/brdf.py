@@ -22,7 +22,7 @@ LEAST_ROUGHNESS = 1e-3
 
 
 def lambert(wi: Array, wo: Array, *, reflectance: ArrayLike) -> Array:
-    """Perfectly diffuse: reflectance [bands] over pi."""
+    """Perfectly diffuse surface: reflectance [bands] over pi."""
     return np.asarray(_above(wi, wo)[..., None] * np.atleast_1d(np.asarray(reflectance, dtype=float)) / np.pi)
 
 
@@ -55,9 +55,11 @@ def ggx(wi: Array, wo: Array, *, roughness: float, fresnel: Fresnel) -> Array:
 
 
 def cook_torrance(wi: Array, wo: Array, *, slope: float, fresnel: Fresnel) -> Array:
-    """Beckmann facets of root mean square slope `slope` in V-shaped grooves: F D G/(4 z_i z_o), D holding 1/pi.
+    """Beckmann facets with the root mean square slope `slope` in V-shaped grooves: F D G/(4 z_i z_o), where D
+    includes 1/pi.
 
-    Cook and Torrance, ACM TOG 1, 7 (1982), but normalised: their F/pi without the 4 reflects four times too much.
+    Cook and Torrance, ACM TOG 1, 7 (1982), but normalised, because their F/pi without the 4 reflects four times
+    too much.
     """
     h, cos_h = half_vector(wi, wo)
     m2 = max(slope, LEAST_ROUGHNESS) ** 2

@@ -38,7 +38,7 @@ class Layer:
     scattering: ArrayLike
     """S of diffuse light, from one direction to the other."""
     direct_absorption: ArrayLike
-    """k."""
+    """k, of directional light."""
     forward: ArrayLike
     """s_i: from directional light to diffuse light in the same direction."""
     backward: ArrayLike
@@ -53,9 +53,9 @@ class Background:
     diffuse: ArrayLike = 0.0
     """Rg, diffuse to diffuse."""
     directed_to_diffuse: ArrayLike = 0.0
-    """Rcg."""
+    """Rcg, directional to diffuse."""
     specular: ArrayLike = 0.0
-    """r_s."""
+    """r_s, of the mirror image."""
 
 
 def reflectances(layer: Layer, background: Background) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ f is the share of the surface that is bare because of holes and cracks, R(d) the
 d, T_in its transmittance, T_out and R_int its transmittance and reflectance for the bole's diffuse light from
 below, and R_b the bole's reflectance inside its binder. The paper's "R_gold - T_p + R_plasmon" has no definition
 of R_plasmon; a thin film includes all three (docs/decisions/0010). For thickness 0 the result is the bole under
-the face of its binder, for thick leaves bulk gold.
+the face of its binder. For thick leaves it is bulk gold.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Gilt:
     bole: InternalReflectance
     """[bands]."""
     bare_share: float
-    """f."""
+    """f: share of the surface without leaf."""
 
 
 def leaf_index(

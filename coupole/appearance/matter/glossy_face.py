@@ -1,9 +1,9 @@
 """Reflectance of a paint as an instrument measures it, and reflectance inside the binder: two types, and
 Saunderson's conversion between them.
 
-A binder's glossy face reflects part of the light before it enters, and most of the diffuse light that wants to
-leave. If a paint reflects 0.50 in air, gloss excluded, the layer inside reflects 0.74 under an index of 1.5. The
-two must not be mixed: the types have no arithmetic, and `Face` is the only way from one to the other.
+A binder's glossy face reflects part of the light before it enters, and most of the diffuse light that would leave.
+If a paint reflects 0.50 in air, gloss excluded, the layer inside reflects 0.74 under an index of 1.5. The two
+reflectances must not be mixed, so the types have no arithmetic, and only `Face` converts one to the other.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ class Binder:
     def two_flux(
         self, ground: Ground, absorption: ArrayLike, scattering: ArrayLike, thickness_mm: float
     ) -> Ground:
-        """A layer that makes all light diffuse at once (Kubelka and Munk)."""
+        """Add a layer that makes all light diffuse immediately (Kubelka and Munk)."""
         rho, tau = kubelka_munk.layer(absorption, scattering, thickness_mm)
         return self.matt(kubelka_munk.over(rho, tau, ground.diffuse))
 

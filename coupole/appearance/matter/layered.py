@@ -51,7 +51,7 @@ class Coat:
     entering: Array
     """[angles, bands], share of light from each angle that reaches the body."""
     leaving: Array
-    """[angles, bands], share of diffuse light from the body that leaves, times pi, per projected solid angle."""
+    """[angles, bands], share of diffuse light from the body that leaves per projected solid angle, times pi."""
 
 
 def sheet(films: Sequence[thin_film.Film], body_index: float) -> Sheet:
@@ -111,7 +111,7 @@ def emerging(sheet: Sheet, body: InternalReflectance) -> Array:
 
 
 def at_cosine(table: Array, cosines: Array) -> Array:
-    """Values [..., bands] of a table [angles, bands] at cosines [...]."""
+    """Return values [..., bands] of a table [angles, bands] at cosines [...]."""
     place = np.sqrt(np.clip(cosines, 0.0, 1.0)) * (_ANGLES - 1)
     low = np.minimum(place.astype(int), _ANGLES - 2)
     share = (place - low)[..., None]
@@ -119,7 +119,7 @@ def at_cosine(table: Array, cosines: Array) -> Array:
 
 
 def _over_angles(table: Array) -> Array:
-    """2 times the integral of table(mu) mu over the cosine mu: [bands]."""
+    """Return 2 times the integral of table(mu) mu over the cosine mu: [bands]."""
     mu = 0.5 * (_GAUSS + 1.0)
     return np.asarray(_GAUSS_WEIGHTS * mu @ at_cosine(table, mu))
 

@@ -74,7 +74,7 @@ def makie_brdf(wi: Array, wo: Array, *, alpha: float, residual: ArrayLike, metal
 
 
 def _three_lacquers(t: Array, m: Array, c: Array, region: str) -> Array:
-    """Eqs 2 to 4."""
+    """Decompose by Eqs 2 to 4."""
     if abs(np.linalg.det(c)) < _SINGULAR * np.prod(np.linalg.norm(c, axis=1)):
         raise InputError(
             "makie: expected three lacquers of independent colours; these lie in one plane; give two of them"

@@ -4,8 +4,8 @@ For light from wi, the polar axis is its mirror direction s'; theta is the angle
 angle about s' from the upper side of the plane of incidence. The peak of a metallic finish is then always at theta
 = 0, and the grid of theta can be dense there and sparse elsewhere: nodes are placed so that the error of linear
 interpolation is the same everywhere. The surface is isotropic: phi goes from 0 to pi only, and wi enters only by
-its angle of incidence. The logarithm is interpolated, which keeps values positive; over phi, where it is even and
-periodic, by cosines, so that a few nodes are enough.
+its angle of incidence. The logarithm is interpolated, which keeps values positive. Over phi it is even and
+periodic, and is interpolated by cosines, so that a few nodes are enough.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def tabulate(source: Brdf, incidence_deg: Array, *, theta_nodes: int = 40, phi_n
 
 
 def tabulated_brdf(wi: Array, wo: Array, *, table: SpecularTable) -> Array:
-    """The table's BRDF, averaged over exchange of wi and wo, which makes it reciprocal."""
+    """Return the table's BRDF, as the mean over both orders of wi and wo, which makes it reciprocal."""
     above = ((wi[..., 2] > 0.0) & (wo[..., 2] > 0.0))[..., None]
     return (
         above
@@ -83,7 +83,7 @@ def specular_coordinates(wi: Array, wo: Array) -> tuple[Array, Array, Array]:
 
 
 def from_specular(incidence: Array, theta: Array, phi: Array) -> tuple[Array, Array]:
-    """wi, in the plane y = 0, and wo [..., 3]."""
+    """Return wi, in the plane y = 0, and wo [..., 3]."""
     wi = directions(np.cos(incidence), np.zeros_like(incidence))
     mirror, upward, side = _frame(wi)
     sine = np.sin(theta)[..., None]
@@ -119,8 +119,8 @@ def _sample(source: Brdf, incidence: Array, theta: Array, phi: Array) -> tuple[A
 
 
 def _adapt(theta: Array, profiles: Array, cosines: Array, nodes: int) -> Array:
-    """`nodes` values of `theta`, dense where the logarithm of the profiles [i, theta, phi, bands] has high
-    curvature.
+    """Return `nodes` values of `theta`, which are dense where the logarithm of the profiles [i, theta, phi, bands]
+    has high curvature.
 
     Linear interpolation of log f over a step h has the error h^2 f (log f)''/8 in f: equal errors need steps
     proportional to the inverse square root of f (log f)''. A tenth of the nodes is spread evenly.

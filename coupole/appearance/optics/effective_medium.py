@@ -1,8 +1,8 @@
 """Effective index of a host with small spheroids in it (Maxwell Garnett 1904; seed 001, Eqs 2-5).
 
 For gilts the host is gold, a continuous leaf, and the inclusions are nanoscopic holes filled with egg white; the
-reverse describes separate grains of gold. Lengths are much smaller than the wavelength; shares up to about a
-third, below percolation.
+reverse describes separate grains of gold. The model is valid for lengths much smaller than the wavelength, and for
+shares up to about a third, below percolation.
 """
 
 from __future__ import annotations

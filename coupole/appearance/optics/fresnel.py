@@ -36,7 +36,7 @@ def cos_inside(cos_outside: ArrayLike, outside: ArrayLike, inside: ArrayLike) ->
 def amplitudes(
     cos_outside: ArrayLike, cos_in: ArrayLike, outside: ArrayLike, inside: ArrayLike
 ) -> tuple[Complex, Complex, Complex, Complex]:
-    """r_s, r_p, t_s, t_p of the interface; all arguments broadcast and may be complex."""
+    """Return r_s, r_p, t_s, t_p of the interface; all arguments broadcast and may be complex."""
     c1, c2 = np.asarray(cos_outside, dtype=complex), np.asarray(cos_in, dtype=complex)
     n1, n2 = np.asarray(outside, dtype=complex), np.asarray(inside, dtype=complex)
     s, p = n1 * c1 + n2 * c2, n2 * c1 + n1 * c2

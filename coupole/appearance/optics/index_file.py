@@ -28,7 +28,8 @@ _SELLMEIER, _SELLMEIER_2, _CAUCHY = "formula 1", "formula 2", "formula 5"
 
 
 def read_index(path: Path) -> Complex:
-    """n + i k [81]; k is 0 where the file has none. Linear in the wavelength between lines.
+    """n + i k [81]; k is 0 where the file has none. Between the lines of the file, values are linear in the
+    wavelength.
 
     Raises InputError, with file and line if there is one, also if 380 to 780 nm are not covered.
     """

@@ -38,7 +38,7 @@ def stack_power(
     """Reflectance and transmittance (into the substrate) of unpolarised light.
 
     `cos_outside` [...] is the cosine in the incident medium, which is transparent; wavelengths, in vacuum, and
-    indices are [bands] or scalars. Both results are [..., bands]; the remainder to 1 is absorbed.
+    indices are [bands] or scalars. Both results are [..., bands]; the films absorb the rest.
     """
     reflectances, transmittances = zip(
         *(

@@ -15,7 +15,7 @@ from coupole.appearance.spectra.grid import Array
 
 _SEGMENTS = 192
 _MARGIN = 0.45
-"""Width of the wall round the opening, in radii."""
+"""Width of the wall around the opening, in radii."""
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ For every path, Mitsuba's spectral variants draw one wavelength from each quarte
 film is sensitive to four neighbouring bands, each quarter has one of them. Spectra that are constant over each
 band are then rendered without noise from the choice of wavelengths. Spectra that Mitsuba makes itself (a map of
 the surroundings) have their mean over the band. With the same seed every group of four has the same random
-numbers. So there is luminance noise, but hardly any colour noise. (A film of 81 channels and full spectra took 5.6
-times as long here for three times the noise.)
+numbers. So there is luminance noise, but hardly any colour noise. (Here a film of 81 channels with full spectra
+took 5.6 times as long, and had three times the noise.)
 
 Lights are known every 5 nm. With coarser steps, a rendered band has the light's mean around it, and `weights`
 integrate over the light's own structure. Only the reflectances are interpolated (as in ASTM E308's tables).

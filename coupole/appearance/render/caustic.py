@@ -34,13 +34,13 @@ class Niche:
     reflectance: Reflectance
     """Reflectance of the gold."""
     roughness: float
-    """0 is a mirror."""
+    """GGX alpha of the gold; 0 for a mirror."""
 
 
 @dataclass(frozen=True)
 class Sun:
     direction: Array
-    """[3] unit, in which light travels: into the opening, towards +y."""
+    """[3] unit direction in which light travels: into the opening, towards +y."""
     width_deg: float
     irradiance: Array
     """[81], W/(m^2 nm) on a surface that faces it."""
@@ -110,7 +110,7 @@ def irradiance(
 
 
 class _Met:
-    """Embree's tree of the niche, and gold's smooth normals."""
+    """Embree's tree of the niche, and the smooth normals of the gold."""
 
     def __init__(self, niche: Niche) -> None:
         from embreex import rtcore_scene
@@ -213,7 +213,7 @@ def _facets(towards: Array, normals: Array, alpha: float, random: np.random.Gene
 
 
 def _unmasked_share(cosine: Array, alpha: float) -> Array:
-    """Smith's G1 of GGX: G2/G1 of separable masking."""
+    """Return Smith's G1 of GGX, which is G2/G1 for separable masking."""
     c = np.maximum(cosine, 0.0)
     return np.asarray(2.0 * c / np.maximum(c + np.sqrt(alpha**2 + (1.0 - alpha**2) * c**2), 1e-12))
 

@@ -15,7 +15,7 @@ from coupole.appearance.shapes.triangles import grid_faces, rectangle
 from coupole.appearance.spectra.grid import Array
 
 _ARC = 12
-"""Segments of each half of a pointed arch."""
+"""Number of segments of each half of a pointed arch."""
 _RIB_WIDTH, _RIB_DEPTH = 0.05, 0.035
 """Width and depth of a rib, in widths of the nave."""
 _TILES = 12

@@ -1,4 +1,4 @@
-"""Convert spectra to a picture on a screen: observer, chromatic adaptation, sRGB."""
+"""Converts spectra to a picture on a screen: observer, chromatic adaptation, sRGB."""
 
 from __future__ import annotations
 

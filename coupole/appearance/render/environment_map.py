@@ -39,7 +39,7 @@ class EnvironmentMap(Model):
     path: Path
     """Equirectangular, .hdr or .exr: twice as wide as high, up is the first row."""
     centre_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    """Azimuth of the picture's middle: degrees from +y by +x (from north by east, where +y is north)."""
+    """Azimuth of the picture's middle: degrees from +y towards +x (from north towards east, if +y is north)."""
     white_cd_m2: Positive | None = None
     """Luminance of a pixel 1, 1, 1. It is 1 if pixels are in cd/m^2, and 179 by Radiance's convention."""
     illuminance_lux: Positive | None = None

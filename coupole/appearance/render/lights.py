@@ -74,7 +74,7 @@ class Area(Model):
 
 
 class Environment(Model):
-    """The same luminance from all directions."""
+    """An environment with the same luminance in all directions."""
 
     kind: Literal["environment"]
     luminance_cd_m2: Positive
@@ -97,9 +97,9 @@ class Daylight(Model):
     """Longitude, positive to the east."""
     altitude_m: Annotated[float, Field(ge=-430, le=9000)] = 0.0
     y_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    """Azimuth of the scene's +y: degrees from north by east."""
+    """Azimuth of the scene's +y: degrees from north towards east."""
     sky: bool = True
-    """The light of the sky, evenly from all directions; without it only the sun shines."""
+    """True for light of the sky, evenly from all directions; if False, only the sun shines."""
     aerosol_depth_500nm: Annotated[float, Field(ge=0, le=2)] = 0.1
     water_cm: Annotated[float, Field(gt=0, le=10)] = 1.42
     ozone_atm_cm: Annotated[float, Field(ge=0, le=0.7)] = 0.344

@@ -37,7 +37,7 @@ class Spectral:
     stokes: NDArray[np.float32]
     """[4 or 1, h, w, bands]: S0, and with polarisation S1 (horizontal), S2 (45 degrees), S3 (right circular)."""
     samples: int
-    """Paths through each pixel."""
+    """Number of paths through each pixel."""
     noise: float | None = None
     """Median over the pixels of the relative standard error, if the scene has a noise limit."""
 
@@ -162,7 +162,7 @@ def _stokes(behind: list[NDArray[np.float32]]) -> NDArray[np.float32]:
 
 
 def degree_of_linear_polarisation(stokes: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[h, w], over all bands together; 0 where it is dark."""
+    """[h, w] degree of polarisation over all bands together; 0 where the picture is dark."""
     s0, s1, s2 = stokes[:3].sum(axis=-1)
     degree: NDArray[np.float32] = np.divide(np.hypot(s1, s2), s0, out=np.zeros_like(s0), where=s0 > 0)
     return degree

@@ -147,7 +147,7 @@ class Turntable(Model):
 
 
 class Scene(Model):
-    """One scene; all cameras see the same."""
+    """One scene; all its cameras see the same objects and lights."""
 
     schema_version: Literal[1]
     name: Name
@@ -195,7 +195,7 @@ class Scene(Model):
         return self
 
     def at(self, when: datetime) -> Scene:
-        """The scene with its daylight at another time."""
+        """Return the scene with its daylight at another time."""
         moved_lights = tuple(
             light.model_copy(update={"when": when}) if isinstance(light, Daylight) else light
             for light in self.lights

@@ -21,7 +21,7 @@ class Glazing(Model):
     """Panes in rows and columns."""
 
     layout: Annotated[tuple[Annotated[str, Field(min_length=1, max_length=200)], ...], Field(min_length=1)]
-    """Rows from the top, a letter for each pane; a dot is left open."""
+    """Rows from the top, with a letter for each pane; a dot is an opening without glass."""
     panes: dict[Annotated[str, Field(min_length=1, max_length=1)], Colour]
     """The glass of each letter."""
     came_mm: Positive = 8.0

@@ -1,4 +1,4 @@
-"""The back wall of a scene's arcature under its sun: light by photons (`caustic`), as a picture."""
+"""A picture of the back wall of a scene's arcature under its sun, with light by photons (`caustic`)."""
 
 from __future__ import annotations
 

@@ -88,7 +88,8 @@ def lab(xyz: Array, white: Array) -> Array:
 
 
 def linear_srgb(xyz: Array) -> Array:
-    """Linear sRGB [..., 3] of XYZ (white D65, 2-degree observer); outside 0 to 1 for colours outside the gamut."""
+    """Linear sRGB [..., 3] of XYZ (white D65, 2-degree observer). Values are outside 0 to 1 for colours outside
+    the gamut."""
     return np.asarray(np.asarray(xyz, dtype=float) @ _SRGB_FROM_XYZ.T)
 
 

@@ -2,8 +2,8 @@
 
 The reader accepts lines of numbers, the wavelength in nm first, separated by tabs, semicolons, commas or blanks.
 Numbers have decimal points or decimal commas; wavelengths ascend or descend. Values are in percent, fractions, or
-the power of a light. Lines without a number among their fields are comments anywhere; so are lines that begin with
-`#`, and all text before the first row. Ambiguous input is refused, with the line.
+the power of a light. Lines without a number among their fields are comments. Lines that begin with `#`, and all
+text before the first row, are comments too. Ambiguous input is refused, and the line is named.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def read_spectrum(path: Path, *, unit: Unit = "auto", column: int | None = None)
 def parse_spectrum(
     text: str, file: str, *, name: str = "", unit: Unit = "auto", column: int | None = None
 ) -> Measured:
-    """Read a spectrum as `read_spectrum`, from text; `file` is the name in errors. Raises InputError for ambiguous
-    input."""
+    """Read a spectrum from text, as `read_spectrum` does from a file; `file` is the name in errors. Raises
+    InputError for ambiguous input."""
     table = _table(text, file)
     rows = table.rows
     _check_columns(table, file)

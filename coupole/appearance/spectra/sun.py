@@ -1,8 +1,8 @@
 """The sun's place, its direct light and the light of a clear sky, from date, time and place.
 
-Place: NREL's algorithm (Reda and Andreas, Solar Energy 76, 577, 2004) with its refraction. Spectra: Bird and
-Riordan, J. Climate Appl. Meteorol. 25, 87, 1986 (SPECTRL2), over the air mass of Kasten and Young at the refracted
-elevation. Both are computed by pvlib, which is imported on first use (this takes seconds).
+The place is by NREL's algorithm (Reda and Andreas, Solar Energy 76, 577, 2004) with its refraction. The spectra
+are by Bird and Riordan, J. Climate Appl. Meteorol. 25, 87, 1986 (SPECTRL2), over the air mass of Kasten and Young
+at the refracted elevation. Both are computed by pvlib, which is imported on first use (this takes seconds).
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Classes of pigments that agree with the few channel values of a camera. Few classes can be distinguished, and
 the answer says so.
 
-A camera's channel is the mean of reflectance over its sensitivity and the light (`spectra.channels`). Every
-reference is tried at many concentrations, with factors of 1/4 to 16 on K/S. Classes that agree with the channels
-within their uncertainty cannot be distinguished by the channels.
+A camera's channel value is the mean of reflectance, weighted by the channel's sensitivity and the light
+(`spectra.channels`). Every reference is tried at many concentrations, with factors of 1/4 to 16 on K/S. Classes
+that agree with the channels within their uncertainty cannot be distinguished by the channels.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Probabilities of classes, and of none of them, from a library of spectra.
+"""Probabilities of classes of pigments, and of none of these classes, from a library of spectra.
 
 A Gaussian process regresses the membership of each class (Rasmussen and Williams, Gaussian Processes for Machine
 Learning, 2006, section 6.5) with a Matern 3/2 kernel on the distances of `spectral_features.features`; the median

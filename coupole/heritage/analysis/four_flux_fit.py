@@ -8,7 +8,7 @@ reflectance is
 
 inside the binder. Two grounds give R_b and T_cd + Tr; the collimated transmittance Tr gives T_cd. R_b and T_cd are
 linear in the scattering coefficients s_i and s_j at a given mu; k = mu - s_i - s_j. The paper's p and q are the
-same two numbers, and diverge where mu = b S; these equations do not.
+same two numbers, and diverge where mu = b S; the equations here do not diverge.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class FourFlux:
     """Coefficients for directional light, [n] per mm or for the layer, with standard uncertainties."""
 
     direct_absorption: Array
-    """k."""
+    """k: absorption of directional light."""
     forward: Array
-    """s_i."""
+    """s_i: scattering of directional light forwards."""
     backward: Array
-    """s_j."""
+    """s_j: scattering of directional light backwards."""
     u_direct_absorption: Array
     u_forward: Array
     u_backward: Array

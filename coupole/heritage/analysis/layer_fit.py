@@ -61,7 +61,7 @@ class Coefficients:
     """[n] per mm, or for the layer."""
     scattering: Array
     covariance: Array
-    """[n, 2, 2] of K and S."""
+    """[n, 2, 2] covariance of K and S."""
     chi2: Array
     """[n], squared residuals over their variances. The expected value is the number of spectra minus 2."""
     unlike: Array

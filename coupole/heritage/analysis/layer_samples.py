@@ -37,11 +37,11 @@ class FilmGiven(_Given):
     """Spectrum of the ground; none for an opaque film."""
     thickness_um: Annotated[float, Field(gt=0)] | None = None
     u_thickness_um: Annotated[float, Field(ge=0)] = 0.0
-    """Standard uncertainty."""
+    """Standard uncertainty of the thickness."""
 
 
 class DirectionalGiven(_Given):
-    """The same film over the same two grounds under light along the normal."""
+    """Spectra of the same film over the same two grounds, under light along the normal."""
 
     over_black: Path
     over_white: Path

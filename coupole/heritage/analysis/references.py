@@ -183,7 +183,7 @@ class References:
         return reliable, f"below {BANDS_NM[last + 1]:g} nm it rises as no reference does (stray light?): left out"
 
     def without_class(self, class_name: str) -> References:
-        """The library as if it had never had a class."""
+        """Return the library without one of its classes."""
         rows = [row for row, name in enumerate(self.class_of) if name != class_name]
         return References(
             tuple(self.names[row] for row in rows),

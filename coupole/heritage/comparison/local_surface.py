@@ -42,7 +42,7 @@ class SurfacePoints:
     is_outward: bool
     """False if the side to which the normals point is not known."""
     spacing_mm: float
-    """Distance of neighbours."""
+    """Distance between neighbouring points."""
 
     def only(self, point_mask: NDArray[np.bool_]) -> SurfacePoints:
         """Return some of the points, given by a mask [m]."""

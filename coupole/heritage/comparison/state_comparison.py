@@ -49,7 +49,7 @@ class Region:
     middle_in_after_mm: Floats
     """[3] in the frame of the second state."""
     across_mm: float
-    """Largest extent."""
+    """Largest extent of the region."""
     distance_mm: float
     """Mean of the surface's distances. Positive means outwards, so that material was added."""
     de00: float

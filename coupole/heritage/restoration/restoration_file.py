@@ -45,7 +45,7 @@ class Source(Model):
     """Source of a hypothesis: a person, publication or analysis."""
 
     says: SourceText
-    """Statement of the source, in one's own words."""
+    """Statement of the source, in the author's own words."""
     reference: SourceText
     """Citation of a publication, archive, analysis or person."""
 

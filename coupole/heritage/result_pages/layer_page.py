@@ -26,7 +26,7 @@ def layer_page(
     four: FourFlux | None,
     predicted_films: Sequence[FilmAtThickness] = (),
 ) -> str:
-    """HTML."""
+    """Return the page as HTML."""
     nm, sure = samples.wavelengths_nm, fit.determined_bands
     unit = "per mm" if samples.is_per_mm else "of the layer"
     told_bands = f"{int(sure.sum())} of {len(nm)} bands"

@@ -24,7 +24,7 @@ MODELS = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-"""COLMAP's camera models that equal our lens model or a part of it, with their parameters."""
+"""COLMAP's camera models that equal our lens model or a special case of it, with their parameters."""
 _NUMBERS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV", 6: "FULL_OPENCV"}
 _PLACES = (".", "sparse/0", "sparse", "0")
 _UNIT = 1e-3
@@ -49,12 +49,12 @@ class ColmapImage:
     """Name of the image's file."""
     camera: int
     camera_from_world: Floats
-    """[4, 4] x right, y down, z forward; in the model's unit."""
+    """[4, 4] with x right, y down, z forward, in the model's unit."""
 
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """Model that was read; `path` is the file of the images."""
+    """A model; `path` is the file of its images."""
 
     path: Path
     cameras: dict[int, ColmapCamera]
@@ -104,7 +104,7 @@ def _image(path: Path, name: str, camera: int, pose: list[float]) -> ColmapImage
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    """Lines with their numbers, without comments."""
+    """Return the lines with their numbers, without comments."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -41,7 +41,7 @@ FEWEST_MATCHES = 30
 MATCHES, STATED = "matches", "records and scan"
 _GROUPS = (Group(MATCHES, is_estimated=True, rejects=2), Group(STATED, is_estimated=False))
 _TOGETHER = 1 << 16
-"""Vertices."""
+"""Number of vertices that are processed together."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def _adjust(unknowns: Unknowns, steps: Floats, matches: Matches) -> Adjusted[Flo
 
 
 def match_lines(unknowns: Unknowns, steps: Floats, matches: Matches) -> list[Block]:
-    """Residuals and derivatives of the matches of each pair of views, whitened by their covariances."""
+    """Return residuals and derivatives of the matches of each pair of views, whitened by their covariances."""
     views = range(len(unknowns.prior_geometry.base_from_camera))
     lens, cameras = unknowns.lens_at(steps), unknowns.cameras_at(steps)
     surface = np.arange(unknowns.mesh.start, unknowns.count)

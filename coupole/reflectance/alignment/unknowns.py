@@ -28,7 +28,7 @@ from coupole.reflectance.extraction.pointing import Doubts
 Floats = NDArray[np.float64]
 MOST_CONTROLS = 600
 _TOGETHER = 1 << 16
-"""Vertices."""
+"""Number of vertices that are processed together."""
 _NUGGET = 1e-6
 """Share of a control point's variance that it shares with no other point: it keeps the covariance's inverse
 exact."""
@@ -43,7 +43,7 @@ class Given:
     base_from_camera: Floats
     """[views, 4, 4] mm."""
     camera_covariance: Floats
-    """[free + 6 views, free + 6 views] of the lens and the cameras' steps."""
+    """[free + 6 views, free + 6 views] covariance of the lens and the cameras' steps."""
     vertices_mm: Floats
     """[n, 3] vertices that triangles use, base frame."""
     triangles: NDArray[np.uint32]

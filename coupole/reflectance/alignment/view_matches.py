@@ -60,9 +60,9 @@ class Matches:
     matched_blocks: Floats
     """[n, 2] block of the other view that shows the spot."""
     expected_blocks: Floats
-    """[n, 2] block of the other view that should show the spot."""
+    """[n, 2] block of the other view that shows the spot by the geometry."""
     covariance: Floats
-    """[n, 2, 2] of `matched_blocks`, blocks squared, from noise and texture."""
+    """[n, 2, 2] covariance of `matched_blocks`, in squared blocks, from noise and texture."""
     shifts_mm: Floats
     """[n, 3] from the spot's place by the reference to its place by the other view."""
 
@@ -95,7 +95,7 @@ def match_views(views: Sequence[ViewSurface], search_mm: float, threads: int, sa
 
 @dataclass(frozen=True)
 class _Places:
-    """Windows of a view that no other view sees in more detail."""
+    """Windows of a view at places that no other view sees in more detail."""
 
     blocks: NDArray[np.int64]
     """[n, 2] middles of windows: column, row."""

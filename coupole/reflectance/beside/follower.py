@@ -98,7 +98,7 @@ class _Follower:
         """View of the newest proven frame; and the view whose visible surface is to be computed next, or an empty
         text."""
         self._tried_views: tuple[str, ...] = ()
-        """Views of the last result so far that was made or tried."""
+        """Views of the newest partial result that was made or tried."""
         self._may_give_up = True
         """True if the newest result of the views so far was not given up, so that the next one may be."""
 

@@ -1,4 +1,5 @@
-"""Samples of reflectance of every triangle under every LED, view by view, on disk: one pass over the frames."""
+"""Samples of reflectance of every triangle under every LED, written to disk view by view, in one pass over the
+frames."""
 
 from __future__ import annotations
 

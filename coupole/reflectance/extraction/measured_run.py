@@ -104,7 +104,8 @@ class Powers:
 
 @dataclass(frozen=True)
 class Drift:
-    """Power of the LEDs over their calibrated power: ln = level + rate_per_h (t - start_s) / 3600 + per_k dT."""
+    """Power of the LEDs over their calibrated power: its logarithm is level + rate_per_h (t - start_s) / 3600 +
+    per_k dT."""
 
     level: float = 0.0
     rate_per_h: float = 0.0
@@ -133,7 +134,7 @@ class MeasuredRun:
     powers: Powers
     emission: Emission
     records: Mapping[str, Path]
-    """Files of the records, by kind."""
+    """Files of the calibration records, by kind."""
     led_u_mm: float
     """Standard uncertainty of each coordinate of an LED's place, from the record, for the median LED."""
     mesh_path: Path
@@ -142,7 +143,7 @@ class MeasuredRun:
     base_from_support: Floats
     drift: Drift
     direct_light_alone: bool
-    """True if the cell is simulated without light from surface to surface."""
+    """True if the cell is simulated without inter-reflection."""
     camera: CameraPrior
     """Lens and hand-eye with their covariance; `axis_sensitivity` has the order of `views`."""
     u_signal: float = 0.0

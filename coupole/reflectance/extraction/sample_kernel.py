@@ -143,7 +143,7 @@ def _lost_by_root(u_signal):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _per_normal_irradiance(place_mm, lamps):  # type: ignore[no-untyped-def]
-    """1 over E / Phi of the lamps on a surface that faces them."""
+    """Return 1 over E / Phi of the lamps on a surface that faces them."""
     square, leaving = lanes(np.float32(0.0)), lanes(np.float32(0.0))
     for k in range(3):
         way = load_row(lamps.centres_mm, k) - np.float32(place_mm[k])
@@ -159,7 +159,7 @@ def _per_normal_irradiance(place_mm, lamps):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _per_irradiance(centre_mm, normal, lamps):  # type: ignore[no-untyped-def]
-    """1 over cos_i E / Phi (`lit_by` of lamp_sight) of the lamps."""
+    """Return 1 over cos_i E / Phi (`lit_by` of lamp_sight) of the lamps."""
     square, leaving, arriving = lanes(np.float32(0.0)), lanes(np.float32(0.0)), lanes(np.float32(0.0))
     for k in range(3):
         way = load_row(lamps.centres_mm, k) - np.float32(centre_mm[k])

@@ -30,7 +30,7 @@ from coupole.reflectance.lanes import LANES
 from coupole.reflectance.parts_in_threads import first_alone
 
 BLOCK = 4096
-"""Triangles."""
+"""Number of triangles in a block."""
 _AHEAD = 4
 """Number of blocks of triangles for each thread that are worked on, or wait until their samples are taken."""
 
@@ -42,7 +42,7 @@ class Samples:
     leds: slice
     """Places in the view's LEDs."""
     rows: slice
-    """Rows of the view's triangles."""
+    """Places of the triangles among the rows of the view's file."""
     codes: NDArray[np.uint8]
     """[triangles, leds]"""
     f: NDArray[np.float16]

@@ -1,4 +1,4 @@
-"""Light from all directions, as a picture of latitude and longitude.
+"""Light from all directions, as a picture with latitude and longitude as axes.
 
 The top row is up. The middle column is the frame's middle direction. The left side of the picture is to the left
 of an observer who looks in the middle direction. For results of runs, up is z and the middle is x, so that left is

@@ -147,7 +147,7 @@ def numbers_of(text: str, counts: Sequence[int], option: str, form: str) -> list
 
 
 def way_of(text: str, option: str) -> Vector:
-    """A direction of any length. Raises InputError."""
+    """Return a direction vector of any length. Raises InputError."""
     form = "X,Y,Z, not all 0"
     x, y, z = numbers_of(text, (3,), option, form)
     length = math.hypot(x, y, z)

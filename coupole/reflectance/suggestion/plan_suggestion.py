@@ -168,7 +168,7 @@ def _job_of(request: SuggestionRequest, text: str) -> Job:
 
 
 class _Trial:
-    """The plans that are compared."""
+    """Comparison of possible plans for a request."""
 
     def __init__(
         self, request: SuggestionRequest, job: Job, cell: SupposedCell, candidates: list[Candidate], say: Said

@@ -11,7 +11,7 @@ class SupposedMaterial:
     """Lambert plus GGX as in `coupole.reflectance.ggx`, the same in all channels."""
 
     kd: float
-    """1/sr"""
+    """Diffuse reflectance kd, 1/sr."""
     ks: float
     alpha: float
 

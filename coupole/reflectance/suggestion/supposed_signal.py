@@ -216,7 +216,7 @@ def reflectances(
     """[parts, leds] reflectance, 1/sr, and cosine of incidence of some parts under LEDs at [leds, 3]; NaN where no
     light reaches the visible part.
 
-    The highlight grows towards grazing angles by Schlick's Fresnel term (1994), as a real one does.
+    Like a real highlight, it grows towards grazing angles, here by Schlick's Fresnel term (1994).
     """
     f, cosines = np.full((2, len(parts), len(leds_mm)), np.nan)
     _fill_reflectances(

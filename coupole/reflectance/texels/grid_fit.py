@@ -33,7 +33,7 @@ _TOGETHER = 1 << 16
 """Number of texels that are fitted together."""
 _PART = 1 << 12
 _MOST_WIDER = 4.0
-"""Largest factor of kd's variance."""
+"""Largest factor by which kd's variance is enlarged."""
 _SPREAD_PX, _LEAST_SPREAD = 2.5, 1.0
 """Standard deviation of the weights of surrounding texels in a colour, px, and its least value, in texels."""
 
@@ -102,7 +102,7 @@ def colours_around(
     """Return colours of texels [h, w, channels], averaged with the texels around them, and their standard
     uncertainty [h, w]. A colour is the logarithm of kd over the channels' mean.
 
-    A texel's red and blue pixels are not in the same places, and paint that changes between them looks like a
+    A texel's red and blue pixels are at different places, so a change of the paint between them looks like a
     colour. So the difference of a texel's colour from its triangle's is averaged with those of the texels around,
     within some pixels. The spread that the mean removes gives its uncertainty. The mean of the logarithms over the
     channels is 0, so kd's mean over the channels stays as it was fitted.

@@ -93,7 +93,7 @@ def texel_widening(result: RunResult, say: Said = silent) -> dict[str, Any] | No
 
 
 def _add_errors(samples: WideningSamples, result: RunResult, view: ViewSamples) -> None:
-    """Add the errors of a view's pictures."""
+    """Add the errors of a view's pictures to the samples."""
     scene = scene_of_view(result, view.view, TEXELS)
     residuals = np.nan_to_num(residuals_of(scene))[..., None].repeat(result.channels, axis=2).astype(np.float32)
     makers: dict[str, Callable[[int], Singles]] = {

@@ -27,7 +27,7 @@ class TexelSize:
 
     @property
     def in_words(self) -> str:
-        """Name for people."""
+        """Name of the size for readers."""
         return "single pixels (auto)" if self.mm is None else f"{self.mm:g} mm"
 
     def side_px(self, of_pixel_mm: float) -> int:

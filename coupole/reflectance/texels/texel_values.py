@@ -136,7 +136,7 @@ def texel_bytes(channels: int, leds: int, side_px: int) -> int:
 
 @dataclass(frozen=True)
 class _Band:
-    """Rows of a grid."""
+    """Some rows of a view's grid."""
 
     triangle_of_pixel: NDArray[np.int32]
     """[h, w] also -1 outside of the band."""

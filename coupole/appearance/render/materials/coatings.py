@@ -116,7 +116,7 @@ class Layers(Model):
     """Reflectance of the ground inside the binder; a measured one was measured under a face of the same index."""
     index: Refraction = indices.BINDER
     roughness: Roughness = 0.05
-    """Roughness of the face; a leaf on top has its own."""
+    """Roughness of the face; a leaf on top has its own roughness."""
 
     @model_validator(mode="after")
     def _check_top_leaf(self) -> Layers:

@@ -1,9 +1,9 @@
 """Materials by Mitsuba's own plugins, with spectra of `appearance.matter`.
 
-Kept: complex indices of metals, interference in films by reflectance at every angle, Kubelka and Munk's layers,
-Fresnel surfaces with all internal reflections (Saunderson), GGX facets, polarisation by surfaces. Simplified:
-bodies under films are Lambertian, metals under lacquer have the absorption along the normal, facets reflect once
-(docs/decisions/0013).
+These are modelled: complex indices of metals, interference in films by reflectance at every angle, Kubelka and Munk's
+layers, Fresnel surfaces with all internal reflections (Saunderson), GGX facets, polarisation by surfaces. These
+are simplified: bodies under films are Lambertian, metals under lacquer have the absorption along the normal,
+facets reflect once (docs/decisions/0013).
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ Facets = Literal["ggx", "beckmann", "cook_torrance"]
 """Kind of facets. `beckmann`: Beckmann's slopes with Smith's shadowing; `cook_torrance`: the same slopes in
 V-shaped grooves (seed 001)."""
 _LEAST_SHARE = 0.1
-"""Least share of the paths for each part of a sum."""
+"""Least share of the paths for each part of a blended material."""
 _LEAST_THROUGH = 1e-5
 """Share of the light that returns through a leaf. Below this share, the leaf hides its bole."""
 
 
 class Diffuse(Model):
-    """Lambert."""
+    """A Lambertian surface."""
 
     kind: Literal["diffuse"]
     reflectance: Reflectance
@@ -177,9 +177,9 @@ def coated_body(body: InternalReflectance, index: Array, roughness: float) -> De
     """Return a body [81] inside a medium with a glossy face; the face itself reflects by its index [81] at 587.6
     nm.
 
-    Mitsuba's polarised plastic (Baek et al. 2020) transmits light in and out once. With all internal reflections
-    the factor is body/(n^2 (1 - k2 body)), with k2 the face's reflectance for diffuse light from within: for light
-    along the normal this agrees with Saunderson.
+    Mitsuba's polarised plastic (Baek et al. 2020) transmits light in once and out once. With all internal
+    reflections the factor is body/(n^2 (1 - k2 body)), with k2 the face's reflectance for diffuse light from
+    within: for light along the normal this agrees with Saunderson.
     """
     return {
         "type": "pplastic",

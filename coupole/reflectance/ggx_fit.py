@@ -28,8 +28,8 @@ ROWS = 11
 existing sample."""
 _OFF = UNKNOWNS
 _TOGETHER = 4
-"""Number of packs in one product, which must stay below the largest double for an error of 1e4 scales in each
-sample."""
+"""Number of packs whose values are multiplied in one product. The product must stay below the largest double, even
+with an error of 1e4 scales in each sample."""
 
 
 @numba.njit(cache=True, nogil=True)

@@ -49,7 +49,7 @@ class PointMaterials:
     ks: Floats
     alpha: Floats
     residual: Floats
-    """Weighted rms of the residuals of the square roots, as a share of sqrt(kd)."""
+    """Weighted rms of the residuals, which are differences of square roots, as a share of sqrt(kd)."""
 
     def at(self, pixels: slice) -> PointMaterials:
         """Return the materials of some of the pixels."""

@@ -25,7 +25,7 @@ _TRIANGLES = 2000
 _LEDS = 128
 """Number of LEDs of each view from which samples are taken."""
 _DRAWN, _DRAWS = 1000, 300
-"""Number of samples, of all views, for Monte Carlo, and of draws for each."""
+"""Number of samples, of all views, for Monte Carlo, and number of draws for each sample."""
 
 
 def uncertainty_of(

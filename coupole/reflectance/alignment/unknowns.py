@@ -169,8 +169,9 @@ def vertex_normals(vertices_mm: Floats, triangles: NDArray[np.uint32]) -> Floats
 
 
 def control_points(points_mm: Floats, spacing_mm: float) -> Floats:
-    """Return some of the points [n, 3]. Each is the farthest from those before it, until all other points are
-    within `spacing_mm` of one. Raises InputError if more than `MOST_CONTROLS` are needed."""
+    """Return some of the points [n, 3]. Each next point is the farthest from the points before it. The choice ends
+    when all other points are within `spacing_mm` of a chosen one. Raises InputError if more than `MOST_CONTROLS`
+    are needed."""
     middle = int(np.argmin(np.sum((points_mm - points_mm.mean(axis=0)) ** 2, axis=1)))
     indices: list[int] = []
     for index, far_mm in farthest_first(points_mm, middle):

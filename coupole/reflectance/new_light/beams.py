@@ -60,7 +60,7 @@ class Emitter:
     centre_mm: Floats
     """[3], of an area."""
     halves_mm: Floats
-    """[2] of its width and height."""
+    """[2] half of its width and half of its height."""
     radiance: NDArray[np.float32]
     """[h, w, channels]; [1, 1, channels] of an area."""
     density: float

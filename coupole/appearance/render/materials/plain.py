@@ -1,8 +1,8 @@
 """Materials by Mitsuba's own plugins, with spectra of `appearance.matter`.
 
-These are modelled: complex indices of metals, interference in films by reflectance at every angle, Kubelka and Munk's
-layers, Fresnel surfaces with all internal reflections (Saunderson), GGX facets, polarisation by surfaces. These
-are simplified: bodies under films are Lambertian, metals under lacquer have the absorption along the normal,
+These are modelled: complex indices of metals, interference in films by reflectance at every angle, Kubelka and
+Munk's layers, Fresnel surfaces with all internal reflections (Saunderson), GGX facets, polarisation by surfaces.
+These are simplified: bodies under films are Lambertian, metals under lacquer have the absorption along the normal,
 facets reflect once (docs/decisions/0013).
 """
 

@@ -37,7 +37,8 @@ TRIANGLES_AROUND = 64
 _MOST_STEP = 1.0
 """Largest step of a triangle, because a failed fit cannot be corrected by a linear step."""
 _OUTLIER = 9.0
-"""Limit beyond which a squared deviation loses weight, as a multiple of the window's mean square."""
+"""Largest squared deviation that is used, as a multiple of the window's mean square; larger ones are reduced to
+it."""
 
 
 def lower_half(covariance: NDArray[np.float64]) -> Singles:

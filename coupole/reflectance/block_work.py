@@ -163,8 +163,8 @@ def _done_alone(function: Callable[[Block], Done], block: Block) -> Done:
 
 @contextmanager
 def workshop(scheduler: str | None) -> Iterator[Workshop]:
-    """Return this process, or the workers of the scheduler at an address. Raises InputError if the scheduler does
-    not answer or has no workers."""
+    """Yield a workshop: this process, or the workers of the scheduler at an address. Raises InputError if the
+    scheduler does not answer or has no workers."""
     if scheduler is None:
         yield Here()
         return

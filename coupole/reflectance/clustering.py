@@ -142,7 +142,7 @@ def _looks(kd, ks, alpha, off_cos, root_reflectances):  # type: ignore[no-untype
 
 @numba.njit(cache=True, nogil=True)
 def axes_about(normal, axes):  # type: ignore[no-untyped-def]
-    """Return rows x, y, z of a frame about a normal (Duff et al. 2017)."""
+    """Fill `axes` [3, 3] with rows x, y, z of a frame about a normal (Duff et al. 2017)."""
     x, y, z = normal
     sign = 1.0 if z >= 0.0 else -1.0
     a = -1.0 / (sign + z)

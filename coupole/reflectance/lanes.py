@@ -238,7 +238,7 @@ def _shuffle(builder: Any, first_vector: Any, second_vector: Any, places: list[i
 
 
 def _vectors_at(builder: Any, address: Any, kind: Any, count: int) -> Iterator[Any]:
-    """Return pointers to `count` consecutive vectors of one kind, aligned like their elements."""
+    """Yield pointers to `count` consecutive vectors of one kind, aligned like their elements."""
     size = kind.count * 4
     for number in range(count):
         yield builder.inttoptr(builder.add(address, ir.IntType(64)(number * size)), kind.as_pointer())

@@ -222,9 +222,9 @@ def add_scores(roots, good, lights, half, views, view_of, group, normal, grey, b
 def _colours(  # type: ignore[no-untyped-def]
     sample_colours, good, lights, half, views, view_of, group, normal, grey, kd, ks, covariance, u_kd, u_ks
 ):
-    """Return the relative uncertainties of each channel's kd and ks. One part comes from their own least squares
-    (`normal_fit.colours_from`), with fixed normal and roughness. The other is the part that normal and roughness
-    add to the channels' mean."""
+    """Fill `u_kd` and `u_ks` with the relative uncertainties of each channel's kd and ks. One part comes from
+    their own least squares (`normal_fit.colours_from`), with fixed normal and roughness. The other is the part
+    that normal and roughness add to the channels' mean."""
     channels = len(kd)
     bread, meat = np.zeros((2, 2)), np.zeros((channels + 1, 2, 2))
     score, row = np.zeros((channels + 1, 2)), np.empty(2)

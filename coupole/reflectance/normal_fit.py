@@ -119,8 +119,9 @@ def _fit_colours(values, normals, grey_kd, grey_ks, alphas, lights, half, view, 
 
 @numba.njit(cache=True, nogil=True)
 def colours_from(values, used_samples, normal, grey, lights, half, views, view_of, kd, ks):  # type: ignore[no-untyped-def]
-    """Return kd and ks [channels] for the samples `used_samples` of values [samples, channels]. Normal and `grey`
-    (kd, ks, alpha) were fitted to the channels' means; samples have the weights of the last step of that fit."""
+    """Fill `kd` and `ks` [channels] from the samples `used_samples` of values [samples, channels]. Normal and
+    `grey` (kd, ks, alpha) were fitted to the channels' means; samples have the weights of the last step of that
+    fit."""
     n0, n1, n2 = normal
     channels = values.shape[1]
     sums = np.zeros((channels, 2))
@@ -255,7 +256,7 @@ def _least_cosine(normal, views):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _move(unknowns, step, trial):  # type: ignore[no-untyped-def]
-    """Return the unknowns after a step: two tilts along the normal's tangents, then the logarithms."""
+    """Fill `trial` with the unknowns after a step: two tilts along the normal's tangents, then the logarithms."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
     t1, t2 = tangents(n0, n1, n2)
     x = n0 + step[0] * t1[0] + step[1] * t2[0]

@@ -213,7 +213,7 @@ def _rows(
 def _taught(
     result: PictureResult, lights: NDArray[np.int64], gains: NDArray[np.float64]
 ) -> Iterator[tuple[NDArray[np.bool_], Floats]]:
-    """Return strips of rows, drawn at random, until they have enough pixels; a small picture is used whole."""
+    """Yield strips of rows, drawn at random, until they have enough pixels; a small picture is used whole."""
     mask = result.mask
     tops = [top for top in range(0, len(mask), _TAUGHT_ROWS) if mask[top : top + _TAUGHT_ROWS].any()]
     np.random.default_rng(0).shuffle(tops)

@@ -168,7 +168,7 @@ def _contradictions_block(job: _Job, threads: int | None, task: tuple[int, slice
 def _blocks_of_views(
     result: RunResult, numbers: Sequence[int], memory_bytes: int, shop: Workshop
 ) -> list[tuple[int, slice]]:
-    """Yield the number of the view, and rows of its file."""
+    """Return the number of the view, and rows of its file."""
     most = shop.most_rows(sum(len(result.views[number].triangles) for number in numbers))
     return [
         (number, rows)

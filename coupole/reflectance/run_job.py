@@ -308,7 +308,7 @@ class _View:
 def _extract(
     request: RunRequest, token: str, measured_runs: Sequence[MeasuredRun], out: Path, shop: Workshop, say: Said
 ) -> None:
-    """Make the samples of all views, and return the report's entry about each."""
+    """Make the samples of all views, and write the report's entry about each view beside its samples."""
     left_out = tuple(read_settings(out)["left_out"])
     remaining_views = [
         _View(

@@ -100,8 +100,8 @@ def for_group(description: Any, group: Sequence[int], step_nm: StepNm, files: Pa
 
 
 def _write_table(table: BakedTable, group: Sequence[int], step_nm: StepNm, files: Path) -> str:
-    """Write the table as a file with the group's values over the quarters. An earlier file is replaced, not
-    changed, because it may still be open."""
+    """Write the table as a file with the group's values over the quarters, and return its path. An earlier file is
+    replaced, not changed, because it may still be open."""
     path, new = files / f"{id(table)}.bsdf", files / "new.bsdf"
     new.write_bytes(table.encode(_nodes_nm(group, step_nm), np.repeat(list(group), 2).tolist()))
     new.replace(path)

@@ -229,7 +229,7 @@ def with_plain_lights(scene: Scene, folder: Path) -> PlainScene:
 
 
 def files(part: Any, at: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Path]]:
-    """Return all paths that a scene names, with the keys that lead to them."""
+    """Yield all paths that a scene names, with the keys that lead to them."""
     if isinstance(part, Path):
         yield at, part
     elif isinstance(part, BaseModel):

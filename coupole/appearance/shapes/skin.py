@@ -63,7 +63,7 @@ def grown(skin: Skin, by_mm: float) -> Skin:
 
 def scatter_points(skin: Skin, count: int, random: np.random.Generator) -> tuple[Array, Array]:
     """Return `count` points [count, 3], evenly by area, and the frames [count, 3, 3] there. Their third columns
-    are normals; their first columns are random directions in the surface."""
+    are normals; their first columns are arbitrary directions in the surface."""
     areas = skin.areas_mm2()
     triangles = random.choice(len(areas), count, p=areas / areas.sum())
     root, second = np.sqrt(random.random(count)), random.random(count)

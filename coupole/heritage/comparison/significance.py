@@ -49,8 +49,8 @@ def of_vectors(differences: Floats, covariances: Floats, freedom: float) -> tupl
 
 
 def discoveries(p: Floats, false_share: float = FALSE_SHARE) -> NDArray[np.bool_]:
-    """Mark the significant p-values [n], so that at most the given share of the marked ones is expected to be
-    false. NaN is not marked."""
+    """Return a mask of the significant p-values [n], for which at most the given share is expected to be false.
+    NaN is not significant."""
     finite_rows = np.flatnonzero(np.isfinite(p))
     order = finite_rows[np.argsort(p[finite_rows])]
     under = p[order] <= false_share * np.arange(1, len(order) + 1) / max(1, len(order))

@@ -164,7 +164,7 @@ class Made:
 
 
 def render_all(restoration: Restoration, out: Path, say: Say) -> list[Made]:
-    """Make spectral pictures of each hypothesis from each camera, in `out`/HYPOTHESIS/CAMERA.exr.
+    """Make and return spectral pictures of each hypothesis from each camera, in `out`/HYPOTHESIS/CAMERA.exr.
 
     Raises InputError for a scene that cannot be rendered, StorageError if the disk cannot be written.
     """

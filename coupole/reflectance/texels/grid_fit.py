@@ -166,9 +166,9 @@ def colours_of(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _colours(values, places_mm, led_mm, camera_mm, normals, grey, shine, kd, u_kd):  # type: ignore[no-untyped-def]
-    """Return each channel's kd by least squares, and its uncertainty from the residuals. The fit uses the
-    difference of a channel's values from their mean over the channels, because the error of a lobe with another
-    form cancels in it."""
+    """Fill `kd` with each channel's kd by least squares, and `u_kd` with its uncertainty from the residuals. The
+    fit uses the difference of a channel's values from their mean over the channels, because the error of a lobe
+    with another form cancels in it."""
     channels, leds = values.shape[1:]
     cosines, lobes, weights = np.empty(leds), np.empty(leds), np.empty(leds)
     for texel in range(len(values)):

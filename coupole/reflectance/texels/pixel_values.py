@@ -77,7 +77,7 @@ class PixelReader:
         return len(self._reader.lists.places)
 
     def blocks(self, memory_bytes: int) -> list[slice]:
-        """Yield rows of the view's file, with pixels' values that fit into a memory."""
+        """Return slices of rows of the view's file, with pixels' values that fit into a memory."""
         starts = self._reader.lists.starts[:: self._reader.pixels.shape[1]]
         pixel_bytes = 2 * len(self._samples.leds)
         most = max(int(memory_bytes // pixel_bytes), int(np.diff(starts).max(initial=1)))

@@ -79,7 +79,7 @@ class TexelReader:
         return int(np.count_nonzero(self.grid.triangle >= 0))
 
     def bands(self, memory_bytes: int) -> list[slice]:
-        """Yield rows of the grid, with texels' values that fit into a memory."""
+        """Return slices of rows of the grid, with texels' values that fit into a memory."""
         counts = np.count_nonzero(self.grid.triangle >= 0, axis=1)
         row_bytes = counts * texel_bytes(self._radiometry.channels, len(self._samples.leds), self.grid.side_px)
         rows, first = [], 0

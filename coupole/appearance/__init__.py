@@ -1,2 +1,2 @@
-"""Published spectral models of materials and light, and a spectral path tracer. Functions of arrays, without a
-rig."""
+"""Published spectral models of materials and light, and a spectral path tracer. All are functions of arrays that
+need no rig."""

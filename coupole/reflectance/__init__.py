@@ -1,1 +1,2 @@
-"""Reflectance: from proven frames, or pictures under known lights, to materials that can be lit anew."""
+"""Reflectance: from proven frames, or from pictures under known lights, to materials that can be lit by new
+lights."""

@@ -1,8 +1,8 @@
-"""Samples of views that were taken beside an acquisition, before anybody knew what else the run would hold.
+"""Samples of views, taken during an acquisition, before the rest of the run was known.
 
-A result is begun with the frames of all its views (`result_folder.begin`). Samples that were taken before are
-noted view by view: the frames that it depends on, and the LEDs kept for the check. When the run is complete, what
-agrees is used, and the rest is taken again.
+A result is begun with the frames of all its views (`result_folder.begin`). For samples that were taken before, a
+note for each view names the frames that they depend on, and the LEDs kept for the check. When the run is complete,
+samples that agree with it are used, and the others are taken again.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _DECIDE = ("records", "mesh", "refined", "emission", "simulated", "channels")
 
 @dataclass(frozen=True)
 class ViewBasis:
-    """Frames and LEDs that a view's samples depend on, beside mesh and records."""
+    """Frames and LEDs that a view's samples depend on, besides mesh and records."""
 
     frames: str
-    """Hash of the frames of the view and of those before it, whose dark frames count too."""
+    """Hash of the frames of the view and of the views before it, because their dark frames are used too."""
     left_out: tuple[int, ...]
     """LEDs kept for the check, whose pictures are written with the samples."""
 
@@ -48,8 +48,8 @@ def frames_basis(frames: LightFrames, view: str) -> str:
 
 
 def is_of_run(out: Path, run: str) -> bool:
-    """Tell whether what a folder holds of a result is of this run, by its name, and of no other. Raises InputError
-    for a folder whose files cannot be read."""
+    """Tell, by the run's name, whether the result in a folder belongs to this run and to no other. Raises
+    InputError for a folder whose files cannot be read."""
     if (out / SETTINGS).exists():
         return list(read_settings(out)["runs"]) == [run]
     notes = _read_notes(out)
@@ -57,8 +57,8 @@ def is_of_run(out: Path, run: str) -> bool:
 
 
 def note_view(out: Path, run: str, settings: Mapping[str, Any], file_name: str, basis: ViewBasis) -> None:
-    """Note, before the samples of a view of a run are taken, what they depend on. Raises InputError if others were
-    taken of another run or with other settings, OSError."""
+    """Note the inputs of a view's samples, before the samples are taken. Raises InputError if the folder has
+    samples of another run or with other settings, and OSError."""
     notes = _read_notes(out)
     decisive = _decisive(settings)
     if notes is None:
@@ -72,7 +72,7 @@ def note_view(out: Path, run: str, settings: Mapping[str, Any], file_name: str, 
 
 
 def is_taken(out: Path, file_name: str, basis: ViewBasis) -> bool:
-    """Tell whether the samples of a view are there, and agree with its frames as they are now."""
+    """Tell whether the samples of a view are there, and agree with its present frames."""
     notes = _read_notes(out)
     view_notes = None if notes is None else notes["views"].get(file_name)
     return (
@@ -85,9 +85,10 @@ def is_taken(out: Path, file_name: str, basis: ViewBasis) -> bool:
 def adopt(
     out: Path, settings: Mapping[str, Any], bases: Mapping[str, ViewBasis], discarded_names: Collection[str]
 ) -> None:
-    """Keep those samples taken during an acquisition that are valid for the complete run; `bases` are those of its
-    views, by the names of their files. Raises InputError if the samples are of other input, if those of a view
-    whose frames were discarded (`discarded_names`) are not valid, or a process is at work on them.
+    """Keep the samples from the acquisition that are valid for the complete run, and remove the others. `bases`
+    holds the basis of each view by the name of its file. Raises InputError if the samples were made from other
+    input, if a process works on them, or if they are not valid and the frames of their view were discarded
+    (`discarded_names`).
     """
     if not (out / FOLDER).is_dir():
         return
@@ -111,7 +112,7 @@ def adopt(
 
 
 def clear_beside(out: Path) -> None:
-    """Remove the files that are needed only while a result is made, when the result is complete."""
+    """Remove the files that are needed only until the result is complete."""
     so_far.remove(out)
     shutil.rmtree(out / FOLDER, ignore_errors=True)
 
@@ -127,7 +128,7 @@ def _of_others(out: Path) -> str:
 
 
 def _read_notes(out: Path) -> dict[str, Any] | None:
-    """None if nothing was noted."""
+    """Read the notes; None if nothing was noted."""
     path = out / _NOTES
     try:
         notes = read_json(path)

@@ -1,7 +1,7 @@
-"""Whole blocks of work, here or by the workers of a cluster (dask.distributed).
+"""Blocks of work, done in this process or by the workers of a cluster (dask.distributed).
 
-A block is a function of few arguments and what it is done for, with a result that is small or is a file. Workers
-share the file system of the result with whoever asks them. If a worker dies, another one repeats its task.
+A block is a function with few arguments; its result is small or is a file. Workers share the file system of the
+result with the process that asks them. If a worker dies, another one repeats its task.
 """
 
 from __future__ import annotations
@@ -24,41 +24,41 @@ Done = TypeVar("Done")
 Said = Callable[[str, int, int], None]
 _ANSWERS_S = 10.0
 _AHEAD = 3
-"""Blocks for each thread of the workers that are asked for before their results are taken."""
+"""Blocks for each thread of the workers that are requested before their results are taken."""
 _BLOCKS_EACH, _FEWEST_ROWS, _MOST_ROWS = 8, 256, 1 << 12
-"""Blocks that a thread gets at least, and triangles of a block."""
+"""Least number of blocks for each thread; least and largest number of triangles in a block."""
 _MISSING = "--scheduler: dask.distributed is not installed here; `pip install 'coupole[cluster]'` adds it"
 
 
 def silent(step: str, done_count: int, of: int) -> None:
-    """Tell nobody."""
+    """Report nothing."""
 
 
 class Workshop(Protocol):
-    """Place where blocks are processed."""
+    """A place where blocks are processed."""
 
     threads: int | None
-    """Number of threads that a block may use; None for as many as there are cores."""
+    """Number of threads that a block may use; None for one thread for each core."""
 
     def most_rows(self, count: int) -> int:
-        """Return the number of triangles of a block, of `count` in all."""
+        """Return the number of triangles of a block, for `count` triangles in all."""
         ...
 
     def map(self, function: Callable[[Block], Done], blocks: Iterable[Block]) -> Iterator[Done]:
-        """Results in the order of the blocks."""
+        """Return the results in the order of the blocks."""
         ...
 
     def everywhere(self, function: Callable[[], Any]) -> None:
-        """Call a function in each process that does blocks."""
+        """Call a function in each process that processes blocks."""
         ...
 
     def reporter(self, say: Said) -> Said:
-        """Return the function by which a block can report its progress."""
+        """Return the function that a block calls to report its progress."""
         ...
 
     def refuse_blind(self, folder: Path, witness: str) -> None:
-        """Raises InputError if a worker sees another content of one file of a folder than this machine, or has
-        another version of Coupole.
+        """Raise InputError if a worker does not see the same content of one file of a folder as this machine, or
+        has another version of Coupole.
         """
         ...
 
@@ -85,7 +85,7 @@ class Here:
 
 
 class Cluster:
-    """Workshop in the workers of a scheduler: a block in each of their threads."""
+    """Workshop in the workers of a scheduler: each of their threads processes one block at a time."""
 
     threads: int | None = 1
 
@@ -93,7 +93,8 @@ class Cluster:
         self._client, self._address = client, address
 
     def most_rows(self, count: int) -> int:
-        """Return a number so small that no worker waits long for the last one's last block."""
+        """Return the number of triangles of a block, small enough that no worker waits long for the last block of
+        another."""
         return int(np.clip(-(-count // (_BLOCKS_EACH * self._all_threads)), _FEWEST_ROWS, _MOST_ROWS))
 
     def map(self, function: Callable[[Block], Done], blocks: Iterable[Block]) -> Iterator[Done]:
@@ -155,15 +156,15 @@ def _seen_from_here(witness: Path) -> tuple[str | None, str]:
 
 
 def _done_alone(function: Callable[[Block], Done], block: Block) -> Done:
-    """Process a block in a worker. BLAS must not take threads that others work with."""
+    """Process a block in a worker. BLAS must not use threads in which other blocks are processed."""
     threadpool_limits(1, user_api="blas")
     return function(block)
 
 
 @contextmanager
 def workshop(scheduler: str | None) -> Iterator[Workshop]:
-    """This process, or the workers of a scheduler by its address. Raises InputError if it does not answer, or has
-    no workers."""
+    """Yield a workshop: this process, or the workers of the scheduler at an address. Raises InputError if the
+    scheduler does not answer or has no workers."""
     if scheduler is None:
         yield Here()
         return

@@ -1,4 +1,4 @@
-"""The file of materials that many triangles share, `fits/clusters.h5`."""
+"""The file `fits/clusters.h5`: materials that many triangles share."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class Clusters:
 
     OF_CLUSTERS: ClassVar = ("kd", "ks", "alpha", "residual")
     cluster: NDArray[np.int32]
-    """[n] of all triangles of the fits; -1 for none."""
+    """[n] cluster of each triangle of the fits; -1 for none."""
     borrowed: NDArray[np.bool_]
-    """[n]"""
+    """[n] True for a triangle that took its material from a cluster."""
     kd: NDArray[np.float64]
     """[clusters, channels]"""
     ks: NDArray[np.float64]
@@ -46,8 +46,8 @@ class Clusters:
     def at(
         self, own_materials: TriangleMaterials, mesh_normals: NDArray[np.float64], block: slice | NDArray[np.int64]
     ) -> TriangleMaterials:
-        """Return the materials of triangles by their places in `RunResult.triangles`. The normals are
-        those of `own_materials`; a triangle that borrows a material has the mesh's normal."""
+        """Return the materials of triangles, given by their places in `RunResult.triangles`. The normals are taken
+        from `own_materials`; a triangle that borrows a material has the mesh's normal."""
         number, is_borrowed = self.cluster[block], self.borrowed[block, None]
         kd, ks, alpha, residual = (getattr(self, name)[number] for name in self.OF_CLUSTERS)
         alpha[number < 0] = np.nan
@@ -56,7 +56,7 @@ class Clusters:
 
 
 def read_clusters(folder: Path) -> Clusters:
-    """Read the clusters of a result of runs. Raises InputError if there are none."""
+    """Read the clusters of a result of runs. Raises InputError if there is no such file."""
     path = folder / CLUSTERS
     if not path.exists():
         raise InputError(f"{path}: is not there; `coupole reflectance cluster {folder}` makes it")
@@ -70,7 +70,7 @@ def read_clusters(folder: Path) -> Clusters:
 
 
 def write_clusters(path: Path, clusters: Clusters, members: NDArray[np.int64]) -> None:
-    """`members` [clusters] is how many triangles a cluster was found by."""
+    """Write the file; `members` [clusters] is the number of triangles by which each cluster was found."""
     with h5py.File(path, "w") as file:
         for name, description in _TOLD.items():
             values = members if name == "members" else getattr(clusters, name)

@@ -1,8 +1,8 @@
-"""Triangles of one material, found by what they look like, and the material from the samples of all of them (seed
-003, section 7: 1,000 materials for 400,000 triangles).
+"""Clusters of triangles that look alike, and one material for each cluster from all its samples (seed 003, section
+7: 1,000 materials for 400,000 triangles).
 
-Each sample is turned into the frame of its own triangle, whose z is the fitted normal: without that, normals that
-are off by degrees would blur what is pooled.
+Each sample is turned into the frame of its own triangle, in which z is the fitted normal. The mesh's normals,
+which are wrong by degrees, would blur the pooled samples.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from coupole.reflectance.triangle_fit import FEWEST, HELD, MOST_KS, USUAL, Trian
 Floats = NDArray[np.float64]
 
 MOST_POOLED = 4096
-"""Samples of a cluster that are kept for its fit."""
+"""Number of samples of a cluster that are kept for its fit."""
 _LEAST_EACH = 8
 _SLANT_COS = math.cos(math.radians(30.0))
 _OFF_DEG = (0.0, 4.0, 8.0, 16.0, 32.0, 64.0)
-"""Angles of the half vector to the normal at which materials are compared; lights and views are slanted by 30
-degrees."""
+"""Angles between half vector and normal at which materials are compared; lights and views are 30 degrees from the
+normal."""
 _LEARNT_FROM = 20_000
 _ROUNDS = 10
 _DISTANCES = 1 << 23
-"""Number of distances that are computed at a time."""
+"""Number of distances that are computed together."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Pool:
     values: NDArray[np.float32]
     """[k, MOST_POOLED, channels] f cos_i."""
     lights: NDArray[np.float32]
-    """[k, MOST_POOLED, 3] directions, z the triangle's normal."""
+    """[k, MOST_POOLED, 3] directions in the triangle's frame, whose z axis is its normal."""
     views: NDArray[np.float32]
     counts: NDArray[np.int64]
     """[k]"""
@@ -56,14 +56,15 @@ def empty_pool(clusters: int, channels: int) -> Pool:
 
 
 def looks(materials: TriangleMaterials) -> Floats:
-    """[b, channels * 6] square roots of reflectance about the mirror direction."""
+    """[b, channels * 6] square roots of reflectance near the mirror direction."""
     root_reflectances = np.empty((len(materials.alpha), materials.kd.shape[1], len(_OFF_DEG)))
     _looks(materials.kd, materials.ks, materials.alpha, np.cos(np.radians(_OFF_DEG)), root_reflectances)
     return root_reflectances.reshape(len(root_reflectances), -1)
 
 
 def clusters_of(features: Floats, count: int) -> NDArray[np.int64]:
-    """[b] number of the cluster of each point [b, n], 0 to at most `count` - 1 without gaps, by k-means."""
+    """[b] cluster of each of the points [b, n], by k-means: numbers from 0 to at most `count` - 1, without
+    gaps."""
     random = np.random.default_rng(0)
     some = features
     if len(features) > _LEARNT_FROM:
@@ -86,8 +87,8 @@ def pool_samples(
     members: NDArray[np.int64],
     random: np.random.Generator,
 ) -> None:
-    """Add samples of triangles with fitted `normals` [b, 3] to the pools of their clusters [b], -1 for none; each
-    of a cluster's `members` [k] gives an equal share."""
+    """Add samples of triangles with fitted `normals` [b, 3] to the pools of their clusters [b] (-1 for none). All
+    triangles of a cluster, `members` [k] in number, contribute equally."""
     most_each = np.maximum(_LEAST_EACH, MOST_POOLED // np.maximum(members, 1))
     order = random.permutation(np.flatnonzero(sample_mask))
     _pool(
@@ -97,7 +98,7 @@ def pool_samples(
 
 
 def fit_pool(pool: Pool, starts: TriangleMaterials) -> TriangleMaterials:
-    """[k] materials of clusters, from `starts` [k]; those whose pool is too small keep their start."""
+    """[k] materials of clusters, fitted from `starts` [k]; a cluster with too small a pool keeps its start."""
     count, channels = len(pool.counts), pool.values.shape[2]
     parameters = np.concatenate([starts.kd, starts.ks, starts.alpha[:, None], np.full((count, 1), np.nan)], axis=1)
 
@@ -120,8 +121,8 @@ def fit_pool(pool: Pool, starts: TriangleMaterials) -> TriangleMaterials:
 def nearest_cluster(
     samples: TriangleSamples, sample_mask: NDArray[np.bool_], materials: TriangleMaterials, fewest: int
 ) -> NDArray[np.int64]:
-    """[b] the cluster whose material explains a triangle's samples best, the mesh's normal taken; -1 for fewer
-    than `fewest` samples."""
+    """[b] cluster whose material fits a triangle's samples best, with the mesh's normal; -1 for fewer than
+    `fewest` samples."""
     nearest = np.full(len(samples.values), -1, np.int64)
     _nearest(
         samples.values, samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, samples.normals,
@@ -141,7 +142,7 @@ def _looks(kd, ks, alpha, off_cos, root_reflectances):  # type: ignore[no-untype
 
 @numba.njit(cache=True, nogil=True)
 def axes_about(normal, axes):  # type: ignore[no-untyped-def]
-    """Rows x, y, z of a frame about a normal (Duff et al. 2017)."""
+    """Fill `axes` [3, 3] with rows x, y, z of a frame about a normal (Duff et al. 2017)."""
     x, y, z = normal
     sign = 1.0 if z >= 0.0 else -1.0
     a = -1.0 / (sign + z)
@@ -199,7 +200,7 @@ def _pool(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _fit_one(values, lights, views, parameters):  # type: ignore[no-untyped-def]
-    """A material (kd, ks, alpha, residual) in place, from the start that is there."""
+    """Fit one material (kd, ks, alpha, residual) in place, starting from its values."""
     count, channels = values.shape
     half, roots, grey = np.empty((count, 3)), np.empty(count), np.zeros(2)
     for n in range(count):

@@ -1,10 +1,10 @@
-"""Samples that something in the cell has shaded which nobody described, for example a cable: they are found by
-their contradiction.
+"""Samples that are shaded by a thing which nobody described, for example a cable. They contradict the samples
+beside them.
 
-A cable's full shadow is too dark to give samples. At its edge a triangle is lit in part, and its sample is too low
-by any amount. A contradicted sample is darker than the triangle's material in all channels, by more than its noise
-allows. The material there is mostly diffuse, so the form of a lobe is not the cause. The neighbouring LEDs agree
-with the material, so neither the triangle nor the model is wrong.
+A cable's full shadow is too dark to give samples. At the shadow's edge a triangle is partly lit, and its sample
+can be too low by any amount. A contradicted sample is darker than the triangle's material in all channels, by more
+than its noise allows. The material there is mostly diffuse, so the form of a lobe is not the cause. The
+neighbouring LEDs agree with the material, so neither the triangle nor the model is wrong.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples,
 Floats = NDArray[np.float64]
 
 BESIDE = 6
-"""Number of LEDs beside an LED that it is compared with."""
+"""Number of neighbouring LEDs with which an LED is compared."""
 _FEWEST_BESIDE = 4
-"""Least number of these that have a sample."""
+"""Least number of these LEDs that must have a sample."""
 _MOST_LEFT = 0.8
-"""Share of its light that a sample has kept."""
+"""A contradicted sample has kept less than this share of its light."""
 _AGREE = (0.9, 1.15)
-"""Median of the LEDs beside it over the material."""
+"""Range in which the median ratio of neighbouring LEDs to the material counts as agreement."""
 _LEAST_DIFFUSE = 0.5
-"""Least diffuse share of what the material gives."""
+"""Least diffuse share of the material's value."""
 _SIGMA = 5.0
 _PART = 256
-"""Triangles that a thread works on at a time."""
+"""Number of triangles that a thread works on at a time."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Neighbours:
 
     @classmethod
     def of(cls, led_mm: Floats, middle_mm: Floats) -> Neighbours:
-        """Return the LEDs in the directions nearest to each LED's own, as seen from the object's middle."""
+        """Return, for each LED, the LEDs in the nearest directions, as seen from the object's middle."""
         ways = led_mm - middle_mm
         ways /= np.linalg.norm(ways, axis=1, keepdims=True)
         if len(ways) < 2:
@@ -69,7 +69,8 @@ def contradiction_mask(
     *,
     threads: int | None = None,
 ) -> NDArray[np.bool_]:
-    """[b, leds] of one view's samples, by materials [b] and relative noise [b, leds, channels]."""
+    """[b, leds] True for contradicted samples of one view, by materials [b] and relative noise [b, leds,
+    channels]."""
     whole = model_values(samples, materials)
     dark = np.zeros(whole.shape[:2], np.bool_)
 
@@ -108,8 +109,8 @@ def _mark(values, whole, u_noise, led_mm, centres_mm, normals, kd, places_beside
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _compare(values, whole, u_noise, kd, cosine):  # type: ignore[no-untyped-def]
-    """Tell whether a sample is darker than the material in all its channels, by more than its noise. The mean
-    of its channels over the material's comes with it, NaN where there is none."""
+    """Tell whether a sample is darker than the material in all its channels, by more than its noise. Return also
+    the ratio of the sample's mean over the channels to the material's; NaN if there is none."""
     count, low_count, total = 0, 0, 0.0
     for channel in range(len(values)):
         ratio = values[channel] / whole[channel]
@@ -124,8 +125,8 @@ def _compare(values, whole, u_noise, kd, cosine):  # type: ignore[no-untyped-def
 
 @numba.njit(cache=True, nogil=True)
 def _is_darker(mean, places, own_ratio, ratios_beside):  # type: ignore[no-untyped-def]
-    """Tell whether the LEDs beside an LED, `places` in `mean`, agree with the material, and it does not;
-    `ratios_beside` is memory."""
+    """Tell whether an LED is darker than the material while the LEDs beside it, `places` in `mean`, agree with the
+    material; `ratios_beside` is working memory."""
     count = 0
     for place in places:
         if np.isfinite(mean[place]):
@@ -139,11 +140,11 @@ def _is_darker(mean, places, own_ratio, ratios_beside):  # type: ignore[no-untyp
 
 @dataclass(frozen=True)
 class Found:
-    """Samples that contradict others, among those of some rows of a view's file."""
+    """Samples that contradict others, in some rows of a view's file."""
 
     rows: slice
     places: NDArray[np.int64]
-    """[2, n] rows, from the first on, and LEDs."""
+    """[2, n] rows, from the first row on, and LEDs."""
     values: int
     """Number of values that these samples have."""
     all_values: int
@@ -161,7 +162,8 @@ def find(result: RunResult, view: ViewSamples, rows: slice, threads: int | None 
 
 
 def leave_out(view: ViewSamples, found_contradictions: Iterable[Found]) -> None:
-    """Take what contradicts others out of a view's file, which is whole, before or after. Raises OSError."""
+    """Remove contradicted samples from a view's file. The file is complete at all times, either the old one or the
+    new one. Raises OSError."""
 
     def write(part: Path) -> None:
         count = total = 0

@@ -1,4 +1,4 @@
-"""Results of runs whose frames are discarded when their samples are safe (`discard: after_fit`)."""
+"""Results of runs whose frames are discarded once their samples are safe (`discard: after_fit`)."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from coupole.storage.sample_proofs import has_proofs, note, problem_of, proofs_o
 
 _LOCK_NAP_S = 0.2
 _MOST_HASHED_BYTES = 2_000_000_000
-"""Files of views beyond it are left to `verify --manifest`."""
+"""Files of views that are larger than this are left to `verify --manifest`."""
 
 
 # -- the result that stands for the frames --------------------------------------------------------------------
 
 
 def refuse_without_frames(run: Run, out: Path) -> None:
-    """Raise FrameDiscarded if frames of a run were discarded for the samples of another result than this; and
-    StorageError if this one's are not what was proven."""
+    """Raise FrameDiscarded if frames of a run were discarded for the samples of another result. Raise StorageError
+    if the samples of this result differ from the proven ones."""
     for view, event in discarded_views(run).items():
         result = place_of_result(run, event)
         if result.resolve() != out.resolve():
@@ -52,8 +52,8 @@ def refuse_without_frames(run: Run, out: Path) -> None:
 
 
 def refuse_texels(run: Run, out: Path) -> None:
-    """Raise FrameDiscarded if texels, which need the frames of all LEDs, are asked for of a run whose frames are
-    discarded, or will be for this result."""
+    """Raise FrameDiscarded if texels are requested for a run whose frames are discarded, or will be for this
+    result: texels need the frames of all LEDs."""
     if discarded_views(run) or is_for_discarding(run, out):
         raise FrameDiscarded(
             f"--texels: needs the frames of all LEDs, and those of {run.folder} are discarded, or will be, as its "
@@ -66,8 +66,8 @@ def refuse_texels(run: Run, out: Path) -> None:
 
 
 def prove_written(out: Path, view: str, digest: str) -> None:
-    """Read the samples of a view back, and note it. If they differ from what was written, they are taken again the
-    next time. Raises ChecksumMismatch, StorageError."""
+    """Read the samples of a view back, and note this proof. If they differ from the written ones, they are taken
+    again the next time. Raises ChecksumMismatch, StorageError."""
     try:
         prove(out, view, digest)
     except ChecksumMismatch:
@@ -76,8 +76,8 @@ def prove_written(out: Path, view: str, digest: str) -> None:
 
 
 def read_back_again(out: Path, view: str) -> str:
-    """Return the digest of the samples of a view that an earlier process has proven, if they still are what they
-    were; empty if they were never proven. Raises ChecksumMismatch, StorageError."""
+    """Return the digest of a view's samples that an earlier process has proven, if they are unchanged; empty if
+    they were never proven. Raises ChecksumMismatch, StorageError."""
     proofs = proofs_of(out, view)
     if not proofs:
         return ""
@@ -87,8 +87,8 @@ def read_back_again(out: Path, view: str) -> str:
 
 
 def read_back_or_drop(out: Path, view: str) -> str:
-    """The same for a view whose frames are there: samples that are not what they were are taken again, and the
-    text is empty."""
+    """Do the same as `read_back_again` for a view whose frames are there. If the samples have changed, they are
+    marked to be taken again, and the returned text is empty."""
     try:
         return read_back_again(out, view)
     except ChecksumMismatch:
@@ -97,9 +97,9 @@ def read_back_or_drop(out: Path, view: str) -> str:
 
 
 def rewrite(path: Path, write: Callable[[Path], Any]) -> None:
-    """Replace a view's file of samples, as `complete` does. Where it may stand for discarded frames, the old file
-    is compared with its proof first, and the new one is read back and noted before it takes its place. Raises
-    ChecksumMismatch, StorageError, OSError."""
+    """Replace a view's file of samples, as `complete` does. If the file may stand for discarded frames, the old
+    file is compared with its proof first. The new file is read back and noted before it replaces the old one.
+    Raises ChecksumMismatch, StorageError, OSError."""
     out, view = path.parents[1], path.stem
     if not has_proofs(out):
         complete(path, write)
@@ -114,8 +114,9 @@ def rewrite(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def discard_complete(run: Run, out: Path, say: Callable[[str, int, int], object]) -> None:
-    """Discard, after a run's last session, what its plan says, of all views whose samples in its result are safe;
-    and what a crash has left. Waits while a session holds the run. Raises StorageError."""
+    """Discard the frames that a run's plan names, after its last session, for all views whose samples in its
+    result are safe. Finish also a discard that a crash interrupted. Waits while a session holds the run. Raises
+    StorageError."""
     if not is_complete(run.folder):
         return
     with _hold_when_free(run):
@@ -137,7 +138,7 @@ def discard_complete(run: Run, out: Path, say: Callable[[str, int, int], object]
 
 
 def refuse_stale(discarded_names: Collection[str], view: str, out: Path) -> None:
-    """Raise InputError if samples that are about to be removed stand for discarded frames."""
+    """Raise InputError if samples that are to be removed stand for discarded frames."""
     if view in discarded_names:
         raise InputError(
             f"{samples_path(out, view)}: does not belong to the frames that the run has now, and cannot be taken "
@@ -147,8 +148,8 @@ def refuse_stale(discarded_names: Collection[str], view: str, out: Path) -> None
 
 
 def is_for_discarding(run: Run, out: Path) -> bool:
-    """Tell whether frames of a run are discarded when this result has their samples: the plan says so, and the run
-    was acquired for this result."""
+    """Tell whether frames of a run are discarded once this result has their samples. This is true if the plan says
+    so and the run was acquired for this result."""
     asked_result = run.asked_result or default_result(run.folder)
     if not asked_result.is_dir():  # both may have been moved together
         asked_result = run.folder.with_name(asked_result.name)
@@ -157,7 +158,7 @@ def is_for_discarding(run: Run, out: Path) -> bool:
 
 @contextmanager
 def _hold_when_free(run: Run) -> Iterator[None]:
-    """Wait until the session that has the run's lock gives it up, then hold the lock."""
+    """Wait until no session has the run's lock, then hold the lock."""
     with ExitStack() as stack:
         while True:
             try:
@@ -169,13 +170,13 @@ def _hold_when_free(run: Run) -> Iterator[None]:
 
 
 def _forget(run: Run, view: str) -> None:
-    """Take the journal and a view's file out of the manifest, before they change."""
+    """Remove the journal and a view's file from the manifest, before they change."""
     paths = run.journal_path, run.view_path(view)
     manifest.forget(run.folder, [str(path.relative_to(run.folder)) for path in paths])
 
 
 def _enter_finished(run: Run) -> None:
-    """Enter the files that do not change any more in the manifest, if they are not too large."""
+    """Add files to the manifest, if they will not change any more and are not too large."""
     paths = [run.journal_path, *map(run.view_path, run.about["views"])]
     listed_names = manifest.read_checksums(run.folder)
     names = {str(path.relative_to(run.folder)): path.stat().st_size for path in paths if path.is_file()}

@@ -1,7 +1,7 @@
-"""The fits of a result of runs: an object for each, and one registry that all who name fits read.
+"""The fits of a result of runs: one object for each fit, in one registry.
 
-A new fit is an object in `MATERIALS` or `SLICES`, and the kernel that it calls. Kernels are imported where they
-are called: the command line reads the registry for its help, without numpy.
+To add a fit, add an object to `MATERIALS` or `SLICES`, and the kernel that it calls. Kernels are imported where
+they are called, because the command line reads the registry for its help, without numpy.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Fit:
-    """Name, title and colour by which reports and charts show a fit."""
+    """Name, title and colour of a fit in reports and charts."""
 
     name: str
-    """Name of the fit's file or folder in `fits/`, and for `--fit`."""
+    """Name of the fit's file or folder in `fits/`, and its name for `--fit`."""
     title: str
     colour: str
-    """Colour in charts: Okabe and Ito's, which the colour-blind tell apart."""
+    """Colour in charts, from Okabe and Ito's palette, which colour-blind readers can tell apart."""
 
 
 @dataclass(frozen=True)
 class MaterialFit(Fit):
-    """A material for each triangle, fitted to the samples of all views; holds from everywhere.
+    """A material for each triangle, fitted to the samples of all views; it is valid from all directions.
 
     Pictures under new light, exports and pages take its `kd`, `ks` and `alpha` as GGX's: a material without a lobe
     has a `ks` of 0."""
@@ -43,7 +43,7 @@ class MaterialFit(Fit):
     def fit(
         self, samples: TriangleSamples, sample_mask: NDArray[np.bool_], noise_um: float, threads: int | None
     ) -> TriangleMaterials:
-        """Fit materials to the samples `sample_mask` [samples]; `noise_um` is that of the mesh's vertices."""
+        """Fit materials to the samples `sample_mask` [samples]; `noise_um` is the noise of the mesh's vertices."""
         from coupole.reflectance.triangle_fit import fit_triangles
 
         return fit_triangles(samples, sample_mask, noise_um if self.fits_normals else None, threads=threads)
@@ -58,7 +58,8 @@ class MaterialFit(Fit):
         threads: int | None,
     ) -> MaterialUncertainty:
         """Compute covariances of the materials fitted to the samples `sample_mask` [samples]; `middle_mm` is the
-        middle of the object. A fit of another form than GGX's needs covariances of its own here."""
+        middle of the object. A fit with a form other than GGX must override this with its own
+        covariances."""
         from coupole.reflectance.material_uncertainty import covariances
 
         return covariances(
@@ -72,7 +73,7 @@ class MaterialFit(Fit):
         )
 
     def values(self, samples: TriangleSamples, materials: TriangleMaterials) -> NDArray[np.float32]:
-        """[b, samples, channels] f cos_i, 1/sr, that materials give."""
+        """[b, samples, channels] f cos_i, 1/sr, of materials."""
         from coupole.reflectance.triangle_fit import model_values
 
         return model_values(samples, materials)
@@ -80,12 +81,12 @@ class MaterialFit(Fit):
 
 @dataclass(frozen=True)
 class ViewFit(Fit):
-    """Coefficients for each triangle, fitted to the samples of one view; holds for that view."""
+    """Coefficients for each triangle, fitted to the samples of one view; they are valid for that view."""
 
     basis_name: str
     """Name of its functions in `slice_basis.BASES`."""
     over: MaterialFit | None = None
-    """Material fit that this fit is added to; this one was fitted to what that leaves."""
+    """Material fit to which this fit is added; this fit was made to the residuals of the material fit."""
 
     @property
     def basis(self) -> Basis:
@@ -96,7 +97,7 @@ class ViewFit(Fit):
 
     @property
     def coefficients(self) -> int:
-        """Number of coefficients of each channel; the last one is the share of `over`, if there is one."""
+        """Number of coefficients of each channel; the last one is the share of `over`, if this is set."""
         from coupole.reflectance.slice_basis import COUNT
 
         return COUNT + (self.over is not None)
@@ -104,7 +105,7 @@ class ViewFit(Fit):
     def values(
         self, samples: TriangleSamples, coefficients: NDArray[np.float32], under: NDArray[np.float32] | None
     ) -> NDArray[np.float32]:
-        """[b, samples, channels] f cos_i, 1/sr, with the values of `over` if there is one."""
+        """[b, samples, channels] f cos_i, 1/sr, with the values of `over` if this is set."""
         from coupole.reflectance.slice_fit import slice_values
 
         return slice_values(samples, coefficients, self.basis, under)
@@ -130,16 +131,17 @@ SLICES = _fits_by_name(
 )
 FITS: dict[str, MaterialFit | ViewFit] = {**MATERIALS, **SLICES}
 CLUSTERED, PAIR_HARMONICS = "clusters", "harmonics"
-"""Names of what `coupole reflectance cluster` adds: materials of clusters, and harmonics of both directions."""
+"""Names of the fits that `coupole reflectance cluster` adds: materials of clusters, and harmonics of both
+directions."""
 TEXELS = "texels"
-"""Name of what `--texels` adds: materials of single pixels of each view."""
+"""Name of the fit that `--texels` adds: materials of single pixels of each view."""
 ANYWHERE = (*MATERIALS, CLUSTERED, PAIR_HARMONICS, TEXELS)
-"""Fits that hold from everywhere."""
+"""Fits that are valid from all directions."""
 RELIT = (*FITS, CLUSTERED, PAIR_HARMONICS, TEXELS)
-"""All that `--fit` of `coupole reflectance relight` takes."""
+"""All values that `--fit` of `coupole reflectance relight` accepts."""
 
 
 def fitted_together() -> list[Sequence[ViewFit]]:
-    """Return the fits of views in groups that share their functions; each group is fitted in one pass."""
+    """Return the fits of views in groups with the same functions; each group is fitted in one pass."""
     fits = sorted(SLICES.values(), key=lambda fit: not fit.basis.harmonic)
     return [list(group) for _, group in groupby(fits, key=lambda fit: fit.basis.harmonic)]

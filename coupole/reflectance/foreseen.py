@@ -1,8 +1,8 @@
-"""Prediction of a picture, and what is known beforehand of its error: what makes it large or small.
+"""Prediction of a picture, and quantities, known beforehand, from which its error is predicted.
 
 Each column is one number for each pixel and channel. Brightness, incidence, highlight, material and nearness to
-edges come from the prediction and the materials; how far kernels and near pictures differ, and how far the kernel
-misses the near pictures themselves, come from the measured lights. The light that is predicted is never used.
+edges come from the prediction and the materials; the differences among kernels and near pictures, and the kernel's
+error for the near pictures themselves, come from the measured lights. The predicted light itself is never used.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ Floats = NDArray[np.float32]
 
 _VIEW = np.array([0.0, 0.0, 1.0])
 _EDGE_PX = 5
-"""Width of the squares in which edges are looked for."""
+"""Width in pixels of the squares in which edges are detected."""
 _FLOOR = 2e-4
-"""Share of the peak that is added to brightnesses before their logarithm is taken."""
+"""Share of the peak that is added to brightness values before their logarithm is taken."""
 
 
 @dataclass(frozen=True)
 class StripMaterials:
-    """Materials of the pixels of a strip; NaN where there is none."""
+    """Materials of the pixels of a strip; NaN for pixels without material."""
 
     normals: NDArray[np.float64]
     """[n, 3]"""
@@ -48,12 +48,12 @@ class StripMaterials:
 
 @dataclass(frozen=True)
 class Foreseen:
-    """A predicted picture of a strip, and what is known of its error beforehand; all [n, 3], values in full scales
-    divided by the intensities."""
+    """A predicted picture of a strip, and quantities known beforehand about its error. All are [n, 3]; values are
+    in full scales divided by the intensities."""
 
     values: Floats
     kernel_spread: Floats
-    """Range of what the kernels say."""
+    """Range of the kernels' predictions."""
     near_spread: Floats
     """Range of the near pictures."""
     near_miss: Floats
@@ -62,7 +62,7 @@ class Foreseen:
     correction: Floats
     """Size of the learnt correction."""
     model_miss: Floats
-    """Distance from the prediction to what the material gives."""
+    """Distance from the prediction to the material's value."""
     edge: Floats
     """Standard deviation of the prediction in a small square."""
     level: Floats
@@ -72,15 +72,15 @@ class Foreseen:
     incidence: Floats
     """Cosine between normal and light, not below 0."""
     shine: Floats
-    """Share of the highlight in what the material gives."""
+    """Share of the highlight in the material's value."""
     shade: Floats
-    """Prediction as a share of what the material gives: small in shadows."""
+    """Prediction as a share of the material's value; it is small in shadows."""
     gain_spread: Floats
-    """Range of the gains of the nearest pictures, over their median."""
+    """Range of the gains of the nearest pictures, divided by their median."""
 
     def regressors(self, peak: float) -> NDArray[np.float64]:
-        """[n * 3, columns] from which the scale of the error is predicted, log-linearly; `peak` is the brightest
-        value of the pictures."""
+        """[n * 3, columns] regressors from which the scale of the error is predicted log-linearly; `peak` is the
+        brightest value of the pictures."""
         bright = (
             self.values, self.kernel_spread, self.near_spread, self.near_miss, self.worst_miss, self.correction,
             self.model_miss, self.edge, self.level,
@@ -92,7 +92,7 @@ class Foreseen:
         return np.stack(columns, axis=-1).reshape(-1, len(columns)).astype(np.float64)
 
     def labels(self, peak: float) -> dict[str, NDArray[np.int64]]:
-        """Return the strata [n * 3] of each pixel and channel, as `strata.fit_strata` takes them."""
+        """Return the strata [n * 3] of each pixel and channel, in the form that `strata.fit_strata` takes."""
         over = self.values + np.float32(0.02 * peak)
         strata = {
             "brightness": np.digitize(self.values / peak, (0.01, 0.03, 0.06, 0.1, 0.2, 0.35, 0.5, 0.75)),
@@ -117,8 +117,8 @@ def foresee(
     directions: NDArray[np.float64],
     direction: NDArray[np.float64],
 ) -> Foreseen:
-    """Predict a strip under a distant light from the unit vector `direction` [3]; `strip` has the values under the
-    interpolation's lights, from `directions` [lights, 3], divided by its gains."""
+    """Predict a strip under a distant light in the unit vector `direction` [3]. `strip` has the values under the
+    interpolation's lights, in `directions` [lights, 3], divided by its gains."""
     kernels = correction.all_kernels(interpolation.kernel)
     sight = correction.look(strip, directions, direction, kernels)
     level = strip.level[:, None]
@@ -156,14 +156,14 @@ def foresee(
 def _sums(
     strip: Strip, directions: NDArray[np.float64], direction: NDArray[np.float64], kernels: tuple[str, ...]
 ) -> Floats:
-    """[kernels, n, 3] sums of the measured pictures."""
+    """[kernels, n, 3] weighted sums of the measured pictures."""
     rows = [light_interpolation.weights(directions, direction[None], kernel)[0] for kernel in kernels]
     sums = np.stack(rows).astype(np.float32) @ strip.values.reshape(len(directions), -1)
     return np.asarray(sums.reshape(len(kernels), *strip.values.shape[1:]), dtype=np.float32)
 
 
 def _miss(strip: Strip, directions: NDArray[np.float64], light: int, kernel: str) -> Floats:
-    """[n, 3] error of the kernel at a measured light that is left out with its nearest neighbour."""
+    """[n, 3] error of the kernel at a measured light that is left out together with its nearest neighbour."""
     other_lights = left_without(directions, light, correction.LEFT_OUT_WITH)
     row = light_interpolation.weights(directions[other_lights], directions[light][None], kernel)[0]
     whole = np.zeros(len(directions), np.float32)
@@ -175,7 +175,7 @@ def _miss(strip: Strip, directions: NDArray[np.float64], light: int, kernel: str
 def _diffuse_and_highlight(
     materials: StripMaterials, direction: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """[n, 3] diffuse part and highlight that materials give, without shadows."""
+    """[n, 3] diffuse part and highlight of materials, without shadows."""
     half = direction + _VIEW
     half /= np.linalg.norm(half)
     black, white = np.zeros(len(materials.alpha)), np.ones(len(materials.alpha))

@@ -1,6 +1,6 @@
-"""Lambert plus GGX of one point under known lights, and its derivatives.
+"""Lambert plus GGX model of one point under known lights, and its derivatives.
 
-The radiance towards v under a distant light of unit irradiance from l, divided by nothing else, is
+The radiance towards v under a distant light of unit irradiance from l is
 
     (n l) (kd + ks D V)
 
@@ -9,7 +9,7 @@ D = alpha^2 / (pi ((n h)^2 (alpha^2 - 1) + 1)^2) (Walter et al. 2007, eq. 33) an
 V = G / (4 (n l) (n v)) = 1 / (2 (n l) B + 2 (n v) A), A^2 = alpha^2 + (1 - alpha^2) (n l)^2, B the same of n v
 (Heitz 2014, eq. 99). The Fresnel term is part of ks.
 
-Rays are drawn from the lobe as Heitz has it, Sampling the GGX distribution of visible normals (2018).
+Rays are drawn from the lobe by Heitz, Sampling the GGX distribution of visible normals (2018).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ alpha."""
 
 @numba.njit(cache=True, nogil=True)
 def lobe(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
-    """D V and its derivatives by n l, n v, n h and alpha. All cosines must be positive."""
+    """Return D V and its derivatives by n l, n v, n h and alpha. All cosines must be positive."""
     alpha2 = alpha * alpha
     t = nh * nh * (alpha2 - 1.0) + 1.0
     d = alpha2 / (math.pi * t * t)
@@ -43,7 +43,7 @@ def lobe(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def tangents(x, y, z):  # type: ignore[no-untyped-def]
-    """Two unit vectors across a unit vector (Duff et al. 2017)."""
+    """Return two unit vectors perpendicular to a unit vector (Duff et al. 2017)."""
     sign = 1.0 if z >= 0.0 else -1.0
     a = -1.0 / (sign + z)
     b = x * y * a
@@ -52,8 +52,8 @@ def tangents(x, y, z):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def root_by_unknowns(normal, t1, t2, light, half, nv, v1, v2, kd, ks, alpha, row):  # type: ignore[no-untyped-def]
-    """Square root of the radiance, and its derivatives by the unknowns into `row`; n l must be positive. The view
-    is given by its components nv, v1, v2 along the normal and the tangents t1, t2."""
+    """Return the square root of the radiance, and write its derivatives by the unknowns to `row`; n l must be
+    positive. The view is given by its components nv, v1, v2 along the normal and the tangents t1, t2."""
     nl = normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2]
     nh = normal[0] * half[0] + normal[1] * half[1] + normal[2] * half[2]
     value, by_nl, by_nv, by_nh, by_alpha = lobe(nl, nv, nh, alpha)
@@ -75,7 +75,7 @@ def root_by_unknowns(normal, t1, t2, light, half, nv, v1, v2, kd, ks, alpha, row
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def shine(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
-    """D V, the specular term of GGX without ks, for pictures."""
+    """Return D V, the specular term of GGX without ks, for pictures."""
     alpha2 = alpha * alpha
     t = nh * nh * (alpha2 - 1.0) + 1.0
     a = math.sqrt(alpha2 + (1.0 - alpha2) * nl * nl)
@@ -85,7 +85,8 @@ def shine(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def lobe_density(nv, nh, alpha):  # type: ignore[no-untyped-def]
-    """Return how often a ray that is drawn from a lobe takes a direction, per sr (Heitz 2018, eq. 17)."""
+    """Return the probability density, per sr, that a ray drawn from a lobe takes a direction (Heitz 2018, eq.
+    17)."""
     alpha2 = alpha * alpha
     t = nh * nh * (alpha2 - 1.0) + 1.0
     return 0.5 * alpha2 / (math.pi * t * t * (nv + math.sqrt(alpha2 + (1.0 - alpha2) * nv * nv)))
@@ -93,8 +94,8 @@ def lobe_density(nv, nh, alpha):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def sample_reflection(normal, v0, v1, v2, nv, alpha, first, second, way):  # type: ignore[no-untyped-def]
-    """Fill `way` [3] with the view (unit, nv to the normal) mirrored at a normal that it sees, which two numbers
-    from 0 to 1 choose; return the cosine of that normal (Heitz 2018, listing 1)."""
+    """Fill `way` [3] with the view (unit, nv to the normal) mirrored at a microfacet normal that is visible from
+    it. Two numbers from 0 to 1 choose this normal; return its cosine (Heitz 2018, listing 1)."""
     x, y, z = normal[0], normal[1], normal[2]
     if abs(z) < 0.9:
         length = math.sqrt(x * x + y * y)

@@ -1,7 +1,8 @@
-"""The fit of `coupole.reflectance.normal_fit.fit_from` for eight samples at once: the same costs, steps and ends.
+"""The fit of `coupole.reflectance.normal_fit.fit_from` for eight samples at once, with the same costs, steps and
+stopping rule.
 
-A trial's derivatives are made with its cost, as most trials are taken. The logarithms of Cauchy's cost are one, of
-the product over some samples.
+A trial's derivatives are computed with its cost, because most trials are accepted. Cauchy's cost takes one
+logarithm of a product over some samples instead of many logarithms.
 """
 
 from __future__ import annotations
@@ -23,11 +24,12 @@ from coupole.reflectance.normal_fit import (
 )
 
 ROWS = 11
-"""Rows of each pack of eight samples: the square root of the value, its light, half vector and view, and 1 where
-there is a sample."""
+"""Rows of each pack of eight samples: the square root of the value, its light, half vector and view, and 1 for an
+existing sample."""
 _OFF = UNKNOWNS
 _TOGETHER = 4
-"""Packs whose product is taken, below what a double can hold: an error of 1e4 scales in each sample."""
+"""Number of packs whose values are multiplied in one product. The product must stay below the largest double, even
+with an error of 1e4 scales in each sample."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -53,9 +55,9 @@ def pack(roots, good, lights, half, views, view_of, packs):  # type: ignore[no-u
 
 @numba.njit(cache=True, nogil=True)
 def fit_packs(packs, views, unknowns, prior, stiffness, usual, settled_share):  # type: ignore[no-untyped-def]
-    """Levenberg-Marquardt from `unknowns` in place, until a step gains less than `settled_share` of the cost; cost
-    and weighted rms, as `fit_from` gives them. `usual` holds ks and roughness: two logarithms, and the weights
-    (1 over the variance) with which they count."""
+    """Fit by Levenberg-Marquardt from `unknowns` in place, until a step lowers the cost by less than the share
+    `settled_share`. Return cost and weighted rms, as `fit_from` does. `usual` is the prior of ks and roughness:
+    two logarithms, and their weights (1 over the variance)."""
     scale = CAUCHY * math.exp(0.5 * unknowns[3])
     rows = np.empty((len(packs) * (UNKNOWNS + 1), LANES))
     matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
@@ -87,7 +89,7 @@ def fit_packs(packs, views, unknowns, prior, stiffness, usual, settled_share):  
 
 @numba.njit(cache=True, nogil=True)
 def _equations(packs, unknowns, prior, stiffness, usual, scale, rows, matrix, right):  # type: ignore[no-untyped-def]
-    """Normal equations of a step, into `matrix` and `right`; Cauchy's cost and the weighted rms."""
+    """Write the normal equations of a step to `matrix` and `right`; return Cauchy's cost and the weighted rms."""
     t1, t2 = tangents(unknowns[0], unknowns[1], unknowns[2])
     cost, rms = _residuals(packs, unknowns, t1, t2, scale, rows)
     count = len(packs)
@@ -128,8 +130,8 @@ def _dot(vector, values, first):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _residuals(packs, unknowns, t1, t2, scale, rows):  # type: ignore[no-untyped-def]
-    """Fill `rows` [6 packs, 8] with the residuals' derivatives by the unknowns, then the residuals, times the
-    square root of the weight; return the sum of the logarithms, and the weighted rms. The formulas are those of
+    """Fill `rows` [6 packs, 8] with the residuals' derivatives by the unknowns, then the residuals, all times the
+    square root of the weight. Return the sum of the logarithms, and the weighted rms. The formulas are those of
     `coupole.reflectance.ggx`."""
     normal = (unknowns[0], unknowns[1], unknowns[2])
     kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])

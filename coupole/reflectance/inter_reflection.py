@@ -1,11 +1,11 @@
 """Light from one part of the object to another, estimated from its mesh and samples, and subtracted from them.
 
-A sample of reflectance counts all light of its triangle as the LED's own. In a fold a part of it came by way of
-other triangles. The object is cut into patches; their radiosity under each LED follows from the light that
-reaches them, the diffuse reflectance that their samples show, and how much of each other they see (Goral et al.
-1984). Rays from each triangle then gather what arrives. Samples of folds are too high, so the reflectance that is
-used is lowered by what was found, and the radiosity found again, until it settles. All reflection on the way is
-taken as diffuse.
+A sample of reflectance counts all light of its triangle as direct light of the LED. In a fold, other triangles
+reflect a part of this light. The object is cut into patches. Their radiosity under each LED follows from the light
+that reaches them, the diffuse reflectance of their samples, and their form factors (Goral et al. 1984). Rays from
+each triangle then gather the arriving light. Samples in folds are too high. So the reflectance is lowered by the
+estimated light, and the radiosity is computed again, until it settles. All intermediate reflection is taken as
+diffuse.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ Said = Callable[[str, int, int], None]
 _PASSES = 3
 _MOST_BOUNCES = 8
 _LEAST_COSINE = 0.2
-"""Least cosine of light in the samples by which a triangle's diffuse reflectance is found."""
+"""Least cosine of incidence in the samples from which a triangle's diffuse reflectance is estimated."""
 _MOST_REFLECTED = 0.95
 MOST_SHARE = 0.5
-"""Upper bound of inter-reflection as a share of a sample; other samples are left out."""
+"""Largest share of a sample that may be inter-reflection; samples with a larger share are left out."""
 
 
 def radiosity(
     form_factors: csr_array, direct: NDArray[np.float32], apparent_reflectance: Floats, passes: int = _PASSES
 ) -> NDArray[np.float32]:
     """[channels, patches, leds] exitance of patches for a power of 1. `apparent_reflectance` [patches, channels]
-    is the reflectance that counts all light as direct; patches that no LED reaches keep it."""
+    is the reflectance if all light counts as direct; patches that no LED reaches keep it."""
     exitances = []
     for channel_reflectance in apparent_reflectance.T:
         reflectance = channel_reflectance.copy()
@@ -69,8 +69,9 @@ def subtract(
     say: Said = lambda step, done, of: None,
     ahead: Ahead = NOTHING_AHEAD,
 ) -> None:
-    """Take inter-reflection off the samples of views that still have it; each view's file is whole, before or
-    after. What `ahead` remembers is the same as if it were computed here. Raises OSError."""
+    """Subtract inter-reflection from the samples of views that still contain it. Each view's file is always
+    complete, either the old one or the new one. Values that `ahead` remembers are the same as if they were
+    computed here. Raises OSError."""
     missing = [view for view in result.views if view.inter_reflection is None]
     if not missing:
         return
@@ -93,8 +94,8 @@ def subtract(
 def _as_measured(
     result: RunResult, paths: PathsOfLight, count: int, support_reflectance: float
 ) -> tuple[Floats, dict[str, Floats]]:
-    """Reflectance of patches and triangles, by `_apparent_reflectance` and `_diffuse`, before anything was taken
-    off: kept in a file, by which a job that was stopped goes on."""
+    """Return the reflectance of patches and triangles, by `_apparent_reflectance` and `_diffuse`, before the
+    subtraction. It is kept in a file, from which a stopped job continues."""
     path = result.folder / AS_MEASURED
     if not path.exists():
         diffuse = {view.path.stem: _diffuse_ahead(paths, result, view) for view in result.views}
@@ -112,7 +113,8 @@ def _as_measured(
 
 
 def _diffuse_ahead(paths: PathsOfLight, result: RunResult, view: ViewSamples) -> Floats:
-    """`_diffuse` of a view, by its file of samples, which is never changed but replaced."""
+    """Return `_diffuse` of a view; it is remembered for the view's file of samples, which is only replaced, never
+    changed."""
     about = view.path.stat()
     key = ("diffuse", *paths.key, about.st_dev, about.st_ino, about.st_mtime_ns, about.st_size)
     diffuse: Floats = paths.ahead.result(paths.count, key, lambda: _diffuse(result, view))
@@ -122,9 +124,8 @@ def _diffuse_ahead(paths: PathsOfLight, result: RunResult, view: ViewSamples) ->
 def _apparent_reflectance(
     result: RunResult, diffuse: dict[str, Floats], scene: Scene, count: int, support_reflectance: float
 ) -> Floats:
-    """[patches, channels] reflectance of each patch by the samples: the mean over its triangles. A patch that no
-    view
-    shows has the median of all triangles. The support has its own reflectance."""
+    """[patches, channels] reflectance of each patch from the samples: the mean over its triangles. A patch that no
+    view shows has the median of all triangles. The support has its own reflectance."""
     channels = result.channels
     sums, weights = np.zeros((scene.patches, channels)), np.zeros(scene.patches)
     every = []
@@ -144,8 +145,8 @@ def _apparent_reflectance(
 
 
 def _diffuse(result: RunResult, view: ViewSamples, most: int = 64) -> Floats:
-    """[n, channels] median of the samples of each triangle under some LEDs that do not graze, or under all where
-    those reach it not."""
+    """[n, channels] median of the samples of each triangle under some LEDs that are not at grazing incidence. If
+    none of these LEDs reaches the triangle, the median is over all LEDs."""
     some_leds = np.zeros(len(view.leds), np.bool_)
     some_leds[:: max(1, len(view.leds) // most)] = True
     medians = np.full((len(view.triangles), result.channels), np.nan)
@@ -158,7 +159,7 @@ def _diffuse(result: RunResult, view: ViewSamples, most: int = 64) -> Floats:
 
 
 def _fill_medians(reflectances: Floats, samples: TriangleSamples) -> None:
-    """Fill those rows of `reflectances` [n, channels] that have NaN with medians of the samples."""
+    """Fill the rows of `reflectances` [n, channels] that have NaN with medians of the samples."""
     cosine = cosines_on(samples.centres_mm, samples.normals, samples.led_mm)
     with np.errstate(divide="ignore", invalid="ignore"):
         values = np.where(cosine[..., None] > _LEAST_COSINE, samples.values / cosine[..., None], np.nan)
@@ -216,8 +217,8 @@ def _off(
     rows: slice,
     paper: bool,
 ) -> NDArray[np.float32]:
-    """[n, leds, channels] what to take off f of triangles: their diffuse reflectance times indirect over
-    direct."""
+    """[n, leds, channels] amount to subtract from f of triangles: their diffuse reflectance times the ratio of
+    indirect to direct light."""
     triangles = view.triangles[rows]
     centres, normals = scene.centres_mm[triangles], scene.normals[triangles]
     arriving = lit_on(centres, view.led_mm, view.led_normals, paper) * cosines_on(centres, normals, view.led_mm)

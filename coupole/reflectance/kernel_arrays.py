@@ -1,7 +1,7 @@
 """Assignment of arrays in compiled code.
 
-What numba makes of `a[:] = b` can say which shapes do not fit: that text and its formatting take two seconds to
-compile, and are optimised anew with each kernel that has them.
+Numba compiles `a[:] = b` with an error message about shapes that do not fit. This message and its formatting take
+two seconds to compile, and are optimised again in each kernel that contains them.
 """
 
 from __future__ import annotations

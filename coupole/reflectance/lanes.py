@@ -1,8 +1,8 @@
 """Eight numbers at once in compiled code: a vector of the processor as a type of numba.
 
-Numba leaves it to LLVM to find such vectors in loops, and it does not find those of loops that are short, branch,
-or read at places that a list names. Lanes are of single or double precision; +, -, * and / work on
-lanes and numbers, and round as for single numbers. They live in compiled code only: Python never gets one.
+Numba relies on LLVM to find such vectors in loops. LLVM does not find them in loops that are short, that branch,
+or that read at places named by a list. Lanes have single or double precision; +, -, * and / work on lanes and
+numbers, and round as for single numbers. Lanes exist in compiled code only: Python never sees one.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def _kind(*argument_types: Any) -> Any:
-    """Return the type of what comes of these types: that of the lanes among them."""
+    """Return the type of the result for these types: the type of the lanes among them."""
     kinds = {kind for kind in argument_types if isinstance(kind, _Lanes)}
     if len(kinds) != 1:
         raise errors.TypingError(f"expected lanes of one precision, got {', '.join(map(str, argument_types))}")
@@ -48,12 +48,12 @@ def _kind(*argument_types: Any) -> Any:
 
 
 def _compiled_function(kind_of: Any) -> Any:
-    """A function of compiled code alone; it takes the types of what it is given."""
+    """Return a function of compiled code alone; it receives the types of its arguments."""
     return intrinsic(kind_of)
 
 
 def _broadcast(context: Any, builder: Any, number: Any, kind: Any, value: Any) -> Any:
-    """A number in all lanes; lanes as they are."""
+    """Return a number in all lanes; lanes are returned unchanged."""
     if isinstance(kind, _Lanes):
         return value
     no_vector = ir.Constant(_vector(number), ir.Undefined)
@@ -62,7 +62,7 @@ def _broadcast(context: Any, builder: Any, number: Any, kind: Any, value: Any) -
 
 
 def _made_of(build: Any) -> Any:
-    """A function of lanes and numbers: `build` makes its code for their vectors."""
+    """Return a function of lanes and numbers; `build` makes its code for their vectors."""
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
         number, typed_values = signature.return_type.number, zip(signature.args, values, strict=True)
@@ -99,14 +99,14 @@ for _function, _in_place, _name in (
 
 @_compiled_function
 def lanes(_context, number):  # type: ignore[no-untyped-def]
-    """A number in all lanes, of its precision."""
+    """Return lanes that all have the value `number`, in its precision."""
     kind = _KINDS[types.float32 if number == types.float32 else types.float64]
     return kind(number), _made_of(lambda builder, value: value)
 
 
 @_compiled_function
 def larger(_context, left, right):  # type: ignore[no-untyped-def]
-    """Lane by lane the larger one; `right` where one is NaN."""
+    """Return the larger number, lane by lane; `right` where one is NaN."""
 
     def build(builder, a, b):  # type: ignore[no-untyped-def]
         return builder.select(builder.fcmp_ordered(">", a, b), a, b)
@@ -116,7 +116,7 @@ def larger(_context, left, right):  # type: ignore[no-untyped-def]
 
 @_compiled_function
 def if_less(_context, left, right, then, otherwise):  # type: ignore[no-untyped-def]
-    """`then` where `left` is less than `right`, else, also where one is NaN, `otherwise`."""
+    """Return `then` where `left` is less than `right`; elsewhere, and where one is NaN, `otherwise`."""
 
     def build(builder, a, b, c, d):  # type: ignore[no-untyped-def]
         return builder.select(builder.fcmp_ordered("<", a, b), c, d)
@@ -142,7 +142,7 @@ root, absolute = _math("sqrt"), _math("fabs")
 
 
 def _address(context: Any, builder: Any, kind: Any, array: Any, *places: Any) -> Any:
-    """Return the address of an element of an array of any strides."""
+    """Return the address of an element of an array with any strides."""
     array_struct = context.make_array(kind)(context, builder, array)
     address = builder.ptrtoint(array_struct.data, ir.IntType(64))
     for number, place in enumerate(places):
@@ -153,7 +153,8 @@ def _address(context: Any, builder: Any, kind: Any, array: Any, *places: Any) ->
 
 @_compiled_function
 def load_row(_context, array, row):  # type: ignore[no-untyped-def]
-    """The first eight numbers of a row of an array [n, 8 or more] in C order; integers in single precision."""
+    """Return the first eight numbers of a row of an array [n, 8 or more] in C order; integers become single
+    precision."""
     if array.layout != "C":
         raise errors.TypingError(f"expected an array in C order, got the order {array.layout}")
     vector_kind = _KINDS.get(array.dtype, _KINDS[types.float32])
@@ -171,8 +172,8 @@ def load_row(_context, array, row):  # type: ignore[no-untyped-def]
 
 @_compiled_function
 def store(_context, numbers, array, row):  # type: ignore[no-untyped-def]
-    """Store lanes as the first eight numbers of a row of an array [n, 8 or more] in C order, of the lanes'
-    precision."""
+    """Store lanes as the first eight numbers of a row of an array [n, 8 or more]. The array is in C order and has
+    the lanes' precision."""
     if array.layout != "C" or array.dtype != numbers.number:
         raise errors.TypingError(f"expected an array of {numbers.number} in C order, got {array}")
 
@@ -187,7 +188,7 @@ def store(_context, numbers, array, row):  # type: ignore[no-untyped-def]
 
 @_compiled_function
 def total(_context, numbers):  # type: ignore[no-untyped-def]
-    """Sum of the lanes, by halves."""
+    """Return the sum of the lanes, computed by halves."""
 
     def generate(_context, builder, _signature, values):  # type: ignore[no-untyped-def]
         vector, count = values[0], LANES
@@ -206,8 +207,8 @@ def total(_context, numbers):  # type: ignore[no-untyped-def]
 
 @_compiled_function
 def gather_lanes(_context, arrays, rows, place):  # type: ignore[no-untyped-def]
-    """The numbers at a place of eight `rows` [8] of `arrays` [m, n], of unsigned integers or floats, in single
-    precision."""
+    """Return the numbers at one place in eight `rows` [8] of `arrays` [m, n], of unsigned integers or floats, in
+    single precision."""
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
         frames, row_number, place = values
@@ -229,14 +230,15 @@ def gather_lanes(_context, arrays, rows, place):  # type: ignore[no-untyped-def]
 
 
 def _shuffle(builder: Any, first_vector: Any, second_vector: Any, places: list[int]) -> Any:
-    """A vector of chosen numbers of two, those of the other numbered after those of the one."""
+    """Return a vector of chosen numbers of two vectors; the numbers of the second vector are counted after those
+    of the first."""
     return builder.shuffle_vector(
         first_vector, second_vector, ir.Constant(ir.VectorType(_INT, len(places)), places)
     )
 
 
 def _vectors_at(builder: Any, address: Any, kind: Any, count: int) -> Iterator[Any]:
-    """Pointers to `count` vectors of a kind that lie one behind the other, aligned like their elements."""
+    """Yield pointers to `count` consecutive vectors of one kind, aligned like their elements."""
     size = kind.count * 4
     for number in range(count):
         yield builder.inttoptr(builder.add(address, ir.IntType(64)(number * size)), kind.as_pointer())
@@ -244,8 +246,9 @@ def _vectors_at(builder: Any, address: Any, kind: Any, count: int) -> Iterator[A
 
 @_compiled_function
 def four_gathered(_context, arrays, rows, first):  # type: ignore[no-untyped-def]
-    """Four lanes: what is at the places `first` to `first` + 3 of eight `rows` [8] of `arrays` [m, n] in C order
-    and single precision. Rows are read whole and transposed in two steps, faster than number by number."""
+    """Return four lanes: the numbers at the places `first` to `first` + 3 in eight `rows` [8] of `arrays` [m, n]
+    in C order and single precision. The four numbers of a row are read together and transposed in two steps, which
+    is faster than number by number."""
     _refuse_but_singles(arrays)
     four = ir.VectorType(ir.FloatType(), 4)
 
@@ -268,7 +271,8 @@ def four_gathered(_context, arrays, rows, first):  # type: ignore[no-untyped-def
 
 @_compiled_function
 def in_turns(_context, array, row):  # type: ignore[no-untyped-def]
-    """Three lanes whose numbers take turns in a row of 24 of an array [n, 24] in C order and single precision."""
+    """Return three lanes from a row of 24 numbers in which the lanes' numbers alternate. The array [n, 24] is in C
+    order and single precision."""
     _refuse_but_singles(array)
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
@@ -288,7 +292,7 @@ def in_turns(_context, array, row):  # type: ignore[no-untyped-def]
 
 @_compiled_function
 def add_in_turns(_context, first, two, three, array, row):  # type: ignore[no-untyped-def]
-    """Add three lanes to a row of 24 in which their numbers take turns, of an array as `in_turns` has it."""
+    """Add three lanes to a row of 24 in which their numbers alternate, in an array as for `in_turns`."""
     _refuse_but_singles(array)
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
@@ -315,7 +319,7 @@ def _refuse_but_singles(array: Any) -> None:
 
 @_compiled_function
 def store_halves(_context, numbers, bits):  # type: ignore[no-untyped-def]
-    """Store eight numbers in `bits` [8] of uint16 as float16, each the nearest to its number."""
+    """Store eight numbers in `bits` [8] of uint16 as float16, each rounded to the nearest."""
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
         halves = builder.fptrunc(values[0], ir.VectorType(_HALF, LANES))

@@ -1,9 +1,10 @@
-"""Correction of what interpolation between lights gets wrong, learnt from the lights themselves.
+"""Correction of the error of interpolation between lights, learnt from the lights themselves.
 
-Shadows and highlights move as the light moves; a weighted sum of pictures fades one into the next instead. If a
-light is left out, the difference between truth and sum is known. A small network is trained on these differences,
-from the kernels' values and from the nearest pictures at the pixel and around it. Each light is left out together
-with its nearest neighbour: a new light is farther from the measured ones than they are from each other.
+Shadows and highlights move as the light moves, but a weighted sum of pictures fades one picture into the next. If
+a light is left out, the difference between its picture and the sum is known. A small network is trained on these
+differences, from the kernels' values and from the nearest pictures at the pixel and around it. Each light is left
+out together with its nearest neighbour: a new light is farther from the measured lights than these are from each
+other.
 
 The network sees values as shares of the pixel's mean, so its answer does not depend on exposure or albedo. The
 corrected value never leaves the range of the kernels' and the nearest pictures' values.
@@ -24,11 +25,11 @@ from coupole.reflectance.light_interpolation import KERNELS, left_without, neare
 Floats = NDArray[np.float32]
 
 NEAR = 6
-"""Pictures of the nearest lights that are looked at."""
+"""Number of pictures of the nearest lights that are used."""
 AROUND = 4
-"""Number of these pictures that are also looked at in the pixel's surroundings."""
+"""Number of these pictures that are also used in the pixel's surroundings."""
 SURROUNDINGS_PX = (3, 7, 5)
-"""Widths of squares: two round the sum, one round the near pictures."""
+"""Widths of squares: two around the sum, one around the near pictures."""
 MARGIN_PX = 3
 LEFT_OUT_WITH = 1
 HIDDEN = (48, 48)
@@ -37,23 +38,24 @@ _BATCH = 4096
 MOST_SAMPLES = 4_000_000
 """Largest number of samples that are kept for training."""
 _MOST_STEPS, _LOOKS = 2500, 8
-"""Training ends after so many steps, or when each sample was looked at so often."""
+"""Training ends after the first number of steps, or when each sample has been used as often as the second
+number."""
 _RATE = 3e-3
 _CLIPPED = 1.0
-"""Differences beyond this many times what is common pull no harder."""
+"""Differences beyond this multiple of the usual difference have no more weight than this."""
 _DISTANCE_SCALE = 5.0
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Values of a picture's rows under some lights."""
+    """Values in some rows of a picture, under some lights."""
 
     mask: NDArray[np.bool_]
     """[rows, w]"""
     values: Floats
-    """[lights, pixels, 3] of the mask's pixels in the order of rows."""
+    """[lights, pixels, 3] values of the mask's pixels, row by row."""
     level: Floats
-    """[pixels] by which values are divided: their mean, never 0."""
+    """[pixels] mean of a pixel's values, never 0; values are divided by it."""
 
 
 def strip_of(mask: NDArray[np.bool_], values: Floats, least_level: float) -> Strip:
@@ -62,10 +64,10 @@ def strip_of(mask: NDArray[np.bool_], values: Floats, least_level: float) -> Str
 
 @dataclass(frozen=True)
 class Sight:
-    """Input of the network for one light at the pixels of a strip, and the bounds of its answer."""
+    """Input of the network for one light at the pixels of a strip, and the bounds of its output."""
 
     kernel_sum: Floats
-    """[pixels, 3] by the first kernel, as shares of the level."""
+    """[pixels, 3] sum by the first kernel, as shares of the level."""
     features: Floats
     """[pixels * 3, features]"""
     low: Floats
@@ -75,7 +77,7 @@ class Sight:
 def look(
     strip: Strip, directions: NDArray[np.float64], direction: NDArray[np.float64], kernels: Sequence[str]
 ) -> Sight:
-    """Return the input for a new light from the strip's values under lights from `directions`; the sum is by the
+    """Return the input for a new light from the strip's values under lights in `directions`; the sum is by the
     first kernel."""
     weights = np.concatenate(
         [light_interpolation.weights(directions, direction[None], kernel) for kernel in kernels]
@@ -108,7 +110,7 @@ def look(
 
 
 def mean_around(mask: NDArray[np.bool_], values: Floats, width_px: int) -> Floats:
-    """[pixels, 3] means over squares, of what the mask holds."""
+    """[pixels, 3] means over squares, of the mask's pixels only."""
     import cv2
 
     picture = np.zeros((*mask.shape, values.shape[-1]), np.float32)
@@ -119,18 +121,18 @@ def mean_around(mask: NDArray[np.bool_], values: Floats, width_px: int) -> Float
 
 
 class Network:
-    """A perceptron with leaky ramps; `layers` are pairs of a matrix and an offset, the first one scaled so that
-    features need no scaling of their own."""
+    """A perceptron with leaky ramps. `layers` are pairs of a matrix and an offset; the first layer includes the
+    scaling of the features."""
 
     def __init__(self, layers: Sequence[tuple[Floats, Floats]]) -> None:
         self.layers = tuple(layers)
 
     def __call__(self, features: Floats) -> Floats:
-        """[n] from features [n, m]."""
+        """[n] outputs from features [n, m]."""
         return self.forward(features)[-1][:, 0]
 
     def forward(self, features: Floats) -> list[Floats]:
-        """The outputs of all layers, the features first."""
+        """Return the outputs of all layers, the features first."""
         outputs = [features]
         for number, (matrix, offset) in enumerate(self.layers):
             output = outputs[-1] @ matrix + offset
@@ -139,8 +141,8 @@ class Network:
         return outputs
 
     def gradients(self, outputs: list[Floats], slope: Floats) -> list[tuple[Floats, Floats]]:
-        """Return the gradients of a cost whose derivative by the last output [n, 1] is `slope`, by matrices and
-        offsets."""
+        """Return, by matrices and offsets, the gradients of a cost with the derivative `slope` [n, 1] by the last
+        output."""
         gradients = []
         for number in range(len(self.layers) - 1, -1, -1):
             gradients.append((outputs[number].T @ slope, slope.sum(axis=0)))
@@ -151,7 +153,7 @@ class Network:
 
 
 def initial_network(features: int, generator: np.random.Generator) -> Network:
-    """A network whose answer is about 0 (He et al. 2015 for the spread of its first weights)."""
+    """Return a network with an output near 0 (He et al. 2015 for the spread of its first weights)."""
     sizes = (features, *HIDDEN, 1)
     layers = []
     for number, (rows, columns) in enumerate(pairwise(sizes)):
@@ -163,7 +165,7 @@ def initial_network(features: int, generator: np.random.Generator) -> Network:
 
 
 class _Adam:
-    """Steps of Kingma and Ba (2015)."""
+    """Optimiser with the steps of Kingma and Ba (2015)."""
 
     def __init__(self, network: Network) -> None:
         self._parts = [part for layer in network.layers for part in layer]
@@ -183,11 +185,11 @@ class _Adam:
 
 @dataclass(frozen=True)
 class Lesson:
-    """A strip without one light, and what that light showed."""
+    """A strip without one light, and the values under that light."""
 
     features: Floats
     targets: Floats
-    """[n] what must be added to the sum, as shares of the level."""
+    """[n] amounts to be added to the sum, as shares of the level."""
     importance: Floats
     """[n] square of the level."""
 
@@ -227,7 +229,8 @@ def join_lessons(parts: Sequence[Lesson]) -> Lesson:
 def train(
     lessons_of_lights: Sequence[Lesson], *, seed: int = 0, say: Callable[[int, int], None] = lambda done, of: None
 ) -> Network:
-    """A network from lessons of all lights. Every light counts alike, however hard it is."""
+    """Return a network trained on lessons of all lights. All lights have the same weight, however difficult they
+    are."""
     features = np.concatenate([lesson.features for lesson in lessons_of_lights])
     targets = np.concatenate([lesson.targets for lesson in lessons_of_lights])
     errors = [float(np.mean(lesson.importance * lesson.targets**2)) for lesson in lessons_of_lights]
@@ -260,7 +263,7 @@ def train(
 
 
 def corrected_values(strip: Strip, sight: Sight, network: Network | None) -> Floats:
-    """[pixels, 3] values of the light that was looked for, not below 0; the sum alone without a network."""
+    """[pixels, 3] values of the new light, not below 0; without a network, the sum alone."""
     values: Floats = sight.kernel_sum
     if network is not None:
         values = np.clip(values + network(sight.features).reshape(values.shape), sight.low, sight.high)
@@ -268,5 +271,5 @@ def corrected_values(strip: Strip, sight: Sight, network: Network | None) -> Flo
 
 
 def all_kernels(first: str) -> tuple[str, ...]:
-    """The kernel of the sum, then the others."""
+    """Return the kernel of the sum first, then the other kernels."""
     return (first, *(kernel for kernel in KERNELS if kernel != first))

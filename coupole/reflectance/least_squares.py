@@ -1,6 +1,6 @@
 """Many small regularised least-squares problems, one after the other in compiled code, by SciPy's BLAS and LAPACK.
 
-The caller must turn off their own threads (`one_thread`), because whole problems are solved in parallel.
+The caller must turn off the threads of BLAS (`one_thread`), because whole problems are solved in parallel.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _INT, _DOUBLE, _CHAR = map(types.CPointer, (types.intc, types.float64, types.uin
 
 
 def _routine(module: str, name: str, *kinds: Any) -> Any:
-    """A Fortran routine that compiled code may call. It is known by name, so functions that call it can be
+    """Return a Fortran routine that compiled code may call. It is called by name, so functions that call it can be
     cached.
     """
     symbol = f"coupole_{name}"
@@ -39,14 +39,14 @@ _dtrsm = _routine("blas", "dtrsm", _CHAR, _CHAR, _CHAR, _CHAR, _INT, _INT, _DOUB
 
 
 def one_thread() -> Any:
-    """Limit BLAS to one thread for each call, while this is entered."""
+    """Context in which BLAS uses one thread for each call."""
     return _libraries().limit(limits=1, user_api="blas")
 
 
 @functools.cache
 def _libraries() -> ThreadpoolController:
-    """Return the libraries that this process has loaded, NumPy's and SciPy's BLAS among them; they are looked for
-    once."""
+    """Return the libraries that this process has loaded, among them the BLAS of NumPy and of SciPy. They are
+    searched once."""
     return ThreadpoolController()
 
 
@@ -77,8 +77,8 @@ def sums(rows, values, right):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def factorise(product, penalty, factor):  # type: ignore[no-untyped-def]
-    """Fill `factor` [n, n] with the Cholesky factor of what `gram` left + diag(penalty); return whether there is
-    one."""
+    """Fill `factor` [n, n] with the Cholesky factor of the matrix from `gram` + diag(penalty); return whether
+    there is one."""
     upper = np.array([85], np.uint8)
     sizes = np.array([len(penalty), 0], np.intc)
     assign_rows(factor, product)
@@ -101,12 +101,13 @@ def solve(factor, right):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def solve_by_samples(rows, penalty, values, memory, factor, right):  # type: ignore[no-untyped-def]
-    """Fill `right` [m, n] with what `gram`, `factorise`, `sums` and `solve` make of `rows` [n, samples] and
-    `values` [m, samples], with less work for fewer samples than rows; return whether there is a solution.
+    """Fill `right` [m, n] with the solution that `gram`, `factorise`, `sums` and `solve` give for `rows` [n,
+    samples] and `values` [m, samples], with less work if there are fewer samples than rows. Return whether there
+    is a solution.
 
-    x = P^-1 R (R^T P^-1 R + 1)^-1 y has a matrix of the samples (Golub and Van Loan, Matrix Computations, 2.1.4:
-    the Sherman-Morrison-Woodbury formula). Cholesky's of that is left in `factor` [samples, samples], its inverse
-    times y in `values`. `memory` has room for 2 n^2.
+    x = P^-1 R (R^T P^-1 R + 1)^-1 y uses a matrix with the size of the samples (Golub and Van Loan, Matrix
+    Computations, 2.1.4: the Sherman-Morrison-Woodbury formula). The Cholesky factor of this matrix is left in
+    `factor` [samples, samples], and its inverse times y in `values`. `memory` has room for 2 n^2.
     """
     count, samples = rows.shape
     weighted_rows = memory[: samples * count].reshape(samples, count)
@@ -130,10 +131,11 @@ def solve_by_samples(rows, penalty, values, memory, factor, right):  # type: ign
 def left_out(rows, values, coefficients, factor, step, off):  # type: ignore[no-untyped-def]
     """Fill `off` [m, ...] with the amount by which each `step`-th sample is missed by the fit to all the others.
 
-    `rows` [n, samples], `coefficients` [m, n] and `factor` are those of a solution. For fewer samples than rows
-    `values` [m, samples] are what `solve_by_samples` left, else the samples. That is what the fit to all leaves
-    over 1 - h, h the diagonal of the matrix from samples to fitted values (Golub, Heath, Wahba, Technometrics 21,
-    1979); with the matrix of the samples both have the diagonal of its inverse as a factor.
+    `rows` [n, samples], `coefficients` [m, n] and `factor` belong to a solution. With fewer samples than rows,
+    `values` [m, samples] are those that `solve_by_samples` left, else the samples. The amount is the residual of
+    the fit to all samples, divided by 1 - h, where h is the diagonal of the matrix from samples to fitted values
+    (Golub, Heath, Wahba, Technometrics 21, 1979). In the form with a matrix of the samples, the diagonal of its
+    inverse is a factor of both and cancels.
     """
     (count, samples), size = rows.shape, len(factor)
     columns = np.zeros((off.shape[1], size))
@@ -160,7 +162,7 @@ def left_out(rows, values, coefficients, factor, step, off):  # type: ignore[no-
 
 @numba.njit(cache=True, nogil=True)
 def _half_solve(factor, right):  # type: ignore[no-untyped-def]
-    """Replace each row of `right` [m, n] by L^-1 times it, with L L^T what was factorised."""
+    """Replace each row of `right` [m, n] by L^-1 times the row, where L L^T is the factorised matrix."""
     letters = np.array([76, 85, 84, 78], np.uint8)  # from the left, upper, transposed, not of diagonal 1
     sizes = np.array([len(factor), len(right)], np.intc)
     unity = np.array([1.0])

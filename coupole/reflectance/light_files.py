@@ -1,8 +1,8 @@
-"""Files that say from where pictures were lit: tables, `.lp`, and relight's `.dome` and `.relight`.
+"""Files with the lights of pictures: tables, `.lp`, and relight's `.dome` and `.relight`.
 
 relight's JSON (its src/dome.cpp, image.cpp and project.cpp): `directions`, `positionsSphere` and `positions3d` are
-lists of {x, y, z}, one for each picture that is not skipped; `lightConfiguration` tells which of them hold. Places
-are mm from the middle of the picture; here they only give directions.
+lists of {x, y, z}, one for each picture that is not skipped; `lightConfiguration` tells which of them are valid.
+Positions are in mm from the middle of the picture; here they only give directions.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from coupole.intake.plain_data import json_of
 Floats = NDArray[np.float64]
 
 _PLACES = {"spherical": "positionsSphere", "lights3d": "positions3d"}
-"""Keys under which relight has the lights, by `lightConfiguration`; else, and where the list is empty, they are in
-`directions`."""
+"""Keys of the lists of lights in relight's files, by `lightConfiguration`. For other configurations, and if that
+list is empty, the lights are in `directions`."""
 _MOST_DIGITS = 9
-"""Largest number of digits in a number of lights."""
+"""Largest number of digits in the count of lights."""
 
 
 @dataclass(frozen=True)
@@ -38,15 +38,15 @@ class LightFile:
     names: tuple[str, ...] = ()
     """Names of the pictures; empty if the file has none."""
     intensities: Floats | None = None
-    """[n, 3] by which values are divided."""
+    """[n, 3] intensities by which values are divided."""
     srgb: bool = False
     """True if the file says that the pictures are encoded for displays."""
     lines: tuple[int, ...] = ()
-    """Lines of the file in which the directions stand; empty for JSON."""
+    """Lines of the file that contain the directions; empty for JSON."""
 
 
 def read_lights(path: Path) -> LightFile:
-    """An `.lp`, `.dome` or `.relight` file, or a table of directions. Raises InputError with the line."""
+    """Read an `.lp`, `.dome` or `.relight` file, or a table of directions. Raises InputError with the line."""
     match path.suffix.lower():
         case ".lp":
             return read_lp(path)
@@ -95,7 +95,7 @@ def _read_dome(path: Path, dome: dict[str, Any]) -> LightFile:
 
 
 def _vectors(path: Path, dome: dict[str, Any], key: str, axes: str) -> Floats:
-    """[n, 3] of a list of objects, or of lists of three."""
+    """[n, 3] vectors from a list of objects, or from lists of three numbers."""
     rows = dome.get(key, [])
     if not isinstance(rows, list):
         refuse(path, f"{key}: expected a list")
@@ -134,7 +134,8 @@ def _twice(name: str) -> str:
 
 
 def read_rows(path: Path, lengths: Sequence[int]) -> NDArray[np.float64]:
-    """[n, 3] numbers, one row a line; a single number stands for three. Raises InputError with the line."""
+    """[n, 3] numbers, one row from each line; a single number stands for three. Raises InputError with the
+    line."""
     return _numbered_rows(path, lengths)[1]
 
 
@@ -150,7 +151,7 @@ def _numbered_rows(path: Path, lengths: Sequence[int]) -> tuple[tuple[int, ...],
 
 
 def read_lp(path: Path) -> LightFile:
-    """An .lp file: a count, then `name x y z` in each line. Raises InputError with the line."""
+    """Read an .lp file: a count, then `name x y z` in each line. Raises InputError with the line."""
     names: list[str] = []
     rows = []
     lines = [(number, text) for number, text in enumerate(read_lines(path), start=1) if text.strip()]

@@ -1,7 +1,8 @@
-"""Brightness of each picture beside what all together say: wrong intensities, other exposures, faulty files.
+"""Brightness of each picture relative to all pictures together: it shows wrong intensities, different exposures,
+faulty files.
 
-A picture's gain is the median over pixels of its value over that of the fitted materials; the fit is robust, so a
-few faulty pictures of many do not move it.
+A picture's gain is the median over pixels of its value, divided by the value of the fitted materials. The fit is
+robust, so a few faulty pictures among many do not change it.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ from coupole.reflectance.normal_fit import PointMaterials
 SUSPECT = 0.05
 """A gain that differs from 1 by more than this is reported."""
 _LIT = 0.2
-"""Least cosine of the light at pixels that count."""
+"""Least cosine of incidence at pixels that are used."""
 GAIN_NEIGHBOURS = 3
-"""Number of nearest pictures whose median gain a new picture has."""
+"""Number of nearest pictures whose median gain a new picture gets."""
 
 
 def gains(
     grey: NDArray[np.float64], materials: PointMaterials, lights: NDArray[np.float64], view: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[lights] gain of each picture, from values [pixels, lights] under lights in the directions [lights, 3]."""
+    """[lights] gain of each picture, from values [pixels, lights] under lights in `directions` [lights, 3]."""
     pixels = np.flatnonzero(np.isfinite(materials.kd))
     half = lights + view
     half /= np.linalg.norm(half, axis=1, keepdims=True)
@@ -49,14 +50,14 @@ def gains(
 def gain_between(
     light_directions: NDArray[np.float64], gains_of_lights: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> float:
-    """The gain that a picture from another direction would have had: the median of the nearest ones', so that one
-    faulty picture among good ones does not count."""
+    """Return the gain that a picture with another light direction would have had. It is the median of the nearest
+    pictures, so that one faulty picture among good ones has no effect."""
     return float(np.median(gains_of_lights[nearest(light_directions, direction, GAIN_NEIGHBOURS)]))
 
 
 @numba.njit(cache=True, nogil=True)
 def modelled_values(normals, kd, ks, alpha, lights, half, view):  # type: ignore[no-untyped-def]
-    """[pixels, lights] values that materials give under lights; 0 where a light or the view is behind."""
+    """[pixels, lights] values of materials under lights; 0 where a light or the view is behind the surface."""
     values = np.zeros((len(normals), len(lights)))
     for pixel in range(len(normals)):
         n0, n1, n2 = normals[pixel]

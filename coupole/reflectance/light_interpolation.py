@@ -1,8 +1,8 @@
-"""Values of a point under a light between measured ones: a weighted sum of the measured values.
+"""Values of a point under a light between the measured lights: a weighted sum of the measured values.
 
 Radial basis functions of the lights' directions with a linear tail (seed 003, 5.2): the weights of the measured
-lights depend on directions alone, so one solution serves all pixels. Which kernel is best depends on the object
-and is found by leaving lights out.
+lights depend on directions alone, so one solution serves all pixels. The best kernel depends on the object and is
+found by leaving lights out.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ KERNELS = ("linear", "thin plate", "power 1.5", "cubic", "root")
 """phi(r) of the distance r between unit vectors: -r, r2 log r, -r^1.5, r3, -sqrt(r)."""
 _DIGITS = 9
 TAIL = 4
-"""Unknowns of the linear tail."""
+"""Number of unknowns of the linear tail."""
 
 
 def _phi(r: Floats, kernel: str) -> Floats:
@@ -35,7 +35,7 @@ def _phi(r: Floats, kernel: str) -> Floats:
 
 
 def weights(light_directions: Floats, new_directions: Floats, kernel: str) -> Floats:
-    """[wanted, measured] weights of values under lights from `light_directions` [n, 3] for lights from
+    """[wanted, measured] weights of the values under lights in `light_directions` [n, 3], for lights in
     `new_directions` [m, 3]."""
     count = len(light_directions)
     tail: Floats = np.hstack([np.ones((count, 1)), light_directions])
@@ -60,12 +60,13 @@ def _distances(a: Floats, b: Floats) -> Floats:
 
 
 def nearest(light_directions: Floats, direction: Floats, count: int) -> NDArray[np.int64]:
-    """Indices of the measured lights nearest to a direction, the nearest first; of equals, as rings of lamps have
-    them, the first in the table, whatever the last bits say."""
+    """Return the indices of the measured lights nearest to a direction, the nearest first. Lights at equal
+    distances, as in rings of lamps, keep the order of the table, whatever the rounding."""
     return np.argsort(_distances(direction[None], light_directions)[0].round(_DIGITS), kind="stable")[:count]
 
 
 def left_without(light_directions: Floats, number: int, neighbours: int) -> NDArray[np.int64]:
-    """Indices of the lights that are left when one goes with so many of its nearest neighbours."""
+    """Return the indices of the lights that remain when one light and some of its nearest neighbours are
+    removed."""
     near_lights = nearest(light_directions, light_directions[number], neighbours + 1)
     return np.setdiff1d(np.arange(len(light_directions)), np.append(near_lights, number))

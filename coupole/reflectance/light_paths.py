@@ -1,7 +1,8 @@
-"""Paths of light from LEDs to an object, and from one part of it to another: rays in its mesh, without any frame.
+"""Paths of light from LEDs to an object, and from one part of the object to another. They are found by rays in its
+mesh and need no frame.
 
-The object is cut into patches. A few triangles stand for each: what of the half space over them other patches
-fill, and what light reaches them straight from LEDs.
+The object is cut into patches. A few triangles represent each patch. Rays from them find the share of the half
+space that other patches fill, and the light that comes directly from LEDs.
 """
 
 from __future__ import annotations
@@ -27,23 +28,23 @@ Floats = NDArray[np.float64]
 MOST_PATCHES = 4000
 _RAYS_OF_A_TRIANGLE = 128
 _POINTS = 4
-"""Triangles that stand for a patch."""
+"""Number of triangles that represent a patch."""
 _BYTES_OF_A_TRIANGLE, _MOST_REMEMBERED_BYTES = 12 * _RAYS_OF_A_TRIANGLE, 10**9
-"""Most bytes that are remembered of a triangle of a view, and of all views."""
+"""Largest memory, in bytes, for one triangle of a view, and for all views."""
 _SUPPORT_CELLS = 24
 _RAYS = 1_000_000
 
 
 class Ahead:
-    """Paths of light between surfaces, and the views' diffuse reflectance, which no later view changes: kept for
-    the next result of the same object in this process."""
+    """Paths of light between surfaces, and the views' diffuse reflectance. No later view changes them, so they are
+    kept for the next result of the same object in this process."""
 
     def __init__(self) -> None:
         self._results: Remembered[Any] = Remembered(1000)
 
     def result(self, count: int, key: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
-        """Return what is computed of all views for `key`; remembered if `count` triangles of views fit in the
-        memory for it."""
+        """Return the value for `key`, computed from all views. It is remembered if `count` triangles of views fit
+        into the memory."""
         if count * _BYTES_OF_A_TRIANGLE > _MOST_REMEMBERED_BYTES:
             return compute()
         return self._results.result(key, compute)
@@ -59,7 +60,7 @@ NOTHING_AHEAD = _NothingAhead()
 
 @dataclass(frozen=True)
 class Scene:
-    """The object's triangles, and those of the support it stands on if that reflects."""
+    """The object's triangles, and those of the support under it if the support reflects."""
 
     rays: Any
     centres_mm: Floats
@@ -78,8 +79,8 @@ class Scene:
 
 
 def scene_of(corners_mm: Floats, *, support_z: tuple[Floats, Floats] | None = None) -> Scene:
-    """Return the scene of triangles [m, 3, 3]. `support_z` is a point of the support and its unit normal, if it
-    reflects: a square of three times the object's width comes to the scene."""
+    """Return the scene of triangles [m, 3, 3]. If the support reflects, `support_z` is a point of the support and
+    its unit normal. A square three times as wide as the object is then added to the scene."""
     count = len(corners_mm)
     if support_z is not None:
         corners_mm = np.concatenate([corners_mm, _support(corners_mm, *support_z)])
@@ -104,8 +105,8 @@ def _support(corners_mm: Floats, point_mm: Floats, normal: Floats) -> Floats:
 
 
 def _patches(centres_mm: Floats, normals: Floats, of_support: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Numbers of cells of a grid and of the sixth of all directions that a normal points to, as fine as there may
-    be patches."""
+    """Return a patch number for each triangle, from its cell in a grid and from the one of six directions that its
+    normal is nearest to. The grid is as fine as the allowed number of patches permits."""
     low, size = centres_mm.min(axis=0), float(np.ptp(centres_mm, axis=0).max())
     axis = np.argmax(np.abs(normals), axis=1)
     facing = 2 * axis + (np.take_along_axis(normals, axis[:, None], axis=1)[:, 0] > 0)
@@ -120,8 +121,8 @@ def _patches(centres_mm: Floats, normals: Floats, of_support: NDArray[np.bool_])
 
 
 def seen_from(scene: Scene, triangles: NDArray[np.int64], seed: int) -> csr_array:
-    """[n, patches] share of the half space over each of some triangles, weighted by the cosine, that a patch's
-    front fills: by rays from places spread over the triangle."""
+    """[n, patches] share of the half space over some triangles, weighted by the cosine, that the front of each
+    patch fills. It is found by rays from places spread over the triangle."""
     random = np.random.default_rng(seed)
     across = math.isqrt(_RAYS_OF_A_TRIANGLE // 2)
     strata = np.stack(np.divmod(np.arange(2 * across * across), 2 * across), axis=-1)
@@ -141,7 +142,8 @@ def seen_from(scene: Scene, triangles: NDArray[np.int64], seed: int) -> csr_arra
 def _gather_rays(
     scene: Scene, triangles: NDArray[np.int64], strata: NDArray[np.int64], random: np.random.Generator
 ) -> csr_array:
-    """`seen_from` of some of the triangles, a ray in each cell of a square that is mapped to the half space."""
+    """Compute `seen_from` for some of the triangles, with one ray in each cell of a square that is mapped to the
+    half space."""
     count, rays = len(triangles), len(strata)
     u = (strata + random.random((count, rays, 2))) / (strata.max(axis=0) + 1)
     radius, phi = np.sqrt(u[..., 0]), 2 * np.pi * u[..., 1]
@@ -167,7 +169,7 @@ def _gather_rays(
 
 
 def points_of(scene: Scene) -> NDArray[np.int64]:
-    """[points, patches] triangles that stand for each patch, any of it."""
+    """[points, patches] triangles that represent each patch, chosen among its triangles."""
     flat = scene.areas_mm2 < 1e-9 * scene.areas_mm2.max()  # has no normal
     order = np.lexsort((np.random.default_rng(3).random(len(scene.patch)), flat, scene.patch))
     first = np.searchsorted(scene.patch[order], np.arange(scene.patches))
@@ -176,8 +178,7 @@ def points_of(scene: Scene) -> NDArray[np.int64]:
 
 
 def direct_irradiance(scene: Scene, led_mm: Floats, led_normals: Floats, *, paper: bool) -> NDArray[np.float32]:
-    """[patches, leds] E / Phi, m^-2, that reaches patches straight from LEDs: the mean of some of their
-    triangles."""
+    """[patches, leds] E / Phi, m^-2, of patches directly from LEDs: the mean of some of their triangles."""
     irradiance = np.zeros((scene.patches, len(led_mm)), np.float32)
     for at in points_of(scene):
         centres, normals = scene.centres_mm[at], scene.normals[at]
@@ -193,7 +194,7 @@ def direct_irradiance(scene: Scene, led_mm: Floats, led_normals: Floats, *, pape
 
 
 def cosines_on(centres_mm: Floats, normals: Floats, led_mm: Floats) -> Floats:
-    """[n, leds] of incidence."""
+    """[n, leds] cosines of incidence."""
     ways = led_mm[None] - centres_mm[:, None]
     cosines: Floats = np.einsum("nlk,nk->nl", ways, normals) / np.linalg.norm(ways, axis=2)
     return cosines
@@ -201,12 +202,12 @@ def cosines_on(centres_mm: Floats, normals: Floats, led_mm: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class PathsOfLight:
-    """Paths of light in a scene, from the LEDs of views to their triangles: they need no frames."""
+    """Paths of light in a scene, from the LEDs of views to their triangles. No frames are needed."""
 
     scene: Scene
     key: tuple[Any, ...]
     count: int
-    """Triangles of the scene and of all views."""
+    """Number of triangles of the scene and of all views."""
     paper: bool
     ahead: Ahead
 
@@ -221,7 +222,7 @@ class PathsOfLight:
         return form_factors
 
     def direct(self, view: ViewSamples) -> NDArray[np.float32]:
-        """[patches, leds] `direct_irradiance` by the LEDs of a view."""
+        """[patches, leds] `direct_irradiance` of the LEDs of a view."""
         direct: NDArray[np.float32] = self.ahead.result(
             self.count,
             ("direct", *self.key, view.led_mm, view.led_normals, self.paper),
@@ -230,7 +231,7 @@ class PathsOfLight:
         return direct
 
     def gathers(self, view: ViewSamples) -> csr_array:
-        """[triangles of the view, patches] what they see of the patches."""
+        """[triangles of the view, patches] share of the half space that each patch fills, by `seen_from`."""
         gathers: csr_array = self.ahead.result(
             self.count,
             ("gathers", *self.key, view.triangles),

@@ -1,12 +1,13 @@
-"""Covariance of normals and materials of triangles, and the uncertainty of values in any direction that follows.
+"""Covariance of normals and materials of triangles, and the resulting uncertainty of values in any direction.
 
-The fit solves equations of scores: sums over samples of weight times derivative times residual, and the priors.
-Its covariance is H^-1 M H^-1 with H the derivatives of the scores and M their variance (Huber 1967). M comes from
-the residuals, summed by groups of neighbouring LEDs before they are squared, since a material that does not fit,
-an LED's power and a shadow's edge are off together there (Liang and Zeger 1986); so it contains noise, each LED's
-own power, and the error of the model. To it come the scanner's noise, which turns normals that are held, and what
-is unknown where only the usual roughness and ks hold them. The uncertainty that all LEDs share is a factor of kd
-and ks, kept apart.
+The fit solves equations of scores. A score is the sum, over the samples, of weight times derivative times
+residual, plus the priors. Its covariance is H^-1 M H^-1, where H is the derivatives of the scores and M their
+variance (Huber 1967). M comes from the residuals, which are summed by groups of neighbouring LEDs before they are
+squared (Liang and Zeger 1986). Within a group, the errors of the material's form, of an LED's power and of a
+shadow's edge are alike. So M contains noise, each LED's own power, and the error of the model. Two parts are
+added: the scanner's noise, for normals that are held to the mesh; and the spread of the prior, where only the
+usual roughness and ks hold them. The uncertainty that all LEDs share is a factor of kd and ks, and is kept
+separately.
 """
 
 from __future__ import annotations
@@ -37,31 +38,32 @@ from coupole.reflectance.triangle_fit import (
 Floats = NDArray[np.float64]
 
 GROUPS = 8
-"""Number of groups of LEDs, of each view."""
+"""Number of groups of LEDs in each view."""
 _FEWEST_GROUPS = 6
-"""Least number of groups: fewer say too little of what they share, and single samples are counted too."""
+"""Least number of groups. Fewer groups say too little about errors that their samples share; then single samples
+are used too."""
 _LEAST_KS = 1e-3
-"""Least ks, as a share of kd: below it the logarithm's covariance would say nothing of the highlight that may be
-there."""
+"""Least ks, as a share of kd. Below it, the covariance of the logarithm would say nothing about a possible
+highlight."""
 LEAST_KNOWN = 1e-2
-"""1 over the variance of the logarithm of a kd of which the samples say nothing."""
+"""1 over the variance of the logarithm of kd if the samples do not determine it."""
 _PART = 256
 
 
 @dataclass(frozen=True)
 class MaterialUncertainty:
-    """Uncertainty of the materials of b triangles; NaN without material."""
+    """Uncertainty of the materials of b triangles; NaN for triangles without material."""
 
     covariance: Floats
-    """[b, 5, 5] of the `ggx.UNKNOWNS`, for the channels' mean."""
+    """[b, 5, 5] covariance of the `ggx.UNKNOWNS`, for the channels' mean."""
     u_kd: Floats
     """[b, channels] relative standard uncertainty."""
     u_ks: Floats
 
 
 def groups_of(samples: TriangleSamples, middle_mm: Floats) -> NDArray[np.int64]:
-    """[samples] numbers of groups of neighbouring LEDs of each view: those that are nearest to some that are
-    spread evenly, as seen from the object's middle."""
+    """[samples] group numbers: LEDs of a view form groups around some evenly spread LEDs, each LED with the
+    nearest of these, as seen from the object's middle."""
     group = np.empty(len(samples.led_mm), np.int64)
     for view in np.unique(samples.view_of):
         view_samples = np.flatnonzero(samples.view_of == view)
@@ -70,7 +72,7 @@ def groups_of(samples: TriangleSamples, middle_mm: Floats) -> NDArray[np.int64]:
 
 
 def groups_of_leds(led_mm: Floats, middle_mm: Floats) -> NDArray[np.int64]:
-    """[leds] numbers of groups of neighbouring LEDs [leds, 3] of one view, from 0."""
+    """[leds] numbers, from 0, of the groups of neighbouring LEDs [leds, 3] of one view."""
     ways = led_mm - middle_mm
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     centres, nearest = [0], np.full(len(ways), -np.inf)
@@ -92,7 +94,7 @@ def covariances(
     threads: int | None = None,
 ) -> MaterialUncertainty:
     """Return the covariances of materials that were fitted to the samples `sample_mask` [samples]; `noise_um` is
-    that of the mesh's vertices, `middle_mm` the middle of the object."""
+    the noise of the mesh's vertices, `middle_mm` the middle of the object."""
     prior = prior_stiffness(samples.areas_mm2, noise_um)
     stiffness = prior if fitted_normals else np.full(len(prior), HELD)
     group = groups_of(samples, middle_mm)
@@ -119,8 +121,8 @@ def covariances(
 def relative_uncertainty(
     samples: TriangleSamples, materials: TriangleMaterials, covariance: Floats
 ) -> NDArray[np.float32]:
-    """[b, samples] relative standard uncertainty of what materials give where samples were measured, without what
-    all LEDs share; NaN where they give nothing."""
+    """[b, samples] relative standard uncertainty of the materials' values for the measured samples, without the
+    part that all LEDs share; NaN where there is no value."""
     u_relative = np.full(samples.values.shape[:2], np.nan, np.float32)
     grey = np.stack([materials.kd.mean(axis=1), materials.ks.mean(axis=1), materials.alpha], axis=1)
     _relative(
@@ -182,7 +184,8 @@ def _fill(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def add_scores(roots, good, lights, half, views, view_of, group, normal, grey, bread, meat):  # type: ignore[no-untyped-def]
-    """Derivatives of the scores of samples in the order of their groups, and the scores' variance."""
+    """Add the derivatives of the scores of samples to `bread`, and the scores' variance to `meat`; samples are in
+    the order of their groups."""
     scale = CAUCHY * math.sqrt(grey[0])
     t1, t2 = tangents(normal[0], normal[1], normal[2])
     row, score = np.empty(UNKNOWNS), np.zeros(UNKNOWNS)
@@ -219,8 +222,9 @@ def add_scores(roots, good, lights, half, views, view_of, group, normal, grey, b
 def _colours(  # type: ignore[no-untyped-def]
     sample_colours, good, lights, half, views, view_of, group, normal, grey, kd, ks, covariance, u_kd, u_ks
 ):
-    """Relative uncertainties of each channel's kd and ks: what their own least squares (`normal_fit.colours_from`)
-    say, with normal and roughness as they are, and what these add to the channels' mean."""
+    """Fill `u_kd` and `u_ks` with the relative uncertainties of each channel's kd and ks. One part comes from
+    their own least squares (`normal_fit.colours_from`), with fixed normal and roughness. The other is the part
+    that normal and roughness add to the channels' mean."""
     channels = len(kd)
     bread, meat = np.zeros((2, 2)), np.zeros((channels + 1, 2, 2))
     score, row = np.zeros((channels + 1, 2)), np.empty(2)

@@ -1,11 +1,11 @@
-"""Common tilt of all fitted normals of a material, which is taken off them.
+"""Common tilt of all fitted normals of a material, which is subtracted from them.
 
-A material that is not of the fit's form makes its normals lean, towards the cameras or away from them: the error
-that the fit would have in its form shows as a tilt. It cannot be estimated from single triangles, and their
-residuals do not show it. But errors of the scanner's vertices are independent of it, and of each other some
-millimetres away, so over many triangles the mean of what lies between fitted and scanned normals is the fit's
-error, which changes slowly with the direction in which the surface faces: a polynomial of second degree of that
-direction, for triangles that look alike. The remainder is noise, which the covariance of the fit states.
+A material that does not have the fit's form makes the fitted normals lean, towards the cameras or away from them.
+This tilt cannot be estimated from single triangles, and their residuals do not show it. But errors of the
+scanner's vertices are independent of the tilt, and of each other at distances of some millimetres. So over many
+triangles the mean difference between fitted and scanned normals is the fit's error. It changes slowly with the
+direction in which the surface faces: it is modelled as a polynomial of second degree of that direction, for
+triangles that look alike. The remainder is noise, which the covariance of the fit states.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from coupole.reflectance.triangle_fit import TriangleMaterials, prior_stiffness
 Floats = NDArray[np.float64]
 
 FEWEST = 90
-"""Triangles of a material: ten for each coefficient."""
+"""Least number of triangles of a material: ten for each coefficient."""
 _TOGETHER, _MOST_GROUPS = 1000, 8
-"""Triangles, at least, that share a polynomial, and polynomials."""
+"""Least number of triangles that share a polynomial, and largest number of polynomials."""
 _NEAREST = 50
-"""Triangles whose mean normal says in which direction the surface faces."""
+"""Number of triangles whose mean normal is taken as the direction in which the surface faces."""
 _USUAL_TILT = np.radians(3.0)
-"""Usual tilt of fitted normals, rad: it keeps large triangles, whose normals the scanner knows well, from deciding
-alone."""
+"""Usual tilt of fitted normals, rad. It limits the weight of large triangles, whose normals the scanner measures
+well."""
 _CHUNK = 1 << 16
 
 
@@ -36,7 +36,7 @@ def unbiased_normals(
     materials: TriangleMaterials, mesh_normals: Floats, centres_mm: Floats, areas_mm2: Floats, noise_um: float
 ) -> Floats:
     """[n, 3] fitted normals without their common deviation from the mesh's normals [n, 3]; unchanged for too few
-    triangles. `noise_um` is that of the mesh's vertices.
+    triangles. `noise_um` is the noise of the mesh's vertices.
     """
     normals = materials.normals.copy()
     fitted_triangles = np.flatnonzero(np.isfinite(materials.alpha))
@@ -61,8 +61,8 @@ def unbiased_normals(
 
 
 def _facing(normals: Floats, centres_mm: Floats, areas_mm2: Floats) -> Floats:
-    """[n, 3] mean normals of the nearest triangles: of one by itself the scanner's noise would be taken as the
-    direction that it depends on, and hence as the fit's error."""
+    """[n, 3] mean normals of the nearest triangles. With the normal of a single triangle, the scanner's noise
+    would change the direction of the polynomial, and would so be taken as the fit's error."""
     tree, mean_normals = cKDTree(centres_mm), np.empty_like(normals)
     for first in range(0, len(normals), _CHUNK):
         part = slice(first, first + _CHUNK)
@@ -72,7 +72,8 @@ def _facing(normals: Floats, centres_mm: Floats, areas_mm2: Floats) -> Floats:
 
 
 def _smooth(faces: Floats, off: Floats, weights: Floats) -> Floats:
-    """[n, 3] polynomial of second degree of directions [n, 3] through `off` [n, 3], by weighted least squares."""
+    """[n, 3] polynomial of second degree in directions [n, 3], fitted to `off` [n, 3] by weighted least
+    squares."""
     x, y, z = faces.T
     terms = np.stack([np.ones_like(x), x, y, z, x * y, x * z, y * z, x * x - y * y, 3.0 * z * z - 1.0], axis=1)
     root = np.sqrt(weights / weights.mean())[:, None]

@@ -1,11 +1,11 @@
-"""Half angles of the cones in which normals of pictures lie, in 95 % of the pixels.
+"""Half angles of cones around normals from pictures: for 95 % of the pixels the true normal lies inside.
 
-No truth is at hand, so the spread over groups of neighbouring lights stands for it: where the material's form is
-wrong, or light comes from the surface itself, one side of the dome says another normal than the other side. Two
+The true normals are not known, so the spread over groups of neighbouring lights is used instead. If the material's
+form is wrong, or the surface reflects light onto itself, the two sides of the dome give different normals. Two
 spreads are used. The fit's own covariance by groups (`material_uncertainty.add_scores`: Huber 1967, Liang and
-Zeger 1986) tells pixels apart, but is far too small. The jackknife over the same groups of the plain robust normal
-(`normal_fit.rank_normals`) has about the size of the fit's error; its 95 % quantile is taken in strata of the
-first spread. Both are added in quadrature.
+Zeger 1986) distinguishes the pixels, but is far too small. The jackknife over the same groups of the plain robust
+normal (`normal_fit.rank_normals`) has about the size of the fit's error; its 95 % quantile is taken in strata of
+the first spread. Both are added in quadrature.
 """
 
 from __future__ import annotations
@@ -29,21 +29,22 @@ FEWEST_LIGHTS = 12
 _NORMAL_QUANTILE = math.sqrt(-math.log(1.0 - LEVEL))
 """Radius that contains 95 % of a two-dimensional normal distribution, divided by its rms radius."""
 _STRATA = (0.25, 0.5, 0.75, 0.9, 0.97)
-"""Quantiles of the fit's own spread between which strata lie."""
+"""Quantiles of the fit's own spread that separate the strata."""
 _SHRINK_PIXELS = 200.0
-"""Pixels at which a stratum's quantile counts half."""
+"""Number of pixels at which a stratum's quantile has half of the weight."""
 _LEAST_KS = 1e-3
-"""Least ks, as a share of kd, of which derivatives say anything."""
+"""Least ks, as a share of kd, for which derivatives are meaningful."""
 _LOOSE = (1.0, 1.0, 1e-2, 1e-3, 1e-3)
-"""1 over variances of the tilts (rad) and logarithms of kd, ks and alpha of which nothing is known."""
+"""1 over the variances of unknown tilts (rad) and of unknown logarithms of kd, ks and alpha."""
 _BLOCK = 2000
 
 
 def spreads_deg(
     values: Floats, materials: PointMaterials, lights: Floats, view: Floats, *, threads: int | None = None
 ) -> tuple[Floats, Floats]:
-    """Return the fit's own spread and the jackknife's, both [n] rms tilts in degrees, of grey values [n, lights]
-    under lights [lights, 3] and their materials; NaN without material. All directions are unit vectors."""
+    """Return the fit's own spread and the jackknife's spread, both [n] rms tilts in degrees; NaN without material.
+    They come from grey values [n, lights] under lights [lights, 3] and from their materials. All directions are
+    unit vectors."""
     group = groups_of_leds(lights.copy(), np.zeros(3))
     return (
         _fit_spread_deg(values, materials, lights, view, group, threads),
@@ -52,7 +53,7 @@ def spreads_deg(
 
 
 def cones_deg(fit_deg: Floats, jackknife_deg: Floats) -> Floats:
-    """[n] half angles of 95 % cones, degrees, from the spreads of all pixels; NaN where these are."""
+    """[n] half angles of 95 % cones, degrees, from the spreads of all pixels; NaN where the spreads are NaN."""
     is_known = np.isfinite(fit_deg) & np.isfinite(jackknife_deg)
     cones = np.full(len(fit_deg), np.nan)
     if is_known.any():
@@ -66,7 +67,7 @@ def cones_deg(fit_deg: Floats, jackknife_deg: Floats) -> Floats:
 
 
 def _shrunk_quantile(values: Floats, in_stratum: NDArray[np.bool_]) -> float:
-    """Return the quantile of a stratum, drawn to that of all values where the stratum is small."""
+    """Return the quantile of a stratum, moved towards the quantile of all values if the stratum is small."""
     every = float(np.quantile(values, LEVEL))
     count = int(np.count_nonzero(in_stratum))
     if not count:
@@ -75,7 +76,7 @@ def _shrunk_quantile(values: Floats, in_stratum: NDArray[np.bool_]) -> float:
 
 
 def _jackknife_deg(values: Floats, lights: Floats, group: NDArray[np.int64]) -> Floats:
-    """[n] jackknife's standard deviation of the robust normals, each group of lights left out in turn."""
+    """[n] jackknife standard deviation of the robust normals; each group of lights is left out in turn."""
     whole = rank_normals(values, lights)[0]
     square = np.zeros(len(values))
     numbers = np.unique(group)
@@ -95,7 +96,7 @@ def _fit_spread_deg(
     group: NDArray[np.int64],
     threads: int | None,
 ) -> Floats:
-    """[n] rms tilt that the covariance of each pixel's fit has."""
+    """[n] rms tilt by the covariance of each pixel's fit."""
     half = lights + view
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     order = np.argsort(group, kind="stable")

@@ -1,9 +1,10 @@
-"""Normals from pictures under known lights: by least squares over the middle ranks, then with a GGX material.
+"""Normals from pictures under known lights: first by least squares over the middle ranks, then with a GGX
+material.
 
-The first is robust against shadows and highlights (Woodham 1980, with the darkest fifth and the brightest fifth of
-a pixel's samples left out). The second fits normal, kd, ks and alpha together by Levenberg-Marquardt to the square
-roots of the values, which have about equal noise, with Cauchy weights: what neither shadow nor interreflection nor
-this material explains pulls little.
+The first fit is robust against shadows and highlights (Woodham 1980, with the darkest fifth and the brightest
+fifth of a pixel's samples left out). The second fits normal, kd, ks and alpha together by Levenberg-Marquardt to
+the square roots of the values, which have about equal noise. It uses Cauchy weights, so that outliers have little
+effect.
 """
 
 from __future__ import annotations
@@ -23,24 +24,24 @@ Floats = NDArray[np.float64]
 
 RANKS = (0.2, 0.8)
 _STARTS = (0.08, 0.2, 0.45)
-"""Values of alpha from which fits start; the best end is kept."""
+"""Values of alpha from which fits start; the best result is kept."""
 SHADOW_SHARE, SHADOW_QUANTILE = 0.05, 0.9
 """Samples below this share of a pixel's quantile are in shadow."""
 CAUCHY = 0.05
-"""Scale of the weights, as a share of sqrt(kd)."""
+"""Scale of the Cauchy weights, as a share of sqrt(kd)."""
 USUAL_KS, SPREAD_KS, USUAL_ALPHA = math.log(0.04), 2.0, math.log(0.3)
-"""Logarithms, for materials in 1/sr: a dielectric's ks within a factor of 7, alpha within one of 3."""
+"""Logarithms for materials in 1/sr: a dielectric's ks within a factor of 7, and alpha within a factor of 3."""
 _MOST_STEPS = 40
 _SETTLED = 1e-5
 LEAST_ALPHA, _MOST_ALPHA = 0.02, 1.0
 _FEWEST = 6
-"""Samples that a pixel needs."""
+"""Least number of samples of a pixel."""
 _BLOCK = 2000
 
 
 @dataclass(frozen=True)
 class PointMaterials:
-    """Materials of n pixels; NaN where there were too few samples."""
+    """Materials of n pixels; NaN for pixels with too few samples."""
 
     normals: Floats
     """[n, 3] unit."""
@@ -48,7 +49,7 @@ class PointMaterials:
     ks: Floats
     alpha: Floats
     residual: Floats
-    """Weighted rms of the square roots, as a share of sqrt(kd)."""
+    """Weighted rms of the residuals, which are differences of square roots, as a share of sqrt(kd)."""
 
     def at(self, pixels: slice) -> PointMaterials:
         """Return the materials of some of the pixels."""
@@ -56,8 +57,8 @@ class PointMaterials:
 
 
 def rank_normals(values: Floats, lights: Floats, ranks: tuple[float, float] = RANKS) -> tuple[Floats, Floats]:
-    """Unit normals [n, 3] and albedos [n] of values [n, lights] under lights [lights, 3] (unit vectors), by least
-    squares over the samples of the middle ranks of each pixel."""
+    """Return unit normals [n, 3] and albedos [n] from values [n, lights] under lights [lights, 3] (unit vectors),
+    by least squares over the samples in the middle ranks of each pixel."""
     count = values.shape[1]
     first, last = round(ranks[0] * count), max(round(ranks[1] * count), round(ranks[0] * count) + 3)
     order = np.argsort(values, axis=1)[:, first:last]
@@ -70,8 +71,8 @@ def rank_normals(values: Floats, lights: Floats, ranks: tuple[float, float] = RA
 
 
 def fit_materials(values: Floats, lights: Floats, view: Floats, *, threads: int | None = None) -> PointMaterials:
-    """Normal and material of each pixel from values [n, lights] under lights [lights, 3]; `view` [3] points to the
-    camera. All are unit vectors."""
+    """Return normal and material of each pixel from values [n, lights] under lights [lights, 3]; `view` [3] points
+    to the camera. All are unit vectors."""
     normals, albedo = rank_normals(values, lights)
     half = lights + view
     half /= np.linalg.norm(half, axis=1, keepdims=True)
@@ -93,7 +94,8 @@ def fit_materials(values: Floats, lights: Floats, view: Floats, *, threads: int 
 
 
 def colours(values: Floats, materials: PointMaterials, lights: Floats, view: Floats) -> tuple[Floats, Floats]:
-    """kd and ks [n, 3] of values [n, lights, 3], normals and alpha as they are: least squares, not below 0."""
+    """Return kd and ks [n, 3] for values [n, lights, 3], with fixed normals and alpha, by least squares, not below
+    0."""
     half = lights + view
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     kd, ks = np.full((len(values), 3), np.nan), np.full((len(values), 3), np.nan)
@@ -117,9 +119,9 @@ def _fit_colours(values, normals, grey_kd, grey_ks, alphas, lights, half, view, 
 
 @numba.njit(cache=True, nogil=True)
 def colours_from(values, used_samples, normal, grey, lights, half, views, view_of, kd, ks):  # type: ignore[no-untyped-def]
-    """kd and ks [channels] of the samples `used_samples` of values [samples, channels], with a normal and `grey`
-    (kd, ks, alpha) that were fitted to their means; samples are weighted as the last step of that fit weighted
-    them."""
+    """Fill `kd` and `ks` [channels] from the samples `used_samples` of values [samples, channels]. Normal and
+    `grey` (kd, ks, alpha) were fitted to the channels' means; samples have the weights of the last step of that
+    fit."""
     n0, n1, n2 = normal
     channels = values.shape[1]
     sums = np.zeros((channels, 2))
@@ -155,7 +157,7 @@ def colours_from(values, used_samples, normal, grey, lights, half, views, view_o
 
 @numba.njit(cache=True, nogil=True)
 def colour_weight(model, values, grey_kd):  # type: ignore[no-untyped-def]
-    """Return the weight of a sample in `colours_from`: values [channels] where grey gives `model`."""
+    """Return the weight of a sample in `colours_from`, for values [channels] and the value `model` of `grey`."""
     off = (math.sqrt(model) - math.sqrt(max(0.0, values.mean()))) / (CAUCHY * math.sqrt(grey_kd))
     return 1.0 / ((1.0 + off * off) * max(model, 1e-12))
 
@@ -189,11 +191,13 @@ def _fit_all(values, lights, half, views, view_of, normals, albedo, least, param
 
 @numba.njit(cache=True, nogil=True)
 def fit_from(roots, used_samples, lights, half, views, view_of, unknowns, prior, stiffness, usual):  # type: ignore[no-untyped-def]
-    """Levenberg-Marquardt from `unknowns` (normal, log kd, log ks, log alpha), in place; cost and weighted rms.
+    """Fit `unknowns` (normal, log kd, log ks, log alpha) by Levenberg-Marquardt in place; return cost and weighted
+    rms.
 
-    `roots` are square roots of the samples `used_samples`; `lights` and `half` [samples, 3], `views` [v, 3] that
-    `view_of` [samples] names. The normal is held to `prior` by `stiffness`, 1 over its variance in rad^2;
-    roughness and ks to what is usual by `usual`, so that no highlight is invented where no sample could show it.
+    `roots` are square roots of the samples `used_samples`; `lights` and half vectors `half` are [samples, 3].
+    `view_of` [samples] gives each sample's row of `views` [v, 3]. The normal is held to `prior` by `stiffness`, 1
+    over its variance in rad^2. Roughness and ks are held to usual values by `usual`, so that no highlight is
+    invented where no sample could show it.
     """
     scale = CAUCHY * math.exp(0.5 * unknowns[3])
     matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
@@ -252,7 +256,7 @@ def _least_cosine(normal, views):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _move(unknowns, step, trial):  # type: ignore[no-untyped-def]
-    """The unknowns after a step: two tilts along the normal's tangents, then the logarithms."""
+    """Fill `trial` with the unknowns after a step: two tilts along the normal's tangents, then the logarithms."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
     t1, t2 = tangents(n0, n1, n2)
     x = n0 + step[0] * t1[0] + step[1] * t2[0]
@@ -268,7 +272,7 @@ def _move(unknowns, step, trial):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _cost(roots, used_samples, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale):  # type: ignore[no-untyped-def]
-    """Cauchy's cost, and the weighted rms of the residuals."""
+    """Return Cauchy's cost, and the weighted rms of the residuals."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
     kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
     to_view = views[:, 0] * n0 + views[:, 1] * n1 + views[:, 2] * n2
@@ -294,7 +298,7 @@ def _cost(roots, used_samples, lights, half, views, view_of, unknowns, prior, st
 def _equations(  # type: ignore[no-untyped-def]
     roots, used_samples, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale, matrix, right
 ):
-    """Normal equations of a step, into `matrix` and `right`; cost and weighted rms."""
+    """Write the normal equations of a step to `matrix` and `right`; return cost and weighted rms."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
     kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
     t1, t2 = tangents(n0, n1, n2)
@@ -341,7 +345,7 @@ def _equations(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _solve(matrix, right, damping):  # type: ignore[no-untyped-def]
-    """The damped step, by Cholesky; the matrix holds its lower half."""
+    """Return the damped step, by Cholesky factors. Only the lower half of the matrix is filled."""
     factor, step = np.zeros((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     for i in range(UNKNOWNS):
         for j in range(i + 1):

@@ -1,10 +1,10 @@
 """Reflectance as one function of both directions: spherical harmonics of pairs, for light and view.
 
-Products of Y(l, m) of the light's direction and Y(l', m') of the view's are a basis of functions on pairs. Where
-reflectance does not change when both directions turn about the normal, nor when they are mirrored, only those of
-equal m are needed, summed over m and -m: P(l, m) P(l', m) cos(m phi), phi between the azimuths. By reciprocity l
-and l' can be exchanged. So d degrees need d (d + 1) (d + 2) / 6 functions: 220 for 10, 969 for 17. They are
-orthonormal over all pairs.
+Products of Y(l, m) of the light's direction and Y(l', m') of the view's are a basis of functions on pairs. If
+reflectance changes neither when both directions turn about the normal nor when they are mirrored, only products
+with equal m are needed. They are summed over m and -m: P(l, m) P(l', m) cos(m phi), where phi is the angle between
+the azimuths. By reciprocity l and l' can be exchanged. So d degrees need d (d + 1) (d + 2) / 6 functions: 220 for
+10, 969 for 17. The functions are orthonormal over all pairs.
 """
 
 from __future__ import annotations
@@ -24,11 +24,9 @@ Floats = NDArray[np.float64]
 
 USUAL_DEGREES, MOST_DEGREES = 10, 17
 TIKHONOV, _LEAST = 0.1, 1e-3
-"""Ridge of the highest degrees as a share of the mean of the normal matrix's diagonal; ridge of the lowest degrees
-as
-a share of that of the highest. On a simulated glossy surface, a tenth and ten times as much changed the error,
-lights
-and a view left out, by 3 % at most."""
+"""Ridge of the highest degrees, as a share of the mean diagonal of the normal matrix; ridge of the lowest degrees,
+as a share of the ridge of the highest. On a simulated glossy surface, a tenth and ten times this ridge changed the
+error under left-out lights and in a left-out view by 3 % at most."""
 _TABLES = (*recurrence(MOST_DEGREES), diagonal(MOST_DEGREES))
 
 
@@ -37,8 +35,8 @@ def count_of(degrees: int) -> int:
 
 
 def pair_functions(lights: Floats, views: Floats, degrees: int) -> Floats:
-    """[n, count_of(degrees)] of pairs of unit vectors [n, 3], z the normal: in the order of l, of l' from l on, of
-    m from 0 to l."""
+    """[n, count_of(degrees)] functions of pairs of unit vectors [n, 3], where z is the normal. They are in the
+    order of l, then of l' from l on, then of m from 0 to l."""
     functions = np.empty((len(lights), count_of(degrees)))
     _functions(lights, views, degrees, *_TABLES, functions)
     return functions
@@ -46,7 +44,7 @@ def pair_functions(lights: Floats, views: Floats, degrees: int) -> Floats:
 
 def fit_pairs(pool: Pool, degrees: int) -> NDArray[np.float32]:
     """[clusters, count_of(degrees), channels] coefficients of reflectance, 1/sr, by least squares of f cos_i with
-    Tikhonov's ridge, which grows with the degrees; NaN where a pool has too few samples."""
+    Tikhonov's ridge, which grows with the degrees; NaN for pools with too few samples."""
     coefficients = np.full((len(pool.counts), count_of(degrees), pool.values.shape[2]), np.nan, np.float32)
     ridge = TIKHONOV * (_LEAST + _roll_off(degrees))
     for number, count in enumerate(pool.counts):
@@ -63,8 +61,8 @@ def fit_pairs(pool: Pool, degrees: int) -> NDArray[np.float32]:
 def pair_values(
     samples: TriangleSamples, normals: Floats, cluster: NDArray[np.integer], coefficients: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """[b, samples, channels] f cos_i where samples were measured, by the `cluster` [b] of each triangle, not below
-    0; NaN without one."""
+    """[b, samples, channels] f cos_i for the measured samples, by the `cluster` [b] of each triangle, not below 0;
+    NaN for triangles without a cluster."""
     modelled_values = np.full(samples.values.shape, np.nan, np.float32)
     degrees = next(d for d in range(MOST_DEGREES + 1) if count_of(d) == coefficients.shape[1])
     _values(
@@ -75,13 +73,14 @@ def pair_values(
 
 
 def _roll_off(degrees: int) -> Floats:
-    """[count] 0 for the constant, 1 for the highest pair: as bending, squared."""
+    """[count] weights of the ridge: 0 for the constant, 1 for the highest pair, growing as the square of the
+    bending."""
     bending = [first * (first + 1) + second * (second + 1) for first, second, _ in _orders(degrees)]
     return np.asarray((np.array(bending, float) / (2 * degrees * (degrees - 1))) ** 2)
 
 
 def _orders(degrees: int) -> list[tuple[int, int, int]]:
-    """l, l' and m of each function."""
+    """Return l, l' and m of each function."""
     every = range(degrees)
     return [
         (low_order, high_order, m)

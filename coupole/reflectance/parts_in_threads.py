@@ -1,4 +1,4 @@
-"""Work in parts, in threads, with kernels that are compiled."""
+"""Work that is divided into parts for threads, with kernels that are compiled."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Done = TypeVar("Done")
 
 _begun: dict[CodeType, threading.Lock] = {}
 _ready: set[CodeType] = set()
-"""Functions that were called once in this process: their kernels are loaded."""
+"""Functions that were called once in this process, so that their kernels are loaded."""
 
 
 def first_alone(work: Callable[..., Done]) -> Callable[..., Done]:
     """Return a function for threads. The first call in this process ends before any other begins, because it loads
-    or compiles the kernels that it calls. Several threads that did so together failed now and then (numba 0.68:
+    or compiles the kernels that it calls. If several threads do so together, they sometimes fail (numba 0.68:
     "dictionary changed size during iteration")."""
     kind: CodeType = work.__code__
 
@@ -35,7 +35,7 @@ def first_alone(work: Callable[..., Done]) -> Callable[..., Done]:
 
 
 def in_threads(work: Callable[[int], object], count: int, *, part: int = 1, threads: int | None = None) -> None:
-    """Do `work(first)` for the first of each `part` of `count`, by so many threads, or as many as there are cores;
-    the very first of its kind alone."""
+    """Call `work(first)` for the first number of each `part` of `count`, in so many threads, or in one thread for
+    each core. The first call of a kind in this process runs alone."""
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         list(pool.map(first_alone(work), range(0, count, part)))

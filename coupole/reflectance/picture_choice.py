@@ -1,7 +1,7 @@
-"""Chooses, among pictures under known lights, the few that tell most; only those that are chosen are read.
+"""Chooses the most informative pictures among pictures under known lights; only chosen pictures are read.
 
-The same choice as `lights: {kind: adaptive}` makes in a run (`coupole.preflight.next_lights`), for domes that take
-pictures in another way, and to see on old pictures how many would have been enough.
+The choice is the same as with `lights: {kind: adaptive}` in a run (`coupole.preflight.next_lights`). It serves
+domes that take pictures in another way, and shows for old pictures how many would have been enough.
 """
 
 from __future__ import annotations
@@ -20,27 +20,28 @@ from coupole.reflectance.picture_set import PictureSet
 Floats = NDArray[np.float64]
 
 _SITES = 4096
-"""Approximate number of pixels by which lights are judged."""
+"""Approximate number of pixels by which lights are rated."""
 
 
 @dataclass(frozen=True)
 class HowMany:
-    """Number of lights that are chosen, and the steps in which they are."""
+    """Number of lights to be chosen, and the size of the steps."""
 
     most: int
     """Greatest number of lights that are chosen."""
     relit_rms: float | None = None
-    """No more lights are chosen at this expected error, a share of the pictures' bright level."""
+    """Expected error at which the choice ends, as a share of the pictures' bright level."""
     first: int = FEWEST_TAKEN
-    """Lights to begin with, spread over the dome."""
+    """Number of lights at the start, spread over the dome."""
     at_a_time: int = 1
-    """Number of lights that are chosen before their pictures are looked at."""
+    """Number of lights that are chosen before their pictures are read."""
 
 
 def choose_pictures(
     pictures: PictureSet, how_many: HowMany, *, say: Callable[[int, int], None] = lambda done, of: None
 ) -> dict[str, Any]:
-    """Numbers of the lights chosen, in their order, each step with its expected error; JSON's values only.
+    """Return the numbers of the chosen lights in their order, and the expected error of each step; all are JSON
+    values.
 
     Raises InputError for fewer or more lights than can be chosen, or for a picture that cannot be read.
     """
@@ -88,7 +89,7 @@ def _with_new(
     say: Callable[[int, int], None],
     most: int,
 ) -> Floats:
-    """[chosen, sites] grey values, in full scales; those of lights chosen before stand in `values`."""
+    """[chosen, sites] grey values, in full scales; `values` has those of the lights that were chosen before."""
     rows = list(values)
     step = max(1, pictures.pixels // _SITES)
     for light in chosen_lights[len(rows) :].tolist():

@@ -1,6 +1,6 @@
-"""Job from pictures under known lights to normals, materials and what relights them, in a result folder.
+"""Job from pictures under known lights to a result folder with normals, materials and the data for relighting.
 
-Each step leaves one file, complete or not there; a job that was killed goes on with the first that is missing.
+Each step leaves one complete file or none; a job that was killed continues with the first missing file.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ from coupole.storage.durable import sha256
 
 VIEW = np.array([0.0, 0.0, 1.0])
 BLOCK = 20_000
-"""Pixels that are fitted at a time."""
+"""Number of pixels that are fitted at a time."""
 PEAK_QUANTILE, _PEAK_PIXELS = 0.999, 100_000
 _GAIN_PIXELS = 20_000
 _FIRST = "fits/first.h5"
-"""Materials fitted with all pictures, before any is known as suspect."""
+"""File of the materials fitted with all pictures, before suspect pictures are known."""
 Said = Callable[[str, int, int], None]
-"""Step, how much of it is done, of how much."""
+"""Function that takes a step, the number of its parts that are done, and their total number."""
 
 
 @dataclass(frozen=True)
 class Checked:
-    """Errors of the picture that was made for a light that was left out."""
+    """Errors of the predicted picture of a left-out light."""
 
     light: int
     psnr_db: float
@@ -68,10 +68,10 @@ class Checked:
 def fit_pictures(
     pictures: PictureSet, out: Path, *, left_out: Sequence[int] = (), say: Said = lambda step, done, of: None
 ) -> dict[str, Any]:
-    """Make the result, or what of it is missing; returns what `result.json` says.
+    """Make the result, or its missing parts, and return the content of `result.json`.
 
     Raises InputError if too few lights are left, or if the folder holds the result of other pictures or settings,
-    StorageError if the disk does not take it.
+    and StorageError if the disk cannot be written.
     """
     try:
         return _fit_pictures(pictures, out, left_out, say)
@@ -148,7 +148,7 @@ _FIELDS = {"normal": 3, "kd": 3, "ks": 3, "alpha": 1, "residual": 1, "grey_kd": 
 
 
 def _fit_twice(result: PictureResult, lights: NDArray[np.int64], say: Said) -> None:
-    """Fit with all lights; then, if there are suspect pictures, again without them."""
+    """Fit with all lights. If there are suspect pictures, fit again without them."""
     first, last = result.folder / _FIRST, result.folder / MATERIALS
     if not first.exists():
         _fit(result, lights, first, "normals and materials", say)
@@ -161,7 +161,7 @@ def _fit_twice(result: PictureResult, lights: NDArray[np.int64], say: Said) -> N
 
 
 def _fit(result: PictureResult, lights: NDArray[np.int64], path: Path, step: str, say: Said) -> None:
-    """Block by block; those that an earlier job made are kept."""
+    """Fit block by block; blocks that an earlier job fitted are kept."""
     begun = path.with_suffix(".begun")  # no `.part`, which the next job would remove
     if begun.exists() and not _can_go_on(begun):
         begun.unlink()
@@ -188,7 +188,7 @@ def _fit(result: PictureResult, lights: NDArray[np.int64], path: Path, step: str
 
 
 def _can_go_on(begun: Path) -> bool:
-    """Tell whether a fit that was killed can be read: its first block may not be on the disk."""
+    """Tell whether the file of a killed fit can be read: perhaps not even its first block is on the disk."""
     try:
         with h5py.File(begun, "r") as file:
             return "fitted" in file.attrs
@@ -204,7 +204,7 @@ def read_materials(path: Path) -> PointMaterials:
 
 
 def _write_cones(result: PictureResult, materials: PointMaterials, say: Said) -> None:
-    """Half angles of the normals' 95 % cones; NaN under too few lights."""
+    """Write the half angles of the normals' 95 % cones; NaN under too few lights."""
     with open_result_file(result.folder / MATERIALS) as file:
         lights = np.asarray(file.attrs["lights"])
     cones_deg = np.full(len(materials.kd), np.nan)
@@ -233,13 +233,13 @@ def _gains(result: PictureResult, lights: NDArray[np.int64], materials: PointMat
 
 
 def peak_of(result: PictureResult) -> float:
-    """The 99.9 % quantile of all pictures."""
+    """Return the 99.9 % quantile of all pictures."""
     some = slice(None, None, 1 + int(np.count_nonzero(result.mask)) // _PEAK_PIXELS)
     return float(np.quantile(result.values(np.arange(len(result.directions)), some), PEAK_QUANTILE))
 
 
 def check(result: PictureResult, interpolation: Interpolation, light: int, peak: float) -> Checked:
-    """One left-out light, made and compared, inside the mask."""
+    """Predict one left-out light and compare it with its picture, inside the mask."""
     relit_picture = relit(result, interpolation, result.directions[light])
     measured_values = result.values(np.array([light]))[0]
     off = (relit_picture[result.mask] - measured_values).astype(np.float64)

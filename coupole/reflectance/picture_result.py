@@ -1,6 +1,7 @@
-"""The result folder of pictures under known lights: what is in it, and how it is read.
+"""The result folder of pictures under known lights: its contents, and how to read it.
 
-Everything large is HDF5, with shapes, units and axes in attributes; docs/reference/result-folder.md describes it.
+Large data are in HDF5 files, with shapes, units and axes in attributes; docs/reference/result-folder.md describes
+them.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ Floats = NDArray[np.float32]
 SCHEMA = "coupole-reflectance-pictures/1"
 SAMPLES, MATERIALS, INTERPOLATION = "samples/pictures.h5", "fits/materials.h5", "fits/interpolation.h5"
 INTERVALS = "fits/intervals.h5"
-"""Coefficients and factors by which intervals of relit pictures are predicted; missing under too few lights."""
+"""File of the coefficients and factors by which intervals of relit pictures are predicted; missing under too few
+lights."""
 CONES = "normals_95_deg.npy"
 NORMALS, ABOUT, REPORT = "normals.npy", "result.json", "report.html"
 AXES = "x to the right of the picture, y up, z to the camera"
@@ -32,7 +34,7 @@ AXES = "x to the right of the picture, y up, z to the camera"
 
 @contextmanager
 def open_result_file(path: Path) -> Iterator[h5py.File]:
-    """An HDF5 file of a result. Raises InputError if it cannot be read."""
+    """Open an HDF5 file of a result. Raises InputError if it cannot be read."""
     try:
         file = h5py.File(path, "r")
     except OSError as error:
@@ -44,13 +46,13 @@ def open_result_file(path: Path) -> Iterator[h5py.File]:
 
 @dataclass(frozen=True)
 class PictureResult:
-    """A result folder, whole or in the making."""
+    """A result folder, complete or unfinished."""
 
     folder: Path
 
     @cached_property
     def about(self) -> dict[str, Any]:
-        """result.json. Raises InputError if the folder has none, or one of another kind."""
+        """Content of result.json. Raises InputError if the folder has no such file, or one of another kind."""
         path = self.folder / ABOUT
         try:
             about = read_json(path, allow_nan=True)
@@ -64,25 +66,26 @@ class PictureResult:
 
     @cached_property
     def mask(self) -> NDArray[np.bool_]:
-        """[h, w] what was fitted."""
+        """[h, w] True for pixels that were fitted."""
         with open_result_file(self.folder / SAMPLES) as file:
             return np.asarray(file["mask"], dtype=bool)
 
     @cached_property
     def directions(self) -> NDArray[np.float64]:
-        """[lights, 3] unit vectors to all lights, left out or not."""
+        """[lights, 3] unit vectors to all lights, including left-out lights."""
         with open_result_file(self.folder / SAMPLES) as file:
             return np.asarray(file["directions"], dtype=np.float64)
 
     @cached_property
     def _scales(self) -> Floats:
-        """[lights, 1, 3] from raw values to full scale 1 divided by the intensities."""
+        """[lights, 1, 3] factors from raw values to full scale 1 divided by the intensities."""
         with open_result_file(self.folder / SAMPLES) as file:
             factors: NDArray[np.float64] = 1.0 / (file.attrs["full_scale"] * np.asarray(file["intensities"]))
         return factors[:, None].astype(np.float32)
 
     def values(self, lights: NDArray[np.int64], pixels: slice = slice(None)) -> Floats:
-        """[lights, pixels, 3] in full scales divided by the intensities; `lights` must rise."""
+        """[lights, pixels, 3] values in full scales divided by the intensities; `lights` must be in rising
+        order."""
         with open_result_file(self.folder / SAMPLES) as file:
             raw = file["values"]
             values = np.empty((len(lights), *raw[0, pixels].shape), np.float32)
@@ -92,7 +95,7 @@ class PictureResult:
         return values
 
     def picture(self, values: Floats, outside: float = 0.0) -> Floats:
-        """[h, w, ...] of values [pixels, ...]."""
+        """[h, w, ...] picture of values [pixels, ...]."""
         picture = np.full((*self.mask.shape, *values.shape[1:]), outside, np.float32)
         picture[self.mask] = values
         return picture

@@ -1,6 +1,6 @@
-"""Pictures of one view under distant lights of known direction, as RTI domes and photometric stereo have them.
+"""Pictures of one view under distant lights of known direction, as in RTI domes and photometric stereo.
 
-Axes: x to the right of the picture, y up, z to the camera, which is taken as far away.
+Axes: x to the right of the picture, y up, z to the camera. The camera is taken as infinitely distant.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from coupole.reflectance.light_files import read_lights, read_lines, read_rows, 
 PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 ORDER_FILE = "filenames.txt"
 FEWEST_LIGHTS = 6
-"""A normal and a material have six unknowns."""
+"""Least number of lights, because a normal and a material have six unknowns."""
 
 
 @dataclass(frozen=True)
 class PictureSet:
-    """Set of pictures as the files describe it; the pictures themselves are read one by one."""
+    """Set of pictures as the files describe it; the pictures themselves are read one at a time."""
 
     files: tuple[Path, ...]
     directions: NDArray[np.float64]
     """[lights, 3] unit vectors from the object to the light."""
     intensities: NDArray[np.float64]
-    """[lights, 3] by which values are divided."""
+    """[lights, 3] intensities by which values are divided."""
     mask: NDArray[np.bool_]
-    """[h, w] what is fitted."""
+    """[h, w] True for pixels that are fitted."""
     full_scale: int
     """Largest value that a picture can hold."""
     srgb: bool = False
     """True if files are encoded for displays; their values are decoded to 16 bit."""
     uncalibrated_run: str = ""
-    """The run that these are pictures of, with nominal lights; empty for others."""
+    """The run that these pictures come from, with nominal lights; empty for other pictures."""
     simulated: bool | None = None
-    """True if the pictures were simulated; None where nobody knows."""
+    """True if the pictures were simulated; None if this is not known."""
 
     def __len__(self) -> int:
         return len(self.files)
@@ -48,9 +48,9 @@ class PictureSet:
         return int(np.count_nonzero(self.mask))
 
     def raw_values(self, number: int) -> NDArray[Any]:
-        """[pixels, 3] of one picture, those of the mask in the order of rows, linear.
+        """[pixels, 3] linear values of one picture inside the mask, row by row.
 
-        Raises InputError if it differs from the first picture in size or depth.
+        Raises InputError if the picture differs from the first one in size or depth.
         """
         picture = read_picture(self.files[number])
         if self.srgb:
@@ -75,10 +75,10 @@ def _differs(picture: NDArray[Any], shape: tuple[int, ...], dtype: Any) -> str:
 def read_pictures(
     folder: Path, lights: Path, *, intensities: Path | None = None, mask: Path | None = None, srgb: bool = False
 ) -> PictureSet:
-    """The set in a folder; `lights` is any file that `read_lights` takes. `srgb`: pictures are encoded for
-    displays, as those are of which the file of the lights says so.
+    """Read the set in a folder; `lights` is any file that `read_lights` accepts. `srgb` tells that the pictures
+    are encoded for displays; the file of lights may say so too.
 
-    Raises InputError that names file and line.
+    Raises InputError with file and line.
     """
     if not folder.is_dir():
         refuse(folder, "is no folder of pictures")
@@ -116,7 +116,7 @@ def read_pictures(
 
 
 def linear_of_srgb(picture: NDArray[Any]) -> NDArray[np.uint16]:
-    """Linear values, full scale 65535, of sRGB's codes (IEC 61966-2-1)."""
+    """Return linear values, full scale 65535, from sRGB codes (IEC 61966-2-1)."""
     most = int(np.iinfo(picture.dtype).max)
     codes = np.arange(most + 1) / most
     linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
@@ -134,7 +134,7 @@ def _names_in(folder: Path, other_files: set[Path]) -> tuple[str, ...]:
 
 
 def read_picture(path: Path) -> NDArray[Any]:
-    """[h, w, 3] red, green, blue, uint8 or uint16; a grey picture three times. Raises InputError."""
+    """[h, w, 3] red, green, blue, uint8 or uint16; a grey picture is repeated three times. Raises InputError."""
     import cv2
 
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)

@@ -1,4 +1,4 @@
-"""Pictures under lights that were not there, from a result of pictures under lights that were."""
+"""Pictures under new lights, from a result of pictures under known lights."""
 
 from __future__ import annotations
 
@@ -25,27 +25,26 @@ Beams = Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
 """Directions [3] to distant lights, and their strengths [3]."""
 
 STRIP_PIXELS = 60_000
-"""Pixels of a strip in which pictures are made; more only if a row has more."""
+"""Number of pixels in a strip, in which pictures are made. A strip has more only if a row has more."""
 _TAUGHT_PIXELS = 60_000
-"""Number of pixels, in strips drawn at random, from which the correction is learnt."""
+"""Number of pixels from which the correction is learnt, in strips drawn at random."""
 _TAUGHT_ROWS = 32
 _KERNEL_PIXELS = 20_000
 LEAST_LEVEL = 1e-3
-"""Least level, as a share of the values' 99.9 % quantile: pixels darker than this count as if they were so
-bright."""
+"""Least level, as a share of the values' 99.9 % quantile. Darker pixels are treated as if they had this level."""
 
 
 @dataclass(frozen=True)
 class Interpolation:
-    """Data from which pictures between the lights are made."""
+    """Data from which pictures under lights between the measured ones are made."""
 
     lights: NDArray[np.int64]
-    """Numbers of the result's lights that are used, rising."""
+    """Numbers of the result's lights that are used, in rising order."""
     gains: NDArray[np.float64]
-    """[lights] of their pictures; values are divided by them."""
+    """[lights] gains of their pictures; values are divided by them."""
     kernel: str
     left_out_rms: dict[str, float]
-    """Rms error of each kernel for a light that was left out, in full scales."""
+    """Rms error of each kernel for a left-out light, in full scales."""
     peak: float
     """99.9 % quantile of the values."""
     network: Network | None
@@ -84,8 +83,8 @@ def learn(
     *,
     say: Callable[[int, int], None] = lambda done, of: None,
 ) -> Interpolation:
-    """Choose the kernel and learn the correction by leaving lights out; pictures whose gain is suspect are
-    interpolated from, but nothing is learnt from how they differ."""
+    """Choose the kernel and learn the correction by leaving lights out. Pictures with a suspect gain are used for
+    interpolation, but their differences are not learnt."""
     taught = list(_taught(result, lights, gains))
     every = np.concatenate([values for _, values in taught], axis=1)
     peak = float(np.quantile(every, 0.999))
@@ -111,8 +110,8 @@ def learn(
 
 
 def left_out_rms(values: Floats, directions: NDArray[np.float64]) -> dict[str, float]:
-    """Return the rms error of each kernel, from values [lights, pixels, 3]: over all lights, each left out with
-    its nearest neighbour."""
+    """Return the rms error of each kernel, from values [lights, pixels, 3], over all lights. Each light is left
+    out with its nearest neighbour."""
     flat = values.reshape(len(values), -1)
     squares = dict.fromkeys(KERNELS, 0.0)
     for light in range(len(values)):
@@ -150,7 +149,7 @@ def relit_by(
     *,
     say: Callable[[int, int], None] = lambda done, of: None,
 ) -> Floats:
-    """The same under several lights, as `beams_of` has them."""
+    """Return the same as `relit` under several lights, in the form of `beams_of`."""
     picture = np.zeros((*result.mask.shape, 3), np.float32)
     beams = beams_of(lights, samples)
     for number, (way, rgb) in enumerate(beams):
@@ -160,8 +159,8 @@ def relit_by(
 
 
 def beams_of(lights: Sequence[AnyLight], samples: int) -> Beams:
-    """Return distant lights of lights, with `samples` directions of each environment; of these, what is behind the
-    object gives none. Raises InputError for lights that have places: pictures tell no distances."""
+    """Return lights as distant beams, with `samples` directions for each environment; directions behind the object
+    are left out. Raises InputError for lights with places, because pictures contain no distances."""
     beams: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
     for light in lights:
         match light:
@@ -183,13 +182,14 @@ def beams_of(lights: Sequence[AnyLight], samples: int) -> Beams:
 
 
 def strip_between(result: PictureResult, interpolation: Interpolation, top: int, bottom: int) -> Strip:
-    """The values of rows, divided by the pictures' gains."""
+    """Return the values of some rows, divided by the pictures' gains."""
     values = _rows(result, interpolation.lights, interpolation.gains, top, bottom)
     return learned.strip_of(result.mask[top:bottom], values, LEAST_LEVEL * interpolation.peak)
 
 
 def strips(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """Rows from and to, of about `STRIP_PIXELS` pixels of the mask each; rows without any are left out."""
+    """Yield the first row and the end of strips with about `STRIP_PIXELS` pixels of the mask each. Rows without
+    such pixels are left out."""
     counts = np.count_nonzero(mask, axis=1)
     top, pixels = 0, 0
     for row, count in enumerate(counts):
@@ -213,7 +213,7 @@ def _rows(
 def _taught(
     result: PictureResult, lights: NDArray[np.int64], gains: NDArray[np.float64]
 ) -> Iterator[tuple[NDArray[np.bool_], Floats]]:
-    """Strips of rows, drawn at random, until they have enough pixels; all of a small picture."""
+    """Yield strips of rows, drawn at random, until they have enough pixels; a small picture is used whole."""
     mask = result.mask
     tops = [top for top in range(0, len(mask), _TAUGHT_ROWS) if mask[top : top + _TAUGHT_ROWS].any()]
     np.random.default_rng(0).shuffle(tops)

@@ -1,10 +1,10 @@
 """Intervals of relit pictures, calibrated by lights that are left out.
 
-Lights are dealt to three folds. Each light's picture is predicted from all other lights, with a correction that
-was learnt without its fold, and compared with what was measured. The scale of the error is predicted log-linearly
-from what is known beforehand (`foreseen`; locally weighted conformal prediction: Lei et al. 2018); quantiles of
-error over scale are fitted by strata (`strata`). Last, folds that were not fitted widen all intervals to what they
-need (cross-conformal prediction: Vovk 2015).
+The lights are divided into three folds. Each light's picture is predicted from all other lights, with a correction
+that was learnt without its fold, and compared with the measured picture. The scale of the error is predicted
+log-linearly from quantities known beforehand (`foreseen`; locally weighted conformal prediction: Lei et al. 2018).
+Quantiles of error over scale are fitted by strata (`strata`). Last, intervals are fitted without each fold in
+turn, and all intervals are widened until those hold in the left-out folds (cross-conformal prediction: Vovk 2015).
 """
 
 from __future__ import annotations
@@ -32,41 +32,42 @@ Floats = NDArray[np.float64]
 Say = Callable[[int, int], None]
 
 LEVELS = {"95": 0.95, "68": 0.6827}
-"""Shares of the pixels that intervals hold, by their names in the file."""
+"""Shares of the pixels for which intervals hold, by their names in the file."""
 FEWEST_LIGHTS = 12
-"""Lights from which intervals can be calibrated."""
+"""Least number of lights from which intervals can be calibrated."""
 FOLDS = 3
 _STRIP_ROWS, _STRIP_PIXELS = 16, 20_000
-"""Rows of strips, drawn at random, and their pixels, from which intervals are calibrated."""
+"""Rows of the strips, drawn at random, and number of their pixels, from which intervals are calibrated."""
 _LESSON_SAMPLES = 400_000
 _SAMPLES = 400_000
 """Largest number of residuals that are kept."""
 _LEAST_SIZE = 5e-5
 """Share of the peak that is added to errors before their logarithm is taken."""
 _FARTHEST = 2.0
-"""Times the lights' spacing beyond which nothing is known of a new light."""
+"""Largest distance of a new light from the measured lights, as a multiple of their spacing. Beyond it nothing is
+known."""
 
 
 @dataclass(frozen=True)
 class RelitIntervals:
-    """Data by which half widths of intervals are predicted."""
+    """Data from which the half widths of intervals are predicted."""
 
     coefficients: Floats
-    """[columns of `Foreseen.regressors`] of the logarithm of the error's scale."""
+    """[columns of `Foreseen.regressors`] coefficients for the logarithm of the error's scale."""
     factors: dict[str, StratumFactors]
-    """Quantiles by `LEVELS`."""
+    """Quantiles, by the names in `LEVELS`."""
     spacing: float
     """Largest distance, between unit vectors, from a measured light to its nearest one."""
 
     def half_widths(self, foreseen: Foreseen, level: str, peak: float) -> NDArray[np.float32]:
-        """[n, 3] half widths of the interval `level` of `LEVELS`; NaN where a pixel has no material."""
+        """[n, 3] half widths of the interval `level` of `LEVELS`; NaN for pixels without material."""
         scale = np.exp(foreseen.regressors(peak) @ self.coefficients)
         widths = scale * self.factors[level].quantiles(foreseen.labels(peak))
         return widths.reshape(foreseen.values.shape).astype(np.float32)
 
     def widening(self, distance: float) -> float:
-        """Return the factor for a light at a distance from its nearest measured light: in proportion beyond the
-        spacing, NaN beyond twice the spacing."""
+        """Return the factor for a light at a distance from its nearest measured light. It is 1 up to the spacing,
+        in proportion to the distance beyond the spacing, and NaN beyond twice the spacing."""
         return float("nan") if distance > _FARTHEST * self.spacing else max(1.0, distance / self.spacing)
 
     def write(self, path: Path) -> None:
@@ -81,7 +82,7 @@ class RelitIntervals:
 
 
 def read_intervals(folder: Path) -> RelitIntervals:
-    """Read the intervals of a result. Raises InputError if it has none."""
+    """Read the intervals of a result. Raises InputError if the result has none."""
     with open_result_file(folder / INTERVALS) as file:
         factors = {
             level: StratumFactors(
@@ -106,7 +107,7 @@ def half_width_picture(
     result: PictureResult, interpolation: Interpolation, beams: Beams, level: str, *, say: Say
 ) -> NDArray[np.float32]:
     """[h, w, 3] half widths of the interval `level` of `LEVELS` of a relit picture; NaN outside the mask, and
-    where nothing is known. Half widths of several beams are added up: the most that they can be together."""
+    where nothing is known. Half widths of several beams are added, which gives an upper bound of their sum."""
     intervals = read_intervals(result.folder)
     materials = read_strip_materials(result)
     directions = result.directions[interpolation.lights]
@@ -137,14 +138,14 @@ def read_strip_materials(result: PictureResult) -> StripMaterials:
 
 
 def _pixels(result: PictureResult, top: int, bottom: int) -> slice:
-    """Return the places, among the pixels of the mask, of those in some rows."""
+    """Return the places, among the pixels of the mask, of the pixels in some rows."""
     before = int(np.count_nonzero(result.mask[:top]))
     return slice(before, before + int(np.count_nonzero(result.mask[top:bottom])))
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Errors of left-out lights at n pixels and channels, and what was known of them beforehand."""
+    """Errors of left-out lights at n pixels and channels, with the quantities that were known beforehand."""
 
     sizes: Floats
     """[n] absolute errors."""
@@ -162,7 +163,8 @@ class Residuals:
 def calibrate(
     result: PictureResult, interpolation: Interpolation, *, say: Say = lambda count, of: None
 ) -> RelitIntervals:
-    """Calibrate the intervals of a result by its own lights, each left out. Needs `FEWEST_LIGHTS` lights."""
+    """Calibrate the intervals of a result by its own lights; each light is left out in turn. Needs `FEWEST_LIGHTS`
+    lights."""
     fold = np.random.default_rng(0).permutation(len(interpolation.lights)) % FOLDS
     residuals = _left_out_residuals(result, interpolation, fold, say)
     coefficients = _fit_scale(residuals, interpolation.peak)
@@ -189,7 +191,8 @@ def _fit_level(residuals: Residuals, coefficients: Floats, level: float) -> Stra
 
 
 def _needed_widening(residuals: Residuals, fold: NDArray[np.int64], peak: float, level: float) -> float:
-    """Return the factor by which intervals that were fitted without a fold must be wider to hold in it."""
+    """Return the factor by which intervals that were fitted without a fold must be widened to hold in this
+    fold."""
     ratios = np.empty(len(residuals.sizes))
     for number in range(FOLDS):
         in_fold = fold[residuals.lights] == number
@@ -206,7 +209,7 @@ Rows = tuple[Strip, StripMaterials]
 def _left_out_residuals(
     result: PictureResult, interpolation: Interpolation, fold: NDArray[np.int64], say: Say
 ) -> Residuals:
-    """Predict each light, left out, in some strips."""
+    """Predict each light from the others, in some strips, and yield the residuals."""
     rows = list(_calibration_rows(result, interpolation))
     directions = result.directions[interpolation.lights]
     networks = _fold_networks([strip for strip, _ in rows], interpolation, directions, fold)
@@ -228,7 +231,7 @@ def _left_out_residuals(
 def _foreseen_without(
     strip: Strip, materials: StripMaterials, without: Interpolation, directions: Floats, light: int
 ) -> Foreseen:
-    """Predict a light of the strip, from `directions` [lights, 3], by the others alone."""
+    """Predict one light of the strip, whose lights have `directions` [lights, 3], from the other lights alone."""
     other_strip = Strip(strip.mask, np.delete(strip.values, light, axis=0), strip.level)
     return foresee(other_strip, materials, without, np.delete(directions, light, axis=0), directions[light])
 
@@ -243,7 +246,7 @@ def _without(interpolation: Interpolation, light: int, network: Network | None) 
 
 
 def _residuals_of(foreseen: Foreseen, measured_values: NDArray[np.floating], light: int, peak: float) -> Residuals:
-    """Return what a prediction misses of the values [n, 3] that its light showed."""
+    """Return the residuals of a prediction against the values [n, 3] under its light."""
     return Residuals(
         np.abs(measured_values - foreseen.values).ravel().astype(np.float64),
         np.full(foreseen.values.size, light),
@@ -278,7 +281,7 @@ def _calibration_rows(result: PictureResult, interpolation: Interpolation) -> It
 def _fold_networks(
     calibration_strips: Sequence[Strip], interpolation: Interpolation, directions: Floats, fold: NDArray[np.int64]
 ) -> list[Network | None]:
-    """Learn the correction once without the lights of each fold; None if the interpolation has none."""
+    """Learn the correction once for each fold without its lights; None if the interpolation has no correction."""
     if interpolation.network is None:
         return [None] * FOLDS
     sound = np.flatnonzero(np.abs(interpolation.gains - 1.0) <= SUSPECT)

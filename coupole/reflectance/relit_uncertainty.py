@@ -1,4 +1,4 @@
-"""Uncertainty of relit pictures, from that of the materials they are made of."""
+"""Uncertainty of relit pictures, from the uncertainty of their materials."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from coupole.reflectance.triangle_fit import TriangleMaterials, turned_normals
 
 Floats = NDArray[np.float64]
 _LONGEST_STEP = 0.02
-"""Longest step of tilts (rad) and alpha's logarithm, to both sides: small enough for a derivative, large enough
-for float32. Pictures are linear in kd and ks."""
+"""Longest step of tilts (rad) and of alpha's logarithm, to both sides. It is small enough for a derivative and
+large enough for float32. Pictures are linear in kd and ks."""
 _NOT_LINEAR = (0, 1, 4)
 
 
 def uncertainty_of_picture(
     scene: RelitScene, lights: Sequence[AnyLight], samples: int = SAMPLES, *, say: Say = lambda done, of: None
 ) -> NDArray[np.float32]:
-    """[h, w, channels] standard uncertainty (68 %) of `scene.picture(lights, samples)`, in its unit. It
-    is a linear combination of the uncertainties of each triangle's normal, kd, ks and roughness, of the responses
-    of its pixels, and of the power of all LEDs. 0 where no material is seen, NaN where its uncertainty is not
-    known. It does not include what the fit cannot show (another lobe than GGX, light from surface to surface), nor
-    any error of the lights asked for.
+    """[h, w, channels] standard uncertainty (68 %) of `scene.picture(lights, samples)`, in its unit. It combines,
+    linearly, the uncertainties of each triangle's normal, kd, ks and roughness, of the responses of its pixels,
+    and of the power of all LEDs. It is 0 where no material is seen, and NaN where the material's uncertainty is
+    not known. It does not include effects that the fit cannot represent (a lobe other than GGX, inter-reflection),
+    nor any error of the requested lights.
 
-    The picture is made again with materials moved along each independent part of their covariance, which takes
+    The picture is made again with materials moved along each independent part of their covariance. This takes
     eleven times as long as the picture alone. Raises InputError for a fit that has no covariance.
     """
     refuse_uncertain(scene.result, scene.fit)
@@ -73,7 +73,7 @@ def uncertainty_of_picture(
 
 
 def refuse_uncertain(result: RunResult, fit: str) -> None:
-    """Raise InputError if the uncertainty of pictures by this fit is not known."""
+    """Raise InputError if the uncertainty of pictures from this fit is not known."""
     if fit == TEXELS:
         return
     if fit not in MATERIALS:
@@ -88,9 +88,9 @@ Uncertain = tuple[TriangleMaterials, Floats, Floats, Floats]
 
 
 def _uncertain(scene: RelitScene) -> Uncertain:
-    """Return for the surface's triangles: materials; covariance [n, 5, 5] of tilts and logarithms; uncertainty
-    [n, 2, channels] of each channel's kd, and ks, as a multiple of that of their mean; relative uncertainty [n]
-    that all light from a triangle has."""
+    """Return for the surface's triangles: the materials; the covariance [n, 5, 5] of tilts and logarithms; the
+    uncertainty [n, 2, channels] of kd and of ks of each channel, as a multiple of the uncertainty of the channels'
+    mean; the relative uncertainty [n] that all light from a triangle shares."""
     places = np.searchsorted(scene.result.triangles, scene.surface.triangles)
     covariance = scene.result.material_covariances(scene.fit, places)
     of_means = np.sqrt(np.einsum("nii->ni", covariance)[:, 2:4, None])
@@ -102,7 +102,8 @@ def _uncertain(scene: RelitScene) -> Uncertain:
 
 
 def _uncertain_texels(scene: RelitScene) -> Uncertain:
-    """Return the same for the picture's texels. Channels of a pixel are as uncertain as its own."""
+    """Return the same values as `_uncertain` for the picture's texels. Each channel of a texel is taken as
+    uncertain as the channels' mean."""
     assert isinstance(scene.reflecting, Texels)
     texels, (u_pixel, u_shared) = (
         scene.reflecting.materials,
@@ -114,8 +115,9 @@ def _uncertain_texels(scene: RelitScene) -> Uncertain:
 
 
 def _stepped_materials(materials: TriangleMaterials, wider: Floats, step: Floats) -> TriangleMaterials:
-    """Materials whose tilts and logarithms have moved by a small step [n, 5]. Channels move together, each as far
-    as its own uncertainty is `wider` [n, 2, channels] (of kd, of ks) than that of their mean."""
+    """Return materials whose tilts and logarithms have moved by a small step [n, 5]. Channels move together; the
+    step of each is multiplied by `wider` [n, 2, channels] (of kd, of ks), the ratio of its uncertainty to that of
+    the channels' mean."""
     return dataclasses.replace(
         materials,
         normals=turned_normals(materials.normals, step[:, :2]),

@@ -1,4 +1,4 @@
-"""A result folder in the making: begun once, one whole file after the other."""
+"""A result folder that is being made: begun once, then filled with one complete file after the other."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SETTINGS = "settings.json"
 
 
 def begin(out: Path, settings: dict[str, Any]) -> None:
-    """Make the folder, or go on with it; refuse one that was begun with other input or settings."""
+    """Make the folder, or continue in it; refuse one that was begun with other input or settings."""
     path = out / SETTINGS
     text = json.dumps(settings) + "\n"
     if path.exists():
@@ -38,7 +38,8 @@ def begin(out: Path, settings: dict[str, Any]) -> None:
 
 
 def _has_other_content(out: Path) -> bool:
-    """Tell whether a folder holds anything that neither a killed writer nor processing beside a run has left."""
+    """Tell whether a folder holds anything besides the remains of a killed writer and of processing beside a
+    run."""
     if not out.exists() or (out / processing.FOLDER).is_dir():
         return False
     return any(content.suffix != ".part" for content in out.iterdir())
@@ -59,22 +60,23 @@ def read_settings(out: Path) -> dict[str, Any]:
 
 
 def clear_remains(out: Path) -> None:
-    """Remove what writers that were killed have left."""
+    """Remove the remains of writers that were killed."""
     for part in out.rglob("*.part"):
         part.unlink(missing_ok=True)
 
 
 def complete(path: Path, write: Callable[[Path], Any], *, unless: Path | None = None) -> None:
-    """Have a file written beside its place, then put there: it is whole or not there, also after a crash. Nothing
-    is put there if `unless` exists by then: another has done it meanwhile."""
+    """Call `write` for a file beside `path`, then move this file to `path`. The file is complete or missing, also
+    after a crash. It is not moved if `unless` exists by then, because another process has made the file
+    meanwhile."""
     with in_the_making(path, unless) as part:
         write(part)
 
 
 @contextmanager
 def in_the_making(path: Path, unless: Path | None = None) -> Iterator[Path]:
-    """Yield the path of a part file, which is put in the place of `path`, whole, when all has gone well. The name
-    is used once: a writer that is believed dead disturbs no other."""
+    """Yield the path of a part file, which replaces `path` when it is complete and no error occurred. Its name is
+    used only once, so a writer that was taken for dead does not disturb another writer."""
     part = path.with_name(f"{path.name}.{uuid4().hex}.part")
     path.parent.mkdir(exist_ok=True)
     try:

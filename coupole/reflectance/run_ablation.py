@@ -1,7 +1,7 @@
 """Dependence of each fit on the number of LEDs, on grazing samples and on the number of coefficients.
 
-Some triangles of a result, spread over it, are fitted anew from fewer samples or coefficients. The fits are
-compared under the LEDs that were left out of all of them (seed 003, 6.3 and 6.4).
+Some triangles of a result, spread over it, are fitted again with fewer samples or coefficients. The fits are
+compared under LEDs that were left out of all fits (seed 003, 6.3 and 6.4).
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]
 ABLATION = "ablation.json"
 LED_STEPS = (1, 2, 4, 8)
-"""Every LED, every second, ..."""
+"""Steps between the LEDs that are used: every LED, every second, and so on."""
 MOST_INCIDENCES_DEG = (89, 80, 70, 60)
 COEFFICIENTS = (100, 64, 36, 16)
 _BLOCKS, _TRIANGLES = 16, 48
-"""Places in the result, and neighbouring triangles at each."""
+"""Number of places in the result, and of neighbouring triangles at each place."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Samples and coefficients that a fit is given."""
+    """Samples and coefficients that a fit may use."""
 
     led_step: int = 1
     most_incidence_deg: float = 89
@@ -57,8 +57,8 @@ VARIANTS: dict[str, list[tuple[float, Variant]]] = {
 
 
 def ablate_result(out: Path, *, say: Said = lambda step, done, of: None) -> dict[str, Any]:
-    """Return, by each setting, the mean absolute error of each fit as a share of the camera's range; write it to
-    the result too. Raises InputError if its samples are not all there, StorageError if the disk takes nothing."""
+    """Return, for each setting, the mean absolute error of each fit as a share of the camera's range, and write it
+    to the result. Raises InputError if the result lacks samples, StorageError if the disk cannot be written."""
     settings = read_settings(out)
     result = RunResult(out)
     result.refuse_unfinished(settings)
@@ -94,7 +94,7 @@ def _mean(off: list[Floats]) -> float | None:
 
 
 def _blocks(result: RunResult) -> list[slice]:
-    """Return blocks of places in `triangles`."""
+    """Return blocks of places in the result's `triangles`."""
     count = len(result.triangles)
     firsts = np.unique(np.linspace(0, max(0, count - _TRIANGLES), _BLOCKS).astype(int))
     return [slice(int(first), min(int(first) + _TRIANGLES, count)) for first in firsts]
@@ -108,11 +108,11 @@ class _Case:
     leds: NDArray[np.int64]
     """[samples]"""
     left_out_mask: NDArray[np.bool_]
-    """[samples] those under LEDs that were left out."""
+    """[samples] True for samples under LEDs that were left out."""
     incidence_deg: Floats
     """[b, samples]"""
     share: Floats
-    """[b, samples, channels] of the camera's range for a value of 1."""
+    """[b, samples, channels] share of the camera's range for a value of 1."""
 
 
 def _case(result: RunResult, block: slice, settings: dict[str, Any]) -> _Case:
@@ -135,7 +135,7 @@ def _case(result: RunResult, block: slice, settings: dict[str, Any]) -> _Case:
 
 
 def _errors(case: _Case, variant: Variant, noise_um: float) -> dict[str, Floats]:
-    """Return the errors of each fit, under the LEDs that were left out, where every fit has something."""
+    """Return the errors of each fit under the LEDs that were left out, for samples where every fit has a value."""
     of_leds = np.unique(case.leds[~case.left_out_mask])[:: variant.led_step]
     is_fitted = np.isin(case.leds, of_leds)
     values = np.where(case.incidence_deg[..., None] <= variant.most_incidence_deg, case.samples.values, np.nan)

@@ -1,8 +1,8 @@
-"""Errors of the fits of runs under LEDs that they have not seen, and what `result.json` says.
+"""Errors of the fits of runs under LEDs that were not fitted, and the content of `result.json`.
 
-The fits are compared with pictures, block by block of 2 x 2 pixels (seed 003, 6.3), and with the samples, which
-are means over triangles and have less noise. Inter-reflection that was taken off the samples is taken off the
-pictures too.
+The fits are compared with pictures, in blocks of 2 x 2 pixels (seed 003, 6.3), and with the samples, which are
+means over triangles and have less noise. Inter-reflection that was subtracted from the samples is subtracted from
+the pictures too.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from coupole.storage.durable import write_synced
 Said = Callable[[str, int, int], None]
 PEAK_QUANTILE = 0.999
 _LEVELS, _LEVELS_OF_RANGE = 1 << 17, 1 << 16
-"""Number of levels of a histogram of shares of the camera's range, up to twice the range; how many of them the
-range has."""
+"""Number of levels of a histogram of shares of the camera's range, up to twice the range; and number of levels in
+the range itself."""
 
 
 @dataclass
 class _Missed:
-    """Errors of one fit; they grow block by block."""
+    """Errors of one fit, summed over blocks."""
 
     absolute: float = 0.0
     square: float = 0.0
@@ -69,19 +69,19 @@ class _Check:
     pictures: dict[str, _Missed] = field(default_factory=lambda: {name: _Missed() for name in FITS})
     triangles: dict[str, _Missed] = field(default_factory=lambda: {name: _Missed() for name in FITS})
     noise: list[float] = field(default_factory=list)
-    """Mean absolute error of the pictures by noise, of each."""
+    """Mean absolute error of each picture from noise."""
     levels: NDArray[np.int64] = field(default_factory=lambda: np.zeros(_LEVELS, np.int64))
-    """Number of values of the pictures at each level."""
+    """Number of the pictures' values at each level."""
     inside: dict[str, list[int]] = field(default_factory=lambda: {name: [0, 0] for name in MATERIALS})
-    """Number of triangles' samples that lie in the interval of what the material gives, and of how many."""
+    """Number of triangles' samples that lie in the interval of the material's value, and number of all samples."""
     ratios: dict[str, WideningSamples] = field(
         default_factory=lambda: {name: WideningSamples() for name in MATERIALS}
     )
-    """Errors of pictures over their stated uncertainty."""
+    """Errors of pictures, divided by their stated uncertainty."""
 
     @property
     def peak(self) -> float:
-        """Peak of the pictures, to which PSNR refers."""
+        """Peak of the pictures, which PSNR uses."""
         upper = np.searchsorted(np.cumsum(self.levels), PEAK_QUANTILE * self.levels.sum())
         return float(upper + 0.5) / _LEVELS_OF_RANGE
 
@@ -95,7 +95,7 @@ def check_result(
 ) -> dict[str, Any]:
     """Compare the fits with the samples under the LEDs that were left out; write and return `result.json`.
 
-    Raises InputError if samples or fits are not all there, StorageError if the disk takes nothing.
+    Raises InputError if samples or fits are missing, StorageError if the disk cannot be written.
     """
     begun_s = time.monotonic() if begun_s is None else begun_s
     settings = read_settings(out)
@@ -117,8 +117,8 @@ def check_result(
 def _check_view(
     result: RunResult, view: ViewSamples, settings: dict[str, Any], memory_bytes: int, check: _Check, say: Said
 ) -> None:
-    """Pictures and samples of a view, in shares of the camera's range, where every fit has something: all fits are
-    compared by the same ones."""
+    """Compare all fits with pictures and samples of a view, in shares of the camera's range. Only places where
+    every fit has a value are used, so that all fits are compared on the same data."""
     check.noise += list(read_check_frames(result, view).noise)
     for part in held_out(result, view, settings, memory_bytes):
         some = part.samples
@@ -160,8 +160,9 @@ def _inside(
     measured_values: NDArray[np.float32],
     noise: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Tell whether the channels' means of samples [n, leds, channels] lie in the interval of what was made, by its
-    uncertainty [n, leds] and theirs. Only samples that have all channels count."""
+    """Tell whether the channels' means of samples [n, leds, channels] lie in the interval of the model's values.
+    The interval has the uncertainty of the model [n, leds] and of the samples. Only samples with all channels are
+    used."""
     middle = modelled_values.mean(axis=2)
     variance = (relative * middle) ** 2 + np.sum((noise * measured_values) ** 2, axis=2) / measured_values.shape[
         2
@@ -177,7 +178,7 @@ def _compare(
     measured_values: NDArray[np.floating],
     misses: dict[str, _Missed],
 ) -> NDArray[np.floating]:
-    """Add what fits miss where all have something; the measured values there."""
+    """Add the errors of the fits where all have a value; return the measured values there."""
     is_finite = np.isfinite(measured_values)
     for values in values_of_fits.values():
         is_finite &= np.isfinite(values)
@@ -188,7 +189,7 @@ def _compare(
 
 
 def _interval_percent(uncertainty: dict[str, Any] | None) -> dict[str, float] | None:
-    """Return the interval of the median sample; None if it is not known, or all are open."""
+    """Return the interval of the median sample; None if it is not known, or if all intervals are open."""
     if uncertainty is None or uncertainty["interval"]["median"] is None:
         return None
     low, high = uncertainty["interval"]["median"]
@@ -196,8 +197,8 @@ def _interval_percent(uncertainty: dict[str, Any] | None) -> dict[str, float] | 
 
 
 def _typical(result: RunResult, name: str) -> dict[str, float | None]:
-    """Medians of standard uncertainties of a material; of kd and ks with what all samples of a triangle, and all
-    triangles, share. None if it is not known.
+    """Return the medians of standard uncertainties of a material. Those of kd and ks include the parts that all
+    samples of a triangle share, and that all triangles share. None for an unknown uncertainty.
     """
     variances = np.einsum("nii->ni", result.material_covariances(name)).copy()
     variances[:, 2:4] += (result.u_triangles(slice(None)) ** 2 + result.u_shared**2)[:, None]

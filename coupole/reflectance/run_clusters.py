@@ -1,4 +1,4 @@
-"""Clusters of a result of runs: a few materials for all triangles, and one for those that had too few samples."""
+"""Clusters of a result of runs: a few materials for all triangles, also for triangles with too few samples."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from coupole.storage.durable import write_synced
 Said = Callable[[str, int, int], None]
 ABOUT_CLUSTERS = "clusters.json"
 FEWEST_TO_BORROW = 4
-"""Samples that tell which cluster a triangle belongs to."""
+"""Least number of samples that determine the cluster of a triangle."""
 USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS = 400, 16, 1000
-"""Members of a cluster, and bounds on the number of clusters, where that number is not given: as the paper has
-them, and some for small objects."""
+"""Number of members of a cluster, and bounds on the number of clusters, if that number is not given. They are
+those of the paper; small objects have at least some clusters."""
 _FROM = GGX_NORMAL.name
 _WAYS = ("own", "clustered", "harmonics", "borrowed")
-"""Ways to make what a triangle shows, each judged by itself."""
+"""Ways to predict the values of a triangle; each is compared separately."""
 
 
 def cluster_result(
@@ -51,11 +51,11 @@ def cluster_result(
     without_view: str | None = None,
     say: Said = lambda step, done, of: None,
 ) -> dict[str, Any]:
-    """Find at most `count` materials for all triangles, and harmonics of pairs of directions of so many `degrees`;
-    write them, and say what is missed with them under the LEDs that were left out. A view that is left out too
-    gives no samples and is judged by itself; normals, and which triangles look alike, are still by all views.
+    """Find at most `count` materials for all triangles, and harmonics of pairs of directions up to `degrees`.
+    Write them, and return their errors under the LEDs that were left out. A left-out view gives no samples, and
+    its errors are also returned separately. Normals, and the triangles that look alike, still come from all views.
 
-    Raises InputError if samples or fits are not all there, or the view is none; StorageError.
+    Raises InputError if samples or fits are missing, or if there is no such view; StorageError.
     """
     settings = read_settings(out)
     result = RunResult(out)
@@ -106,13 +106,13 @@ def cluster_result(
 def _sample_mask(
     result: RunResult, block: slice, left_out: list[int], without_view: str | None
 ) -> NDArray[np.bool_]:
-    """[samples] of a block: True for samples that are neither of the LEDs nor of the view that are left out."""
+    """[samples] of a block: True for samples that belong neither to a left-out LED nor to the left-out view."""
     led_in_use = ~np.isin(result.along_samples(block, "leds"), left_out)
     return np.asarray(led_in_use & (result.along_samples(block, "names") != without_view))
 
 
 def _medians(materials: TriangleMaterials, cluster: NDArray[np.int64], count: int) -> TriangleMaterials:
-    """[count] of the members of each cluster."""
+    """[count] medians of the members of each cluster."""
     order = np.argsort(cluster, kind="stable")
     firsts = np.searchsorted(cluster[order], np.arange(count + 1))
     rows = [order[first:end] for first, end in pairwise(firsts)]
@@ -132,7 +132,8 @@ def _borrow(
     memory_bytes: int,
     say: Said,
 ) -> NDArray[np.bool_]:
-    """Give triangles without material the cluster that explains their few samples best; which ones got one."""
+    """Give triangles without material the cluster that fits their few samples best, and return which triangles got
+    one."""
     is_borrowed = np.zeros(len(cluster), np.bool_)
     for block in result.blocks(memory_bytes):
         lacking = np.flatnonzero(cluster[block] < 0)
@@ -149,8 +150,8 @@ def _borrow(
 def _left_out_errors(
     result: RunResult, settings: dict[str, Any], without_view: str | None, memory_bytes: int, say: Said
 ) -> dict[str, Any]:
-    """Mean absolute errors, shares of the camera's range, under the LEDs that were left out: of all views, and of
-    the view that was left out too."""
+    """Return mean absolute errors, in shares of the camera's range, under the LEDs that were left out: for all
+    views, and for the left-out view."""
     report: dict[str, Any] = _mae(result, settings, result.views, memory_bytes, say)
     if without_view is not None:
         alone = [view for view in result.views if view.view == without_view]
@@ -163,8 +164,9 @@ def _mae(
     result: RunResult, settings: dict[str, Any], views: Sequence[ViewSamples], memory_bytes: int, say: Said
 ) -> dict[str, dict[str, float | None]]:
     """Return the errors of pictures by blocks of pixels, and of means of triangles. Triangles with a material of
-    their own are judged by it, by their cluster's, and by its harmonics, where all three give a value; those that
-    borrowed one, by that."""
+    their own have errors of three predictions: by this material, by their cluster's material, and by the cluster's
+    harmonics, where all three have a value. Triangles that borrowed a material have errors by the borrowed
+    material."""
     clusters = result.clusters
     pictures, triangles = ({name: [0.0, 0] for name in _WAYS} for _ in range(2))
     for view in views:
@@ -196,8 +198,8 @@ def _mae(
 
 
 def _alike(*values: NDArray[np.floating]) -> dict[str, NDArray[np.floating]]:
-    """Return what all ways but the last give, where all of them give a value: harmonics have no value below the
-    horizon of the fitted normal, where GGX has one."""
+    """Return the values of all ways but the last, where all of them have a value. Below the horizon of the fitted
+    normal, harmonics have no value but GGX has one."""
     all_do = np.logical_and.reduce([np.isfinite(way_values) for way_values in values])
     return {
         name: np.where(all_do, way_values, np.nan) for name, way_values in zip(_WAYS[:-1], values, strict=True)
@@ -205,7 +207,7 @@ def _alike(*values: NDArray[np.floating]) -> dict[str, NDArray[np.floating]]:
 
 
 def _add(sums: list[float], off: NDArray[np.floating]) -> None:
-    """Add to the sum of magnitudes, and to their number."""
+    """Add the differences' magnitudes to a sum, and their number to a count."""
     is_finite = np.isfinite(off)
     sums[0] += float(np.abs(off[is_finite]).sum())
     sums[1] += int(np.count_nonzero(is_finite))

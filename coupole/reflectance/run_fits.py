@@ -1,4 +1,4 @@
-"""Makes the fits of a result of runs, each a file of its own; and what they give in a direction."""
+"""Makes the fits of a result of runs, one file for each, and predicts samples from them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class _Job:
 
     folder: Path
     token: str
-    """Token of this job alone."""
+    """Token that identifies this job."""
     left_out: list[int]
     memory_bytes: int
     noise_um: float
@@ -58,9 +58,9 @@ class _Job:
 
 
 def fit_result(out: Path, memory_bytes: int, *, scheduler: str | None = None, say: Said = silent) -> None:
-    """Make the fits that a result lacks, in the workers of a `scheduler` if one is named; between materials and
-    slices, samples that contradict others are left out. Raises InputError if the samples are not all there, or for
-    the scheduler as `workshop`; StorageError."""
+    """Make the missing fits of a result, in the workers of a `scheduler` if one is named. Between materials and
+    slices, samples that contradict others are removed. Raises InputError if samples are missing, or for the
+    scheduler as `workshop` does; StorageError."""
     settings = read_settings(out)
     result = RunResult(out.resolve())
     result.refuse_unfinished(settings)
@@ -82,8 +82,9 @@ def fit_result(out: Path, memory_bytes: int, *, scheduler: str | None = None, sa
 def predict_samples(
     result: RunResult, name: str, view: ViewSamples, rows: slice, samples: TriangleSamples
 ) -> NDArray[np.float32]:
-    """[b, samples, channels] f cos_i, 1/sr, that a fit gives for `samples` of rows of a view's file, whatever
-    their lights are; NaN where the fit has nothing, the material alone where what it leaves was not fitted."""
+    """[b, samples, channels] f cos_i, 1/sr, of a fit for `samples` of rows of a view's file, under any lights. It
+    is NaN where the fit has no value. If the residual of the material was not fitted, it is the material's
+    value."""
     places = np.searchsorted(result.triangles, view.triangles[rows])
     if name == CLUSTERED:
         own_materials = result.materials(GGX_NORMAL.name, places)
@@ -121,7 +122,7 @@ def _fit_materials(result: RunResult, job: _Job, material_fit: MaterialFit, shop
 
 
 def _mesh(result: RunResult) -> tuple[Floats, Floats, Floats]:
-    """Normals [n, 3], centres [n, 3] and areas [n] of the triangles of the fits."""
+    """Return normals [n, 3], centres [n, 3] and areas [n] of the triangles of the fits."""
     corners = result.corners_mm[result.triangles].astype(np.float64)
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     twice = np.linalg.norm(across, axis=1)
@@ -137,7 +138,7 @@ def _materials_block(job: _Job, material_fit: MaterialFit, threads: int | None, 
 def _uncertain_block(
     job: _Job, material_fit: MaterialFit, threads: int | None, task: tuple[slice, TriangleMaterials]
 ) -> tuple[TriangleMaterials, MaterialUncertainty]:
-    """Materials of a block with the normals that they shall have: fitted ones without what they have in common."""
+    """Return the materials of a block with their final normals: the fitted normals without their common tilt."""
     block, materials = task
     result = _open_result(job.folder, job.token)
     sample_mask = ~np.isin(result.along_samples(block, "leds"), job.left_out)
@@ -167,7 +168,7 @@ def _contradictions_block(job: _Job, threads: int | None, task: tuple[int, slice
 def _blocks_of_views(
     result: RunResult, numbers: Sequence[int], memory_bytes: int, shop: Workshop
 ) -> list[tuple[int, slice]]:
-    """Number of the view, and rows of its file."""
+    """Return the number of the view, and rows of its file."""
     most = shop.most_rows(sum(len(result.views[number].triangles) for number in numbers))
     return [
         (number, rows)
@@ -177,7 +178,7 @@ def _blocks_of_views(
 
 
 def _fit_slices(result: RunResult, job: _Job, shop: Workshop, say: Said) -> None:
-    """All views in one go: no worker waits for the last block of each."""
+    """Fit the slices of all views in one pass, so that no worker waits for the last block of a view."""
     tasks = []
     for together in fitted_together():
         view_numbers = [
@@ -227,11 +228,11 @@ def _slices_block(
 def _under(
     result: RunResult, fit: ViewFit, view: ViewSamples, rows: slice, samples: TriangleSamples
 ) -> NDArray[np.float32] | None:
-    """Return what the material gives that a fit is added to; None for a fit without one."""
+    """Return the values of the material to which a fit is added; None for a fit without one."""
     return None if fit.over is None else predict_samples(result, fit.over.name, view, rows, samples)
 
 
 @lru_cache(maxsize=1)
 def _open_result(folder: Path, _token: str) -> RunResult:
-    """A result as it is during one job, once in each process."""
+    """Open a result as it is during one job, once in each process."""
     return RunResult(folder)

@@ -1,8 +1,8 @@
-"""Intervals of relit pictures of runs: stated uncertainties, widened to what LEDs kept for the check show.
+"""Intervals of relit pictures of runs: stated uncertainties, widened by the errors under LEDs kept for the check.
 
-Materials' covariances know neither another form of the material nor the noise of a frame. Errors of pictures under
-LEDs that no fit has seen, over the stated uncertainty, have a 95 % quantile in each stratum (`strata`); the
-half width of an interval is this quantile times the uncertainty.
+Materials' covariances include neither another form of the material nor the noise of a frame. For LEDs that no fit
+has used, the errors of pictures are divided by the stated uncertainty. Their 95 % quantile is found in each
+stratum (`strata`). The half width of an interval is this quantile times the uncertainty.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ Floats = NDArray[np.float64]
 
 LEVEL = 0.95
 FEWEST_SAMPLES = 500
-"""Pixels of pictures kept for the check from which a widening is found."""
+"""Least number of pixels, in pictures kept for the check, from which a widening is found."""
 _MOST_SAMPLES = 20_000
-"""Errors of each block of triangles and channel that are kept."""
+"""Number of errors that are kept for each block of triangles and channel."""
 _UNCERTAINTY_EDGES = (0.01, 0.02, 0.04, 0.08, 0.16)
-"""Relative uncertainties between which strata lie."""
+"""Relative uncertainties that separate the strata."""
 _RESIDUAL_EDGES = (0.01, 0.02, 0.04, 0.08)
-"""Residuals of a triangle's material between which strata lie."""
+"""Residuals of a triangle's material that separate the strata."""
 
 
 def strata_of(relative: NDArray[np.floating], residual: NDArray[np.floating]) -> dict[str, NDArray[np.int64]]:
@@ -47,7 +47,7 @@ def strata_of(relative: NDArray[np.floating], residual: NDArray[np.floating]) ->
 
 @dataclass
 class WideningSamples:
-    """Errors of one fit, divided by their uncertainty; each block adds some."""
+    """Errors of one fit, divided by their uncertainty, collected from the blocks."""
 
     ratios: list[Floats] = field(default_factory=list)
     relative: list[Floats] = field(default_factory=list)
@@ -55,8 +55,8 @@ class WideningSamples:
     leds: list[NDArray[np.int64]] = field(default_factory=list)
 
     def add(self, part: HeldOut, values: NDArray[np.floating], relative: Floats, residual: Floats) -> None:
-        """Add a part's pictures: `values` [n, leds, channels] of the fit, its relative uncertainty [n, leds], and
-        the residuals [n] of its materials."""
+        """Add the pictures of a part, by the fit's `values` [n, leds, channels], its relative uncertainty [n,
+        leds], and the residuals [n] of its materials."""
         for channel, (triangles, measured_values) in enumerate(part.blocks):
             modelled_values = part.pixels(values, channel)
             of_pixels = relative[:, part.columns][triangles]
@@ -71,7 +71,7 @@ class WideningSamples:
             self.leds.append(leds.ravel()[places])
 
     def widening(self) -> dict[str, Any] | None:
-        """Return what `result.json` says of the quantiles by strata; None from too few samples."""
+        """Return the entry of `result.json` about the quantiles by strata; None from too few samples."""
         if sum(map(len, self.ratios)) < FEWEST_SAMPLES:
             return None
         strata = strata_of(np.concatenate(self.relative), np.concatenate(self.residual))
@@ -87,8 +87,8 @@ def _stratum_count(name: str) -> int:
 
 
 def read_widening(result: RunResult, fit: str) -> StratumFactors:
-    """Read the quantiles of a fit; of texels their own, or, if an earlier version made them, those of the fit that
-    they start from. Raises InputError if the result has none."""
+    """Read the quantiles of a fit. Texels have their own; if an earlier version made the texels, the quantiles of
+    the fit from which they start are used. Raises InputError if the result has none."""
     name = GGX_NORMAL.name if fit == TEXELS else fit
     widening = read_texel_widening(result.folder) if fit == TEXELS else None
     if widening is None:
@@ -107,9 +107,9 @@ def read_widening(result: RunResult, fit: str) -> StratumFactors:
 def half_width_of_picture(
     scene: RelitScene, lights: Sequence[AnyLight], samples: int = SAMPLES, *, say: Say = lambda count, of: None
 ) -> NDArray[np.float32]:
-    """[h, w, channels] half width of the 95 % interval of `scene.picture(lights, samples)`, in its unit; NaN where
-    the picture is black, since neither light from surface to surface nor noise is known there, and where the
-    uncertainty is not known. Raises InputError as `read_widening` and `uncertainty_of_picture`."""
+    """[h, w, channels] half width of the 95 % interval of `scene.picture(lights, samples)`, in its unit. It is NaN
+    where the uncertainty is not known, and where the picture is black, since neither inter-reflection nor noise is
+    known there. Raises InputError as `read_widening` and `uncertainty_of_picture`."""
     widening = read_widening(scene.result, scene.fit)
     uncertainty = uncertainty_of_picture(scene, lights, samples, say=say)
     picture = scene.picture(lights, samples)
@@ -121,7 +121,7 @@ def half_width_of_picture(
 
 
 def residuals_of(scene: RelitScene) -> Floats:
-    """[h, w] residual of the material of the triangle that each pixel sees."""
+    """[h, w] residual of the material at each pixel, by the triangle that the pixel sees."""
     name = GGX_NORMAL.name if scene.fit == TEXELS else scene.fit
     places = np.searchsorted(scene.result.triangles, scene.surface.triangles)
     residual = scene.result.materials(name, places).residual

@@ -1,7 +1,7 @@
-"""Job from runs of the cell to samples, materials and their errors, in a result folder.
+"""Job from runs of the cell to a result folder with samples, materials and their errors.
 
-Each view's samples and each fit are files of their own, whole or not there; a job that was killed goes on with the
-first that is missing.
+Each view's samples and each fit are separate files, complete or missing. A job that was killed continues with the
+first missing file.
 """
 
 from __future__ import annotations
@@ -64,21 +64,22 @@ class RunRequest:
     mesh: Path | None = None
     calibrations: tuple[Path, ...] = ()
     left_out: tuple[int, ...] = ()
-    """LEDs; empty for every twelfth."""
+    """LEDs kept for the check; empty for every twelfth."""
     scan_noise_um: float = 30.0
     memory_bytes: int = 2_000_000_000
     support_reflectance: float = 0.0
-    """Reflectance of the disk, from which light comes to the object too."""
+    """Reflectance of the disk, which reflects light to the object."""
     keep_inter_reflection: bool = False
-    """Do not take it off the samples."""
+    """True if inter-reflection is not subtracted from the samples."""
     refined_folder: Path | None = None
-    """Folder of `coupole reflectance refine`: its poses, lens and mesh hold instead of the records' and scan's."""
+    """Folder of `coupole reflectance refine`. Its poses, lens and mesh are used instead of those of records and
+    scan."""
     poses: Path | None = None
-    """Folder of COLMAP's, of one run: its poses hold instead of the records'."""
+    """COLMAP folder of one run. Its poses are used instead of the records' poses."""
 
     @property
     def sources(self) -> Sources:
-        """Sources of the runs' geometry, by whole paths."""
+        """Sources of the runs' geometry, by absolute paths."""
         mesh, refined_path, poses = (
             path and path.resolve() for path in (self.mesh, self.refined_folder, self.poses)
         )
@@ -86,14 +87,15 @@ class RunRequest:
 
     @property
     def is_plain(self) -> bool:
-        """True for what is made beside an acquisition too: of one run, by its own mesh and records."""
+        """True for a request that can also be processed beside an acquisition: one run, with its own mesh and
+        records."""
         named_files = (self.mesh, self.calibrations, self.left_out, self.refined_folder, self.poses)
         return len(self.runs) == 1 and not any(named_files)
 
 
 @dataclass(frozen=True)
 class Sources:
-    """Files that give the runs' geometry, by whole paths."""
+    """Files that give the runs' geometry, by absolute paths."""
 
     mesh: Path | None
     records: tuple[Path, ...]
@@ -109,12 +111,13 @@ def reflectance_of(
     say: Said = silent,
     ahead: Ahead = NOTHING_AHEAD,
 ) -> dict[str, Any]:
-    """Make the result, or what of it is missing, in the workers of a `scheduler` if one is named; returns what
-    `result.json` says. `ahead` is what was computed before of the same object.
+    """Make the result, or its missing parts, in the workers of a `scheduler` if one is named. Return the content
+    of `result.json`. `ahead` has values that were computed before for the same object.
 
-    Raises InputError: runs without calibrations, of different objects or cameras, records that do not belong to
-    them, a folder that holds another result, a scheduler that does not answer or whose workers do not see the
-    folder; StorageError if a frame is damaged or the disk takes nothing.
+    Raises InputError for runs without calibrations, for runs of different objects or cameras, and for records that
+    do not belong to the runs. Raises it also for a folder with another result, for a scheduler that does not
+    answer, and for workers that do not see the folder. Raises StorageError if a frame is damaged or the disk
+    cannot be written.
     """
     begun_s = time.monotonic()
     extract_runs(request, out, scheduler=scheduler, say=say, ahead=ahead)
@@ -132,7 +135,7 @@ def extract_runs(
     say: Said = silent,
     ahead: Ahead = NOTHING_AHEAD,
 ) -> None:
-    """The samples of all views. Raises as `reflectance_of`."""
+    """Make the samples of all views. Raises as `reflectance_of`."""
     token = uuid4().hex
     measured_runs = read_runs(request, token)
     for measured_run in measured_runs:
@@ -157,7 +160,7 @@ def extract_runs(
 
 
 def subtract_from(out: Path, say: Said, ahead: Ahead) -> None:
-    """Take inter-reflection off the samples of a result, if its settings say so. Raises OSError."""
+    """Subtract inter-reflection from the samples of a result, if its settings say so. Raises OSError."""
     settings = read_settings(out)
     if settings["subtracted"]:
         is_paper, support = settings["emission"] == "paper", settings["support_reflectance"]
@@ -165,12 +168,12 @@ def subtract_from(out: Path, say: Said, ahead: Ahead) -> None:
 
 
 def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> str:
-    """The samples of a complete view of a run that is still acquired, with the run's own mesh and records. Files
-    that are there already, and agree with the view's frames, stay. A result that was begun with all frames of its
-    runs stays as well. Raises as `reflectance_of`.
+    """Make the samples of a complete view of a run that is still being acquired, with the run's own mesh and
+    records. Existing files stay if they agree with the view's frames. A result that was begun with all frames of
+    its runs stays too. Raises as `reflectance_of`.
 
-    Returns the digest of the samples if the view's frames may be discarded for them: they were read back just now,
-    and are what was written; else an empty text.
+    Returns the digest of the samples if the view's frames may be discarded for them, which means that they were
+    just read back and are as written. Otherwise returns an empty text.
     """
     if (out / SETTINGS).exists():
         return ""
@@ -210,7 +213,8 @@ def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> 
 
 
 def look_ahead(run: Path, view_name: str) -> None:
-    """Find what a view sees whose frames still come, as far as it has one. Raises as `reflectance_of`."""
+    """Find the surface that a view sees, while its frames still arrive, if it has a frame already. Raises as
+    `reflectance_of`."""
     try:
         measured_run, geometry, _ = prepare_run(uuid4().hex, run.resolve(), RunRequest((run,)).sources)
         for view in measured_run.views:
@@ -221,7 +225,7 @@ def look_ahead(run: Path, view_name: str) -> None:
 
 
 def discards(request: RunRequest, run: Run, out: Path) -> bool:
-    """Tell whether frames of a run are discarded when the result of a request has their samples."""
+    """Tell whether frames of a run are discarded once the result of a request has their samples."""
     return request.is_plain and is_for_discarding(run, out)
 
 
@@ -230,7 +234,7 @@ def _write_object(measured_run: MeasuredRun, path: Path) -> None:
 
 
 def expected_leds(run: Run) -> set[int]:
-    """LEDs of all views; where they are chosen in the run, of those that were chosen so far."""
+    """LEDs of all views. If LEDs are chosen in the run, those chosen so far."""
     return {shot.light.id for shot in run.expected_shots() if isinstance(shot.light, Led)}
 
 
@@ -252,7 +256,7 @@ def read_runs(request: RunRequest, token: str) -> list[MeasuredRun]:
 
 
 def settings_of(request: RunRequest, token: str, measured_runs: Sequence[MeasuredRun]) -> dict[str, Any]:
-    """Return what a result of a request is begun with."""
+    """Return the settings with which a result of a request is begun."""
     frames = [frame for m in measured_runs for view in m.views for frame in view.frames]
     leds = sorted({frame.led for frame in frames if frame.led is not None})
     left_out = list(request.left_out) or held_out_leds(leds)
@@ -276,7 +280,7 @@ def settings_of(request: RunRequest, token: str, measured_runs: Sequence[Measure
 
 
 def _pose_summary(request: RunRequest, token: str) -> dict[str, Any]:
-    """Return what a result says of poses by COLMAP."""
+    """Return the entry of a result about poses by COLMAP."""
     if request.poses is None:
         return {}
     return {"poses": read_poses(request.poses, _read_records(token, request.runs[0], request.sources)).summary()}
@@ -284,7 +288,7 @@ def _pose_summary(request: RunRequest, token: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _View:
-    """A block of extraction: one view's samples, a file."""
+    """A block of extraction: the samples of one view, which become one file."""
 
     run: Path
     view: str
@@ -304,7 +308,7 @@ class _View:
 def _extract(
     request: RunRequest, token: str, measured_runs: Sequence[MeasuredRun], out: Path, shop: Workshop, say: Said
 ) -> None:
-    """Samples of all views, and what the report says of each."""
+    """Make the samples of all views, and write the report's entry about each view beside its samples."""
     left_out = tuple(read_settings(out)["left_out"])
     remaining_views = [
         _View(
@@ -347,8 +351,8 @@ def _extract_one(
     say: Said,
     task: _View,
 ) -> tuple[dict[str, Any], str]:
-    """Write the files of a view's samples and frames for the check; what the report says of them, and the digest
-    of the samples that were written, empty if they were there."""
+    """Write the files of a view's samples and frames for the check. Return the report's entry about them, and the
+    digest of the written samples, which is empty if they existed."""
     measured_run, geometry, radiometry = prepare_run(token, task.run, sources)
     view = next(view for view in measured_run.views if view.name == task.view)
     summary_path = task.path.with_suffix(".json")
@@ -363,7 +367,7 @@ def _extract_one(
 
 @lru_cache(maxsize=1)
 def prepare_run(token: str, run: Path, sources: Sources) -> tuple[MeasuredRun, Geometry, Radiometry]:
-    """Return what all views of a run share, made once in each process and job (`token`)."""
+    """Return the data that all views of a run share, made once in each process and job (`token`)."""
     measured_run = _read_run(token, run, sources)
     return measured_run, geometry_of(measured_run), Radiometry(measured_run)
 
@@ -391,5 +395,5 @@ def forget() -> None:
 
 
 def view_file_name(measured_runs: Sequence[MeasuredRun], measured_run: MeasuredRun, view: MeasuredView) -> str:
-    """Return the name of a view's files: its own, with its run's before where there are several."""
+    """Return the name of a view's files: the view's name, preceded by the run's name if there are several runs."""
     return view.name if len(measured_runs) == 1 else f"{measured_run.run.folder.name}-{view.name}"

@@ -21,16 +21,17 @@ class CheckFrames:
     """Pictures of one view for the check."""
 
     share: NDArray[np.float16]
-    """[leds, h / 2, w / 2, channels] of the camera's range; NaN where there is none."""
+    """[leds, h / 2, w / 2, channels] shares of the camera's range; NaN where there is none."""
     leds: NDArray[np.int64]
     noise: NDArray[np.float64]
-    """[leds] mean absolute error of `share` by noise; NaN where it is not known."""
+    """[leds] mean absolute error of `share` from noise; NaN if it is not known."""
     triangle: NDArray[np.int32]
-    """[channels, h / 2, w / 2] place of what a pixel sees in the triangles of the view's file, or -1."""
+    """[channels, h / 2, w / 2] place of the triangle that a pixel sees, among the triangles of the view's file, or
+    -1."""
 
     def pairs(self, rows: slice, channel: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Return, for the blocks whose pixel sees one of some rows of the view's file, its place among these rows
-        [blocks], and `share` [blocks, leds]."""
+        """Return, for the blocks whose pixel sees a triangle in some rows of the view's file, the triangle's place
+        among these rows [blocks], and `share` [blocks, leds]."""
         order, places = self._blocks_by_place[channel]
         first, end = np.searchsorted(places, [rows.start, rows.stop])
         leds, height, width, channels = self.share.shape
@@ -38,13 +39,14 @@ class CheckFrames:
         return places[first:end] - rows.start, flat[:, order[first:end], channel].T.astype(np.float32)
 
     def picture(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
-        """[h / 2, w / 2, channels] of values [triangles of the view, channels]; NaN where nothing is seen."""
+        """[h / 2, w / 2, channels] picture of values [triangles of the view, channels]; NaN where no triangle is
+        seen."""
         of_none = np.append(values, np.full((1, values.shape[1]), np.nan), axis=0).astype(np.float32)
         return np.stack([of_none[places, channel] for channel, places in enumerate(self.triangle)], axis=-1)
 
     @cached_property
     def _blocks_by_place(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Blocks of each channel in the order of what they see, and what they see."""
+        """Return the blocks of each channel in the order of the triangles that they see, and these triangles."""
         channels = []
         for places in self.triangle.reshape(len(self.triangle), -1):
             order = np.argsort(places, kind="stable")
@@ -53,7 +55,7 @@ class CheckFrames:
 
 
 def read_check_frames(result: RunResult, view: ViewSamples) -> CheckFrames:
-    """The pictures that extraction kept of a view."""
+    """Read the pictures of a view that extraction kept for the check."""
     with h5py.File(result.folder / FRAMES / view.path.name, "r") as file:
         share, leds, noise, offsets = (file[name][()] for name in ("share", "leds", "noise", "offsets"))
     with h5py.File(view.path, "r") as file:
@@ -73,14 +75,14 @@ class HeldOut:
     """[n] in the triangles of the fits."""
     samples: TriangleSamples
     share: NDArray[np.float64]
-    """[n, leds, channels] of the camera's range that f cos_i of 1 gives."""
+    """[n, leds, channels] share of the camera's range for f cos_i = 1."""
     columns: list[int]
-    """Places of the pictures' LEDs among those of the samples."""
+    """Places of the pictures' LEDs among the samples' LEDs."""
     blocks: tuple[tuple[NDArray[np.int64], NDArray[np.float32]], ...]
-    """Triangle [blocks] that each block sees, and what was measured [blocks, pictures]; by channel."""
+    """Triangle [blocks] that each block sees, and measured values [blocks, pictures], by channel."""
 
     def pixels(self, values: NDArray[np.floating], channel: int) -> NDArray[np.floating]:
-        """[blocks, pictures] of values [n, leds, channels]."""
+        """[blocks, pictures] values of the blocks, from values [n, leds, channels]."""
         block_values: NDArray[np.floating] = values[:, self.columns, channel][self.blocks[channel][0]]
         return block_values
 
@@ -88,7 +90,7 @@ class HeldOut:
 def held_out(
     result: RunResult, view: ViewSamples, settings: dict[str, Any], memory_bytes: int
 ) -> Iterator[HeldOut]:
-    """A view's triangles, block by block. Light from surface to surface is taken off the pictures, as off the
+    """Yield a view's triangles, block by block. Inter-reflection is subtracted from the pictures, as from the
     samples."""
     is_held_out = np.isin(view.leds, settings["left_out"])
     frames, column = read_check_frames(result, view), {int(led): n for n, led in enumerate(view.leds[is_held_out])}

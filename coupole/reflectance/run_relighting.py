@@ -1,4 +1,4 @@
-"""Views of a run under lights that were not there, from a fit to its triangles."""
+"""Views of a run under new lights, from a fit to its triangles."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples,
 
 Say = Callable[[int, int], None]
 SAMPLES = 256
-"""Beams of an area or an environment."""
+"""Number of beams of an area or an environment."""
 _FAR_MM = 1e5
-"""Distance of distant light for a slice."""
+"""Distance at which distant light is placed for a slice."""
 _TRIANGLES = 1 << 13
 
 
@@ -70,12 +70,12 @@ def best_fit(result: RunResult, among: Collection[str] = FITS) -> str:
 
 @dataclass(frozen=True)
 class Slices:
-    """A fit to one view by itself."""
+    """A fit to one view alone."""
 
     fit: ViewFit
     coefficients: NDArray[np.float32]
     under: TriangleMaterials | None
-    """Materials that the slices are added to."""
+    """Materials to which the slices are added."""
 
 
 @dataclass(frozen=True)
@@ -89,23 +89,23 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Texels:
-    """Materials of the picture's own pixels; roughness is 0 where there is none."""
+    """Materials of the picture's own pixels; roughness is 0 for a pixel without material."""
 
     materials: TriangleMaterials
     covariance: NDArray[np.floating]
-    """[n, 15] as files have it."""
+    """[n, 15] lower halves, as in files."""
     of_pixel: NDArray[np.int32]
-    """[h, w] which of them; -1 where no surface is seen."""
+    """[h, w] number of each pixel's material; -1 where no surface is seen."""
 
     @cached_property
     def coats(self) -> Coats:
-        """Materials as they are shaded."""
+        """Materials in the form that shading uses."""
         return coats_of(self.materials)
 
 
 @dataclass(frozen=True)
 class RelitScene:
-    """A picture's surface and what it is made of; any lights can be put on it."""
+    """A picture's surface and its materials, which can be lit by any lights."""
 
     result: RunResult
     fit: str
@@ -113,17 +113,17 @@ class RelitScene:
     reflecting: Coats | Slices | Pairs | Texels
     """Reflectance of the surface's triangles, or of its pixels."""
     views: tuple[ViewSamples, ...]
-    """Views in the order in which LEDs are looked for."""
+    """Views in the order in which they are searched for LEDs."""
     mesh: PacketMesh
-    """Mesh that throws shadows."""
+    """Mesh that casts shadows."""
 
     @property
     def material_of_pixel(self) -> NDArray[np.int32]:
-        """[h, w] place of a pixel's material among those of the scene; -1 where no surface is seen."""
+        """[h, w] place of a pixel's material among the materials of the scene; -1 where no surface is seen."""
         return self.reflecting.of_pixel if isinstance(self.reflecting, Texels) else self.surface.triangle_of_pixel
 
     def with_materials(self, materials: TriangleMaterials) -> RelitScene:
-        """The same scene of other materials, of triangles or of texels."""
+        """Return the same scene with other materials, of triangles or of texels."""
         if isinstance(self.reflecting, Texels):
             return replace(self, reflecting=replace(self.reflecting, materials=materials))
         return replace(self, reflecting=coats_of(materials))
@@ -137,10 +137,10 @@ class RelitScene:
         say: Say = lambda done, of: None,
     ) -> Picture:
         """[h, w, channels] radiance, linear, in the unit of `coupole.reflectance.new_light.light_kinds`; 0 where
-        no triangle with a material is seen. Light from surface to surface is not in it.
+        no triangle with a material is seen. It does not include inter-reflection.
 
-        `samples` of each area and environment. The picture is made in the memory of `into`, one of before that is
-        wanted no more. Raises InputError for a light that the result does not have.
+        Each area and environment is divided into `samples` beams. The picture is made in the memory of `into`, an
+        earlier picture that is no longer needed. Raises InputError for a light that the result does not have.
         """
         paper = read_about(self.result.folder).get("emission") == "paper"
         base_from_support, channels = self.result.base_from_support, self.result.channels
@@ -211,7 +211,7 @@ class RelitScene:
 
 
 def _values_of(reflecting: Slices | Pairs, light: TriangleSamples, part: slice) -> NDArray[np.float32]:
-    """[b, 1, channels] f cos_i of a part of the surface's triangles."""
+    """[b, 1, channels] f cos_i of some of the surface's triangles."""
     if isinstance(reflecting, Pairs):
         return pair_values(light, reflecting.normals[part], reflecting.cluster[part], reflecting.coefficients)
     under = None
@@ -221,9 +221,8 @@ def _values_of(reflecting: Slices | Pairs, light: TriangleSamples, part: slice) 
 
 
 def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = None) -> RelitScene:
-    """A measured view and its fit. Unless they are named, it is the first view, and the fit with the smallest
-    error
-    under the LEDs that were kept for the check. Raises InputError for a view or a fit that is not there."""
+    """Return the scene of a measured view and a fit. By default these are the first view, and the fit with the
+    smallest error under the LEDs kept for the check. Raises InputError for a view or a fit that does not exist."""
     names = [run_view.view for run_view in result.views]
     if view is not None and view not in names:
         raise InputError(f"--view: expected one of {', '.join(names)}; got {view!r}")
@@ -247,8 +246,8 @@ def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = 
 
 
 def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) -> RelitScene:
-    """Return the scene that a camera anywhere sees. Raises InputError for a fit that does not hold there, or one
-    that is not there; if the camera sees nothing."""
+    """Return the scene that a camera at any place sees. Raises InputError for a fit that is not valid from there
+    or does not exist, and if the camera sees nothing."""
     _refuse_unknown(fit)
     if fit is not None and fit not in ANYWHERE:
         raise InputError(
@@ -263,7 +262,8 @@ def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) ->
 
 
 def best_with_texels(result: RunResult, among: Collection[str] = FITS) -> str:
-    """Texels where they missed less than the best fit of triangles, in the same pixels; else that one `among`."""
+    """Return the name of texels if their error is smaller than that of the best fit of triangles, in the same
+    pixels; else the best fit `among` those named."""
     texel_errors = read_texel_errors(result.folder)
     known_mae = {name: mae for name, mae in texel_errors.items() if mae is not None}
     best = min(known_mae, key=known_mae.__getitem__, default=None)
@@ -282,7 +282,7 @@ def _texels_of(result: RunResult, view: ViewSamples, surface: Surface) -> Texels
 
 
 def _gathered_texels(result: RunResult, surface: Surface) -> Texels:
-    """Texels of a picture from anywhere: a material for each of its pixels."""
+    """Return the texels of a picture from any camera: a material for each of its pixels."""
     seen = surface.triangle_of_pixel >= 0
     gathered = gather(open_views(result), surface.places_mm[seen])
     of_pixel = np.full(seen.shape, -1, np.int32)

@@ -25,25 +25,25 @@ from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples
 SCHEMA = "coupole-reflectance-run/1"
 ABOUT, REPORT, OBJECT = "result.json", "report.html", "object.h5"
 FRAMES = "samples/frames"
-"""Folder of the pictures that the fits are compared with."""
+"""Folder of the pictures with which the fits are compared."""
 Block = slice | NDArray[np.int64]
-"""Places of triangles; numbers rise."""
+"""Places of triangles, in rising order."""
 INTER_REFLECTION = "inter_reflection"
-"""Attribute of a file of samples that inter-reflection was taken from."""
+"""Attribute of a file of samples from which inter-reflection was subtracted."""
 CONTRADICTED = "contradicted"
-"""Attribute too: samples that were left out because they contradict others."""
+"""Attribute of a file of samples: number of samples that were left out because they contradict others."""
 SAMPLES = "samples"
-"""Attribute too: how many are left."""
+"""Attribute of a file of samples: number of samples that are left."""
 AS_MEASURED = "as_measured.h5"
-"""File of the reflectance before inter-reflection was taken off, from the folder."""
+"""File, in the folder, of the reflectance before inter-reflection was subtracted."""
 U_OF_INTER_REFLECTION = 0.2
-"""Relative standard uncertainty of what is taken off. For a simulated relief of white stone it was 0.15 to
-0.19.
+"""Relative standard uncertainty of the subtracted inter-reflection. For a simulated relief of white stone it was
+0.15 to 0.19.
 """
 MOST_ROWS = 1 << 16
 LOWER = np.tril_indices(UNKNOWNS)
 VARIANCES = [row * (row + 3) // 2 for row in range(UNKNOWNS)]
-"""Places of the variances in the lower half of a covariance."""
+"""Places of the variances in the lower half of a covariance matrix."""
 _HEAD = ("triangles", "camera_mm", "leds", "led_positions_mm", "led_normals", "full_scales")
 _TOLD = {
     "software": dict,
@@ -53,7 +53,7 @@ _TOLD = {
     "scan_noise_um": int | float,
     "simulated": bool,
 }
-"""Keys of result.json that others than its report read, and their types."""
+"""Keys of result.json that are read by more than its report, and their types."""
 FIELDS = {
     "normals": "unit, base frame",
     "kd": "1/sr, by channel",
@@ -71,39 +71,40 @@ UNCERTAIN = {
 
 @dataclass(frozen=True)
 class ViewSamples:
-    """A view's file of samples, without the samples."""
+    """A view's file of samples, without the samples themselves."""
 
     path: Path
     view: str
     inter_reflection: tuple[float, float] | None
-    """Median and 95th percentile of its share that was taken off f; None if nothing was."""
+    """Median and 95th percentile of the share of f that was subtracted as inter-reflection; None if nothing was
+    subtracted."""
     contradicted_count: int | None
-    """Samples that were left out because they contradict others; None before they were looked for."""
+    """Number of samples that were left out because they contradict others; None before the search."""
     samples_left: int | None
-    """Samples that can be used after both."""
+    """Number of samples that remain after both steps."""
     triangles: NDArray[np.int64]
     camera_mm: NDArray[np.float64]
     leds: NDArray[np.int64]
     led_mm: NDArray[np.float64]
     led_normals: NDArray[np.float64]
     full_scales: NDArray[np.float64]
-    """[leds, channels] of the camera, that f cos_i E/Phi of 1 gives."""
+    """[leds, channels] share of the camera's range for f cos_i E/Phi = 1."""
 
     @property
     def names(self) -> NDArray[np.str_]:
-        """[leds] the view's own, for each."""
+        """[leds] the view's own name, repeated for each LED."""
         return np.full(len(self.leds), self.path.stem)
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """A result folder of runs, whole or in the making."""
+    """A result folder of runs, complete or unfinished."""
 
     folder: Path
 
     @cached_property
     def corners_mm(self) -> NDArray[np.float32]:
-        """[m, 3, 3] of all triangles of the mesh, base frame."""
+        """[m, 3, 3] corners of all triangles of the mesh, base frame."""
         with h5py.File(self.folder / OBJECT, "r") as file:
             return np.asarray(file["corners_mm"])
 
@@ -140,7 +141,7 @@ class RunResult:
 
     @property
     def summaries(self) -> list[dict[str, Any]]:
-        """Summaries that extraction gave of each view."""
+        """Summaries of each view from extraction."""
         files = sorted((self.folder / "samples").glob("*.json"))
         summaries = [read_json(path, allow_nan=True) for path in files]
         return [
@@ -154,7 +155,7 @@ class RunResult:
         ]
 
     def refuse_unfinished(self, settings: dict[str, Any], *, fits: bool = False) -> None:
-        """Raises InputError if the samples of a view, or a fit, are missing."""
+        """Raise InputError if the samples of a view, or a fit, are missing."""
         for name in settings["view_names"]:
             if not (self.folder / "samples" / f"{name}.json").exists():
                 raise InputError(
@@ -173,19 +174,20 @@ class RunResult:
 
     @cached_property
     def triangles(self) -> NDArray[np.int64]:
-        """All that any view sees, rising."""
+        """Numbers of all triangles that any view sees, in rising order."""
         return np.unique(np.concatenate([view.triangles for view in self.views]))
 
     def blocks(self, budget_bytes: int, most: int = MOST_ROWS) -> Iterator[slice]:
-        """Places in `triangles` that are processed together within a budget of memory, `most` of them."""
+        """Yield places in `triangles` that are processed together within a budget of memory, at most `most` of
+        them."""
         return _parts(len(self.triangles), sum(len(view.leds) for view in self.views), budget_bytes, most)
 
     def view_blocks(self, view: ViewSamples, budget_bytes: int, most: int = MOST_ROWS) -> Iterator[slice]:
-        """The same of the rows of a view's file."""
+        """Yield rows of a view's file that are processed together, as `blocks` does for triangles."""
         return _parts(len(view.triangles), len(view.leds), budget_bytes, most)
 
     def samples(self, block: slice) -> TriangleSamples:
-        """Return the samples of the triangles of a block, in all views that see one of them."""
+        """Return the samples of the triangles of a block, in all views that see one of these triangles."""
         triangles = self.triangles[block]
         values: list[NDArray[np.float32]] = []
         seeing = [view for view in self.views if _rows(view, triangles)]
@@ -229,8 +231,8 @@ class RunResult:
         )
 
     def view_noise(self, view: ViewSamples, rows: slice, leds: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """[n, leds, channels] relative standard uncertainty of `view_samples` by noise, each LED's power, and the
-        inter-reflection and the glare that were taken off."""
+        """[n, leds, channels] relative standard uncertainty of `view_samples` from noise, each LED's power, and
+        the subtracted inter-reflection and glare."""
         columns = np.flatnonzero(leds)
         with h5py.File(view.path, "r") as file:
             noise = np.hypot(file["u_own"][rows][:, columns], file["led_u_own"][columns])
@@ -241,8 +243,8 @@ class RunResult:
             return np.asarray(noise, np.float64)
 
     def direct_shares(self, view: ViewSamples, rows: slice, leds: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """[n, leds, channels] share of a triangle's light that came straight from the LED; NaN where there is no
-        sample, 1 everywhere if inter-reflection was left in the samples."""
+        """[n, leds, channels] share of a triangle's light that came directly from the LED. It is NaN where there
+        is no sample, and 1 everywhere if inter-reflection was left in the samples."""
         columns = np.flatnonzero(leds)
         if view.inter_reflection is None:
             return np.ones((rows.stop - rows.start, len(columns), self.channels), np.float32)
@@ -250,8 +252,9 @@ class RunResult:
             return np.asarray(1.0 - file[INTER_REFLECTION][rows][:, columns], np.float32)
 
     def u_triangles(self, block: slice) -> NDArray[np.float32]:
-        """[n] relative standard uncertainty, mean of channels, that samples of a triangle share by the responses
-        of its pixels, which are others in each view. NaN without a record of the response."""
+        """[n] relative standard uncertainty, mean of channels, that samples of a triangle share, from the
+        responses of its pixels. Each view has different pixels of a triangle. NaN without a record of the
+        response."""
         triangles = self.triangles[block]
         squares, views = np.zeros(len(triangles)), np.zeros(len(triangles))
         for view in self.views:
@@ -272,8 +275,8 @@ class RunResult:
         return float(np.nanmean([np.nanmean(file["led_u_shared"][()]) for file in files]))
 
     def along_samples(self, block: slice, name: str) -> NDArray[Any]:
-        """[samples, ...] what each sample of `samples(block)` has by its LED: `leds`, `led_normals`,
-        `full_scales`, and its view: `names`."""
+        """[samples, ...] values for each sample of `samples(block)`: `leds`, `led_normals` or `full_scales` of its
+        LED, or `names` of its view."""
         triangles = self.triangles[block]
         return np.concatenate([getattr(view, name) for view in self.views if _rows(view, triangles)])
 
@@ -284,23 +287,24 @@ class RunResult:
         return self.folder / "fits" / name / view.path.name
 
     def materials(self, name: str, block: Block = slice(None)) -> TriangleMaterials:
-        """A fit by its name in `MATERIALS`."""
+        """Read the materials of a fit by its name in `MATERIALS`."""
         with h5py.File(self.materials_path(name), "r") as file:
             return TriangleMaterials(*(_read_rows(file[field], block) for field in FIELDS))
 
     def material_covariances(self, name: str, block: Block = slice(None)) -> NDArray[np.float64]:
-        """[n, 5, 5] of a fit by its name in `MATERIALS`, as `material_uncertainty.covariances` gives them."""
+        """[n, 5, 5] covariances of a fit by its name in `MATERIALS`, in the form of
+        `material_uncertainty.covariances`."""
         with h5py.File(self.materials_path(name), "r") as file:
             return whole_covariances(_read_rows(file["covariance"], block))
 
     @cached_property
     def clusters(self) -> Clusters:
-        """Raises InputError if there are none."""
+        """The clusters of this result. Raises InputError if there are none."""
         return read_clusters(self.folder)
 
     def slices(self, name: str, view: ViewSamples, rows: slice = slice(None)) -> NDArray[np.float32]:
         """[n, channels, coefficients] of rows of a view's file, by a fit's name in `SLICES`. Raises InputError for
-        one that an earlier version made."""
+        a fit that an earlier version made."""
         path = self.slices_path(name, view)
         with h5py.File(path, "r") as file:
             if file["coefficients"].shape[-1] != SLICES[name].coefficients:
@@ -309,7 +313,7 @@ class RunResult:
 
 
 def whole_covariances(lower: NDArray[np.floating]) -> NDArray[np.float64]:
-    """[n, 5, 5] of their lower halves [n, 15], row by row."""
+    """[n, 5, 5] matrices from their lower halves [n, 15], row by row."""
     covariances = np.empty((len(lower), UNKNOWNS, UNKNOWNS))
     covariances[:, *LOWER] = lower
     covariances[:, *LOWER[::-1]] = lower
@@ -317,7 +321,7 @@ def whole_covariances(lower: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _read_rows(data: h5py.Dataset, block: Block) -> NDArray[np.float64]:
-    """Rows; h5py takes rising numbers one by one."""
+    """Read rows of a dataset. Given a list of rows, h5py would read them one by one."""
     if isinstance(block, slice):
         return np.asarray(data[block], np.float64)
     if not len(block):
@@ -347,7 +351,7 @@ def read_view_samples(path: Path) -> ViewSamples:
 
 
 def read_about(folder: Path) -> dict[str, Any]:
-    """result.json of a result of runs. Raises InputError if there is none, or one without what results have."""
+    """Read result.json of a result of runs. Raises InputError if there is none, or if it lacks required keys."""
     path = folder / ABOUT
     try:
         about = read_json(path, allow_nan=True)
@@ -376,8 +380,8 @@ def _parts(count: int, samples: int, budget_bytes: int, most: int) -> Iterator[s
 
 
 def _rows(view: ViewSamples, triangles: NDArray[np.int64]) -> range:
-    """Return the rows of a view's file that hold the `triangles` triangles, whose numbers rise; no other triangle
-    may lie between them."""
+    """Return the rows of a view's file that hold the triangles `triangles`, given in rising order. No other
+    triangle may lie between them."""
     first, end = np.searchsorted(view.triangles, [triangles[0], triangles[-1] + 1])
     return range(int(first), int(end))
 

@@ -1,4 +1,4 @@
-"""Writing the files of a result of runs, as `run_result` reads them."""
+"""Writes the files of a result of runs, which `run_result` reads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from coupole.reflectance.triangle_fit import TriangleMaterials
 
 
 def write_object(path: Path, corners_mm: NDArray[np.float64], base_from_support: NDArray[np.float64]) -> None:
-    """The mesh as it stood in the cell."""
+    """Write the mesh as it was placed in the cell."""
     with h5py.File(path, "w") as file:
         data = file.create_dataset("corners_mm", data=corners_mm.astype(np.float32), track_times=False)
         data.attrs["told"] = "[triangles, corners, 3] mm, base frame"
@@ -33,8 +33,8 @@ def write_materials(
     u_shared: float,
     triangles: NDArray[np.int64],
 ) -> None:
-    """A fit of all triangles, from those of blocks; `u_triangle` [n] and `u_shared` are relative standard
-    uncertainties of kd and ks, of a triangle and of all."""
+    """Write a fit of all triangles, joined from blocks. `u_triangle` [n] and `u_shared` are relative standard
+    uncertainties of kd and ks: `u_triangle` belongs to each triangle alone, `u_shared` to all together."""
     with h5py.File(path, "w") as file:
         file.create_dataset("triangles", data=triangles, track_times=False).attrs["told"] = "numbers in the mesh"
         for field, description in FIELDS.items():
@@ -54,7 +54,8 @@ def write_materials(
 
 
 def begin_slices(file: h5py.File, fit: ViewFit, view: ViewSamples, channels: int) -> h5py.Dataset:
-    """Describe a fit of a view in a new file; where its coefficients [triangles, channels, ...] go."""
+    """Describe a fit of a view in a new file. Return the dataset for its coefficients [triangles, channels,
+    ...]."""
     shape = (len(view.triangles), channels, fit.coefficients)
     data = file.create_dataset("coefficients", shape, np.float32, fillvalue=np.nan, track_times=False)
     data.attrs["told"] = "[triangles of the view, channels, coefficients] 1/sr; NaN where too few samples are"

@@ -1,4 +1,4 @@
-"""Uncertainty of the samples of a result of runs: bounds of what is typical, and a table by source."""
+"""Uncertainty of the samples of a result of runs: typical bounds, and a table by source."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ COVERAGE, QUANTILE = 0.95, 1.959964
 TABLE_COVERAGE, TABLE_QUANTILE = 0.68, 0.994458
 """Coverage and quantile of the table, as in seed 003, 6.1."""
 _TYPICAL = 200_000
-"""Samples of all views, for what is typical."""
+"""Number of samples of all views from which the typical bounds are found."""
 _TRIANGLES = 2000
-"""Triangles of each view of which the samples are taken."""
+"""Number of triangles of each view from which samples are taken."""
 _LEDS = 128
-"""LEDs of each view of which the samples are taken."""
+"""Number of LEDs of each view from which samples are taken."""
 _DRAWN, _DRAWS = 1000, 300
-"""Samples, of all views, and draws for each."""
+"""Number of samples, of all views, for Monte Carlo, and number of draws for each sample."""
 
 
 def uncertainty_of(
     result: RunResult, scan_noise_um: float, *, paper: bool, say: Said = lambda step, done, of: None
 ) -> dict[str, Any] | None:
-    """Return what `result.json` says of the uncertainty; None without a record of the response, by which noise is
-    known."""
+    """Return the entry of `result.json` about the uncertainty; None without a record of the response, which gives
+    the noise."""
     most = _TYPICAL // len(result.views)
     channel_parts = [
         known_samples(result, view, result.channels // 2, scan_noise_um, most=most, of_triangles=_TRIANGLES)
@@ -69,7 +69,8 @@ def uncertainty_of(
 
 
 def _quantiles(values: Floats, shares: list[float]) -> Floats:
-    """[shares, n] of values [n, draws], without NaN. `nanquantile` goes through the rows one by one."""
+    """[shares, n] quantiles of values [n, draws], without NaN. NumPy's `nanquantile` is slower, because it
+    processes the rows one by one."""
     quantiles = np.asarray(np.quantile(values, shares, axis=1))
     has_unknown = np.isnan(values).any(axis=1)
     if has_unknown.any():
@@ -78,7 +79,8 @@ def _quantiles(values: Floats, shares: list[float]) -> Floats:
 
 
 def percentiles(low: Floats, high: Floats) -> dict[str, Any]:
-    """Median and 95th percentile of bounds, percent; infinite ones are left out and counted; None if all are."""
+    """Return median and 95th percentile of bounds, in percent. Infinite bounds are left out and counted; None if
+    all are infinite."""
     is_finite = np.isfinite(high)
     if not is_finite.any():
         return {"median": None, "percentile_95": None, "unbounded_share": 1.0}
@@ -93,8 +95,8 @@ def percentiles(low: Floats, high: Floats) -> dict[str, Any]:
 def known_samples(
     result: RunResult, view: ViewSamples, channel: int, scan_noise_um: float, *, most: int, of_triangles: int
 ) -> ChannelSamples:
-    """Return at most `most` samples that have a value, of triangles and LEDs that are spread over the view, about
-    `of_triangles` of the former."""
+    """Return at most `most` samples that have a value. They are of about `of_triangles` triangles, and of LEDs,
+    spread over the view."""
     rows = np.arange(0, len(view.triangles), max(1, len(view.triangles) // of_triangles))
     leds = np.arange(0, len(view.leds), -(-len(view.leds) // _LEDS))
     some = channel_samples(result, view, rows, leds, channel, scan_noise_um)
@@ -105,5 +107,5 @@ def known_samples(
 
 
 def _join_fields(parts: Sequence[Places] | Sequence[Sources]) -> list[Floats]:
-    """Their fields, one part after the other."""
+    """Join the fields of all parts, one part after the other."""
     return [np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)]

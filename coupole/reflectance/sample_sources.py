@@ -1,4 +1,4 @@
-"""Sources of uncertainty in samples of a view, put together from its file: for bounds, tables and exports."""
+"""Sources of uncertainty in samples of a view, read from its file, for bounds, tables and exports."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _SIDES = 8
-"""Number of sides of a triangle on which other triangles are searched for."""
+"""Number of sides of a triangle on which neighbouring triangles are searched."""
 _SMALL_BYTES = 64 * 2**20
-"""Greatest size of a table that is read in one piece."""
+"""Greatest size of a table that is read at once."""
 _BESIDE = 1.2
-"""Least distance of a neighbour, divided by the square root of a triangle's area."""
+"""Least distance of a searched neighbour, divided by the square root of the triangle's area."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class ChannelSamples:
     """Samples of one channel on a grid of triangles and LEDs of a view, flattened row by row."""
 
     rows: Integers
-    """[n] of the view's file."""
+    """[n] rows of the view's file."""
     leds: Integers
     """[n] places in the view's LEDs."""
     f: Floats
-    """[n] 1/sr; NaN where there is none."""
+    """[n] 1/sr; NaN where there is no sample."""
     places: Places
     sources: Sources
 
@@ -48,7 +48,7 @@ class ChannelSamples:
 
     @property
     def known_places(self) -> Integers:
-        """Places of those that have a value."""
+        """Places of the samples that have a value."""
         return np.flatnonzero(np.isfinite(self.f) & np.isfinite(self.sources.u_noise))
 
 
@@ -61,9 +61,10 @@ def channel_samples(
     scan_noise_um: float,
     beside: Beside | None = None,
 ) -> ChannelSamples:
-    """Return the samples of some rows of a view's file, rising, and some of its LEDs; without a channel, of the
-    channels' mean, as if all were off to the same side. `beside` saves finding the rows' `triangles_beside` anew.
-    Raises InputError for a file that an earlier version made."""
+    """Return the samples of some rows of a view's file, in rising order, and some of its LEDs. Without a channel
+    they are those of the channels' mean, as if the errors of all channels had the same sign. `beside` has the
+    `triangles_beside` of the rows, if they were found before. Raises InputError for a file that an earlier version
+    made."""
     beside = beside or triangles_beside(result, view, rows)
     with h5py.File(view.path, "r") as file:
         lateral_u_mm, led_u_mm = float(file.attrs["lateral_u_mm"]), float(file.attrs["led_u_mm"])
@@ -114,20 +115,20 @@ def channel_samples(
 
 @dataclass(frozen=True)
 class Beside:
-    """Triangles that pixels may show in the place of others."""
+    """Triangles that pixels may show instead of others."""
 
     rows: Integers
-    """[n, sides] of the view's file; a triangle's own where there is no other."""
+    """[n, sides] rows of the view's file; a triangle's own row where it has no neighbour."""
     square_mm2: Floats
-    """[n, sides] of the distance across the line of sight."""
+    """[n, sides] square of the distance across the line of sight."""
 
     def uncertainty(
         self, signal: Floats, u_noise: Floats, own_places: Integers, beside: Integers, lateral_u_mm: float
     ) -> Floats:
         """[n, leds] relative standard uncertainty of `signal` [used, leds], in any unit, of triangles at places
-        `own_places` [n] by those at `beside` [n, sides]: what they differ by, less what noise alone makes them
-        differ by, as the square of the shift over that of the distance, at most as far as they are away. 1 where
-        nothing beside is known."""
+        `own_places` [n], by their neighbours at places `beside` [n, sides]. The squared difference from a
+        neighbour, without the part from noise, is multiplied by the squared shift over the squared distance; this
+        ratio is at most 1. The uncertainty is 1 where no neighbour is known."""
         own_signal, noise = signal[own_places], (signal[own_places] * u_noise[own_places]) ** 2
         share = np.minimum(2.0 * lateral_u_mm**2 / np.maximum(self.square_mm2, 1e-12), 1.0)
         total, count = np.zeros(own_signal.shape), np.zeros(own_signal.shape)
@@ -153,8 +154,9 @@ def _centres(path: Path) -> tuple[Floats, Floats, cKDTree]:
 
 
 def triangles_beside(result: RunResult, view: ViewSamples, rows: Integers) -> Beside:
-    """Triangles as far away as a picture is likely to be off, or the nearest ones, on all sides of `rows`, in the
-    plane across the line of sight. Raises InputError for a file that an earlier version made."""
+    """Return triangles on all sides of `rows`, in the plane across the line of sight. Their distance is the likely
+    shift of a picture, or they are the nearest triangles. Raises InputError for a file that an earlier version
+    made."""
     with h5py.File(view.path, "r") as file:
         if "lateral_u_mm" not in file.attrs:
             raise InputError(f"{view.path}: an earlier version made it; make the result again")
@@ -184,9 +186,9 @@ def triangles_beside(result: RunResult, view: ViewSamples, rows: Integers) -> Be
 def _u_taken_off(
     file: h5py.File, tables: Callable[[str], Floats], shares: Floats, u_veils: Floats | None
 ) -> tuple[Floats, Floats]:
-    """[rows, leds] relative standard uncertainties by inter-reflection and by glare that were taken off, mean of
-    channels by their `shares` [channels, rows, leds]; `u_veils` [leds, channels] are those of the glare in the
-    LEDs' frames."""
+    """[rows, leds] relative standard uncertainties from subtracted inter-reflection and from subtracted glare:
+    means of the channels, weighted by their `shares` [channels, rows, leds]. `u_veils` [leds, channels] are the
+    uncertainties of the glare in the LEDs' frames."""
     indirect, glare = np.zeros(shares.shape[1:]), np.zeros(shares.shape[1:])
     if INTER_REFLECTION in file:
         indirect = np.sum(shares * u_inter_reflection(tables(INTER_REFLECTION).astype(np.float16)), axis=0)
@@ -196,15 +198,15 @@ def _u_taken_off(
 
 
 def _cosines(centres_mm: Floats, normals: Floats, led_mm: Floats) -> Floats:
-    """[n, leds] of incidence."""
+    """[n, leds] cosines of incidence."""
     ways = led_mm - centres_mm[:, None]
     cosines: Floats = np.einsum("nlk,nk->nl", ways, normals) / np.linalg.norm(ways, axis=2)
     return cosines
 
 
 def _table(data: h5py.Dataset, rows: Integers, leds: Integers, channel: int | None) -> Floats:
-    """[rows, leds] of a channel, if there are channels: in one piece if that is small, else by rows or by LEDs,
-    whichever reads less of the file."""
+    """[rows, leds] table, of one channel if there are channels. A small table is read at once; a large one is read
+    by rows or by LEDs, whichever reads less of the file."""
     channel_index = () if channel is None else (channel,)
     first = int(rows[0])
     some = slice(first, int(rows[-1]) + 1)

@@ -2,9 +2,9 @@
 equation, source by source (seed 003, 6.1; JCGM 101).
 
 A sample is f = S / (P L cos): the signal S over the LED's power P, the geometry L of its emission and distance,
-and the cosine of incidence. Relative errors are normal: a of the signal above, b of all that stands below, the
-cosine's by the tilt that noise of the scanner's vertices gives a triangle. The ratio of two such values is
-asymmetric; its bounds are Fieller's (1954).
+and the cosine of incidence. Relative errors are normal: a for the signal in the numerator, b for all factors of
+the denominator. The cosine's error comes from the tilt that noise of the scanner's vertices gives a triangle. The
+ratio of two such values is asymmetric; its bounds are Fieller's (1954).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SOURCES = {
     "led_mm": "places of the LEDs",
     "u_glare": "veiling glare taken off",
 }
-"""Fields of `Sources`, and what they are."""
+"""Fields of `Sources`, and their meaning."""
 
 
 @dataclass(frozen=True)
@@ -40,21 +40,21 @@ class Sources:
     u_noise: Floats
     """[n] relative."""
     u_response: Floats
-    """[n] relative, of the responses of the pixels that a triangle covers."""
+    """[n] relative, from the responses of the pixels that a triangle covers."""
     u_indirect: Floats
-    """[n] relative, of the inter-reflection that was taken off."""
+    """[n] relative, from the subtracted inter-reflection."""
     u_place: Floats
-    """[n] relative, of what pixels may see beside a triangle."""
+    """[n] relative, from the surface beside a triangle that pixels may see."""
     u_own: Floats
-    """[n] relative, of an LED's power."""
+    """[n] relative, from an LED's own power."""
     u_shared: Floats
-    """[n] relative, of what all LEDs share."""
+    """[n] relative, from errors that all LEDs share."""
     vertex_um: Floats
-    """[n] of each coordinate of a vertex, independent."""
+    """[n] uncertainty of each coordinate of a vertex; coordinates are independent."""
     led_mm: Floats
-    """[n] of each coordinate of an LED."""
+    """[n] uncertainty of each coordinate of an LED."""
     u_glare: Floats
-    """[n] relative, of the veil that was taken off."""
+    """[n] relative, from the subtracted veil."""
 
     @property
     def u_signal(self) -> Floats:
@@ -64,7 +64,7 @@ class Sources:
         return u_relative
 
     def without(self, source: str) -> Sources:
-        """The same with one of `SOURCES` at 0."""
+        """Return the same uncertainties with one of `SOURCES` at 0."""
         return replace(self, **{source: np.zeros_like(getattr(self, source))})
 
     def at(self, row_numbers: NDArray[np.int64]) -> Sources:
@@ -73,10 +73,10 @@ class Sources:
 
 @dataclass(frozen=True)
 class Places:
-    """Places where n samples were measured, mm, base frame."""
+    """Places of n measured samples, mm, base frame."""
 
     corners_mm: Floats
-    """[n, 3, 3] of their triangles."""
+    """[n, 3, 3] corners of their triangles."""
     led_mm: Floats
     """[n, 3]"""
     led_normals: Floats
@@ -87,8 +87,8 @@ class Places:
 
 
 def bounds(places: Places, sources: Sources, quantile: float) -> tuple[Floats, Floats]:
-    """[n] lower and upper bounds of the true reflectance over the measured one, `quantile` standard deviations of
-    a normal distribution away; the upper one is infinite where the light grazes too much to tell."""
+    """[n] lower and upper bounds of the true reflectance over the measured one, at `quantile` standard deviations
+    of a normal distribution. The upper bound is infinite if the incidence is too grazing for a bound."""
     centres, normals = _centres_and_normals(places.corners_mm)
     ways = places.led_mm - centres
     distances = np.linalg.norm(ways, axis=1)
@@ -109,8 +109,9 @@ def bounds(places: Places, sources: Sources, quantile: float) -> tuple[Floats, F
 
 
 def tilt_covariance(corners_mm: Floats, vertex_um: Floats) -> Floats:
-    """[n, 3, 3] rad^2 of the tilt of triangles whose vertices are off: a vertex that is higher by h tilts the
-    normal by -h times the gradient of its barycentric coordinate, which is 1 over the triangle's height there."""
+    """[n, 3, 3] covariance, rad^2, of the tilt of triangles from errors of their vertices. A vertex that is higher
+    by h tilts the normal by -h times the gradient of its barycentric coordinate. This gradient is 1 over the
+    triangle's height at the vertex."""
     across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     twice_area = np.linalg.norm(across, axis=1, keepdims=True)
     normals = across / twice_area
@@ -123,8 +124,8 @@ def tilt_covariance(corners_mm: Floats, vertex_um: Floats) -> Floats:
 
 
 class MonteCarlo:
-    """Power, vertices and LEDs of n places, drawn anew so many times. Tables of the same draws differ by their
-    sources alone, and share what these leave as it is."""
+    """Random draws of power, vertices and LEDs for n places. Tables from the same draws differ only by their
+    sources, and share the values that these do not change."""
 
     def __init__(self, places: Places, draws: int, random: np.random.Generator, *, paper: bool = False) -> None:
         self._places, self._paper = places, paper
@@ -134,8 +135,8 @@ class MonteCarlo:
         self._by_sources: dict[tuple[bytes, bytes], Floats] = {}
 
     def ratios(self, sources: Sources) -> Floats:
-        """[n, draws] true over measured reflectance: the signal is divided by what power, vertices and LEDs give.
-        Draws in which the light would come from below are NaN."""
+        """[n, draws] true over measured reflectance: the drawn signal is divided by the irradiance from the drawn
+        power, vertices and LEDs. Draws in which the light would come from below are NaN."""
         places = self._places
         measured_geometry = _geometry(places.corners_mm, places.led_mm, places.led_normals, self._paper)
         key = sources.vertex_um.tobytes(), sources.led_mm.tobytes()
@@ -160,7 +161,7 @@ class MonteCarlo:
 
 
 def _geometry(corners_mm: Floats, led_mm: Floats, led_normals: Floats, paper: bool) -> Floats:
-    """[n] irradiance for a power of 1."""
+    """Return the irradiance [n] for a power of 1."""
     centres, normals = _centres_and_normals(corners_mm)
     ways = led_mm - centres
     cosine = np.sum(ways * normals, axis=1) / np.linalg.norm(ways, axis=1)

@@ -1,4 +1,5 @@
-"""Bases for a slice of reflectance: what one view sees of a point, a function of the light's direction.
+"""Bases for a slice of reflectance. A slice is the reflectance of a point in one view, as a function of the
+light's direction.
 
 Directions are unit vectors in the slice's frame: z the mesh's normal, x towards the camera along the surface.
 """
@@ -15,48 +16,50 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 COUNT = 100
-"""Coefficients of each basis, as in seed 003, 6.3."""
+"""Number of coefficients of each basis, as in seed 003, 6.3."""
 _DEGREES = 10
 TIKHONOV = 0.1
 """Penalty of the highest degree of the harmonics (seed 003, 5.2)."""
 _TAIL = 4
 _RADIAL, _RESIDUAL = 1e-3, 0.1
-"""Ridge of the radial functions: of reflectance, and of what a material leaves of it, which is noise for the most
-part. Chosen on simulated glossy reliefs by lights left out; a tenth and tenfold change the error by 5 %."""
+"""Ridge of the radial functions: for reflectance, and for the residual of a material, which is mostly noise. Both
+were chosen on simulated glossy reliefs by leaving lights out; a tenth and ten times the ridge change the error by
+5 %."""
 USUAL_LEFT = 2e-4
-"""Share of the samples' square that a material of the fit's form leaves: where it leaves more, the ridge of what
-it leaves is as much smaller, down to that of reflectance."""
+"""Residual of a material with the fit's form, as a share of the samples' sum of squares. If the residual is
+larger, its ridge is smaller in proportion, down to the ridge of reflectance."""
 LEAST_RESIDUAL = _RADIAL / _RESIDUAL
-"""Least factor on the ridge of what a material leaves, where it leaves much."""
+"""Least factor on the ridge of a material's residual, for a large residual."""
 _TAIL_SHARE = 0.01
 _HELD = 1e9
-"""Ridge of a coefficient that is to be 0."""
+"""Ridge of a coefficient that is held at 0."""
 
 
 @dataclass(frozen=True)
 class Basis:
-    """Functions of a direction, and what holds their coefficients small."""
+    """Functions of a direction, and the penalty that keeps their coefficients small."""
 
     harmonic: bool
-    """Spherical harmonics; else radial functions with a linear tail."""
+    """True for spherical harmonics; else radial functions with a linear tail."""
     penalty: Floats
     """[COUNT]"""
 
 
 def _degrees() -> NDArray[np.int64]:
-    """[COUNT] of the harmonics, in the order of `_harmonics`."""
+    """[COUNT] degrees of the harmonics, in the order of `_harmonics`."""
     return np.concatenate([np.full(2 * degree + 1, degree) for degree in range(_DEGREES)])
 
 
 def _roll_off() -> Floats:
-    """[COUNT] 0 for the constant, 1 for the highest degree: high degrees are damped before they ring. A window of
-    coefficients after the fit would do harm: on half a sphere they are not orthogonal."""
+    """[COUNT] weights of the penalty: 0 for the constant, 1 for the highest degree, so that high degrees do not
+    ring. A window on the coefficients after the fit would increase the error, because the functions are not
+    orthogonal on half a sphere."""
     degrees = _degrees()
     return (degrees * (degrees + 1) / (_DEGREES * (_DEGREES - 1))) ** 4.0
 
 
 def centres() -> Floats:
-    """[COUNT - 4, 3] of the radial functions: a Fibonacci spiral on the half sphere."""
+    """[COUNT - 4, 3] centres of the radial functions: a Fibonacci spiral on the half sphere."""
     number = np.arange(COUNT - _TAIL) + 0.5
     z = 1.0 - number / len(number)
     azimuth = number * math.pi * (3.0 - math.sqrt(5.0))
@@ -69,17 +72,17 @@ def _ridge(weight: float) -> Floats:
 
 
 HARMONICS = Basis(True, 1e-6 + TIKHONOV * _roll_off())
-"""Real, orthonormal, degrees 0 to 9."""
+"""Real, orthonormal spherical harmonics, degrees 0 to 9."""
 RADIAL = Basis(False, _ridge(_RADIAL))
-"""-r of the distance r to each centre, then 1, x, y, z."""
+"""Functions -r of the distance r to each centre, then 1, x, y, z."""
 RESIDUAL = Basis(False, _ridge(_RESIDUAL))
 BASES = {"harmonics": HARMONICS, "radial": RADIAL, "residual": RESIDUAL}
 """Bases by the names that fits have for them."""
 
 
 def fewer(basis: Basis, count: int) -> Basis:
-    """The same with some `count` of the coefficients free and the others held at 0: whole degrees, or centres that
-    are spread as all of them, and the tail."""
+    """Return the same basis with about `count` free coefficients; the others are held at 0. Whole degrees stay
+    free, or the tail and centres that are spread over all centres."""
     if basis.harmonic:
         free = _degrees() < int(count**0.5)
     else:
@@ -111,7 +114,7 @@ _CENTRES = centres()
 
 @numba.njit(cache=True, nogil=True)
 def functions(harmonic, x, y, z, rows):  # type: ignore[no-untyped-def]
-    """The values of a basis in directions x, y, z [n], into `rows` [COUNT, n]."""
+    """Write the values of a basis in directions x, y, z [n] to `rows` [COUNT, n]."""
     if harmonic:
         _harmonics(x, y, z, rows)
     else:
@@ -120,7 +123,7 @@ def functions(harmonic, x, y, z, rows):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _harmonics(x, y, z, rows):  # type: ignore[no-untyped-def]
-    """Y(l, m) in row l (l + 1) + m: sqrt 2 P(l, |m|) times Re or Im of (x + iy)^|m|."""
+    """Write Y(l, m) to row l (l + 1) + m: sqrt 2 P(l, |m|) times Re or Im of (x + iy)^|m|."""
     cosine, sine = np.ones(len(x)), np.zeros(len(x))
     before, now = np.empty(len(x)), np.empty(len(x))
     p_mm = math.sqrt(0.25 / math.pi)

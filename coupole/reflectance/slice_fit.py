@@ -1,10 +1,10 @@
 """Slices of reflectance of triangles: coefficients in a basis, from the samples of one view.
 
-A sample's error counts as it shows in a picture, multiplied with the cosine of incidence; what a slice gives is
-never below 0. A slice holds for the view that it was fitted to (seed 003, 6.3).
+A sample's error is weighted as it appears in a picture, multiplied by the cosine of incidence. A slice's values
+are never below 0. A slice is valid for the view to which it was fitted (seed 003, 6.3).
 
 A fit to the residual of a model is stacked with a fit to the samples themselves (Breiman, Stacked regressions,
-Machine Learning 24, 1996): the share of the model is the one with the smallest error for left-out samples.
+Machine Learning 24, 1996): the chosen share of the model has the smallest error for left-out samples.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from coupole.reflectance.triangle_fit import FEWEST, TriangleSamples
 _PART = 64
 _FLAT = 1e-9
 _LEFT_OUT = 64
-"""Samples, at least, that the share of a model is judged by, if there are so many."""
+"""Least number of samples from which the share of a model is chosen; fewer if there are not enough."""
 
 
 def fit_slices(
@@ -42,12 +42,13 @@ def fit_slices(
     *fits: tuple[Basis, NDArray[np.float32] | None],
     threads: int | None = None,
 ) -> list[NDArray[np.float32]]:
-    """Return, for each of some fits with the same functions, [b, channels, COUNT] coefficients; NaN for too few
+    """Return coefficients [b, channels, COUNT] for each of some fits with the same functions; NaN for too few
     samples.
 
-    The fits are to the samples `sample_mask` [samples] of one view. With a model [b, samples, channels] they are
-    added to a share of it, one more coefficient at the end: the mean of a fit to what the model leaves and of one
-    to the samples, by how well each predicts samples. The more a model leaves, the less are coefficients held.
+    The fits use the samples `sample_mask` [samples] of one view. With a model [b, samples, channels] a fit is
+    added to a share of the model, which is one more coefficient at the end. The result is a weighted mean of a fit
+    to the model's residual and a fit to the samples; the weights depend on how well each predicts samples. The
+    larger the residual, the smaller is the ridge.
     """
     count, _, channels = samples.values.shape
     coefficients = np.full((len(fits), count, channels, COUNT + 1), np.nan, np.float32)
@@ -80,8 +81,8 @@ def slice_values(
     basis: Basis,
     model: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
-    """[b, samples, channels] f cos_i, 1/sr, that slices, on top of their share of a `model` if they were fitted
-    with one, give where the samples of one view are. Without slice: the model, or NaN."""
+    """[b, samples, channels] f cos_i, 1/sr, of slices at the samples of one view. If the slices were fitted with a
+    `model`, their share of it is added. For a triangle without slice it is the model, or NaN."""
     values = np.zeros(samples.values.shape, np.float32)
     if model is not None:
         share = coefficients[..., COUNT]
@@ -114,7 +115,7 @@ def _frame(normal, centre_mm, camera_mm, frame):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def _directions(frame, centre_mm, led_mm, led_numbers, x, y, z):  # type: ignore[no-untyped-def]
     """Fill `x`, `y` and `z` with the directions of the LEDs `led_numbers` [n] in a slice's frame; LEDs below the
-    surface get z = 0. Return how many are above it."""
+    surface get z = 0. Return the number of LEDs above the surface."""
     above = 0
     for n in range(len(led_numbers)):
         led = led_mm[led_numbers[n]]
@@ -141,7 +142,7 @@ def _fit_part(  # type: ignore[no-untyped-def]
     over,
     coefficients,
 ):
-    """Channels with the same samples share their matrix."""
+    """Fit some triangles; channels with the same samples share their matrix."""
     count, _, channels = values.shape
     memory, indices = np.empty(COUNT * len(used_samples)), np.empty(len(used_samples), np.int64)
     xyz, product, frame = np.empty((3, len(used_samples))), np.zeros((COUNT, COUNT)), np.empty((3, 3))
@@ -179,8 +180,8 @@ def _fit_part(  # type: ignore[no-untyped-def]
 def _fit_one(  # type: ignore[no-untyped-def]
     rows, product, values, residuals, sample_numbers, first, penalty, over, memories, coefficients
 ):
-    """Fill `coefficients` [channels, COUNT + 1] with a fit to `residuals` of the samples `sample_numbers` [n] in
-    channels from `first`."""
+    """Fill `coefficients` [channels, COUNT + 1] with a fit to `residuals` of the samples `sample_numbers` [n], in
+    the channels from `first` on."""
     channels, n, size = len(coefficients), len(sample_numbers), min(len(sample_numbers), COUNT)
     ridge, matrix, room, target_memory, solution = memories
     targets, right = target_memory[: channels * n].reshape(channels, n), solution[:channels]
@@ -207,7 +208,7 @@ def _fit_one(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _take_samples(values, sample_numbers, first, targets):  # type: ignore[no-untyped-def]
-    """Fill `targets` [channels, n] with the samples `sample_numbers` [n] in the channels from `first`."""
+    """Fill `targets` [channels, n] with the samples `sample_numbers` [n] in the channels from `first` on."""
     for channel in range(len(targets)):
         for number in range(len(sample_numbers)):
             targets[channel, number] = values[sample_numbers[number], first + channel]
@@ -216,7 +217,7 @@ def _take_samples(values, sample_numbers, first, targets):  # type: ignore[no-un
 @numba.njit(cache=True, nogil=True)
 def _stack(off, plain, coefficients):  # type: ignore[no-untyped-def]
     """Combine `coefficients` [channels, COUNT + 1] (a model and its residual) and `plain` [channels, COUNT] into
-    the mean with the smallest error, from the errors of both, `off` [2, channels, samples].
+    the weighted mean with the smallest error. `off` [2, channels, samples] are the errors of both.
     """
     covariance, apart = 0.0, 0.0
     for channel in range(off.shape[1]):
@@ -233,8 +234,8 @@ def _stack(off, plain, coefficients):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _held_by(residuals, values, sample_numbers, first):  # type: ignore[no-untyped-def]
-    """Share of the usual ridge by which coefficients are held, by what is left [channels, n] of the samples
-    `sample_numbers` [n] in the channels from `first`."""
+    """Return the factor on the usual ridge, from the residuals [channels, n] of the samples `sample_numbers` [n]
+    in the channels from `first` on."""
     remains, whole = 0.0, 0.0
     for channel in range(len(residuals)):
         for number in range(len(sample_numbers)):
@@ -245,8 +246,9 @@ def _held_by(residuals, values, sample_numbers, first):  # type: ignore[no-untyp
 
 @numba.njit(cache=True, nogil=True)
 def _solve(rows, product, penalty, values, room, factor, right):  # type: ignore[no-untyped-def]
-    """Fill `right` with the coefficients; return whether there are some. The equations are solved by samples or by
-    functions, whichever are fewer. `product` is that of `gram` if there are at least as many samples as functions.
+    """Fill `right` with the coefficients; return whether there is a solution. The equations are solved by samples
+    or by functions, whichever are fewer. `product` comes from `gram` if there are at least as many samples as
+    functions.
     """
     if rows.shape[1] < COUNT:
         return solve_by_samples(rows, penalty, values, room, factor, right)
@@ -259,7 +261,8 @@ def _solve(rows, product, penalty, values, room, factor, right):  # type: ignore
 
 @numba.njit(cache=True, nogil=True)
 def _known_samples(values, used_samples, sample_numbers):  # type: ignore[no-untyped-def]
-    """Fill `sample_numbers` with those of the samples `used_samples` that a channel has; return how many."""
+    """Fill `sample_numbers` with those of the samples `used_samples` in which a channel has a value; return their
+    number."""
     n = 0
     for sample in used_samples:
         if not math.isnan(values[sample]):

@@ -1,8 +1,8 @@
 """GGX materials of triangles from the samples of all views, with the mesh's normal and with a fitted one.
 
-The normal of the mesh is the prior of the fitted one, with the variance that noise of the scanner's vertices gives
-it: for a triangle of area A about that of an equilateral one, 2 s^2 / a^2 with a^2 = 4 A / sqrt 3 (a plane through
-three points, each off by s). The fit is that of `coupole.reflectance.normal_fit`, reckoned by
+The normal of the mesh is the prior of the fitted normal. Its variance comes from noise of the scanner's vertices.
+For a triangle of area A it is about that of an equilateral one: 2 s^2 / a^2 with a^2 = 4 A / sqrt 3 (a plane
+through three points, each with an error s). The fit is that of `coupole.reflectance.normal_fit`, computed by
 `coupole.reflectance.ggx_fit`.
 """
 
@@ -26,20 +26,20 @@ from coupole.reflectance.parts_in_threads import in_threads
 Floats = NDArray[np.float64]
 
 FEWEST = 24
-"""Samples that a triangle needs: about five times the unknowns."""
+"""Least number of samples of a triangle: about five times the number of unknowns."""
 USUAL = 0.1
-"""Weight of the usual roughness and ks beside that of a sample, which can be some 6: it decides where no sample is
-near a highlight. Without it one triangle in thousands shone five times as bright as white between the LEDs."""
+"""Weight of the usual roughness and ks; a sample can have a weight of about 6. This prior decides where no sample
+is near a highlight. Without it, one triangle in thousands was five times as bright as white between the LEDs."""
 _USUAL_MATERIAL = (USUAL_KS, USUAL_ALPHA, USUAL / SPREAD_KS**2, USUAL)
-"""The same as `ggx_fit.fit_packs` has it."""
+"""The usual material in the form of `ggx_fit.fit_packs`."""
 MOST_KS = 1.0
-"""No more light than there is."""
+"""Largest ks, because a surface cannot reflect more light than it receives."""
 _STARTS = (0.08, 0.2, 0.45)
 _FIRST_KS = 0.02
 _TO_CHOOSE = 256
-"""Approximate number of samples by which the best start is chosen."""
+"""Approximate number of samples from which the best start is chosen."""
 LEAST_KD = 1e-6
-"""1/sr: of black, where a share of kd is asked for."""
+"""kd of black, 1/sr, where a share of kd is needed."""
 _CHOSEN, _SETTLED = 1e-4, 1e-5
 """A fit ends when a step lowers the cost by less than this share: for each start, and for the best one."""
 HELD = 1e9
@@ -49,10 +49,10 @@ _PART = 256
 
 @dataclass(frozen=True)
 class TriangleSamples:
-    """Samples of b triangles in v views; the samples of all views stand one after the other."""
+    """Samples of b triangles in v views; the samples of the views follow one another."""
 
     values: NDArray[np.float32]
-    """[b, samples, channels] f cos_i, 1/sr, with the cosine of the mesh's normal; NaN where there is none."""
+    """[b, samples, channels] f cos_i, 1/sr, with the cosine at the mesh's normal; NaN where there is no sample."""
     led_mm: Floats
     """[samples, 3] positions of their LEDs."""
     view_of: NDArray[np.int64]
@@ -74,7 +74,7 @@ class TriangleSamples:
 
 @dataclass(frozen=True)
 class TriangleMaterials:
-    """Materials of b triangles; NaN where there were too few samples."""
+    """Materials of b triangles; NaN for triangles with too few samples."""
 
     normals: Floats
     kd: Floats
@@ -82,7 +82,7 @@ class TriangleMaterials:
     ks: Floats
     alpha: Floats
     residual: Floats
-    """Weighted rms of the square roots, as a share of sqrt(kd)."""
+    """Weighted rms of the residuals of the square roots, as a share of sqrt(kd)."""
 
     def at(self, triangles: NDArray[np.int64]) -> TriangleMaterials:
         """Return the materials of some of the triangles."""
@@ -96,7 +96,8 @@ def join_materials(parts: Sequence[TriangleMaterials]) -> TriangleMaterials:
 
 
 def prior_stiffness(areas_mm2: Floats, noise_um: float) -> Floats:
-    """1 over the variance, rad^2, of normals of triangles whose vertices are off by `noise_um` (standard)."""
+    """Return 1 over the variance, rad^2, of normals of triangles whose vertices have the standard uncertainty
+    `noise_um`."""
     side2_mm2 = 4.0 * areas_mm2 / math.sqrt(3.0)
     stiffness: Floats = side2_mm2 / (2.0 * (noise_um * 1e-3) ** 2)
     return stiffness
@@ -105,7 +106,7 @@ def prior_stiffness(areas_mm2: Floats, noise_um: float) -> Floats:
 def fit_triangles(
     samples: TriangleSamples, sample_mask: NDArray[np.bool_], noise_um: float | None, *, threads: int | None = None
 ) -> TriangleMaterials:
-    """Materials from the samples `sample_mask` [samples]; normals are fitted if `noise_um` is given."""
+    """Fit materials to the samples `sample_mask` [samples]; normals are fitted if `noise_um` is given."""
     count, _, channels = samples.values.shape
     stiffness = np.full(count, HELD) if noise_um is None else prior_stiffness(samples.areas_mm2, noise_um)
     parameters = np.full((count, 5 + 2 * channels), np.nan)
@@ -137,8 +138,8 @@ def recolour_materials(
     *,
     threads: int | None = None,
 ) -> TriangleMaterials:
-    """Materials with other normals [b, 3]: kd and ks are fitted anew to the samples `sample_mask` [samples],
-    roughness and residual stay."""
+    """Return materials with other normals [b, 3]. kd and ks are fitted again to the samples `sample_mask`
+    [samples]; roughness and residual stay."""
     kd, ks = materials.kd.copy(), materials.ks.copy()
     grey = np.stack([np.maximum(kd.mean(axis=1), LEAST_KD), ks.mean(axis=1), materials.alpha], axis=1)
 
@@ -154,7 +155,7 @@ def recolour_materials(
 
 
 def model_values(samples: TriangleSamples, materials: TriangleMaterials) -> NDArray[np.float32]:
-    """[b, samples, channels] what the materials give where the samples were measured; NaN without material."""
+    """[b, samples, channels] values of the materials for the measured samples; NaN without material."""
     modelled_values = np.full(samples.values.shape, np.nan, np.float32)
     _model(
         samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, materials.normals, materials.kd,
@@ -218,8 +219,8 @@ def _recolour(values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, us
 def gather(  # type: ignore[no-untyped-def]
     values, led_mm, view_of, cameras_mm, centre_mm, normal, used_samples, colours, good, roots, lights, half, views
 ):
-    """Fill the arrays with one triangle's samples and directions; how many there are. A camera that does not see
-    the triangle is put on its normal, so that it forbids no normal."""
+    """Fill the arrays with one triangle's samples and directions, and return their number. A camera that does not
+    see the triangle is placed on its normal, so that it excludes no normal."""
     seeing = np.zeros(len(cameras_mm), np.bool_)
     for view in range(len(cameras_mm)):
         towards(centre_mm, cameras_mm[view], views[view])
@@ -245,7 +246,8 @@ def gather(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _best_start(roots, good, lights, half, views, view_of, normal, stiffness, packs):  # type: ignore[no-untyped-def]
-    """Return about where the best of the starts ends, by some of the samples; `packs` is memory."""
+    """Return, approximately, the end of the best of the starts, from some of the samples; `packs` is working
+    memory."""
     kd = _first_kd(roots, good, lights, normal)
     step = max(1, len(good) // _TO_CHOOSE)
     count = pack(roots[::step], good[::step], lights, half, views, view_of, packs)
@@ -262,7 +264,7 @@ def _best_start(roots, good, lights, half, views, view_of, normal, stiffness, pa
 
 @numba.njit(cache=True, nogil=True)
 def _first_kd(roots, good, lights, normal):  # type: ignore[no-untyped-def]
-    """Median of value over cosine: highlights are few."""
+    """Return the median of value over cosine, because few samples are highlights."""
     ratios = np.empty(len(good))
     for n in range(len(good)):
         light = lights[good[n]]
@@ -311,7 +313,7 @@ def _model(led_mm, view_of, cameras_mm, centres_mm, normals, kd, ks, alpha, mode
 
 @numba.njit(cache=True, nogil=True)
 def turned_normals(normals, tilts):  # type: ignore[no-untyped-def]
-    """Unit normals [n, 3] after tilts [n, 2] along their tangents."""
+    """Return unit normals [n, 3] after tilts [n, 2] along their tangents."""
     new_normals = np.empty_like(normals)
     for n in range(len(normals)):
         t1, t2 = tangents(normals[n, 0], normals[n, 1], normals[n, 2])

@@ -1,7 +1,7 @@
-"""Pictures of one view of a run without calibrations, for what is done with pictures under known lights.
+"""Pictures of one view of a run without calibrations, to be used as pictures under known lights.
 
-Only nominal places of rig and LED table are used: the directions to the LEDs, and their light by the table, are
-those at the point in focus. Values are relative, and each pixel stands for itself.
+Only nominal places of rig and LED table are used. The directions to the LEDs, and their light by the table, are
+those at the point in focus. Values are relative, and each pixel is treated alone.
 """
 
 from __future__ import annotations
@@ -31,28 +31,29 @@ FILES = LIGHTS, INTENSITIES, MASK = "lights.txt", "intensities.txt", "mask.png"
 ABOUT = "pictures.json"
 _MOST_CLIPPED = 1e-3
 _LEAST_SHARE = 0.02
-"""Least share of the range that a pixel of the mask has under its brightest LED."""
+"""Least share of the range that a pixel of the mask reaches under its brightest LED."""
 
 
 @dataclass(frozen=True)
 class PicturedView:
-    """LEDs, lights and pictures of a view, by nominal places."""
+    """LEDs, lights and pictures of a view, from nominal places."""
 
     leds: tuple[int, ...]
     files: tuple[Path, ...]
-    """Files in the order of the LEDs; none if they were not asked for."""
+    """Files in the order of the LEDs; none if they were not requested."""
     lights_mm: NDArray[np.float64]
-    """[n, 3] LEDs from the point that the camera is focused on: x right, y up, z to the camera."""
+    """[n, 3] vectors from the point in focus to the LEDs: x right, y up, z to the camera."""
     width_mm: float
-    """Width of what a row of pixels shows at that distance."""
+    """Width that a row of pixels shows at this distance."""
     is_simulated: bool
 
 
 def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> PicturedView:
-    """Write pictures of a view of a run [h / 2, w / 2], 16 bit, linear, one pixel of each channel of a block, with
-    `filenames.txt`, lights, intensities and mask; what is there already is kept.
+    """Write pictures of a view of a run [h / 2, w / 2], 16 bit, linear, with one pixel for each channel of a
+    block. Also write `filenames.txt`, lights, intensities and mask. Existing files are kept.
 
-    Raises InputError: no such view, too few LEDs, a folder with other pictures; StorageError for damaged frames.
+    Raises InputError if there is no such view, or too few LEDs, or if the folder has other pictures. Raises
+    StorageError for damaged frames.
     """
     import cv2
 
@@ -95,8 +96,8 @@ def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> Pict
 
 
 def lights_of_view(folder: Path, view: str | None) -> PicturedView:
-    """Return what the pictures of a view of a run are taken with, without writing them or reading a frame. Raises
-    InputError: no such view, too few LEDs."""
+    """Return the LEDs and lights of a view's pictures, without writing them or reading a frame. Raises InputError
+    if there is no such view, or too few LEDs."""
     run = Run(folder)
     exposures_of_led = _exposures_of_leds(folder, open_light_frames([folder]), view)
     frame_of_led = {led: exposures[0] for led, exposures in exposures_of_led.items()}
@@ -117,7 +118,7 @@ def _nominal(files: PlanFiles, frame_of_led: dict[int, LightFrame], is_simulated
 
 
 def _target_mm(files: PlanFiles, base_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[3] the point that the camera is focused on."""
+    """[3] the point in focus."""
     return base_from_camera[:3, 3] + files.cell.rig.lens.focus_distance_mm * base_from_camera[:3, 2]
 
 
@@ -128,7 +129,8 @@ def _refuse_others(path: Path, text: str) -> None:
 
 
 def frames_of_leds(folder: Path, frames: LightFrames, view: str | None) -> dict[int, LightFrame]:
-    """Return for each LED the frame of the longest exposure that is hardly clipped, else of the shortest."""
+    """Return, for each LED, the frame of the longest exposure that is hardly clipped, else of the shortest
+    exposure."""
     frame_of_led: dict[int, LightFrame] = {}
     for led, exposures in _exposures_of_leds(folder, frames, view).items():
         frame_of_led[led] = exposures[0]
@@ -139,8 +141,8 @@ def frames_of_leds(folder: Path, frames: LightFrames, view: str | None) -> dict[
 
 
 def _exposures_of_leds(folder: Path, frames: LightFrames, view: str | None) -> dict[int, list[LightFrame]]:
-    """Return the frames of each LED in a view, the longest exposure first. Raises InputError: no such view, too
-    few LEDs."""
+    """Return the frames of each LED in a view, the longest exposure first. Raises InputError if there is no such
+    view, or too few LEDs."""
     views = list(dict.fromkeys(frame.view for frame in frames.lit if frame.led is not None))
     if not views:
         raise InputError(f"{folder}: no proven frame under a single LED; acquire the plan first")
@@ -165,7 +167,7 @@ def _clipped_share(frame: LightFrame, white_dn: int) -> float:
 def _picture(
     frames: LightFrames, frame: LightFrame, dark: NDArray[np.float32], shortest_us: float
 ) -> NDArray[np.uint16]:
-    """[h / 2, w / 2, 3], blue first as OpenCV writes it, or one channel."""
+    """[h / 2, w / 2, 3] picture with blue first, as OpenCV writes it, or one channel."""
     width, height = frames.size_px
     channel = np.zeros((height, width), np.int8)
     names = channels_of(frames.pattern)

@@ -1,7 +1,7 @@
 """Spectral appearance of heritage materials: metals, films, paints, gilts, lacquer.
 
-Plain functions on arrays, from the papers named in each file. Spectra are [..., 81] on the grid of `grid`, 380 to
-780 nm by 5 nm; thicknesses carry their unit; complex indices are n + i k.
+The modules have plain functions on arrays, by the papers named in each file. Spectra are [..., 81] on the grid of
+`grid`, 380 to 780 nm by 5 nm; thicknesses carry their unit; complex indices are n + i k.
 
 ====================================  =================================================================
 `fresnel`, `thin_film`, `indices`     one interface, many, and what they are made of

@@ -1,9 +1,10 @@
-"""Samples of reflectance as ALTA's text files hold them (Belcour, Barla, Pacanowski 2013 on; its page of data file
-formats, and its source where that says more).
+"""Samples of reflectance from ALTA's text files (Belcour, Barla, Pacanowski 2013 on). The format is that of its
+page of data file formats, and of its source where the source says more.
 
-Lines that begin with # and a letter are the head: `DIM n m`, inputs and outputs of a sample; `PARAM_IN`, what the
-inputs are; `PARAM_OUT`; `VS`, bounds behind the outputs: 0 none, 1 a radius, 2 a lower and an upper one. One
-number after VS is that of the first output, and there are no others; several are those of all.
+Lines that begin with # and a letter are the head. `DIM n m` is the number of inputs and of outputs of a sample.
+`PARAM_IN` and `PARAM_OUT` name the kinds of inputs and outputs. `VS` tells which bounds follow the outputs: 0 for
+none, 1 for a radius, 2 for a lower and an upper bound. With one number after VS, only the first output has bounds;
+several numbers are for all outputs.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ PER_STERADIAN = "INV_STERADIAN"
 _HEAD = re.compile(r"#\s?([A-Za-z]\w*)\s*(.*)")
 _END = "ALTA END HEADER"
 _OPEN = float(np.finfo(np.float32).max)
-"""A bound of at least this size means that there is no bound."""
+"""A bound of at least this size counts as no bound."""
 _FEWEST = 8
 """Least number of samples between which values can be interpolated."""
 
@@ -35,20 +36,20 @@ class AltaSamples:
 
     path: Path
     given_in: str
-    """PARAM_IN."""
+    """Kind of the inputs, from PARAM_IN."""
     given_out: str | None
-    """PARAM_OUT, None where the file does not say."""
+    """Kind of the outputs, from PARAM_OUT; None if the file does not name it."""
     inputs: Array
     """[n, inputs]"""
     values: Array
     """[n, outputs]"""
     low: Array
-    """[n, outputs] bounds; NaN where the file has none."""
+    """[n, outputs] lower bounds; NaN if the file has none."""
     high: Array
-    """[n, outputs] upper bounds, as `low`; inf where a bound is open."""
+    """[n, outputs] upper bounds; NaN if the file has none, inf for an open bound."""
 
     def directions(self) -> tuple[Array, Array]:
-        """Unit vectors [n, 3] to light and eye. Raises InputError for angles that do not say both."""
+        """Unit vectors [n, 3] to light and eye. Raises InputError for angles that do not give both directions."""
         if self.given_in not in WAYS:
             raise InputError(
                 f"{self.path}: PARAM_IN {self.given_in}: expected one of {', '.join(WAYS)}, which give both "
@@ -58,8 +59,9 @@ class AltaSamples:
 
 
 def read_alta(path: Path) -> AltaSamples:
-    """Raises InputError with line and column: no such file, a head that lacks DIM or PARAM_IN, another number of
-    values in a line than the head says, words that are no numbers, a lower bound above the upper one."""
+    """Read a file. Raises InputError with line and column for a missing file, for a head without DIM or PARAM_IN,
+    for a line with another number of values than in the head, for words that are no numbers, and for a lower bound
+    above the upper one."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except OSError as error:
@@ -87,7 +89,7 @@ def read_alta(path: Path) -> AltaSamples:
 
 
 def _head(path: Path, lines: Sequence[str]) -> tuple[dict[str, tuple[str, int]], int]:
-    """Values of the head's keys with their lines, and how many lines there are before the samples."""
+    """Return the values of the head's keys with their lines, and the number of lines before the samples."""
     fields: dict[str, tuple[str, int]] = {}
     for number, line in enumerate(lines, start=1):
         key = _HEAD.match(line)
@@ -115,7 +117,7 @@ def _dim(path: Path, head: dict[str, tuple[str, int]]) -> tuple[int, int]:
 
 
 def _kinds(path: Path, head: dict[str, tuple[str, int]], outputs: int) -> list[int]:
-    """Bounds of each output: 0, 1 or 2 numbers."""
+    """Return the number of bounds of each output: 0, 1 or 2."""
     text, line = head.get("VS", ("0", 0))
     words = text.split()
     if len(words) not in (1, outputs) or not all(word in ("0", "1", "2") for word in words):
@@ -125,7 +127,7 @@ def _kinds(path: Path, head: dict[str, tuple[str, int]], outputs: int) -> list[i
 
 
 def _rows(path: Path, lines: Sequence[str], first: int, width: int) -> tuple[list[list[float]], list[int]]:
-    """Numbers of the samples, and their lines from 1."""
+    """Return the numbers of the samples, and their line numbers from 1."""
     rows: list[list[float]] = []
     numbers: list[int] = []
     for number, line in enumerate(lines[first:], start=first + 1):
@@ -146,7 +148,7 @@ def _rows(path: Path, lines: Sequence[str], first: int, width: int) -> tuple[lis
 
 
 def _wrong(line: str, width: int) -> str:
-    """Column and what is wrong there."""
+    """Return the column of the first error in a line, and a description of the error."""
     words = list(re.finditer(r"\S+", line))
     for word in words:
         try:
@@ -162,7 +164,7 @@ def _wrong(line: str, width: int) -> str:
 def _bounds(
     path: Path, table: Array, values: Array, kinds: Sequence[int], numbers: Sequence[int]
 ) -> tuple[Array, Array]:
-    """Lower and upper ones [n, outputs], NaN where there are none."""
+    """Return lower and upper bounds [n, outputs], NaN for no bound."""
     low, high = np.full(values.shape, np.nan), np.full(values.shape, np.nan)
     column = 0
     for output, kind in enumerate(kinds):
@@ -190,7 +192,7 @@ def _way(theta: Array, phi: Array) -> Array:
 
 
 def _about_half(theta_h: Array, phi_h: Array, theta_d: Array, phi_d: Array) -> tuple[Array, Array]:
-    """Light and eye; ALTA's difference vector is the eye's."""
+    """Return the directions to light and eye; ALTA's difference vector is the eye's."""
     about = _way(theta_d, phi_d)
     cosine, sine = np.cos(theta_h), np.sin(theta_h)
 
@@ -221,20 +223,23 @@ WAYS: dict[str, tuple[int, Callable[..., tuple[Array, Array]]]] = {
     "SPHERICAL_TL_PL_TV_PV": (4, lambda led, phi_led, eye, phi_eye: (_way(led, phi_led), _way(eye, phi_eye))),
     "CARTESIAN": (6, lambda *all_six: (np.stack(all_six[3:], axis=-1), np.stack(all_six[:3], axis=-1))),
 }
-"""Inputs of each parametrisation that gives both directions, and the directions to light and eye; rad."""
+"""Number of inputs of each parametrisation that gives both directions, and its function for the directions to
+light and eye; rad."""
 
 
 # -- between samples ------------------------------------------------------------------------------------------
 
 
 def interpolated_brdf(samples: AltaSamples) -> Brdf:
-    """The reflectance [..., outputs] of an isotropic, reciprocal material by its samples.
+    """Return the reflectance [..., outputs] of an isotropic, reciprocal material, interpolated between its
+    samples.
 
-    A pair of directions is a point: the root of theta_h, and the light about the half vector, theta_d at the
-    azimuth phi_d, folded to 0 to 90 degrees as exchange and mirror image of the directions allow. Between the four
-    samples around a point (Delaunay's tetrahedra) values are linear; outside of all the nearest sample's holds.
-    Samples at one point count with their mean, values below 0 as 0. Raises InputError: values that are not f in
-    1/sr, too few samples, or all in one plane.
+    Each pair of directions is a point. Its coordinates are the root of theta_h, and the light's position about the
+    half vector: theta_d at the azimuth phi_d. The azimuth is folded to 0 to 90 degrees, because exchange and
+    mirror image of the directions allow it. Between the four samples around a point (Delaunay's tetrahedra) values
+    are linear; outside of all tetrahedra the nearest sample is used. Samples at one point are averaged, and values
+    below 0 become 0. Raises InputError for values that are not f in 1/sr, for too few samples, and for samples in
+    one plane.
     """
     from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
     from scipy.spatial import QhullError
@@ -257,7 +262,7 @@ def interpolated_brdf(samples: AltaSamples) -> Brdf:
 
 
 def _merge_points(points: Array, values: Array) -> tuple[Array, Array]:
-    """The different ones among the points, and the mean of the values at each."""
+    """Return the different points, and the mean of the values at each."""
     _, first, group = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
     total = np.zeros((len(first), values.shape[1]))
     np.add.at(total, group.ravel(), values)
@@ -265,7 +270,7 @@ def _merge_points(points: Array, values: Array) -> tuple[Array, Array]:
 
 
 def _place(light: Array, eye: Array) -> Array:
-    """[..., 3] of unit directions."""
+    """[..., 3] coordinates of pairs of unit directions."""
     half, _ = half_vector(light, eye)
     theta_h = np.arctan2(np.hypot(half[..., 0], half[..., 1]), half[..., 2])
     across = np.linalg.norm(light - eye, axis=-1)

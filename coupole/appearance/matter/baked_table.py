@@ -1,7 +1,7 @@
-"""Any isotropic BRDF as a table of RGL's format, which a renderer reads natively.
+"""An isotropic BRDF as a table of RGL's format, which a renderer reads natively.
 
-Angles of incidence and half vectors as in the format; `ndf` has the reflectance back to the light, by the half
-vector's elevation, so that what is left to the table changes little within a lobe.
+Angles of incidence and half vectors are those of the format. `ndf` has the reflectance back to the light, by the
+half vector's elevation. So the values in the table, which are divided by it, change little within a lobe.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ THETAS, SIDE = 32, 64
 _CROWDING = 1.3
 _NDF_NODES = 2048
 _STEEPEST = np.radians(80.0)
-"""Beyond it the reflectance back to the light is held, as some models diverge there."""
+"""Beyond this angle the reflectance back to the light is held constant, because some models diverge there."""
 _FLOOR = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class BakedTable:
-    """Fields of a tensor file whose channels make bands."""
+    """Fields of a tensor file with channels, and the conversion of these channels to bands."""
 
     fields: Mapping[str, NDArray[Any]]
-    """All but the values and their wavelengths."""
+    """All fields except the values and their wavelengths."""
     values: NDArray[np.float32]
     """[phi_i, theta_i, channels, rows, columns]"""
     to_bands: Array
     """[channels, bands]"""
 
     def encode(self, wavelengths_nm: Sequence[float], bands: Sequence[int]) -> bytes:
-        """A file with the values of `bands` at `wavelengths_nm`."""
+        """Return the bytes of a file with the values of `bands` at `wavelengths_nm`."""
         band_values = np.einsum("ptcrk,cb->ptbrk", self.values, self.to_bands[:, list(bands)].astype(np.float32))
         return tensors(
             {
@@ -58,7 +58,7 @@ class BakedTable:
         )
 
     def decoded_table(self) -> RglTable:
-        """Return the table as a reader of the file has it; of all channels."""
+        """Return the table, with all channels, as a reader gets it from the file."""
         phi_i, theta_i, ndf, sigma, vndf = (
             np.asarray(self.fields[name], np.float64) for name in ("phi_i", "theta_i", "ndf", "sigma", "vndf")
         )
@@ -68,7 +68,7 @@ class BakedTable:
 
 
 def bake(source: Brdf, to_bands: Array | None = None, *, thetas: int = THETAS, side: int = SIDE) -> BakedTable:
-    """Bake an isotropic BRDF of 81 bands, or of channels that `to_bands` [channels, 81] makes bands of."""
+    """Bake an isotropic BRDF of 81 bands, or of channels; `to_bands` [channels, 81] converts channels to bands."""
     steps = np.linspace(0.0, 1.0, thetas)
     theta_i = np.asarray(0.5 * np.pi * (1.0 - (1.0 - steps) ** _CROWDING), np.float32)
     ndf = _back(source)
@@ -91,7 +91,7 @@ def bake(source: Brdf, to_bands: Array | None = None, *, thetas: int = THETAS, s
 
 
 def from_file(path: Path, table: RglTable, to_bands: Array) -> BakedTable:
-    """An isotropic file of the format as it is, with its own grid. Raises InputError."""
+    """Return a table from an isotropic file of the format, unchanged, with its own grid. Raises InputError."""
     file_fields = read_fields(path)
     if "luminance" not in file_fields:
         raise InputError(f"{path}: expected a field `luminance`, by which directions are drawn; found none")
@@ -103,7 +103,7 @@ def from_file(path: Path, table: RglTable, to_bands: Array) -> BakedTable:
 
 
 def _back(source: Brdf) -> Array:
-    """[nodes] the channels' mean of the reflectance back to the light."""
+    """[nodes] reflectance back to the light, as the mean over the channels."""
     theta = 0.5 * np.pi * np.linspace(0.0, 1.0, _NDF_NODES) ** 2
     ways = directions(np.cos(np.minimum(theta, _STEEPEST)), np.zeros(_NDF_NODES))
     reflectance = source(ways, ways).mean(axis=-1)
@@ -111,7 +111,7 @@ def _back(source: Brdf) -> Array:
 
 
 def wavelengths_of(table: RglTable) -> Array:
-    """[channels, 81] straight between the table's own wavelengths, ends held."""
+    """[channels, 81] weights: linear between the table's own wavelengths, constant beyond its ends."""
     assert table.wavelengths_nm is not None
     nodes_nm = table.wavelengths_nm
     return np.stack([np.interp(WAVELENGTHS_NM, nodes_nm, node_weights) for node_weights in np.eye(len(nodes_nm))])

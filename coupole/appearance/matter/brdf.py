@@ -3,7 +3,7 @@
 Directions are unit vectors [..., 3] away from the surface in its own frame, z along the normal: `wi` to the light,
 `wo` to the eye. Results are [..., bands]; they are 0 where either direction is at or below the horizon. The
 radiance reflected from a light of irradiance E (on a plane facing it) is f E wi_z. Other parameters are bound with
-`functools.partial`, which makes any of these a `Brdf`.
+`functools.partial`, which makes each of these functions a `Brdf`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LEAST_ROUGHNESS = 1e-3
 
 
 def lambert(wi: Array, wo: Array, *, reflectance: ArrayLike) -> Array:
-    """Perfectly diffuse: reflectance [bands] over pi."""
+    """Perfectly diffuse surface: reflectance [bands] over pi."""
     return np.asarray(_above(wi, wo)[..., None] * np.atleast_1d(np.asarray(reflectance, dtype=float)) / np.pi)
 
 
@@ -55,9 +55,11 @@ def ggx(wi: Array, wo: Array, *, roughness: float, fresnel: Fresnel) -> Array:
 
 
 def cook_torrance(wi: Array, wo: Array, *, slope: float, fresnel: Fresnel) -> Array:
-    """Beckmann facets of root mean square slope `slope` in V-shaped grooves: F D G/(4 z_i z_o), D holding 1/pi.
+    """Beckmann facets with the root mean square slope `slope` in V-shaped grooves: F D G/(4 z_i z_o), where D
+    includes 1/pi.
 
-    Cook and Torrance, ACM TOG 1, 7 (1982), but normalised: their F/pi without the 4 reflects four times too much.
+    Cook and Torrance, ACM TOG 1, 7 (1982), but normalised, because their F/pi without the 4 reflects four times
+    too much.
     """
     h, cos_h = half_vector(wi, wo)
     m2 = max(slope, LEAST_ROUGHNESS) ** 2
@@ -69,7 +71,8 @@ def cook_torrance(wi: Array, wo: Array, *, slope: float, fresnel: Fresnel) -> Ar
 
 
 def half_vector(wi: Array, wo: Array) -> tuple[Array, Array]:
-    """Unit vector [..., 3] halfway between two directions, and the cosine [...] from it to each of them."""
+    """Return the unit vector [..., 3] halfway between two directions, and the cosine [...] between it and each of
+    them."""
     total = wi + wo
     length = np.maximum(np.linalg.norm(total, axis=-1, keepdims=True), 1e-12)
     h = total / length
@@ -82,5 +85,6 @@ def _above(wi: Array, wo: Array) -> Array:
 
 
 def _cosines(wi: Array, wo: Array) -> tuple[Array, Array, Array]:
-    """Cosines to the normal, bounded away from zero, and 1 where both directions are above the horizon."""
+    """Return the cosines to the normal, limited to values above zero, and 1 where both directions are above the
+    horizon."""
     return np.maximum(wi[..., 2], 1e-9), np.maximum(wo[..., 2], 1e-9), _above(wi, wo)

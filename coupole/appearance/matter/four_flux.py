@@ -8,10 +8,10 @@ With z downward, l the directional and L the diffuse fluxes, mu = k + s_i + s_j:
     l+(0) = 1    L+(0) = 0    l-(h) = r_s l+(h)    L-(h) = Rg L+(h) + Rcg l+(h)
 
 The paper solves this with p and q, which diverge where mu = b S although the fluxes do not. Here the scattered
-light is integrated with the layer's Green's function instead. Of diffuse light that starts at depth z downwards,
-the layer alone sends sinh(bS(h-z))/A up through its top and A(z)/A through its bottom, where A(z) = a sinh(bSz) +
-b cosh(bSz) and A = A(h); for light going up, the two are exchanged. The integrals of these with exp(-mu z) are
-divided differences of exponentials, finite everywhere.
+light is integrated with the layer's Green's function instead. If diffuse light starts at depth z downwards, the
+layer alone sends the share sinh(bS(h-z))/A through its top and the share A(z)/A through its bottom, where A(z) = a
+sinh(bSz) + b cosh(bSz) and A = A(h). For light going up, the two are exchanged. The integrals of these with
+exp(-mu z) are divided differences of exponentials, finite everywhere.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from coupole.appearance.matter.kubelka_munk import decay
 from coupole.appearance.spectra.grid import Array, within
 
 _LEAST_X = 1e-5
-"""x = bSh is kept above this: a layer without absorption of diffuse light gets a very small one. The results
-depend on x^2, so the error is 1e-10, as large as rounding in the differences divided by x."""
+"""x = bSh is not smaller than this: a layer without absorption of diffuse light gets a very small one. The results
+depend on x^2, so the error is 1e-10. This is as large as the rounding error of the differences divided by x."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,13 @@ class Layer:
     absorption: ArrayLike
     """K, diffuse light."""
     scattering: ArrayLike
-    """S, diffuse light, from one direction to the other."""
+    """S of diffuse light, from one direction to the other."""
     direct_absorption: ArrayLike
-    """k."""
+    """k, of directional light."""
     forward: ArrayLike
     """s_i: from directional light to diffuse light in the same direction."""
     backward: ArrayLike
-    """s_j: ... in the opposite direction."""
+    """s_j: from directional light to diffuse light in the opposite direction."""
     thickness_mm: ArrayLike
 
 
@@ -53,9 +53,9 @@ class Background:
     diffuse: ArrayLike = 0.0
     """Rg, diffuse to diffuse."""
     directed_to_diffuse: ArrayLike = 0.0
-    """Rcg."""
+    """Rcg, directional to diffuse."""
     specular: ArrayLike = 0.0
-    """r_s."""
+    """r_s, of the mirror image."""
 
 
 def reflectances(layer: Layer, background: Background) -> tuple[Array, Array]:
@@ -71,9 +71,10 @@ def reflectances(layer: Layer, background: Background) -> tuple[Array, Array]:
 
 
 def response(layer: Layer) -> tuple[Array, Array, Array, Array, Array]:
-    """The layer alone: rho and tau (diffuse light), R_b and T_cd (directional to diffuse, up and down), Tr.
+    """Return values of the layer alone: rho and tau (diffuse light), R_b and T_cd (directional to diffuse, up and
+    down), Tr.
 
-    Tr = exp(-mu h) is the directional light that passes.
+    Tr = exp(-mu h) is the share of directional light that passes.
     """
     k, s, k_direct, forward, backward, h = (
         within(name, getattr(layer, name), 0.0, 1e12)

@@ -2,11 +2,11 @@
 
     R = f R_bole + (1 - f) (R(d) + T_in T_out R_b/(1 - R_int R_b))
 
-f is the share of the surface not covered because of holes and cracks, R(d) the reflectance of a leaf of thickness
+f is the share of the surface that is bare because of holes and cracks, R(d) the reflectance of a leaf of thickness
 d, T_in its transmittance, T_out and R_int its transmittance and reflectance for the bole's diffuse light from
 below, and R_b the bole's reflectance inside its binder. The paper's "R_gold - T_p + R_plasmon" has no definition
-of R_plasmon; a thin film includes all three (docs/decisions/0010). For thickness 0 the result is the bole
-under the face of its binder, for thick leaves bulk gold.
+of R_plasmon; a thin film includes all three (docs/decisions/0010). For thickness 0 the result is the bole under
+the face of its binder. For thick leaves it is bulk gold.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class Gilt:
     bole: InternalReflectance
     """[bands]."""
     bare_share: float
-    """f."""
+    """f: share of the surface without leaf."""
 
 
 def leaf_index(
     metal: Complex, holes_share: float, *, flatness: float = 20.0, filling: float = indices.EGG_WHITE
 ) -> Complex:
     """Effective index of a leaf of `metal` with a share of nanoscopic lens-shaped holes filled with egg white, for
-    light along its normal (Eqs 2-5). `flatness` is a hole's width over its height."""
+    light along its normal (Eqs 2-5). `flatness` is the ratio of a hole's width to its height."""
     depolarisation = effective_medium.depolarisation_in_plane(flatness)
     return effective_medium.maxwell_garnett(metal, filling, holes_share, depolarisation)
 
@@ -54,7 +54,7 @@ def gilt(
 ) -> Gilt:
     """A leaf of `index` and thickness on a bole [bands]; under the leaf there is no air.
 
-    For a bole measured in air: `glossy_face.face(binder_index).inside(measured)`.
+    For a bole measured in air, use `glossy_face.face(binder_index).inside(measured)`.
     """
     return Gilt(
         leaf=layered.sheet([Film(index, thickness_nm)], binder_index),

@@ -1,9 +1,9 @@
-"""Reflectance of a paint as an instrument sees it, and as it holds inside the binder: two types, and Saunderson
-between them.
+"""Reflectance of a paint as an instrument measures it, and reflectance inside the binder: two types, and
+Saunderson's conversion between them.
 
-A binder's glossy face reflects part of the light before it enters, and most of the diffuse light that wants to
-leave. If a paint reflects 0.50 in air, gloss excluded, the layer inside reflects 0.74 under an index of 1.5. The
-two must not be mixed: the types have no arithmetic, and `Face` is the only way from one to the other.
+A binder's glossy face reflects part of the light before it enters, and most of the diffuse light that would leave.
+If a paint reflects 0.50 in air, gloss excluded, the layer inside reflects 0.74 under an index of 1.5. The two
+reflectances must not be mixed, so the types have no arithmetic, and only `Face` converts one to the other.
 """
 
 from __future__ import annotations
@@ -19,23 +19,24 @@ from coupole.appearance.spectra.grid import Array, within
 from coupole.errors import InputError
 
 Geometry = Literal["gloss excluded", "gloss included", "45:0"]
-"""Geometry of an instrument. Gloss excluded: diffuse light seen along the normal, or the reverse, with a gloss
-trap (d:8, SCE). Gloss included: without the trap (d:8, SCI). 45:0: light at 45 degrees seen along the normal."""
+"""Geometry of an instrument. Gloss excluded: diffuse light measured along the normal, or the reverse, with a gloss
+trap (d:8, SCE). Gloss included: without the trap (d:8, SCI). 45:0: light at 45 degrees measured along the
+normal."""
 _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredReflectance:
-    """Reflectance in air, as an instrument sees it: fractions [..., bands]; noise may go below 0, gloss above
-    1."""
+    """Reflectance in air, as an instrument measures it: fractions [..., bands]. Noise may lower them below 0, and
+    gloss may raise them above 1."""
 
     values: Array
 
 
 @dataclass(frozen=True, eq=False)
 class InternalReflectance:
-    """Reflectance of a layer inside its binder, for diffuse light: 0 to 1, [..., bands]. Raises InputError
-    beyond."""
+    """Reflectance of a layer inside its binder, for diffuse light: 0 to 1, [..., bands]. Raises InputError for
+    values outside this range."""
 
     values: Array
 
@@ -51,11 +52,11 @@ class Face:
     """
 
     passing: Array
-    """Share of the incident light that enters, times the share of the emerging light that is seen."""
+    """Share of the incident light that enters, times the share of the emerging light that is measured."""
     inner: Array
     """Reflectance for diffuse light from within (k2)."""
     gloss: Array
-    """Light that the face itself sends to the instrument."""
+    """Light that the face itself reflects to the instrument."""
 
     def reflectance_in_air(self, internal: InternalReflectance) -> MeasuredReflectance:
         """Return the reflectance in air of a layer under this face."""
@@ -63,8 +64,8 @@ class Face:
         return MeasuredReflectance(np.asarray(self.passing * r / (1.0 - self.inner * r) + self.gloss))
 
     def inside(self, measured_reflectance: MeasuredReflectance) -> InternalReflectance:
-        """Return the reflectance of the layer under this face. Raises InputError if no layer can have the
-        reflectance that was seen.
+        """Return the reflectance of the layer under this face. Raises InputError if no layer can have the measured
+        reflectance.
         """
         r = np.asarray(measured_reflectance.values, dtype=float) - self.gloss
         internal = np.asarray(r / (self.passing + self.inner * r))
@@ -86,10 +87,12 @@ class Face:
 
 
 def face(index: ArrayLike, geometry: Geometry = "gloss excluded") -> Face:
-    """The face of a transparent binder of real index n >= 1, a number or [bands], for a geometry of measurement.
+    """Return the face of a transparent binder of real index n >= 1, a number or [bands], for a geometry of
+    measurement.
 
-    By diffuse light and along the normal 1 - F(0) passes inwards and 1 - k2 outwards, or the reverse: the product
-    is the same. At 45:0 the emerging radiance is seen along the normal: (1 - F(45)) (1 - F(0))/n^2.
+    With diffuse light and measurement along the normal, the share 1 - F(0) passes inwards and 1 - k2 outwards, or
+    the reverse; the product is the same. At 45:0 the emerging radiance is measured along the normal: (1 - F(45))
+    (1 - F(0))/n^2.
     """
     if geometry not in get_args(Geometry):
         raise InputError(f"geometry: expected one of {', '.join(get_args(Geometry))}; found {geometry!r}")
@@ -104,4 +107,5 @@ def face(index: ArrayLike, geometry: Geometry = "gloss excluded") -> Face:
 
 
 BARE = Face(np.ones(()), np.zeros(()), np.zeros(()))
-"""No face: dry powder, matt distemper. The reflectance seen and the reflectance inside are the same."""
+"""No face, as for dry powder or matt distemper. The measured reflectance and the internal reflectance are the
+same."""

@@ -18,9 +18,9 @@ def albedo(brdf: Brdf, cosines: Array, *, nodes: int = 64) -> Array:
     """Directional-hemispherical reflectance [n, bands] at n cosines of incidence.
 
     For a reciprocal BRDF this is also its radiance in a white furnace (radiance 1 from all directions). The
-    integral uses a polar grid about the specular direction, with polar angles concentrated there (`nodes` Gauss
-    points of theta = (pi/2 + theta_i) u^3, `nodes` midpoints of azimuth), so narrow lobes are resolved; the
-    horizon cuts through the grid, which gives an error of about 1/nodes of the light reflected there.
+    integral uses a polar grid about the specular direction, with polar angles concentrated there, so that narrow
+    lobes are resolved. It has `nodes` Gauss points of theta = (pi/2 + theta_i) u^3, and `nodes` midpoints of
+    azimuth. The horizon cuts through the grid, which gives an error of about 1/nodes of the light reflected there.
     """
     u, weight = np.polynomial.legendre.leggauss(nodes)
     u, weight = 0.5 * (u + 1.0), 0.5 * weight
@@ -39,6 +39,6 @@ def albedo(brdf: Brdf, cosines: Array, *, nodes: int = 64) -> Array:
 
 
 def _about(axis: Array, local: Array) -> Array:
-    """`local` vectors turned so that their z is along `axis`, a unit vector of the plane y = 0."""
+    """Return `local` vectors turned so that their z axis becomes `axis`, a unit vector in the plane y = 0."""
     x, z = local[..., 0], local[..., 2]
     return np.stack([axis[2] * x + axis[0] * z, local[..., 1], axis[2] * z - axis[0] * x], axis=-1)

@@ -1,6 +1,6 @@
 """Two diffuse fluxes in a scattering layer (Kubelka and Munk 1931; seed 000, Eqs 5-7).
 
-All reflectances are inside the binder: `glossy_face` leads there from what an instrument sees, and back.
+All reflectances are inside the binder; `glossy_face` converts measured reflectances to these, and back.
 
 K and S are absorption and scattering per mm, h is the thickness in mm; all arguments broadcast. With a = 1 + K/S,
 b = sqrt(a^2 - 1) and x = b S h, a layer reflects rho = sinh x/A and transmits tau = b/A, where A = a sinh x + b
@@ -32,7 +32,7 @@ def layer(absorption: ArrayLike, scattering: ArrayLike, thickness_mm: ArrayLike)
 
 
 def over(rho: ArrayLike, tau: ArrayLike, background: ArrayLike) -> Array:
-    """Reflectance of a layer (rho, tau) on a background of reflectance `background`."""
+    """Return the reflectance of a layer (rho, tau) on a background with reflectance `background`."""
     rho, tau, ground = (
         np.asarray(rho, dtype=float),
         np.asarray(tau, dtype=float),

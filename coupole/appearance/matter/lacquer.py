@@ -12,14 +12,14 @@ from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array, within
 def urushi_absorption(at_450_nm_per_mm: float = 6.0, fall_per_nm: float = 0.016) -> Array:
     """Absorption [81] per mm of transparent (suki) urushi: amber, fading exponentially towards the red.
 
-    The shape is the tail of aromatic chromophores; both numbers are assumed, such that 0.1 mm of lacquer looks
-    amber. From a measured transmittance use `absorption_from`.
+    The shape is the tail of aromatic chromophores; both numbers are assumed, so that 0.1 mm of lacquer looks
+    amber. For a measured transmittance use `absorption_from`.
     """
     return at_450_nm_per_mm * np.exp(-fall_per_nm * (WAVELENGTHS_NM - 450.0))
 
 
 def absorption_from(transmittance: ArrayLike, thickness_mm: float, index: float = indices.URUSHI) -> Array:
-    """Absorption per mm from the transmittance of a free film, whose two surfaces also reflect.
+    """Return the absorption per mm from the transmittance of a free film with two reflecting surfaces.
 
     Without interference, T = (1 - F)^2 t/(1 - F^2 t^2), solved for t = exp(-absorption h).
     """
@@ -36,7 +36,7 @@ def absorption_from(transmittance: ArrayLike, thickness_mm: float, index: float 
 def transmittance(
     depth_mm: ArrayLike, cos_in_air: ArrayLike, absorption_per_mm: Array, index: float = indices.URUSHI
 ) -> Array:
-    """Share [..., bands] of light that reaches a depth, for light from air at an angle [...]."""
+    """Return the share [..., bands] of light from air, at an angle [...], that reaches a depth."""
     cosine = fresnel.cos_inside(cos_in_air, 1.0, index).real
     path_mm = within("depth", depth_mm, 0.0, np.inf) / cosine
     return np.exp(-path_mm[..., None] * absorption_per_mm)

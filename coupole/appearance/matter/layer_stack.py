@@ -1,13 +1,13 @@
 """Layers over layers in one binder under one face, for light of any direction.
 
-A ground is known by what it does with light inside the binder: diffuse to diffuse, directed to diffuse, directed
-to its mirror image. A layer over a ground is a ground again; so layers are laid from the bottom up: two fluxes
-(Kubelka and Munk), four fluxes (seed 000, section 3.4, with the directed light's path 1/cos longer), clear ones
-(Beer and Lambert), metal leaves (thin films). A face closes the stack.
+A ground is described by its reflectances for light inside the binder: diffuse to diffuse, directed to diffuse, and
+directed to its mirror image. A layer over a ground is again a ground, so layers are added from the bottom up.
+Layers have two fluxes (Kubelka and Munk) or four fluxes (seed 000, section 3.4, with a path of directed light that
+is 1/cos longer), are clear (Beer and Lambert), or are metal leaves (thin films). A face closes the stack.
 
-Along one direction this is the exact solution of the four fluxes' equations with the faces' reflections. Between
-directions the emerging light is spread as the entering light is taken in, f = A(i) A(o)/(pi <A>), which keeps the
-reflectance A of each direction, and is reciprocal.
+Along one direction this is the exact solution of the four fluxes' equations with the faces' reflections. Over
+directions, the emerging light is distributed as the entering light is accepted: f = A(i) A(o)/(pi <A>). This keeps
+the reflectance A of each direction, and is reciprocal.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _GAUSS, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 
 @dataclass(frozen=True)
 class Ground:
-    """Reflectances inside the binder. Directed light comes at the cosines that refraction makes of
-    `layered.COSINES` in air."""
+    """Reflectances inside the binder. Directed light has the cosines of `layered.COSINES` in air after
+    refraction."""
 
     diffuse: Array
     """[bands], diffuse to diffuse."""
@@ -48,18 +48,19 @@ class Binder:
 
     @property
     def cosines(self) -> Array:
-        """[angles, 1] inside, of light from air at `layered.COSINES`."""
+        """[angles, 1] cosines, inside, of light from air at `layered.COSINES`."""
         sine2 = (1.0 - layered.COSINES**2) / self.index**2
         return np.asarray(np.sqrt(1.0 - sine2))[:, None]
 
     def matt(self, reflectance: ArrayLike) -> Ground:
-        """A Lambertian ground [bands]."""
+        """Return a Lambertian ground with a reflectance [bands]."""
         g = np.broadcast_to(within("ground", reflectance, 0.0, 1.0), BANDS)
         flat = np.broadcast_to(g, (len(layered.COSINES), BANDS))
         return Ground(g, flat, np.zeros_like(flat))
 
     def mirroring(self, ground: Ground, share: ArrayLike, roughness: float) -> Ground:
-        """A ground that has a mirror's reflectance as well, for directed light; diffuse light counts with both."""
+        """Return the ground with an additional mirror reflectance for directed light; diffuse light is reflected
+        by both."""
         mirror = np.broadcast_to(np.asarray(share, dtype=float), ground.directional.shape)
         within("ground and its mirror together", ground.diffuse + mirror.max(axis=0), 0.0, 1.0 + 1e-9)
         return Ground(ground.diffuse + self._mean(mirror), ground.directional, mirror, roughness)
@@ -67,12 +68,12 @@ class Binder:
     def two_flux(
         self, ground: Ground, absorption: ArrayLike, scattering: ArrayLike, thickness_mm: float
     ) -> Ground:
-        """A layer that makes all light diffuse at once (Kubelka and Munk)."""
+        """Add a layer that makes all light diffuse immediately (Kubelka and Munk)."""
         rho, tau = kubelka_munk.layer(absorption, scattering, thickness_mm)
         return self.matt(kubelka_munk.over(rho, tau, ground.diffuse))
 
     def four_flux(self, ground: Ground, layer: four_flux.Layer) -> Ground:
-        """A layer of four fluxes; its directed coefficients hold along the path."""
+        """Add a layer of four fluxes; its directed coefficients apply along the path."""
         longer = 1.0 / self.cosines
         slanted_layer = replace(
             layer,
@@ -87,14 +88,15 @@ class Binder:
         return Ground(diffuse, directed_reflectance, mirror, ground.roughness)
 
     def clear(self, ground: Ground, absorption: ArrayLike, thickness_mm: float) -> Ground:
-        """A layer without scattering; the path of diffuse light is twice as long, as Kubelka and Munk's is."""
+        """Add a layer without scattering. The path of diffuse light is twice as long, as in Kubelka and Munk's
+        theory."""
         k = np.asarray(absorption, dtype=float)
         return self.four_flux(ground, four_flux.Layer(2.0 * k, 0.0, k, 0.0, 0.0, thickness_mm))
 
     def leaf(self, ground: Ground, films: Sequence[Film], roughness: float, bare_share: float = 0.0) -> Ground:
-        """Thin films of metal with binder on both sides, on all but a share of the ground.
+        """Add thin films of metal, with binder on both sides, on all but the share `bare_share` of the ground.
 
-        The ground's own mirror image is seen through the leaf as if it lay in the leaf's facets.
+        The ground's own mirror image is treated as if it lay in the leaf's facets.
         """
         index = self.index
         cosines = self.cosines[:, 0]
@@ -115,8 +117,8 @@ class Binder:
         )
 
     def _mean(self, mirror: Array) -> Array:
-        """[bands], of light from everywhere inside: 2 mu dmu over the table's cosines; the table's end at the
-        critical angle holds beyond it."""
+        """[bands] mean for light from all directions inside: 2 mu dmu over the table's cosines. Beyond the
+        critical angle, the last value of the table is used."""
         mu = 0.5 * (_GAUSS + 1.0)
         sine2 = np.minimum((1.0 - mu**2) * self.index**2, 1.0)
         values = layered.at_cosine(mirror, np.sqrt(1.0 - sine2))
@@ -129,17 +131,17 @@ class Stack:
 
     coat: layered.Coat
     body: Array
-    """Share of light from an angle that comes back as diffuse light."""
+    """Share of light from an angle that returns as diffuse light."""
     mirror: Array
-    """Share that comes back as the ground's mirror image."""
+    """Share that returns as the ground's mirror image."""
     mean_body: Array
-    """[bands], of `body` for light from everywhere."""
+    """[bands] mean of `body` for light from all directions."""
     mirror_roughness: float
     """Roughness of the mirror image, as seen from air."""
 
 
 def stack(binder: Binder, ground: Ground, roughness: float, films: Sequence[Film] = ()) -> Stack:
-    """All layers under the binder's face, or under `films` of metal that lie on it."""
+    """Return all layers under the binder's face, or under `films` of metal that lie on it."""
     sheet = layered.sheet(films, binder.index)
     coat = layered.coat(sheet, roughness)
     inner, out = stack_power(
@@ -155,7 +157,7 @@ def stack(binder: Binder, ground: Ground, roughness: float, films: Sequence[Film
 
 
 def stack_brdf(wi: Array, wo: Array, *, stack: Stack) -> Array:
-    """The face's gloss, the mirror image of a ground, and diffuse light: f [..., bands], 1/sr."""
+    """Return the sum of the face's gloss, the ground's mirror image, and diffuse light: f [..., bands], 1/sr."""
     coat = stack.coat
     total = brdf.ggx(
         wi, wo, roughness=coat.roughness, fresnel=lambda c: layered.at_cosine(coat.sheet.reflectance, c)

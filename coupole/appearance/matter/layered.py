@@ -3,8 +3,8 @@
 The sheet is the interface between air and the body's medium: a bare surface, or thin films. Part of the light is
 reflected by the sheet's facets (GGX); the rest enters, is scattered by the body and leaves again, partly after
 reflection at the sheet's inner side. Energy is conserved by construction: light that is not reflected at an angle
-enters or is absorbed there, and the emerging light has the angular distribution of the sheet's transmittance, so
-that the result is reciprocal.
+enters or is absorbed there. The emerging light has the angular distribution of the sheet's transmittance, so that
+the result is reciprocal.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Sheet:
     internal_reflectance: Array
     """[bands], for diffuse light from the body."""
     internal_transmittance: Array
-    """[bands], to air, for diffuse light from the body; the remainder to 1 is absorbed in the sheet."""
+    """[bands], to air, for diffuse light from the body; the sheet absorbs the rest."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,12 @@ class Coat:
     entering: Array
     """[angles, bands], share of light from each angle that reaches the body."""
     leaving: Array
-    """[angles, bands], share of diffuse light from the body that leaves, times pi, per projected solid angle."""
+    """[angles, bands], share of diffuse light from the body that leaves per projected solid angle, times pi."""
 
 
 def sheet(films: Sequence[thin_film.Film], body_index: float) -> Sheet:
-    """The sheet made by `films` (from the air inwards; none for a bare surface) over a body of real index > 1."""
+    """Return the sheet made by `films` over a body of real index > 1. The films are in order from the air inwards;
+    none make a bare surface."""
     within("index of the body", body_index, 1.0 + 1e-9, 10.0)
     outwards = tuple(reversed(films))
 
@@ -84,9 +85,10 @@ def sheet(films: Sequence[thin_film.Film], body_index: float) -> Sheet:
 
 
 def coat(smooth: Sheet, roughness: float) -> Coat:
-    """The sheet on a rough surface, in facets of GGX `roughness`.
+    """Return the sheet on a rough surface, in facets of GGX `roughness`.
 
-    Of the light that it does not reflect at an angle, the rough sheet transmits the same share as the smooth one.
+    At each angle the rough sheet transmits the same share of the light that it does not reflect as the smooth
+    sheet.
     """
     remainder = 1.0 - _facets(roughness) @ smooth.reflectance
     entering = remainder * smooth.transmittance / np.maximum(1.0 - smooth.reflectance, 1e-12)
@@ -94,7 +96,7 @@ def coat(smooth: Sheet, roughness: float) -> Coat:
 
 
 def layered_brdf(wi: Array, wo: Array, *, coat: Coat, body: InternalReflectance) -> Array:
-    """The coat's gloss, and the light of the body [bands] through it."""
+    """Return the sum of the coat's gloss and the light of the body [bands] through the coat."""
     gloss = brdf.ggx(wi, wo, roughness=coat.roughness, fresnel=lambda c: at_cosine(coat.sheet.reflectance, c))
     exchange = at_cosine(coat.entering, wi[..., 2]) * at_cosine(coat.leaving, wo[..., 2])
     above = ((wi[..., 2] > 0.0) & (wo[..., 2] > 0.0))[..., None]
@@ -102,13 +104,14 @@ def layered_brdf(wi: Array, wo: Array, *, coat: Coat, body: InternalReflectance)
 
 
 def emerging(sheet: Sheet, body: InternalReflectance) -> Array:
-    """Share [bands] of the entering light that leaves again, with all reflections between sheet and body."""
+    """Return the share [bands] of the entering light that leaves again, after all reflections between sheet and
+    body."""
     r = body.values
     return np.asarray(sheet.internal_transmittance * r / (1.0 - sheet.internal_reflectance * r))
 
 
 def at_cosine(table: Array, cosines: Array) -> Array:
-    """Values [..., bands] of a table [angles, bands] at cosines [...]."""
+    """Return values [..., bands] of a table [angles, bands] at cosines [...]."""
     place = np.sqrt(np.clip(cosines, 0.0, 1.0)) * (_ANGLES - 1)
     low = np.minimum(place.astype(int), _ANGLES - 2)
     share = (place - low)[..., None]
@@ -116,13 +119,13 @@ def at_cosine(table: Array, cosines: Array) -> Array:
 
 
 def _over_angles(table: Array) -> Array:
-    """2 times the integral of table(mu) mu over the cosine mu: [bands]."""
+    """Return 2 times the integral of table(mu) mu over the cosine mu: [bands]."""
     mu = 0.5 * (_GAUSS + 1.0)
     return np.asarray(_GAUSS_WEIGHTS * mu @ at_cosine(table, mu))
 
 
 def _facets(roughness: float) -> Array:
-    """[angles, angles]: row i holds the share of the light from angle i that GGX facets reflect, by local angle at
+    """[angles, angles]: row i has the share of the light from angle i that GGX facets reflect, by local angle at
     the facet.
 
     The product of this table with a sheet's reflectances gives those of the rough sheet. Facets are weighted by

@@ -1,12 +1,13 @@
 """Makie: decomposition of a photograph of metal powder on lacquer (seed 002, section 4).
 
-A pixel of the picture is T = p m + sum of q_l c_l: m is the colour of the metallic finish alone, c_l those of up
-to three lacquers, photographed under the same light, all linear and not negative. p becomes the alpha channel: the
-weight of the metallic BRDF. The residual T - p m becomes the colour channels: the lacquers' diffuse light.
+A pixel of the picture is T = p m + sum of q_l c_l: m is the colour of the metallic finish alone, and c_l are the
+colours of up to three lacquers. All are photographed under the same light, linear and not negative. p becomes the
+alpha channel: the weight of the metallic BRDF. The residual T - p m becomes the colour channels: the lacquers'
+diffuse light.
 
 With three lacquers there are four unknowns and three channels. Eq. 4 takes the largest p that leaves no lacquer
-negative, which is exact where at least one lacquer whose m' is positive is absent, and too large elsewhere. Where
-the weights are known to sum to 1 (inside the drawing), p follows without that assumption. With one or two lacquers
+negative. This is exact where at least one lacquer with positive m' is absent, and too large elsewhere. Where the
+weights are known to sum to 1 (inside the drawing), p is found without this assumption. With one or two lacquers
 the system is determined, and is solved by least squares.
 """
 
@@ -24,7 +25,7 @@ from coupole.errors import InputError
 
 _SINGULAR = 1e-9
 _SUM_IS_ONE = 1e-3
-"""Largest departure of a sum from 1: if the metal's weights m' sum to 1 within this, the sum does not determine
+"""Largest deviation of a sum from 1. If the metal's weights m' sum to 1 within this, the sum does not determine
 p."""
 
 
@@ -37,7 +38,7 @@ class Makie:
     residual: Array
     """[..., 3], the lacquers' part of the picture, in its unit."""
     clamped_share: float
-    """Share of the pixels whose p was beyond 0 or 1 by more than rounding: noise, shadow or a wrong sample
+    """Share of the pixels with p outside 0 to 1 by more than rounding, because of noise, shadow or a wrong sample
     colour."""
 
 
@@ -73,7 +74,7 @@ def makie_brdf(wi: Array, wo: Array, *, alpha: float, residual: ArrayLike, metal
 
 
 def _three_lacquers(t: Array, m: Array, c: Array, region: str) -> Array:
-    """Eqs 2 to 4."""
+    """Decompose by Eqs 2 to 4."""
     if abs(np.linalg.det(c)) < _SINGULAR * np.prod(np.linalg.norm(c, axis=1)):
         raise InputError(
             "makie: expected three lacquers of independent colours; these lie in one plane; give two of them"

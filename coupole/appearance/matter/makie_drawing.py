@@ -25,17 +25,18 @@ _HALF_LINE = 0.014
 def motif(name: Motif, period_mm: float, edge_mm: float) -> Drawing:
     """A motif repeated every `period_mm`: blue-sea waves (seigaiha) or five-petalled flowers in staggered rows.
 
-    Over `edge_mm` the share falls from 1 in the line to 0, as powder scatters beside it.
+    Over the width `edge_mm` the share falls from 1 in the line to 0, because powder scatters beside the line.
     """
     distance = {"waves": _waves, "flowers": _flowers}[name]
     return lambda places_mm: np.clip(0.5 - distance(places_mm / period_mm) * period_mm / edge_mm, 0.0, 1.0)
 
 
 def picture(path: Path, width_mm: float) -> Drawing:
-    """A picture `width_mm` wide about the origin, upright along +y; none beside it.
+    """Return a picture, `width_mm` wide, with its centre at the origin, upright along +y. Outside the picture the
+    share is 0.
 
-    Its alpha channel is the share if it has one (as `coupole makie` makes it), otherwise its grey value over
-    white: white is metal. Values are taken as they are, without a transfer function. Raises InputError.
+    Its alpha channel is the share if it has one (as `coupole makie` makes it), otherwise its grey value divided by
+    white, so that white is metal. Values are used without a transfer function. Raises InputError.
     """
     share = _shares(path)
     rows, columns = share.shape
@@ -66,7 +67,8 @@ def _shares(path: Path) -> Array:
 
 
 def _waves(place: Array) -> Array:
-    """Distance to the line, negative in it, both in periods: rows of ringed disks, each over the one above it."""
+    """Return the distance to the line, in periods, negative inside the line. The motif has rows of ringed disks;
+    each row covers part of the row above it."""
     lowest = np.floor(4.0 * place[:, 1]) - 2.0
     distance, is_covered = np.full(len(place), np.inf), np.zeros(len(place), bool)
     for row in range(5):
@@ -81,7 +83,7 @@ def _waves(place: Array) -> Array:
 
 
 def _flowers(place: Array) -> Array:
-    """Distance to petals and hearts, negative in them, in periods: petals have a bare vein."""
+    """Return the distance to petals and hearts, in periods, negative inside them. Petals have a bare vein."""
     row = np.round(place[:, 1] / 0.75)
     x = np.mod(place[:, 0] - 0.5 * np.mod(row, 2.0) + 0.5, 1.0) - 0.5
     y = place[:, 1] - 0.75 * row

@@ -18,12 +18,12 @@ from coupole.errors import InputError
 _STEPS = (90, 90, 180)
 _BYTES = 12 + 3 * 8 * 90 * 90 * 180
 _SCALES = (1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0)
-"""Scales of the database: a value is what is stored, times the scale of its colour."""
+"""Scales of the database: a value is the stored number times the scale of its colour."""
 
 
 def read_merl(path: Path) -> Brdf:
-    """[..., 3] per steradian, linear between the middles of steps. Below the horizon, where nothing is stored, the
-    last value above it holds. Raises InputError for another kind of file."""
+    """[..., 3] per steradian, linear between the middles of steps. Below the horizon nothing is stored; there the
+    last value above it is used. Raises InputError for another kind of file."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -1,8 +1,9 @@
 """Nashiji: metal flakes at random depths in clear lacquer (seed 002, section 5).
 
 A flake is a superquadric (Barr 1981), |x/a|^(2/e2) + |y/b|^(2/e2) to the power e2/e1, plus |z/c|^(2/e1), equal to
-1: a, b, c are its half axes. Flakes lie in a slab of lacquer whose surface is z = 0 and whose substrate is at z =
--depth; x and y go from 0 to the slab's size. The same slab and seed give the same flakes. Flakes may intersect.
+1: a, b, c are its half axes. Flakes lie in a slab of lacquer with its surface at z = 0 and its substrate at z =
+-depth; x and y go from 0 to the slab's size. The same slab with the same seed has the same flakes. Flakes may
+intersect.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from coupole.errors import InputError
 
 @dataclass(frozen=True)
 class Slab:
-    """A piece of nashiji; defaults are assumed, of the paper's order of magnitude (depth below 1 mm)."""
+    """A piece of nashiji. Defaults are assumed, with the paper's order of magnitude (depth below 1 mm)."""
 
     size_mm: tuple[float, float] = (20.0, 20.0)
     depth_mm: float = 0.4
@@ -28,21 +29,22 @@ class Slab:
     radius_spread: float = 0.3
     """Standard deviation of the logarithm of the radius."""
     elongation_spread: float = 0.2
-    """... of the logarithm of b/a."""
+    """Standard deviation of the logarithm of b/a."""
     flake_thickness_mm: float = 0.002
-    """2 c: a beaten foil cut into flakes."""
+    """2 c: thickness of a beaten foil that is cut into flakes."""
     tilt_deg: float = 8.0
-    """Root mean square slope of the flakes out of the slab's plane, as an angle."""
+    """Root mean square slope of the flakes against the slab's plane, as an angle."""
     roundness: tuple[float, float] = (0.3, 0.8)
-    """e1 and e2: 1 is an ellipsoid, towards 0 a box."""
+    """e1 and e2: 1 gives an ellipsoid; values near 0 give a box."""
     seed: int = 1
     flattens: bool = False
-    """True if a flake too steep for the lacquer is tilted only as far as it fits; else it is refused."""
+    """True if a flake that is too steep for the lacquer is tilted only as far as it fits; if False, it is
+    refused."""
 
 
 @dataclass(frozen=True)
 class Flakes:
-    """n flakes: `slab_from_flake` rotations, centres and half axes."""
+    """n flakes: rotations `slab_from_flake`, centres and half axes."""
 
     slab: Slab
     centres_mm: Array
@@ -88,9 +90,9 @@ def flakes(slab: Slab) -> Flakes:
 
 
 def triangulate(all_flakes: Flakes, *, around: int = 24, along: int = 6) -> tuple[Array, NDArray[np.int64]]:
-    """Corners [n * m, 3] in mm and triangles [n * k, 3] of all flakes, normals outwards, each flake closed.
+    """Return corners [n * m, 3] in mm and triangles [n * k, 3] of all flakes, normals outwards, each flake closed.
 
-    `around` corners about the normal on each of `along` - 1 rings between two poles.
+    There are `around` corners about the normal on each of the `along` - 1 rings between two poles.
     """
     e1, e2 = all_flakes.slab.roundness
     eta = np.linspace(-0.5 * np.pi, 0.5 * np.pi, along + 1)[1:-1]
@@ -106,17 +108,18 @@ def triangulate(all_flakes: Flakes, *, around: int = 24, along: int = 6) -> tupl
 
 
 def settle_flakes(all_flakes: Flakes, tops_mm: Array, frames: Array) -> Flakes:
-    """The same flakes, each at its depth and tilt under a place [n, 3] of another surface than the slab's.
+    """Return the same flakes, each with its depth and tilt, under a place [n, 3] of another surface.
 
-    `frames` [n, 3, 3] there have the surface's outward normals as third columns. Where the surface is curved, a
-    flake is as flat as before: that is a deviation of its radius squared over twice the surface's radius.
+    The third columns of `frames` [n, 3, 3] are the surface's outward normals at these places. A flake stays flat
+    even where the surface is curved. So it deviates from the surface by its radius squared over twice the
+    surface's radius.
     """
     centres = tops_mm + all_flakes.centres_mm[:, 2:] * frames[:, :, 2]
     return replace(all_flakes, centres_mm=centres, slab_from_flake=frames @ all_flakes.slab_from_flake)
 
 
 def _power(base: Array, exponent: float) -> Array:
-    """Signed power, which the superquadric's angles need."""
+    """Return a signed power, which the superquadric's angles need."""
     return np.sign(base) * np.abs(base) ** exponent
 
 
@@ -131,7 +134,7 @@ def _about_y(angle: Array) -> Array:
 
 
 def _faces(around: int, along: int) -> NDArray[np.int64]:
-    """Triangles of one flake: a fan about each pole, two triangles for each field between rings."""
+    """Return the triangles of one flake: a fan about each pole, and two triangles for each field between rings."""
     k = np.arange(around)
     after = (k + 1) % around
     last = 1 + (along - 2) * around

@@ -1,6 +1,6 @@
-"""Paints by their K and S in a plain file: what `coupole layer` writes, and recipes and scene files read.
+"""Paints by their K and S in a plain file. `coupole layer` writes it, and recipes and scene files read it.
 
-The head is YAML in lines that begin with `#`; below are columns, comma-separated, with a line of their names::
+The head is YAML in lines that begin with `#`. Below it are comma-separated columns, with a line of their names::
 
     # coupole: paint 1
     # name: azurite, coarse
@@ -45,26 +45,27 @@ class PaintFile:
     unit: Unit
     binder_index: float
     wavelengths_nm: Array
-    """[n], rising."""
+    """[n], in rising order."""
     absorption: Array
     scattering: Array
     u_absorption: Array
-    """0 where nothing is known of it."""
+    """Standard uncertainty of K; 0 if it is not known."""
     u_scattering: Array
     head_lines: Mapping[str, Any] = field(default_factory=dict)
-    """Other lines of the head: how it was measured."""
+    """Other lines of the head, about the measurement."""
     other: Mapping[str, Array] = field(default_factory=dict)
     """Further columns [n], such as those of four fluxes."""
 
     def on_grid(self) -> Pigment:
-        """Return the paint as a pigment on 380 to 780 nm, linear between its wavelengths, its ends held."""
+        """Return the paint as a pigment on 380 to 780 nm, linear between its wavelengths and constant beyond its
+        ends."""
         return Pigment(
             self.name,
             *(np.interp(WAVELENGTHS_NM, self.wavelengths_nm, v) for v in (self.absorption, self.scattering)),
         )
 
     def covered_bands(self) -> NDArray[np.bool_]:
-        """[81] of bool: the bands that were measured."""
+        """[81] True for bands that were measured."""
         nm = self.wavelengths_nm
         return np.asarray((nm[0] - STEP_NM / 2 <= WAVELENGTHS_NM) & (nm[-1] + STEP_NM / 2 >= WAVELENGTHS_NM))
 
@@ -94,7 +95,7 @@ def encode(paint: PaintFile) -> str:
 
 
 def read_paint(path: Path) -> PaintFile:
-    """The paint in a file. Raises InputError with file and line."""
+    """Read the paint in a file. Raises InputError with file and line."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -131,7 +132,7 @@ def read_paint(path: Path) -> PaintFile:
 
 
 def _head(text: str, path: Path) -> tuple[dict[str, Any], int, list[str]]:
-    """The head, the number of the line of names, and the lines from there."""
+    """Return the head, the number of the line of names, and the lines from that one on."""
     lines = text.splitlines()
     end = next((at for at, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
     head_text = "\n".join(line[1:].strip(" ") for line in lines[1:end])

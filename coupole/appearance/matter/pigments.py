@@ -1,7 +1,7 @@
 """One pigment's absorption and scattering (Kubelka and Munk, `kubelka_munk`).
 
-A pigment has absorption K and scattering S [81] per mm at full concentration in its binder. Where only opaque
-samples were measured, K and S are relative to the scattering of a white: enough for opaque paints.
+A pigment has absorption K and scattering S [81] per mm at full concentration in its binder. If only opaque samples
+were measured, K and S are relative to the scattering of a white, which is enough for opaque paints.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Pigment:
 
 
 def from_opaque(name: str, reflectance: InternalReflectance, scattering: ArrayLike = 1.0) -> Pigment:
-    """A pigment of known relative scattering, from an opaque sample's reflectance [bands]."""
+    """Return a pigment with known relative scattering, from an opaque sample's reflectance [bands]."""
     s = np.broadcast_to(np.asarray(scattering, dtype=float), reflectance.values.shape)
     return Pigment(name, kubelka_munk.k_over_s(reflectance.values) * s, s)
 

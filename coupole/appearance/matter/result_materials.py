@@ -24,9 +24,10 @@ _LOBES = 12
 def read_result(
     folder: Path, fit: str = "ggx", *, cluster: int | None = None, triangles: Sequence[int] | None = None
 ) -> Brdf:
-    """[..., 3] of one cluster, or of the mean over triangles by their numbers in the mesh (all if not given).
+    """[..., 3] BRDF of one cluster, or of the mean over triangles, given by their numbers in the mesh (all by
+    default).
 
-    A mean is that of the triangles' f, each about its own normal, with the lobes in `_LOBES` groups of alike
+    A mean is over the triangles' f, each about its own normal, with the lobes in `_LOBES` groups of similar
     roughness. `fit` is a fit of the result that has a material for each triangle. Raises InputError.
     """
     if cluster is not None:
@@ -59,7 +60,8 @@ def _mixed_brdf(wi: Array, wo: Array, *, kd: Array, lobes: Sequence[tuple[Array,
 
 
 def _read_materials(folder: Path, name: str) -> tuple[Array, Array, Array, Array]:
-    """Numbers [n] of triangles (of `clusters`: of themselves), kd and ks [n, 3], alpha [n]."""
+    """Return the numbers [n] of triangles (or of the clusters themselves, with `clusters`), kd and ks [n, 3],
+    alpha [n]."""
     path = folder / "fits" / f"{name}.h5"
     if not path.is_file():
         does = "cluster" if name == _CLUSTERS else "fit"

@@ -1,10 +1,10 @@
-"""Measured materials as RGL's tensor files hold them (`.bsdf`): a table that adapts to its material (Dupuy and
-Jakob, An adaptive parameterization for efficient material acquisition and rendering, ACM TOG 37(6), 2018; files of
-their database).
+"""Measured materials in RGL's tensor files (`.bsdf`). The table adapts to its material (Dupuy and Jakob, An
+adaptive parameterization for efficient material acquisition and rendering, ACM TOG 37(6), 2018; files of their
+database).
 
 The half vector is placed in the unit square by (sqrt(2 theta / pi), phi / (2 pi) + 1/2). For each direction of
-incidence a density over that square, `vndf`, warps it: columns and rows of the values are evenly spaced in the
-cumulative density. A value is f cos(theta_o), divided by ndf / (4 sigma) where `jacobian` says so.
+incidence, the square is warped by a density over it, `vndf`: columns and rows of the values are evenly spaced in
+the cumulative density. A value is f cos(theta_o), divided by ndf / (4 sigma) if `jacobian` says so.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from coupole.errors import InputError
 Floats32 = NDArray[np.float32]
 Indices = NDArray[np.intp]
 Weighted = list[tuple[Indices, Array]]
-"""Slices of a table, each with its share; [n] each."""
+"""Slices of a table, each with its weight; [n] each."""
 _MAGIC = b"tensor_file\0\1\0"
 _DTYPES = {
     1: np.uint8, 2: np.int8, 3: np.uint16, 4: np.int16, 5: np.uint32, 6: np.int32, 7: np.uint64, 8: np.int64,
     9: np.float16, 10: np.float32, 11: np.float64,
 }  # fmt: skip
 _ISOTROPIC = 2
-"""Greatest number of azimuths of incidence."""
+"""Largest number of azimuths of incidence in an isotropic table."""
 _CHUNK = 1 << 15
-"""Directions that are looked up together."""
+"""Number of directions that are looked up together."""
 _WHAT = "expected a material of RGL's tensor format"
 
 
@@ -42,11 +42,11 @@ class RglTable:
     """A table as a `Brdf`: call it with unit directions [..., 3] to light and eye."""
 
     phi_i: Array
-    """[P] azimuths of incidence, rad; of isotropic materials one or two."""
+    """[P] azimuths of incidence, rad; one or two for isotropic materials."""
     theta_i: Array
-    """[T] rad, rising."""
+    """[T] elevations of incidence, rad, in rising order."""
     ndf: Array
-    """[h, w] rows of azimuth, columns of elevation, as all planes here."""
+    """[h, w] with rows of azimuth and columns of elevation, as in all planes here."""
     sigma: Array
     vndf: Array
     """[P, T, h, w]"""
@@ -74,11 +74,11 @@ class RglTable:
         return len(self.phi_i) <= _ISOTROPIC
 
     def seen_with(self, weights: Array) -> RglTable:
-        """The same with other channels, sums of its own by `weights` [new, channels]."""
+        """Return the same table with other channels: sums of its own, weighted by `weights` [new, channels]."""
         return replace(self, values=np.asarray(self.values @ weights.T, np.float32), wavelengths_nm=None)
 
     def _looked_up(self, wi: Array, wo: Array) -> Array:
-        """[n, channels] of directions [n, 3] above the horizon."""
+        """[n, channels] values for directions [n, 3] above the horizon."""
         cosine = wo[:, 2:]
         wi, wo = self._in_the_measured_part(wi, wo)
         half = wi + wo
@@ -101,7 +101,8 @@ class RglTable:
         return np.asarray(np.maximum(values, 0.0) / cosine)
 
     def _in_the_measured_part(self, wi: Array, wo: Array) -> tuple[Array, Array]:
-        """Directions turned or mirrored to where incidence was measured, if that is a half or a quarter of all."""
+        """Return directions that are turned or mirrored into the measured range of incidence, if that is a half or
+        a quarter of all azimuths."""
         if self.isotropic:
             return wi, wo
         parts = round(2.0 * np.pi / float(self.phi_i[-1] - self.phi_i[0]))
@@ -114,7 +115,7 @@ class RglTable:
         return wi * signs, wo * signs
 
     def _slices(self, phi_i: Array, theta_i: Array) -> Weighted:
-        """Numbers of slices [P, T], flat, with their shares."""
+        """Return the numbers of slices, as flat indices of [P, T], with their weights."""
         slices: Weighted = []
         for row, share_of_row in _neighbours(self.phi_i, phi_i):
             for column, share in _neighbours(self.theta_i, theta_i):
@@ -123,8 +124,8 @@ class RglTable:
 
     @cached_property
     def _cumulative(self) -> tuple[Array, Array, Array]:
-        """Density [slices, h, w] of each slice, its integral along columns, and that of the rows' totals
-        [slices, h]; of a whole of 1 in units of the nodes' distances."""
+        """Density [slices, h, w] of each slice, its integral along columns, and the integral of the rows' totals
+        [slices, h]. They are normalised to a whole of 1, in units of the nodes' distances."""
         density = self.vndf.reshape(-1, *self.vndf.shape[2:])
         along = np.zeros_like(density)
         along[..., 1:] = np.cumsum(0.5 * (density[..., 1:] + density[..., :-1]), axis=2)
@@ -134,8 +135,8 @@ class RglTable:
         return density / whole[:, None, None], along / whole[:, None, None], rows / whole[:, None]
 
     def _unwarped_positions(self, u: Array, slices: Weighted) -> Array:
-        """[n, 2] where in the warped square half vectors [n, 2] are: share of the row's density to the left of
-        it, share of all density below it."""
+        """[n, 2] positions of half vectors [n, 2] in the warped square: the share of the row's density to the
+        left, and the share of all density below."""
         density, along, rows = self._cumulative
         height, width = density.shape[1:]
         column, x = _cell(u[:, 0], width)
@@ -160,8 +161,8 @@ class RglTable:
 
 
 def read_bsdf(path: Path) -> RglTable:
-    """Raises InputError for a file that is not there, of another kind, cut short, or whose tables do not belong
-    together."""
+    """Read a file. Raises InputError if the file is missing, of another kind or cut short, or if its tables do not
+    belong together."""
     fields = read_fields(path)
 
     def field(name: str, *shape: int | None) -> Array:
@@ -206,7 +207,7 @@ def read_bsdf(path: Path) -> RglTable:
 
 
 def read_fields(path: Path) -> dict[str, NDArray[np.generic]]:
-    """Fields of a tensor file by name, as they are. Raises InputError."""
+    """Read the fields of a tensor file by name, unchanged. Raises InputError."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -219,7 +220,7 @@ def _densities(grid: tuple[int, int]) -> dict[str, tuple[int | None, ...]]:
 
 
 def _fields(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]:
-    """Fields of a tensor file by name. Raises InputError."""
+    """Return the fields of a tensor file by name. Raises InputError."""
     if not data.startswith(_MAGIC):
         raise InputError(f"{path}: {_WHAT}, version 1.0, which begins with `tensor_file`; found {data[:12]!r}")
     fields: dict[str, NDArray[np.generic]] = {}
@@ -242,7 +243,7 @@ def _fields(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]:
 
 
 def _elevation(ways: Array) -> Array:
-    """[n] angle to the normal, exact near it, of unit directions [n, 3]."""
+    """[n] angles between unit directions [n, 3] and the normal, exact near it."""
     chord = np.sqrt(ways[:, 0] ** 2 + ways[:, 1] ** 2 + (ways[:, 2] - 1.0) ** 2)
     return np.asarray(2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0)))
 
@@ -256,14 +257,14 @@ def _of_phi(phi: Array) -> Array:
 
 
 def _cell(u: Array, nodes: int) -> tuple[Indices, Array]:
-    """The node at or below places [n] of 0 to 1, and the share of the next."""
+    """Return the node at or below places [n] in 0 to 1, and the weight of the next node."""
     at = np.clip(u, 0.0, 1.0) * (nodes - 1)
     low = np.minimum(at.astype(np.intp), nodes - 2)
     return low, at - low
 
 
 def _neighbours(nodes: Array, at: Array) -> Weighted:
-    """Nodes around values [n], with their shares; beyond the last node it holds."""
+    """Return the nodes around values [n], with their weights. Beyond the last node, this node has all weight."""
     if len(nodes) == 1:
         return [(np.zeros(len(at), np.intp), np.ones(len(at)))]
     low = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, len(nodes) - 2)
@@ -272,7 +273,8 @@ def _neighbours(nodes: Array, at: Array) -> Weighted:
 
 
 def _bilinear(planes: Array | Floats32, slices: Weighted, u: Array) -> Array:
-    """[n, channels] of planes [P, T, rows, columns, channels] at places [n, 2]: column, row, each 0 to 1."""
+    """[n, channels] interpolated values of planes [P, T, rows, columns, channels] at places [n, 2]: column, row,
+    each 0 to 1."""
     height, width, channels = planes.shape[2:]
     flat = planes.reshape(-1, height, width, channels)
     column, x = _cell(u[:, 0], width)

@@ -1,6 +1,6 @@
-"""Tables of RGL's tensor format as they are written: nodes, what directions are drawn by, and the file.
+"""Writing of tables in RGL's tensor format: nodes, the density for drawing directions, and the file.
 
-Half vectors are not warped by `vndf`; what changes fast with the half vector's elevation is left to `ndf`
+Half vectors are not warped by `vndf`; `ndf` holds the fast change with the half vector's elevation
 (docs/decisions/0038).
 """
 
@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from coupole.appearance.matter.brdf import Brdf
 
 _LEAST_DRAWN = 1e-3
-"""Share of the mean density that is added everywhere, so that all that reflects is drawn at times."""
+"""Share of the mean density that is added everywhere, so that all reflecting directions are drawn at times."""
 _NDF = 4.0
-"""Value of `ndf`: over 4 sigma it is 1."""
+"""Value of `ndf`: divided by 4 sigma it is 1."""
 _TYPES = {"uint8": 1, "float32": 10}
 
 
 def half_vectors(side: int) -> NDArray[np.float64]:
-    """[side, side, 3] unit vectors of the rows and columns."""
+    """[side, side, 3] unit vectors for the rows and columns."""
     steps = np.linspace(0.0, 1.0, side)
     phi_m, theta_m = np.meshgrid((2.0 * steps - 1.0) * np.pi, 0.5 * np.pi * steps**2, indexing="ij")
     sine = np.sin(theta_m)
@@ -30,14 +30,15 @@ def half_vectors(side: int) -> NDArray[np.float64]:
 
 
 def way_in(theta_i: float) -> NDArray[np.float64]:
-    """[3] at azimuth 0, and above the horizon."""
+    """[3] direction at azimuth 0, and above the horizon."""
     return np.array([np.sin(theta_i), 0.0, max(np.cos(theta_i), 1e-6)])
 
 
 def cosine_weighted(
     reflectance: Brdf, theta_i: NDArray[np.float32], half: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """[1, theta_i, channels, rows, columns] f cos(theta_o) of half vectors [rows, columns, 3]; 0 from below."""
+    """[1, theta_i, channels, rows, columns] f cos(theta_o) of half vectors [rows, columns, 3]; 0 for light from
+    below."""
     slices = []
     ways = half.reshape(-1, 3)
     for theta in theta_i.astype(np.float64):
@@ -49,11 +50,12 @@ def cosine_weighted(
 
 
 def nodes_for_linear_reading(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Nodes [1, theta_i, channels, phi, theta_m] whose linear interpolation has the smallest error, from values
-    there.
+    """Return nodes [1, theta_i, channels, phi, theta_m] with the smallest error of linear interpolation, from the
+    values at the nodes.
 
-    Between values h apart it misses f by f'' h^2 t (1 - t) / 2, in the mean by f'' h^2 / 12, on each axis: that
-    much is taken from the nodes, of h before and after them, but not where f ends at the horizon.
+    Between nodes at a distance h, the interpolation differs from f by f'' h^2 t (1 - t) / 2, on average by f'' h^2
+    / 12, on each axis. This amount is subtracted from the nodes, with h before and after them, but not where f
+    ends at the horizon.
     """
     node_values = values.copy()
     even = np.linspace(0.0, 1.0, values.shape[3])
@@ -72,8 +74,9 @@ def nodes_for_linear_reading(values: NDArray[np.float32], theta_i: NDArray[np.fl
 
 
 def drawn_by(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[1, theta_i, rows, columns] `luminance`, by which renderers draw directions: the light that a step of rows
-    and columns reflects, of `values` f cos(theta_o). Its ways out take a solid angle as (wi m) u sin(theta_m)."""
+    """[1, theta_i, rows, columns] `luminance`, by which renderers draw directions. It is the light that a step of
+    rows and columns reflects, from `values` f cos(theta_o). The solid angle of its outgoing directions is in
+    proportion to (wi m) u sin(theta_m)."""
     half = half_vectors(values.shape[-1])
     u = np.linspace(0.0, 1.0, values.shape[-1])
     lights = np.stack([way_in(float(theta)) for theta in theta_i])
@@ -85,8 +88,8 @@ def drawn_by(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArr
 def fields_of(
     theta_i: NDArray[np.float32], rgb: NDArray[np.float32], luminance: NDArray[np.float32], text: str
 ) -> dict[str, NDArray[np.float32] | NDArray[np.uint8]]:
-    """Return the fields of an isotropic file whose half vectors are not warped, and whose values are not divided
-    by anything."""
+    """Return the fields of an isotropic file with half vectors that are not warped and values that are not
+    divided."""
     return {
         "theta_i": theta_i,
         "phi_i": np.zeros(1, np.float32),
@@ -101,7 +104,7 @@ def fields_of(
 
 
 def tensors(fields: Mapping[str, NDArray[Any]]) -> bytes:
-    """A tensor file: its head, then the fields, each at a multiple of 8 bytes."""
+    """Return the bytes of a tensor file: its head, then the fields, each at a multiple of 8 bytes."""
     size = 12 + 2 + 4 + sum(2 + len(name) + 2 + 1 + 8 + 8 * values.ndim for name, values in fields.items())
     head = [b"tensor_file\0", bytes([1, 0]), len(fields).to_bytes(4, "little")]
     blocks: list[bytes] = []

@@ -1,10 +1,10 @@
-"""Diffuse light in a layer of grains by radiative transfer, where Kubelka and Munk have two fluxes.
+"""Diffuse light in a layer of grains by radiative transfer, instead of the two fluxes of Kubelka and Munk.
 
 Radiances at `DIRECTIONS` cosines for each hemisphere are followed through the layer by doubling: the matrices of a
 very thin layer are a series of second order, and the layer is made twice as thick 14 times (van de Hulst, "A new
-look at multiple scattering", 1963; Hansen and Travis, Space Sci. Rev. 16, 1974, section 3). The grains scatter as
-Henyey and Greenstein have it (Astrophys. J. 93, 1941), with the mean cosine as the only parameter. Light that a
-grain sends nearly straight on counts as not scattered (delta-M, Wiscombe, J. Atmos. Sci. 34, 1977).
+look at multiple scattering", 1963; Hansen and Travis, Space Sci. Rev. 16, 1974, section 3). The grains scatter by
+Henyey and Greenstein (Astrophys. J. 93, 1941), with the mean cosine as the only parameter. Light that a grain
+scatters nearly straight on counts as not scattered (delta-M, Wiscombe, J. Atmos. Sci. 34, 1977).
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from numpy.polynomial import legendre
 from coupole.appearance.spectra.grid import Array
 
 DIRECTIONS = 10
-"""Cosines for each hemisphere, Gauss and Legendre's on 0 to 1."""
+"""Number of cosines for each hemisphere, at Gauss-Legendre points from 0 to 1."""
 _DOUBLINGS = 14
 
 
 def diffuse_response(absorption: Array, scattering: Array, mean_cosine: float) -> tuple[Array, Array]:
     """Reflectance and transmittance [n] of a layer under Lambertian light; absorption and scattering [n] are
-    optical depths, `mean_cosine` is that of one scattering, from 0 up to 0.9."""
+    optical depths, `mean_cosine` is the mean cosine of one scattering, from 0 to 0.9."""
     cosines, weights, forward, backward = _directions(mean_cosine)
     straight_on = mean_cosine ** (2 * DIRECTIONS)
     optical_depth = np.asarray(scattering, float)[:, None, None] * (1.0 - straight_on)
@@ -43,8 +43,8 @@ def diffuse_response(absorption: Array, scattering: Array, mean_cosine: float) -
 
 @cache
 def _directions(mean_cosine: float) -> tuple[Array, Array, Array, Array]:
-    """Cosines and weights [DIRECTIONS], and the phase function averaged over azimuth, into the same and into the
-    other hemisphere [DIRECTIONS, DIRECTIONS]; its mean over all directions is 1."""
+    """Return cosines and weights [DIRECTIONS], and the phase function averaged over azimuth, into the same and
+    into the other hemisphere [DIRECTIONS, DIRECTIONS]. Its mean over all directions is 1."""
     nodes, weights = legendre.leggauss(DIRECTIONS)
     cosines, weights = 0.5 * (nodes + 1.0), 0.5 * weights
     orders = np.arange(2 * DIRECTIONS)

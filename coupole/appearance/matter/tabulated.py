@@ -1,11 +1,11 @@
 """A tabulated BRDF in coordinates about the specular direction (seed 002, section 3.1).
 
-For light from wi, the polar axis is its mirror direction s'; theta is the angle of wo to s', phi the angle about
-s' from the plane of incidence, upward side. The peak of a metallic finish is then always at theta = 0, and the
-grid of theta can be dense there and sparse elsewhere: nodes are placed so that the error of linear interpolation
-is the same everywhere. The surface is isotropic: phi goes from 0 to pi only, and of wi only the angle of incidence
-matters. The logarithm is interpolated, which keeps values positive; over phi, where it is even and periodic, by
-cosines, so that a few nodes are enough.
+For light from wi, the polar axis is its mirror direction s'; theta is the angle between wo and s', and phi is the
+angle about s' from the upper side of the plane of incidence. The peak of a metallic finish is then always at theta
+= 0, and the grid of theta can be dense there and sparse elsewhere: nodes are placed so that the error of linear
+interpolation is the same everywhere. The surface is isotropic: phi goes from 0 to pi only, and wi enters only by
+its angle of incidence. The logarithm is interpolated, which keeps values positive. Over phi it is even and
+periodic, and is interpolated by cosines, so that a few nodes are enough.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ _PROFILE = 2001
 _FLOOR = 1e-9
 """Zeros are replaced by this share of the peak, because they have no logarithm."""
 _HORIZON_Z = 0.01
-"""Lower values are ignored when nodes are placed: the bend at the horizon is an artefact of the table."""
+"""Lower values are ignored when nodes are placed, because the bend at the horizon is an artefact of the table."""
 _LOWEST_Z = 1e-3
-"""Directions of the grid below the horizon take the value just above it, for interpolation."""
+"""Grid directions below the horizon take the value just above it, for interpolation."""
 
 
 @dataclass(frozen=True)
 class SpecularTable:
-    """A BRDF on a grid of incidence and theta (radians, increasing) and of as many phi as there are cosines."""
+    """A BRDF on a grid of incidence and theta (radians, increasing), and of phi, with as many values as
+    cosines."""
 
     incidence: Array
     theta: Array
@@ -59,7 +60,7 @@ def tabulate(source: Brdf, incidence_deg: Array, *, theta_nodes: int = 40, phi_n
 
 
 def tabulated_brdf(wi: Array, wo: Array, *, table: SpecularTable) -> Array:
-    """The table's BRDF, averaged over exchange of wi and wo, which makes it reciprocal."""
+    """Return the table's BRDF, as the mean over both orders of wi and wo, which makes it reciprocal."""
     above = ((wi[..., 2] > 0.0) & (wo[..., 2] > 0.0))[..., None]
     return (
         above
@@ -69,7 +70,7 @@ def tabulated_brdf(wi: Array, wo: Array, *, table: SpecularTable) -> Array:
 
 
 def specular_coordinates(wi: Array, wo: Array) -> tuple[Array, Array, Array]:
-    """Angle of incidence, theta and phi [...] of two directions; inverse: `from_specular`."""
+    """Return the angle of incidence, theta and phi [...] of two directions; the inverse is `from_specular`."""
     mirror, upward, _ = _frame(wi)
     along, up = np.sum(wo * mirror, axis=-1), np.sum(wo * upward, axis=-1)
     across = np.linalg.norm(np.cross(mirror, wo), axis=-1)
@@ -82,7 +83,7 @@ def specular_coordinates(wi: Array, wo: Array) -> tuple[Array, Array, Array]:
 
 
 def from_specular(incidence: Array, theta: Array, phi: Array) -> tuple[Array, Array]:
-    """wi, in the plane y = 0, and wo [..., 3]."""
+    """Return wi, in the plane y = 0, and wo [..., 3]."""
     wi = directions(np.cos(incidence), np.zeros_like(incidence))
     mirror, upward, side = _frame(wi)
     sine = np.sin(theta)[..., None]
@@ -93,7 +94,8 @@ def from_specular(incidence: Array, theta: Array, phi: Array) -> tuple[Array, Ar
 
 
 def _frame(wi: Array) -> tuple[Array, Array, Array]:
-    """Mirror direction, the perpendicular to it in the plane of incidence on the upper side, and their cross."""
+    """Return the mirror direction, the perpendicular to it in the plane of incidence on the upper side, and their
+    cross product."""
     mirror = wi * np.array([-1.0, -1.0, 1.0])
     sine = np.hypot(wi[..., 0], wi[..., 1])
     # At normal incidence the azimuth is arbitrary, and f does not depend on it.
@@ -117,8 +119,8 @@ def _sample(source: Brdf, incidence: Array, theta: Array, phi: Array) -> tuple[A
 
 
 def _adapt(theta: Array, profiles: Array, cosines: Array, nodes: int) -> Array:
-    """`nodes` values of `theta`, dense where the logarithm of the profiles [i, theta, phi, bands] has high
-    curvature.
+    """Return `nodes` values of `theta`, which are dense where the logarithm of the profiles [i, theta, phi, bands]
+    has high curvature.
 
     Linear interpolation of log f over a step h has the error h^2 f (log f)''/8 in f: equal errors need steps
     proportional to the inverse square root of f (log f)''. A tenth of the nodes is spread evenly.
@@ -135,8 +137,8 @@ def _adapt(theta: Array, profiles: Array, cosines: Array, nodes: int) -> Array:
 
 
 def look_up(incidence: Array, theta: Array, phi: Array, table: SpecularTable) -> Array:
-    """The table [..., bands] at coordinates [...], for one order of the directions: not reciprocal between its
-    nodes."""
+    """The table [..., bands] at coordinates [...], for one order of the directions. It is not reciprocal between
+    its nodes."""
     cosines = np.cos(phi[..., None] * np.arange(table.log_cosines.shape[2]))
     first, second = _place(table.incidence, incidence), _place(table.theta, theta)
     total: Array = np.zeros(1)
@@ -147,7 +149,7 @@ def look_up(incidence: Array, theta: Array, phi: Array, table: SpecularTable) ->
 
 
 def _place(nodes: Array, at: Array) -> tuple[Indices, Indices, Array]:
-    """Nodes below and above, and the share of the latter; beyond the last node its value holds."""
+    """Return the nodes below and above, and the weight of the latter. Beyond the last node, its value is used."""
     last = len(nodes) - 1
     high = np.clip(np.searchsorted(nodes, at), min(1, last), last)
     low = np.maximum(high - 1, 0)

@@ -2,8 +2,8 @@
 
 They are no measurements, and no pigments: the shape that was once called azurite scores 0.62 against a measured
 azurite. Each is K/S as a sum of a floor, edges (reds and yellows: absorption below a wavelength) and bands (blues
-and greens), placed where the seeds and general knowledge of reflectance spectroscopy put them for paints of such a
-colour. Use `measured` for measured spectra, `paint_file` for measured K and S.
+and greens). Their wavelengths follow the seeds and general knowledge of reflectance spectroscopy for paints of
+such a colour. Use `measured` for measured spectra, `paint_file` for measured K and S.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class Shape:
 
     floor: float
     edges: tuple[tuple[float, float, float], ...] = ()
-    """height, wavelength of half height in nm, width in nm: absorbs below."""
+    """Height, wavelength of half height in nm, width in nm; the edge absorbs below this wavelength."""
     bands: tuple[tuple[float, float, float], ...] = ()
-    """height, centre in nm, standard deviation in nm."""
+    """Height, centre in nm, standard deviation in nm."""
 
 
 SHAPES: dict[str, Shape] = {
@@ -55,11 +55,11 @@ FORMER_NAMES = {
     "malachite": "green_shape",
     "green earth": "dull_green_shape",
 }
-"""Pigments' names that these shapes had, and scene files may still have."""
+"""Names of pigments that these shapes had formerly; scene files may still use them."""
 
 
 def reflectance(name: str) -> InternalReflectance:
-    """Assumed reflectance [81] of an opaque layer, inside its binder; a former name is understood."""
+    """Return the assumed reflectance [81] of an opaque layer, inside its binder; a former name is accepted."""
     shape = SHAPES.get(FORMER_NAMES.get(name, name))
     if shape is None:
         raise InputError(f"shape: expected one of {', '.join(SHAPES)}; found {name!r}; choose one of them")
@@ -73,7 +73,7 @@ def reflectance(name: str) -> InternalReflectance:
 
 
 def bole() -> InternalReflectance:
-    """The papers' bole, equal parts of red lead and red ochre (seed 001, section 5), of the assumed shapes of such
-    colours, by K/S of equal scattering; inside its binder."""
+    """Return the papers' bole, equal parts of red lead and red ochre (seed 001, section 5), inside its binder. It
+    is mixed from the assumed shapes of these colours, by K/S with equal scattering."""
     halves = [kubelka_munk.k_over_s(reflectance(name).values) for name in ("orange_shape", "dull_red_shape")]
     return InternalReflectance(kubelka_munk.opaque(0.5 * (halves[0] + halves[1])))

@@ -1,7 +1,7 @@
 """Reflection at one smooth interface, dielectric or metal.
 
-Complex indices are n + i k with k >= 0, for fields exp(-i omega t): waves decay into the material. The incident
-medium is transparent. Source of the formulas: Born and Wolf, Principles of Optics, sections 1.5 and 14.2.
+Complex indices are n + i k with k >= 0, for fields exp(-i omega t), so that waves decay into the material. The
+incident medium is transparent. Source of the formulas: Born and Wolf, Principles of Optics, sections 1.5 and 14.2.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def cos_inside(cos_outside: ArrayLike, outside: ArrayLike, inside: ArrayLike) ->
 def amplitudes(
     cos_outside: ArrayLike, cos_in: ArrayLike, outside: ArrayLike, inside: ArrayLike
 ) -> tuple[Complex, Complex, Complex, Complex]:
-    """r_s, r_p, t_s, t_p of the interface; all arguments broadcast and may be complex."""
+    """Return r_s, r_p, t_s, t_p of the interface; all arguments broadcast and may be complex."""
     c1, c2 = np.asarray(cos_outside, dtype=complex), np.asarray(cos_in, dtype=complex)
     n1, n2 = np.asarray(outside, dtype=complex), np.asarray(inside, dtype=complex)
     s, p = n1 * c1 + n2 * c2, n2 * c1 + n1 * c2
@@ -50,7 +50,8 @@ def reflectance(cos_outside: ArrayLike, inside: ArrayLike, outside: ArrayLike = 
 
 
 def of_index(inside: ArrayLike) -> Fresnel:
-    """The interface from air to an index [bands], as a function of the cosine for `brdf`."""
+    """Return the reflectance of the interface from air to an index [bands], as a function of the cosine for
+    `brdf`."""
     index = np.atleast_1d(np.asarray(inside, dtype=complex))
     return lambda cosine: reflectance(np.asarray(cosine)[..., None], index)
 
@@ -65,8 +66,8 @@ def diffuse_external(inside: ArrayLike) -> Array:
 def diffuse_internal(inside: ArrayLike) -> Array:
     """Reflectance of the interface for diffuse light from within, total reflection included.
 
-    1 - (1 - external)/n^2: in equilibrium both directions transmit the same power. For a transparent material of
-    real index n >= 1.
+    It is 1 - (1 - external)/n^2, because in equilibrium both directions transmit the same power. The material is
+    transparent, with real index n >= 1.
     """
     index = np.asarray(inside, dtype=float)
     return np.asarray(1.0 - (1.0 - diffuse_external(index)) / index**2)

@@ -1,4 +1,4 @@
-"""Complex indices of the user's own: YAML as refractiveindex.info has it, or columns of wavelength, n and k.
+"""Complex indices from a user's file: YAML as on refractiveindex.info, or columns of wavelength, n and k.
 
 YAML: `DATA`, a list of parts of type `tabulated nk`, `tabulated n`, `tabulated k`, `formula 1` or `2` (Sellmeier)
 and `formula 5` (Cauchy), wavelengths in micrometres. Columns: wavelength, n and, unless it is transparent, k;
@@ -23,14 +23,15 @@ _YAML = {".yml", ".yaml"}
 _MICROMETRES_BELOW = 30.0
 _HIGHEST = 20.0
 _WIDEST_GAP_NM = 80.0
-"""Widest gap of tables: Johnson and Christy's lines are up to 65 nm apart."""
+"""Widest allowed gap in tables: Johnson and Christy's lines are up to 65 nm apart."""
 _SELLMEIER, _SELLMEIER_2, _CAUCHY = "formula 1", "formula 2", "formula 5"
 
 
 def read_index(path: Path) -> Complex:
-    """n + i k [81]; k is 0 where the file has none. Linear in the wavelength between lines.
+    """n + i k [81]; k is 0 where the file has none. Between the lines of the file, values are linear in the
+    wavelength.
 
-    Raises InputError, with file and line where there is one, also if 380 to 780 nm are not covered.
+    Raises InputError, with file and line if there is one, also if 380 to 780 nm are not covered.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -125,7 +126,7 @@ def _of_columns(text: str, path: Path, first_line: int) -> Complex:
 
 
 def _line_of(text: str, key: str) -> int:
-    """Line after the first that has a key."""
+    """Return the line after the first line that has a key."""
     lines = text.splitlines()
     return next((number for number, line in enumerate(lines, start=2) if line.strip().startswith(key)), 1)
 

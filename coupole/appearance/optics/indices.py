@@ -15,11 +15,11 @@ import numpy as np
 from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Complex, within
 
 EGG_WHITE = 1.36
-"""Size of egg white under and in the leaf (seed 001, section 5.1)."""
+"""Index of egg white (size) under and in the leaf (seed 001, section 5.1)."""
 BINDER = 1.5
-"""A dried oil or egg binder; drying oils have 1.48 to 1.52 (assumed without dispersion)."""
+"""Index of a dried oil or egg binder; drying oils have 1.48 to 1.52 (assumed without dispersion)."""
 URUSHI = 1.53
-"""Cured lacquer; published values lie between 1.52 and 1.55 (assumed without dispersion)."""
+"""Index of cured lacquer; published values lie between 1.52 and 1.55 (assumed without dispersion)."""
 
 
 def gold(source: str = "Johnson") -> Complex:
@@ -63,15 +63,15 @@ def sellmeier(terms: Sequence[tuple[float, float]], constant: float = 0.0) -> Co
 
 
 def acrylic() -> Complex:
-    """Poly(methyl methacrylate), as of acrylic binders: Sultanova et al., Acta Phys. Pol. A 116, 585 (2009).
+    """Poly(methyl methacrylate), as in acrylic binders: Sultanova et al., Acta Phys. Pol. A 116, 585 (2009).
 
-    Measured from 437 nm; the formula is continued to 380 nm.
+    It was measured from 437 nm on; the formula is continued to 380 nm.
     """
     return sellmeier([(1.1819, 0.011313)])
 
 
 def at_d_line(index: Complex) -> float:
-    """n at 587.6 nm, for models that know only one index."""
+    """Return n at 587.6 nm, for models that take only one index."""
     return float(np.interp(587.6, WAVELENGTHS_NM, index.real))
 
 

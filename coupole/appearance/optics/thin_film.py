@@ -1,9 +1,9 @@
 """Stacks of thin films: reflectance and transmittance with interference, by the transfer matrix of each layer.
 
-A layer's transfer matrix is applied in the form of Airy's recursion, from the substrate up: r and t of what lies
-below a layer give those of what lies below the next. It is the same algebra as the product of 2x2 matrices (Born
-and Wolf, section 1.6; Byrnes, arXiv:1603.02720), but with decaying exponentials only, so that thick metal films do
-not cause overflow.
+A layer's transfer matrix is applied in the form of Airy's recursion, from the substrate up: r and t below one
+layer give r and t below the next layer above it. It is the same algebra as the product of 2x2 matrices (Born and
+Wolf, section 1.6; Byrnes, arXiv:1603.02720), but with decaying exponentials only, so that thick metal films do not
+cause overflow.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def stack_power(
     """Reflectance and transmittance (into the substrate) of unpolarised light.
 
     `cos_outside` [...] is the cosine in the incident medium, which is transparent; wavelengths, in vacuum, and
-    indices are [bands] or scalars. Both results are [..., bands]; the remainder to 1 is absorbed.
+    indices are [bands] or scalars. Both results are [..., bands]; the films absorb the rest.
     """
     reflectances, transmittances = zip(
         *(
@@ -58,7 +58,7 @@ def _power_ratios(
     substrate: ArrayLike,
     polarisation: int,
 ) -> tuple[Array, Array]:
-    """R and T of s (0) or p (1) light."""
+    """Return R and T of s (0) or p (1) light."""
     wavelengths = np.atleast_1d(np.asarray(wavelengths_nm, dtype=float))
     cosine = np.asarray(cos_outside, dtype=complex)[..., None]
     media = [np.asarray(n, dtype=complex) for n in (outside, *(film.index for film in films), substrate)]

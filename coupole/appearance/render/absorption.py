@@ -18,7 +18,7 @@ NotNegative = Annotated[float, Field(ge=0)]
 
 
 class NumbersFile(Model):
-    """Numbers by wavelength, in columns; those beyond it keep its ends."""
+    """Numbers by wavelength, in columns of a file; beyond its ends, the last numbers are used."""
 
     kind: Literal["file"]
     path: Path
@@ -26,7 +26,7 @@ class NumbersFile(Model):
 
 
 PerMm = NotNegative | NumbersFile
-"""A coefficient per mm, the same at all wavelengths or by a file."""
+"""A coefficient per mm, one number for all wavelengths or numbers from a file."""
 
 
 class Urushi(Model):
@@ -38,22 +38,22 @@ class Urushi(Model):
 
 
 class TypicalVarnish(Model):
-    """Absorption of a natural resin's varnish as it yellows: an assumed shape, no measured varnish.
+    """Absorption of a yellowing varnish of natural resin: an assumed shape, no measured varnish.
 
-    age k exp(-fall (w - 450 nm)): strong in the violet, next to nothing in the red.
+    The absorption is age k exp(-fall (w - 450 nm)): strong in the violet, nearly zero in the red.
     """
 
     kind: Literal["typical_varnish"]
     age: NotNegative
-    """0 is fresh and clear, 1 yellowed for long."""
+    """0 for fresh and clear, 1 for strongly yellowed."""
     at_450_nm_per_mm: NotNegative = 15.0
     """Coefficient at 450 nm and age 1."""
     fall_per_nm: Positive = 0.018
 
 
 class Absorbance(Model):
-    """A film's decadic absorbance by wavelength, measured: that of an aged one less that of a fresh one, or of
-    one whose faces do not count."""
+    """A film's measured decadic absorbance by wavelength. It is the difference between an aged and a fresh film,
+    or the absorbance of one film without the effect of its faces."""
 
     kind: Literal["absorbance"]
     path: Path
@@ -61,13 +61,13 @@ class Absorbance(Model):
     film_mm: Positive
     """Thickness of the film that was measured."""
     age: NotNegative = 1.0
-    """Age in parts of the measured film's age."""
+    """Age, as a multiple of the measured film's age."""
 
 
 class AbsorptionPerMm(Model):
     kind: Literal["values"]
     per_mm: PerMm
-    """Natural, of directed light."""
+    """Natural coefficient, for directed light."""
 
 
 class Transmittance(Model):
@@ -85,8 +85,8 @@ Absorption = Annotated[
 
 
 def per_mm(absorption: Absorption, index: float, folder: Path) -> Array:
-    """[81] per mm, natural, of directed light in a medium of `index`; paths are relative to `folder`. Raises
-    InputError."""
+    """[81] natural coefficients per mm for directed light in a medium of `index`; paths are relative to `folder`.
+    Raises InputError."""
     match absorption:
         case Urushi():
             return lacquer.urushi_absorption(absorption.at_450_nm_per_mm, absorption.fall_per_nm)
@@ -106,7 +106,7 @@ def per_mm(absorption: Absorption, index: float, folder: Path) -> Array:
 
 
 def coefficient(value: PerMm, folder: Path) -> Array:
-    """[81] per mm. Raises InputError."""
+    """[81] coefficients per mm. Raises InputError."""
     if isinstance(value, NumbersFile):
         return _numbers(folder / value.path, value.column)
     return np.full(BANDS, value)

@@ -15,7 +15,7 @@ from coupole.appearance.spectra.grid import Array
 
 _SEGMENTS = 192
 _MARGIN = 0.45
-"""Width of the wall round the opening, in radii."""
+"""Width of the wall around the opening, in radii."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Niche:
 
 
 def arcature(radius_mm: float, height_mm: float, depth_mm: float) -> Niche:
-    """A niche of half width `radius_mm` whose arch begins `height_mm` above the sill."""
+    """Return a niche of half width `radius_mm` with an arch that begins `height_mm` above the sill."""
     angle = np.linspace(np.pi, 0.0, _SEGMENTS + 1)
     arch = np.stack([radius_mm * np.cos(angle), height_mm + radius_mm * np.sin(angle)], axis=1)
     outline = np.concatenate([[[-radius_mm, 0.0]], arch, [[radius_mm, 0.0]]])
@@ -49,7 +49,7 @@ def arcature(radius_mm: float, height_mm: float, depth_mm: float) -> Niche:
 
 
 def _at(outline: Array, y_mm: float) -> Array:
-    """Points [n, 3] of an outline [n, 2] of x and z."""
+    """Return points [n, 3] from an outline [n, 2] of x and z."""
     return np.stack([outline[:, 0], np.full(len(outline), y_mm), outline[:, 1]], axis=1)
 
 
@@ -64,6 +64,7 @@ def _between(low: Array, high: Array) -> Array:
 
 
 def _fan(rim: Array, middle: Array) -> Array:
-    """Triangles from a closed rim, clockwise as the viewer sees it, to a point inside; they face the viewer."""
+    """Return triangles from a closed rim, clockwise as seen by the viewer, to a point inside it; they face the
+    viewer."""
     after = np.roll(rim, -1, axis=0)
     return np.stack([after, rim, np.broadcast_to(middle, rim.shape)], axis=1)

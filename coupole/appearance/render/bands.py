@@ -1,14 +1,14 @@
 """Rendering of 81 bands with a renderer that carries four wavelengths along a path.
 
-Mitsuba's spectral variants draw one wavelength from each quarter of what the film is sensitive to, for every
-path. A film that sees four neighbouring bands has one of them in each quarter. Spectra that are constant over
-each band are then rendered without noise from the choice of wavelengths, and those that Mitsuba knows itself (a
-map of the surroundings) have their mean over the band. With the same seed every group of four has the same random
-numbers. So there is luminance noise, but hardly any colour noise. (A film of 81 channels and full spectra took
-5.6 times as long here for three times the noise.)
+For every path, Mitsuba's spectral variants draw one wavelength from each quarter of the film's sensitivity. If a
+film is sensitive to four neighbouring bands, each quarter has one of them. Spectra that are constant over each
+band are then rendered without noise from the choice of wavelengths. Spectra that Mitsuba makes itself (a map of
+the surroundings) have their mean over the band. With the same seed every group of four has the same random
+numbers. So there is luminance noise, but hardly any colour noise. (Here a film of 81 channels with full spectra
+took 5.6 times as long, and had three times the noise.)
 
-Lights are known every 5 nm. With coarser steps a rendered band has a light's mean about it, and `weights`
-integrate over the light's own structure; only the reflectances are interpolated (as ASTM E308's tables do).
+Lights are known every 5 nm. With coarser steps, a rendered band has the light's mean around it, and `weights`
+integrate over the light's own structure. Only the reflectances are interpolated (as in ASTM E308's tables).
 
 A scene is described once, with an array [81] for each spectrum; `for_group` replaces it by Mitsuba's spectrum for
 a group of bands.
@@ -31,7 +31,7 @@ Description = dict[str, Any]
 StepNm = Literal[5, 10, 20, 40]
 QUARTERS = 4
 _RAMP_NM = 0.01
-"""Width of the transition between two bands: one path in 500 has a wavelength there, with bands of 5 nm."""
+"""Width of the transition between two bands. With bands of 5 nm, one path in 500 has a wavelength there."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Sensitivity:
 
 
 def rendered_bands(step_nm: StepNm) -> list[int]:
-    """Return the numbers of those of the 81 bands that are rendered."""
+    """Return the numbers of the bands, among the 81, that are rendered."""
     return list(range(0, BANDS, step_nm // int(STEP_NM)))
 
 
@@ -51,7 +51,8 @@ def wavelengths(step_nm: StepNm) -> Array:
 
 
 def around_nodes(power: Array, step_nm: StepNm) -> Array:
-    """A light's power [81] with its mean about each rendered band at that band (a triangle of twice the step)."""
+    """Return a light's power [81] in which each rendered band has the mean around it (a triangle of twice the
+    step)."""
     nodes = rendered_bands(step_nm)
     triangles = np.maximum(0.0, 1.0 - np.abs(WAVELENGTHS_NM[nodes][:, None] - WAVELENGTHS_NM) / step_nm)
     means = np.array(power, dtype=float)
@@ -60,8 +61,9 @@ def around_nodes(power: Array, step_nm: StepNm) -> Array:
 
 
 def weights(functions: Array, power: Array, step_nm: StepNm) -> Array:
-    """[n, bands] in nm: their products with radiance in the rendered bands sum to the integrals of radiance times
-    `functions` [n, 81], under the light `power` [81], for reflectances that are cubic splines over the bands."""
+    """[n, bands] weights in nm. The sum of weights times radiance in the rendered bands is the integral of
+    radiance times `functions` [n, 81], under the light `power` [81]. This holds for reflectances that are cubic
+    splines over the bands."""
     from scipy.interpolate import CubicSpline
 
     nodes = rendered_bands(step_nm)
@@ -81,8 +83,8 @@ def groups(step_nm: StepNm) -> list[list[int]]:
 
 
 def for_group(description: Any, group: Sequence[int], step_nm: StepNm, files: Path) -> Any:
-    """The description with Mitsuba's spectra for the four bands of `group`; a `table` is written to the folder
-    `files`."""
+    """Return the description with Mitsuba's spectra for the four bands of `group`. A `table` is written to the
+    folder `files`."""
     if isinstance(description, np.ndarray):
         return _steps(description[list(group)], group, step_nm)
     if isinstance(description, Sensitivity):
@@ -98,8 +100,8 @@ def for_group(description: Any, group: Sequence[int], step_nm: StepNm, files: Pa
 
 
 def _write_table(table: BakedTable, group: Sequence[int], step_nm: StepNm, files: Path) -> str:
-    """A file of `measured` with the group's values over the quarters. The one before it is replaced, not changed:
-    it may still be open."""
+    """Write the table as a file with the group's values over the quarters, and return its path. An earlier file is
+    replaced, not changed, because it may still be open."""
     path, new = files / f"{id(table)}.bsdf", files / "new.bsdf"
     new.write_bytes(table.encode(_nodes_nm(group, step_nm), np.repeat(list(group), 2).tolist()))
     new.replace(path)
@@ -119,7 +121,8 @@ def film(width_px: int, height_px: int) -> Description:
 
 
 def _steps(values: Array, group: Sequence[int], step_nm: StepNm) -> Description:
-    """A spectrum that is `values` [4] over the bands, and over those after them where a group has fewer."""
+    """Return a spectrum with `values` [4] over the bands; a group with fewer bands uses the bands after them
+    too."""
     if not np.any(values):
         return {"type": "uniform", "value": 0.0}  # the other kind does not accept zero
     return {

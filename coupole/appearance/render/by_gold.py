@@ -1,4 +1,5 @@
-"""A picture of gold in the sun: paths, and photons for what paths find only by chance (`photon_map`)."""
+"""A picture of gold in the sun, by paths, and by photons for light that paths find only by chance
+(`photon_map`)."""
 
 from __future__ import annotations
 
@@ -31,10 +32,11 @@ _BLACK = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.0
 
 
 def render(scene: PlainScene, gathering: Gathered, camera: Camera, folder: Path, progress: Progress) -> Spectral:
-    """Radiance in three parts: other lights by paths; the suns by paths with black gold, where matt surfaces are
-    seen, or with all there is, where gold is seen; the suns over gold on matt surfaces by photons.
+    """Return radiance as the sum of three parts. Other lights are rendered by paths. The suns are rendered by
+    paths: with black gold where matt surfaces are seen, and with all materials where gold is seen. Sunlight that
+    gold sends onto matt surfaces is rendered by photons.
 
-    Raises InputError for materials that photons do not know.
+    Raises InputError for materials that are not supported for photons.
     """
     suns = tuple(light for light in scene.lights if isinstance(light, Distant))
     other_lights = tuple(light for light in scene.lights if not isinstance(light, Distant))
@@ -61,7 +63,7 @@ def render(scene: PlainScene, gathering: Gathered, camera: Camera, folder: Path,
 
 
 def eye_rays(camera: Camera) -> tuple[Array, NDArray[np.float64]]:
-    """Starts and directions [h w 4, 3] of a camera's rays, four for each pixel, row by row."""
+    """Return starts and directions [h w 4, 3] of a camera's rays, four for each pixel, row by row."""
     ahead = np.subtract(camera.target_mm, camera.position_mm) / np.linalg.norm(
         np.subtract(camera.target_mm, camera.position_mm)
     )

@@ -1,8 +1,8 @@
 """A candle: a flame that emits, on a stem of wax.
 
 The flame is a body of revolution, r proportional to sqrt(t) (1 - t) of its height, that emits the same radiance
-everywhere: its intensity in a direction is that radiance times its area as seen from there. The candela was once
-the intensity of such a flame, seen from the side.
+everywhere. Its intensity in a direction is this radiance times its area as seen from this direction. The candela
+was once the intensity of such a flame from the side.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ _WAX = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.75)
 
 
 class Candle(Model):
-    """A burning candle that stands upright; without `wax_height_mm`, a flame alone."""
+    """A burning candle that stands upright; it has no wax without `wax_height_mm`."""
 
     kind: Literal["candle"]
     position_mm: Vector
     """Position of the candle's foot."""
     intensity_cd: Positive = 1.0
-    """Seen from the side."""
+    """Intensity to the side."""
     flame_height_mm: Positive = 28.0
     flame_width_mm: Positive = 9.0
     wax_height_mm: Annotated[float, Field(ge=0)] = 180.0

@@ -34,13 +34,13 @@ class Niche:
     reflectance: Reflectance
     """Reflectance of the gold."""
     roughness: float
-    """0 is a mirror."""
+    """GGX alpha of the gold; 0 for a mirror."""
 
 
 @dataclass(frozen=True)
 class Sun:
     direction: Array
-    """[3] unit, in which light travels: into the opening, towards +y."""
+    """[3] unit direction in which light travels: into the opening, towards +y."""
     width_deg: float
     irradiance: Array
     """[81], W/(m^2 nm) on a surface that faces it."""
@@ -65,7 +65,7 @@ class Photons:
 def photons(
     niche: Niche, sun: Sun, opening_mm: tuple[float, float, float], count: int, seed: int | tuple[int, ...]
 ) -> Photons:
-    """Trace `count` photons that pass the rectangle x from `opening_mm[0]` to [1], z from 0 to [2] in y = 0."""
+    """Trace `count` photons that pass a rectangle in y = 0: x from `opening_mm[0]` to [1], z from 0 to [2]."""
     ray_tracer = _Met(niche)
     left_mm, right_mm, top_mm = opening_mm
     area_m2 = (right_mm - left_mm) * top_mm * 1e-6
@@ -93,8 +93,8 @@ def photons(
 def irradiance(
     stopped_photons: Photons, width_mm: tuple[float, float], height_mm: float, cell_mm: float, y_mm: float
 ) -> Array:
-    """[rows, columns, 81] W/(m^2 nm) on the plane y = `y_mm`: x over `width_mm`, z from 0 to `height_mm`, top
-    first."""
+    """[rows, columns, 81] W/(m^2 nm) on the plane y = `y_mm`, with x over `width_mm` and z from 0 to `height_mm`;
+    the top row is first."""
     from scipy.sparse import csr_matrix
 
     columns, rows = round((width_mm[1] - width_mm[0]) / cell_mm), round(height_mm / cell_mm)
@@ -110,7 +110,7 @@ def irradiance(
 
 
 class _Met:
-    """Embree's tree of the niche, and gold's smooth normals."""
+    """Embree's tree of the niche, and the smooth normals of the gold."""
 
     def __init__(self, niche: Niche) -> None:
         from embreex import rtcore_scene
@@ -123,7 +123,8 @@ class _Met:
         self._normals = smooth_normals(niche.gilded_mm)
 
     def first(self, starts: Array, ways: Array) -> tuple[NDArray[np.int64], Array, Array]:
-        """Triangle [n] (-1: none), distance [n] and smooth normal [n, 3] of the first gold hit of each ray."""
+        """Return triangle [n] (-1 for none), distance [n] and smooth normal [n, 3] at the first gold that each ray
+        meets."""
         hit = self._tree.run(starts.astype(np.float32), ways.astype(np.float32), output=True)
         triangle = np.where(hit["primID"] == -1, -1, hit["primID"]).astype(np.int64)
         normals = np.zeros_like(starts)
@@ -136,7 +137,8 @@ class _Met:
 
 
 def smooth_normals(corners_mm: Array) -> Array:
-    """[triangles, 3, 3] unit normals at the corners [triangles, 3, 3]: means over triangles that share them."""
+    """[triangles, 3, 3] unit normals at the corners [triangles, 3, 3]: means over the triangles that share a
+    corner."""
     points, faces = weld_corners(corners_mm)
     sums = np.zeros_like(points)
     np.add.at(sums, faces.ravel(), np.repeat(flat_normals(corners_mm), 3, axis=0))
@@ -185,7 +187,8 @@ def reflect_at_gold(
 
 
 def _facets(towards: Array, normals: Array, alpha: float, random: np.random.Generator) -> Array:
-    """Normals [n, 3] of facets as seen from `towards` [n, 3]: uniform on the disk of Heitz 2018, listing 1."""
+    """Return normals [n, 3] of facets as seen from `towards` [n, 3], uniform on the disk of Heitz 2018, listing
+    1."""
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     t1 = np.cross(helper, normals)
     t1 /= np.linalg.norm(t1, axis=1, keepdims=True)
@@ -210,7 +213,7 @@ def _facets(towards: Array, normals: Array, alpha: float, random: np.random.Gene
 
 
 def _unmasked_share(cosine: Array, alpha: float) -> Array:
-    """Smith's G1 of GGX: G2/G1 of separable masking."""
+    """Return Smith's G1 of GGX, which is G2/G1 for separable masking."""
     c = np.maximum(cosine, 0.0)
     return np.asarray(2.0 * c / np.maximum(c + np.sqrt(alpha**2 + (1.0 - alpha**2) * c**2), 1e-12))
 

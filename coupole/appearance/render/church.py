@@ -1,5 +1,5 @@
-"""The inside of a small church, as surroundings: walls with pointed windows, a pointed barrel vault on ribs, a
-floor.
+"""The inside of a small church, as surroundings. It has walls with pointed windows, a pointed barrel vault on
+ribs, and a floor.
 
 x is across the nave, y along it (the altar's end is +y), z up; the origin is in the middle of the floor.
 """
@@ -15,7 +15,7 @@ from coupole.appearance.shapes.triangles import grid_faces, rectangle
 from coupole.appearance.spectra.grid import Array
 
 _ARC = 12
-"""Segments of each half of a pointed arch."""
+"""Number of segments of each half of a pointed arch."""
 _RIB_WIDTH, _RIB_DEPTH = 0.05, 0.035
 """Width and depth of a rib, in widths of the nave."""
 _TILES = 12
@@ -30,7 +30,7 @@ class Size:
     """Height from the floor to where the vault begins."""
     bays: int
     wall_mm: float
-    """Thickness of the walls, seen in the windows' reveals."""
+    """Thickness of the walls, visible in the windows' reveals."""
     window_width_mm: float
     window_sill_mm: float
     window_spring_mm: float
@@ -39,7 +39,8 @@ class Size:
 
 @dataclass(frozen=True)
 class Opening:
-    """A window's outside: `scene_from_window` places x across, z up from the sill, seen from inside."""
+    """The outer opening of a window: `scene_from_window` places x across, z up from the sill, as seen from
+    inside."""
 
     church_from_window: Array
     """[4, 4]."""
@@ -49,7 +50,7 @@ class Opening:
 
 @dataclass(frozen=True)
 class Church:
-    """Corners [triangles, 3, 3], mm, and the openings, which the walls go round."""
+    """Corners [triangles, 3, 3], mm, and the openings that the walls surround."""
 
     stone_mm: Array
     light_tiles_mm: Array
@@ -81,7 +82,8 @@ def church(size: Size) -> Church:
 
 
 def _pointed_arch(width_mm: float, spring_mm: float) -> Array:
-    """Points [n, 2] of x and z of a pointed arch from left to right: each half is about the other's springing."""
+    """Return points [n, 2], x and z, of a pointed arch from left to right. The centre of each half is the other
+    half's springing."""
     angle = np.linspace(0.0, np.pi / 3.0, _ARC + 1)
     right_arc = width_mm * np.stack([np.cos(angle) - 0.5, np.sin(angle)], axis=1)
     left_arc = right_arc * [-1.0, 1.0]
@@ -135,7 +137,7 @@ def _rib(outline: Array, y_mm: float, size: Size) -> Array:
 
 
 def _opening(place: Array, size: Size) -> Opening:
-    """The rectangle about the window, at its outside."""
+    """Return the rectangle around the window, at its outside."""
     behind = np.eye(4)
     behind[:3, 3] = [0.0, size.wall_mm, size.window_sill_mm]
     top_mm = size.window_spring_mm + np.sqrt(0.75) * size.window_width_mm
@@ -143,7 +145,7 @@ def _opening(place: Array, size: Size) -> Opening:
 
 
 def _upright(turned_deg: float, at_mm: list[float]) -> Array:
-    """A wall's frame, turned about z; at 0 it is seen from -y."""
+    """Return a wall's frame, turned about z; at angle 0 the wall faces -y."""
     c, s = np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))
     pose = np.eye(4)
     pose[:2, :2], pose[:3, 3] = [[c, -s], [s, c]], at_mm

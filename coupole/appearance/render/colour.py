@@ -1,4 +1,4 @@
-"""Convert spectra to a picture on a screen: observer, chromatic adaptation, sRGB."""
+"""Converts spectra to a picture on a screen: observer, chromatic adaptation, sRGB."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ _D65 = np.array([0.95047, 1.0, 1.08883])
 
 @dataclass(frozen=True)
 class Eye:
-    """An observer who is used to a light."""
+    """An observer who is adapted to a light."""
 
     weights: Array
-    """[4, bands]: of radiance in W/(m^2 sr nm), to X, Y, Z and luminance."""
+    """[4, bands] weights of radiance in W/(m^2 sr nm) for X, Y, Z and luminance."""
     white: Array
     """XYZ [3] of that light, Y = 1."""
 
     def tristimulus(self, radiance: NDArray[np.floating]) -> Array:
-        """XYZ [..., 3] in cd/m^2 of radiance [..., bands].
+        """Return XYZ [..., 3] in cd/m^2 of radiance [..., bands].
 
-        Scaled such that Y of the light itself is its luminance: Y of the 10-degree observer is no luminance (under
-        D65 it is 10 % higher).
+        They are scaled so that Y of the light itself is its luminance. Without this, Y of the 10-degree observer
+        is no luminance (under D65 it is 10 % higher).
         """
         return np.asarray(np.asarray(radiance, dtype=float) @ self.weights[:3].T)
 
     def luminance(self, radiance: NDArray[np.floating]) -> Array:
-        """[...] in cd/m^2, by V(lambda) of the 2-degree observer (CIE 1924)."""
+        """Return luminance [...] in cd/m^2, by V(lambda) of the 2-degree observer (CIE 1924)."""
         return np.asarray(np.asarray(radiance, dtype=float) @ self.weights[3])
 
 
 def eye(observer: light.Observer, power: Array, white_power: Array, step_nm: StepNm) -> Eye:
-    """Return the eye of an observer in the light `power` [81] who is used to `white_power` [81]."""
+    """Return the eye of an observer in the light `power` [81] who is adapted to `white_power` [81]."""
     luminosity = light.observer("2 deg")[1]
     functions = light.observer(observer)
     white = functions @ white_power
@@ -56,7 +56,7 @@ def eye(observer: light.Observer, power: Array, white_power: Array, step_nm: Ste
 
 
 def adapted_xyz(xyz: Array, white: Array, transform: str) -> Array:
-    """Corresponding XYZ [..., 3] under D65 for XYZ under `white` [3] (von Kries adaptation)."""
+    """Return corresponding XYZ [..., 3] under D65 for XYZ under `white` [3] (von Kries adaptation)."""
     if transform == "none":
         return xyz
     cones = np.array(_CONES[transform])
@@ -65,9 +65,9 @@ def adapted_xyz(xyz: Array, white: Array, transform: str) -> Array:
 
 
 def displayed_srgb(xyz: Array) -> tuple[NDArray[np.uint8], float]:
-    """sRGB [h, w, 3] of XYZ with white at Y = 1, and the share of pixels outside the gamut.
+    """Return sRGB [h, w, 3] of XYZ with white at Y = 1, and the share of pixels outside the gamut.
 
-    Pixels that are too bright are scaled down with constant hue; too saturated ones are clipped at 0.
+    Pixels that are too bright are scaled down with constant hue. Pixels that are too saturated are clipped at 0.
     """
     linear = light.linear_srgb(xyz)
     brightest = linear.max(axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Intel Open Image Denoise for the pictures that people look at; spectra are never denoised."""
+"""Intel Open Image Denoise for pictures for viewing; spectra are never denoised."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ DENOISED = "denoised by Open Image Denoise"
 
 
 def denoised_xyz(xyz: Array) -> Array:
-    """XYZ [h, w, 3] with less noise. Raises InputError without the library (extra `denoiser`)."""
+    """Return XYZ [h, w, 3] with less noise. Raises InputError if the library is missing (extra `denoiser`)."""
     pyoidn = import_extra("pyoidn", extra="denoiser")
     level = max(float(xyz.mean()), 1e-30)
     picture = pyoidn.denoise(np.ascontiguousarray(xyz / level, np.float32), hdr=True)

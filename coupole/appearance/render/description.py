@@ -26,13 +26,14 @@ Filter = float | Literal["circular"]
 right-handed circular light."""
 _BLACK = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.0))
 _BALL_PARTS = 64
-"""A weathered ball has 20 times their square of triangles."""
+"""Number of parts n into which edges of a weathered ball are divided; the ball has 20 n^2 triangles."""
 _FILTER_MM = 1.0
 """Distance from the projection centre to the polariser."""
 
 
 def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any, more: Sequence[Piece] = ()) -> Description:
-    """Objects, `more` pieces and lights; triangles are written into the folder `meshes`, for Mitsuba to read."""
+    """Return objects, `more` pieces and lights; triangles are written into the folder `meshes`, from which Mitsuba
+    reads them."""
     parts: Description = {}
     reach_mm = 0.0
     surfaces: dict[Material | Pane, Description] = {}
@@ -71,7 +72,7 @@ def _reach_mm(piece: Piece | Ball) -> float:
 
 
 def _candle(light: candle.Candle, emitter: Description, name: str, folder: Path, meshes: Path) -> Description:
-    """Its flame, and its wax if it has any."""
+    """Return the candle's flame, and its wax if it has any."""
     bodies = {f"{name}_flame": Piece(candle.flame(light), _BLACK)}
     if light.wax_height_mm > 0.0:
         bodies[f"{name}_wax"] = Piece(candle.stem(light), light.wax)
@@ -122,7 +123,7 @@ def scene_description(
 
 
 def _inside(material: Material | Pane, folder: Path) -> Description:
-    """The medium of a body, if it absorbs."""
+    """Return the medium of a body that absorbs."""
     if not isinstance(material, Glass) or material.absorption is None:
         return {}
     absorption_per_mm = absorption.per_mm(material.absorption, material.index, folder)
@@ -130,8 +131,8 @@ def _inside(material: Material | Pane, folder: Path) -> Description:
 
 
 def _integrator(parts: Description, *, is_polarised: bool) -> str:
-    """Choose the integrator. The one for media weighs a way by all bands of a group, as their absorption may
-    differ by far. The one for panes looks for light through panes.
+    """Choose the integrator. The integrator for media weights a path by all bands of a group, because their
+    absorption may differ widely. The integrator for panes searches for light through panes.
 
     Raises InputError for media and polarisation together.
     """

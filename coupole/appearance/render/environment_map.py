@@ -1,10 +1,9 @@
-"""Light from a picture of all directions: an equirectangular HDR map, as photographed of a mirror ball or
-stitched.
+"""Light from a picture of all directions: an equirectangular HDR map, photographed from a mirror ball or stitched.
 
-Pixels are linear, of the primaries of sRGB (ITU-R BT.709) and white D65. A pixel becomes the smooth spectrum that
-has its colour under D65 (Jakob and Hanika, "A Low-Dimensional Function Space for Efficient Spectral Upsampling",
-Computer Graphics Forum 38(2), 2019; Mitsuba's table), times the light's own white. Mitsuba draws directions by
-the map's luminance, the same for all bands.
+Pixels are linear, with the primaries of sRGB (ITU-R BT.709) and white D65. A pixel becomes the smooth spectrum
+with the pixel's colour under D65 (Jakob and Hanika, "A Low-Dimensional Function Space for Efficient Spectral
+Upsampling", Computer Graphics Forum 38(2), 2019; Mitsuba's table), times the light's own white. Mitsuba draws
+directions by the map's luminance, the same for all bands.
 """
 
 from __future__ import annotations
@@ -27,24 +26,24 @@ MOST_COLUMNS = 2048
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Luminance of the primaries of linear sRGB (IEC 61966-2-1)."""
 _D65_AT_560_NM = 100.0 / 98.8900106203
-"""Mitsuba's D65, whose luminance is that of 1 W/(m^2 sr nm) at all wavelengths."""
+"""Scale of Mitsuba's D65, which has the luminance of 1 W/(m^2 sr nm) at all wavelengths."""
 _MOST_NEGATIVE = 0.01
 _PARTS = 40
-"""Number of parts of a band, in which D65 is averaged over it as the renderer does."""
+"""Number of parts of a band in which D65 is averaged, as in the renderer."""
 
 
 class EnvironmentMap(Model):
-    """Luminance and colour by direction, from a file. Give one of `white_cd_m2` and `illuminance_lux`."""
+    """Luminance and colour by direction, from a file. Give either `white_cd_m2` or `illuminance_lux`."""
 
     kind: Literal["environment_map"]
     path: Path
     """Equirectangular, .hdr or .exr: twice as wide as high, up is the first row."""
     centre_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    """Azimuth of the picture's middle: degrees from +y by +x (from north by east, where +y is north)."""
+    """Azimuth of the picture's middle: degrees from +y towards +x (from north towards east, if +y is north)."""
     white_cd_m2: Positive | None = None
-    """Luminance of a pixel 1, 1, 1: 1 if pixels are cd/m^2, 179 after Radiance."""
+    """Luminance of a pixel 1, 1, 1. It is 1 if pixels are in cd/m^2, and 179 by Radiance's convention."""
     illuminance_lux: Positive | None = None
-    """Illuminance of a level plane that sees nothing else."""
+    """Illuminance of a horizontal plane that receives light from the map alone."""
     spectrum: Power = Illuminant(kind="illuminant", name="D65")
     """Spectrum of a white pixel."""
 
@@ -55,8 +54,8 @@ class EnvironmentMap(Model):
         return self
 
     def white_luminance_cd_m2(self, pixels: Array) -> float:
-        """Return the luminance of a pixel 1, 1, 1. Raises InputError for an amount of light that a dark map cannot
-        give."""
+        """Return the luminance of a pixel 1, 1, 1. Raises InputError if a dark map cannot give this amount of
+        light."""
         if self.white_cd_m2 is not None:
             return self.white_cd_m2
         assert self.illuminance_lux is not None
@@ -106,14 +105,14 @@ def _reduced_map(pixels: Array) -> Array:
 
 
 def level_irradiance(radiance: Array) -> float:
-    """Return the irradiance of a plane that faces up, by radiance [h, w] of an equirectangular map."""
+    """Return the irradiance of a plane that faces up, from radiance [h, w] of an equirectangular map."""
     height, width = radiance.shape
     above = np.minimum(np.linspace(0.0, np.pi, height + 1), 0.5 * np.pi)
     return float(radiance.sum(axis=1) @ np.diff(np.sin(above) ** 2) * (np.pi / width))
 
 
 def factor(source: EnvironmentMap, folder: Path, step_nm: StepNm) -> Array:
-    """[81], the map's light in units of its rendered light, which has white D65. Raises InputError."""
+    """[81] factors of the map's light over its rendered light, which has white D65. Raises InputError."""
     white = around_nodes(power(source.spectrum, folder), step_nm)
     if not np.all(white > 0.0):
         raise InputError(
@@ -140,11 +139,11 @@ def emitter(source: EnvironmentMap, folder: Path, mi: Any) -> Any:
 
 
 def _refined_map(pixels: Array) -> Array:
-    """The map at nodes of Mitsuba's, whose rows go from zenith to nadir, where pixels are half a step from the
-    poles.
+    """Return the map at Mitsuba's nodes. Mitsuba's rows go from zenith to nadir; the pixels of the map are half a
+    step from the poles.
 
-    Mitsuba interpolates brightness and colour apart: they are close together, and interpolated here, by their
-    products.
+    Mitsuba interpolates brightness and colour separately. So the nodes are made dense, and are interpolated here
+    by the product of both.
     """
     height, width = pixels.shape[:2]
     finer = max(1, MOST_COLUMNS // 2 // width)
@@ -154,7 +153,7 @@ def _refined_map(pixels: Array) -> Array:
 
 
 def _between(pixels: Array, places: Array, axis: int) -> Array:
-    """Interpolated linearly along an axis that is periodic."""
+    """Interpolate linearly along a periodic axis."""
     first = np.floor(places).astype(int)
     part = np.reshape(places - first, (-1, 1, 1) if axis == 0 else (1, -1, 1))
     count = pixels.shape[axis]
@@ -163,7 +162,8 @@ def _between(pixels: Array, places: Array, axis: int) -> Array:
 
 
 def _scene_from_map(centre_azimuth_deg: float, mi: Any) -> Any:
-    """Mitsuba's map has its middle at +z, up at +y, and what is right of the middle towards -x."""
+    """Return the map's frame: Mitsuba's map has its middle at +z, up at +y, and the right of the middle towards
+    -x."""
     east, north = np.sin(np.radians(centre_azimuth_deg)), np.cos(np.radians(centre_azimuth_deg))
     matrix = np.eye(4)
     matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = [-north, east, 0.0], [0.0, 0.0, 1.0], [east, north, 0.0]

@@ -1,8 +1,9 @@
 """An equivalent metal for a stack of films, because Mitsuba's rough conductor takes complex indices, but no films.
 
-At each wavelength the equivalent bulk index n + i k reflects as the stack does: exactly along the normal, and as
-nearly as possible at other angles. For a metal leaf it is nearly the leaf's own; for an interference film it is
-not that of a real substance, and if the film's hue depends strongly on the angle there is no equivalent.
+At each wavelength the equivalent bulk index n + i k has the reflectance of the stack: exactly along the normal,
+and as closely as possible at other angles. For a metal leaf it is nearly the leaf's own index. For an interference
+film it is not the index of a real substance. If the film's hue depends strongly on the angle, there is no
+equivalent.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ MOST_OFF = 0.05
 
 
 def equivalent_index(reflectance: Callable[[Array], Array]) -> Complex:
-    """n + i k [81] of bulk whose unpolarised reflectance comes nearest `reflectance`(cosines) -> [angles, 81].
+    """Return n + i k [81] of bulk with the unpolarised reflectance nearest to `reflectance`(cosines) -> [angles,
+    81].
 
-    Raises InputError where they differ by more than `MOST_OFF` at some wavelength and angle up to 78 degrees.
+    Raises InputError if they differ by more than `MOST_OFF` at some wavelength and angle up to 78 degrees.
     """
     target = reflectance(_COSINES)
     normal = np.clip(target[0], 1e-6, 1.0 - 1e-6)

@@ -10,7 +10,7 @@ import numpy as np
 
 
 def write_film(pictures: Sequence[Path], path: Path, frames_per_s: int, about: str) -> None:
-    """H.264 in MP4 of PNG pictures of one size; `about` becomes its comment. Raises OSError."""
+    """Write H.264 in MP4 from PNG pictures of one size; `about` becomes its comment. Raises OSError."""
     import av
     from PIL import Image
 

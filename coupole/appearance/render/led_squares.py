@@ -21,7 +21,8 @@ class Leds:
 
 
 def read_leds(path: Path) -> Leds:
-    """LEDs of a dome's CSV: id, board, x_mm, y_mm, z_mm, nx, ny, nz, flux_lm; `#` starts a comment."""
+    """Read the LEDs of a dome's CSV file: id, board, x_mm, y_mm, z_mm, nx, ny, nz, flux_lm; `#` starts a
+    comment."""
     lines = [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
     table = np.array([[float(v) for v in line.split(",")] for line in lines[1:]])
     return Leds(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:5], table[:, 5:8], table[:, 8])

@@ -1,4 +1,5 @@
-"""Lights of a scene file, in photometric units: spectra give the shape, lm, lux or cd/m^2 the scale."""
+"""Lights of a scene file, in photometric units: the spectrum has any scale, and lm, lux or cd/m^2 give the
+amount."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ from coupole.errors import InputError
 
 LED_SIDE_MM = 7.0
 _FAR_MM, _FAR_REACHES = 1e5, 100.0
-"""Distance of the sun's disk, in mm and in sizes of the scene, at least; limited by single precision."""
+"""Least distance of the sun's disk, in mm and in sizes of the scene; it is limited by single precision."""
 _MM2 = 1e-6
 _SAME_HEIGHT_DEG = 1.0
 
@@ -38,7 +39,7 @@ class Leds(Model):
 
 
 class Distant(Model):
-    """Parallel light, or a disk of some apparent width such as the sun (0.53 degrees)."""
+    """Parallel light, or light from a disk with an apparent width, such as the sun (0.53 degrees)."""
 
     kind: Literal["distant"]
     direction: Vector
@@ -61,7 +62,7 @@ class Distant(Model):
 
 
 class Area(Model):
-    """A rectangle that emits towards its target."""
+    """A rectangle that emits light towards its target."""
 
     kind: Literal["area"]
     position_mm: Vector
@@ -73,7 +74,7 @@ class Area(Model):
 
 
 class Environment(Model):
-    """The same luminance from all directions."""
+    """An environment with the same luminance in all directions."""
 
     kind: Literal["environment"]
     luminance_cd_m2: Positive
@@ -84,29 +85,31 @@ PlainLight = Leds | Distant | Area | Environment | EnvironmentMap | Candle
 
 
 class Daylight(Model):
-    """Sun and clear sky at a time and place: direction, spectrum and amount are computed (`spectra.sun`)."""
+    """Sun and clear sky at a time and place. Direction, spectrum and amount of light are computed
+    (`spectra.sun`)."""
 
     kind: Literal["daylight"]
     when: AwareDatetime
     """ISO 8601, with the offset from UTC."""
     latitude_deg: Annotated[float, Field(ge=-90, le=90)]
-    """North."""
+    """Latitude, positive to the north."""
     longitude_deg: Annotated[float, Field(ge=-180, le=180)]
-    """East."""
+    """Longitude, positive to the east."""
     altitude_m: Annotated[float, Field(ge=-430, le=9000)] = 0.0
     y_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    """Azimuth of the scene's +y: degrees from north by east."""
+    """Azimuth of the scene's +y: degrees from north towards east."""
     sky: bool = True
-    """The light of the sky, evenly from all directions; without it only the sun shines."""
+    """True for light of the sky, evenly from all directions; if False, only the sun shines."""
     aerosol_depth_500nm: Annotated[float, Field(ge=0, le=2)] = 0.1
     water_cm: Annotated[float, Field(gt=0, le=10)] = 1.42
     ozone_atm_cm: Annotated[float, Field(ge=0, le=0.7)] = 0.344
     ground_albedo: Share = 0.2
     series: Path | None = None
-    """Measured spectra of the sun at several times (`spectra.light_series`), in place of the computed ones."""
+    """Measured spectra of the sun at several times (`spectra.light_series`), instead of the computed ones."""
 
     def lights(self, folder: Path) -> tuple[PlainLight, ...]:
-        """The sun's disk, and the sky. Raises InputError if the sun is down, or if the series does not reach."""
+        """Return the sun's disk, and the sky. Raises InputError if the sun is down, or if the series does not
+        cover the time."""
         place = sun.place(self.when, self.latitude_deg, self.longitude_deg, self.altitude_m)
         air = sun.Air(self.aerosol_depth_500nm, self.water_cm, self.ozone_atm_cm, self.ground_albedo)
         clear_sky = sun.clear_sky(place, air)
@@ -136,7 +139,7 @@ Light = Annotated[PlainLight | Daylight, Field(discriminator="kind")]
 
 
 def plain(lights: Iterable[Light], folder: Path) -> tuple[PlainLight, ...]:
-    """The lights, with daylight as sun and sky. Raises InputError, also for two surroundings."""
+    """Return the lights, with daylight as sun and sky. Raises InputError, also if there are two environments."""
     plain_lights = tuple(
         part for light in lights for part in (light.lights(folder) if isinstance(light, Daylight) else (light,))
     )
@@ -150,7 +153,8 @@ def plain(lights: Iterable[Light], folder: Path) -> tuple[PlainLight, ...]:
 
 
 def radiance_unit(lights: Iterable[PlainLight], folder: Path, step_nm: StepNm) -> Array:
-    """[81], the radiance that is 1 in the renderer: there a map's white is always D65. Raises InputError."""
+    """[81] radiance that has the value 1 in the renderer, in which a map's white is always D65. Raises
+    InputError."""
     maps = [light for light in lights if isinstance(light, EnvironmentMap)]
     return factor(maps[0], folder, step_nm) if maps else np.ones(BANDS)
 
@@ -160,7 +164,7 @@ class Setting:
     """Quantities that lights depend on."""
 
     folder: Path
-    """Folder that relative paths start from."""
+    """Folder at which relative paths start."""
     step_nm: StepNm
     radiance_unit: Array
     """[81] W/(m^2 sr nm)."""
@@ -169,7 +173,7 @@ class Setting:
 
 
 def emitters(light: PlainLight, setting: Setting, mi: Any) -> list[Description]:
-    """The light for Mitsuba; of a candle, what its flame's body emits. Raises InputError."""
+    """Return the light for Mitsuba; for a candle, the emission of its flame. Raises InputError."""
     folder = setting.folder
     if isinstance(light, EnvironmentMap):
         return [emitter(light, folder, mi)]
@@ -234,7 +238,7 @@ def _rectangle(mi: Any, position: Any, target: Any, size_mm: tuple[float, float]
 
 
 def _look(mi: Any, origin: Any, target: Any) -> Any:
-    """A frame at `origin` whose z axis points to `target`."""
+    """Return a frame at `origin` with its z axis towards `target`."""
     start, end = (np.asarray(point, dtype=float) for point in (origin, target))
     steep = np.linalg.norm(np.cross(end - start, [0.0, 0.0, 1.0])) < 1e-6 * np.linalg.norm(end - start)
     up = [0.0, 1.0, 0.0] if steep else [0.0, 0.0, 1.0]

@@ -13,13 +13,13 @@ Vector = tuple[float, float, float]
 Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
 Roughness = Annotated[float, Field(ge=0.01, le=1)]
-"""GGX alpha. Perfect mirrors are excluded, because point lights would be invisible in them."""
+"""GGX alpha. Perfect mirrors are not allowed, because point lights would be invisible in them."""
 Index = Annotated[float, Field(gt=1, le=3)]
-"""Index of refraction of something transparent."""
+"""Index of refraction of a transparent material."""
 
 
 class Model(BaseModel):
-    """Frozen; unknown keys are errors."""
+    """Base of the models: frozen, and unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -35,6 +35,6 @@ class Pose(Model):
 
 
 def unit(vector: Vector) -> Vector:
-    """`vector` at length 1."""
+    """Return `vector` with length 1."""
     x, y, z = np.asarray(vector, dtype=float) / np.linalg.norm(vector)
     return float(x), float(y), float(z)

@@ -48,7 +48,7 @@ class Mesh(Pose):
 
 
 class Plane(Pose):
-    """A sheet in z = 0 about the origin, facing up."""
+    """A sheet in z = 0 around the origin, facing up."""
 
     kind: Literal["plane"]
     width_mm: Positive
@@ -57,7 +57,7 @@ class Plane(Pose):
 
 
 class Sphere(Pose):
-    """It rests on z = 0."""
+    """A sphere that rests on z = 0."""
 
     kind: Literal["sphere"]
     radius_mm: Positive
@@ -73,7 +73,7 @@ class SculptedRelief(Pose):
 
 
 class GiltStepWedge(Pose):
-    """Gold leaf of rising thickness on bole, along x (seed 001, section 5)."""
+    """Gold leaf of increasing thickness on bole, along x (seed 001, section 5)."""
 
     kind: Literal["gilt_step_wedge"]
     thicknesses_nm: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)] = samples.GILT_NM
@@ -82,11 +82,11 @@ class GiltStepWedge(Pose):
 
 
 class PaintWedge(Pose):
-    """A paint of rising thickness along x, over white towards +y and over black towards -y."""
+    """A paint of increasing thickness along x, over white towards +y and over black towards -y."""
 
     kind: Literal["paint_wedge"]
     pigment: str = "blue_one_peak_shape"
-    """A shape's name."""
+    """Name of a shape."""
     thicknesses_mm: Annotated[tuple[Positive, ...], Field(min_length=1)] = samples.PAINT_MM
     scattering_per_mm: Positive = 8.0
 
@@ -105,8 +105,8 @@ class MakieTile(Pose):
 class NashijiSlab(Pose):
     """Gold flakes in clear lacquer over black (seed 002, section 5); x and y go from 0 to the slab's size.
 
-    Rays are refracted at the lacquer's face, which also reflects the lights, are absorbed along their ways through
-    it, and hit the flakes at their positions.
+    Rays are refracted at the lacquer's face, which also reflects the lights. They are absorbed along their paths
+    through the lacquer, and hit the flakes at their positions.
     """
 
     kind: Literal["nashiji_slab"]
@@ -126,7 +126,7 @@ class Arcature(Pose):
     kind: Literal["arcature"]
     radius_mm: Positive = 400.0
     height_mm: Positive = 600.0
-    """Height from the sill to where the arch begins."""
+    """Height from the sill to the springing of the arch."""
     depth_mm: Positive = 300.0
     gilt: Gilt = Gilt(kind="gilt")
     stone: Material = Diffuse(kind="diffuse", reflectance=Shape(kind="shape", name="dull_yellow_shape"))
@@ -148,7 +148,7 @@ class Church(Pose):
     width_mm: Positive = 6000.0
     length_mm: Positive = 12000.0
     spring_mm: Positive = 5000.0
-    """Height from the floor to where the vault begins."""
+    """Height from the floor to the springing of the vault."""
     bays: Annotated[int, Field(ge=1, le=20)] = 3
     wall_mm: Positive = 600.0
     window_width_mm: Positive = 1000.0
@@ -158,7 +158,7 @@ class Church(Pose):
     light_tiles: Material = _STONE
     dark_tiles: Material = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.12))
     glazing: Glazing | None = None
-    """Glazing of all windows; without it they are open."""
+    """Glazing of all windows; without it the windows are open."""
     lead: Material = _LEAD
 
     @model_validator(mode="after")
@@ -270,7 +270,8 @@ def _panel(panel: samples.SteppedPanel, materials: Sequence[Material]) -> list[P
 
 
 def _paint_fields(thing: PaintWedge) -> list[Material]:
-    """Return the paints in the generator's order: row by row, black ground first, with the steps' thicknesses."""
+    """Return the paints in the order of the fields: row by row, black ground first, with the steps'
+    thicknesses."""
     return [
         Paint(
             kind="paint",
@@ -309,15 +310,15 @@ def _nashiji(thing: NashijiSlab) -> list[Piece]:
 
 
 def _clear(width: float, length: float, thickness_mm: float, rim_mm: float) -> Piece:
-    """The lacquer's outside: it extends into the body, and is slightly wider, because flakes at the rim extend
-    over it."""
+    """Return the outer surface of the lacquer. It extends into the body, and is slightly wider than the slab,
+    because flakes at the rim extend beyond it."""
     box = slab(width + 2 * rim_mm, length + 2 * rim_mm, thickness_mm + _DIP_MM)
     lift = np.array([0.5 * width, 0.5 * length, _NASHIJI_BODY_MM - _DIP_MM])
     return Piece(box + lift, Glass(kind="glass", index=indices.URUSHI, absorption=Urushi(kind="urushi")))
 
 
 def placed_piece(piece: Piece, pose: Pose) -> Piece:
-    """Move a piece from its thing's frame into the scene's frame."""
+    """Move a piece from its object's frame into the scene's frame."""
     return _moved_piece(piece, pose.scene_from_thing())
 
 

@@ -1,7 +1,7 @@
 """Coloured glass of windows: thin sheets that filter light and let it pass straight on.
 
-Transmittance along the normal is exact, with all reflections between the two faces; at other angles the faces
-follow Fresnel, and the absorption stays that along the normal (at 45 degrees the way in glass is 1.13 times as
+Transmittance along the normal is exact, with all reflections between the two faces. At other angles the faces
+follow Fresnel, and the absorption stays as along the normal (at 45 degrees the path in glass is 1.13 times as
 long).
 """
 
@@ -21,7 +21,7 @@ from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
 from coupole.errors import InputError
 
 PLUGIN = "thindielectric"
-"""Mitsuba's."""
+"""Name of Mitsuba's plugin."""
 _SHAPES: dict[str, tuple[tuple[float, float, float], ...]] = {
     "cobalt_blue_shape": ((1.0, 540.0, 22.0), (1.35, 592.0, 22.0), (1.25, 645.0, 25.0)),
     "copper_ruby_shape": ((1.6, 562.0, 16.0), (1.5, 480.0, 70.0), (0.8, 395.0, 35.0)),
@@ -29,13 +29,13 @@ _SHAPES: dict[str, tuple[tuple[float, float, float], ...]] = {
     "manganese_purple_shape": ((1.2, 495.0, 45.0), (0.25, 570.0, 45.0)),
     "copper_green_shape": ((1.7, 790.0, 105.0), (1.5, 380.0, 42.0)),
 }
-"""Assumed: optical density, centre and width in nm of absorption bands. Centres are where colourants of glass
-absorb (cobalt in tetrahedra, copper and silver colloids, trivalent manganese, bivalent copper); densities are no
-measurement."""
+"""Assumed optical density, centre and width in nm of absorption bands. The centres are those of colourants of
+glass (cobalt in tetrahedra, copper and silver colloids, trivalent manganese, bivalent copper). The densities are
+not measured."""
 
 
 class Transmitted(Model):
-    """Measured on a sheet along its normal, reflections at its faces included."""
+    """Transmittance of a sheet, measured along its normal, including reflections at its faces."""
 
     kind: Literal["transmittance"]
     path: Path
@@ -43,8 +43,7 @@ class Transmitted(Model):
 
 
 class Absorbed(Model):
-    """Sheet of glass, by the glass's coefficient of absorption in 1/mm (natural logarithm) and the sheet's
-    thickness."""
+    """A sheet of glass, given by its coefficient of absorption in 1/mm (natural logarithm) and its thickness."""
 
     kind: Literal["absorption"]
     path: Path
@@ -53,7 +52,7 @@ class Absorbed(Model):
 
 
 class AssumedGlass(Model):
-    """An assumed spectrum, of `density` times its usual depth of colour."""
+    """An assumed spectrum, with `density` times its usual depth of colour."""
 
     kind: Literal["shape"]
     name: Literal[
@@ -84,7 +83,8 @@ class Pane(Model):
 
 
 def passage(pane: Pane, folder: Path) -> Array:
-    """[81], what is left of light on one way through the glass itself, along the normal. Raises InputError."""
+    """[81] share of light that remains after one passage through the glass itself, along the normal. Raises
+    InputError."""
     colour = pane.colour
     if isinstance(colour, Clear):
         return np.ones_like(WAVELENGTHS_NM)
@@ -111,14 +111,14 @@ def passage(pane: Pane, folder: Path) -> Array:
 
 
 def sheet(internal_transmittance: Array, face: float) -> tuple[Array, Array]:
-    """Reflectance and transmittance of a sheet that leaves `internal_transmittance` of light on each way, and
-    whose faces reflect `face`: the sums over all reflections between them."""
+    """Return reflectance and transmittance of a sheet: the sums over all reflections between its faces. Each
+    passage leaves the share `internal_transmittance` of light, and the faces have the reflectance `face`."""
     through = (1.0 - face) ** 2 * internal_transmittance / (1.0 - (face * internal_transmittance) ** 2)
     return np.asarray(face + face * internal_transmittance * through), np.asarray(through)
 
 
 def _inside(through: Array, face: float) -> Array:
-    """The inverse of `sheet`'s transmittance, a quadratic equation."""
+    """Return the inverse of `sheet`'s transmittance, from a quadratic equation."""
     half = 0.5 * (1.0 - face) ** 2
     return np.asarray(through / (half + np.sqrt(half**2 + (face * through) ** 2)))
 
@@ -128,8 +128,8 @@ def _face(pane: Pane) -> float:
 
 
 def bsdf(pane: Pane, folder: Path) -> Description:
-    """The sheet for Mitsuba. Mitsuba's own sheet is clear, so its parts are multiplied by the effect of
-    the colour."""
+    """Return the sheet for Mitsuba. Mitsuba's own sheet is clear, so its parts are multiplied by the effect of the
+    colour."""
     face = _face(pane)
     reflectance, through = sheet(passage(pane, folder), face)
     clear_reflectance, clear_through = sheet(np.ones(1), face)

@@ -1,9 +1,9 @@
-"""Sunlight that comes over gold onto matt surfaces, anywhere: photons are kept there and gathered by the eye.
+"""Sunlight that gold reflects onto matt surfaces: photons are kept there and gathered by the eye.
 
-Photon mapping (Jensen 1996) for light that path tracing finds only by chance. Photons start at the sun, are
-reflected by gold as in `caustic`, and by matt surfaces with Lambert's distribution; they are kept at each matt
-surface that they meet after gold. This light and that of paths without gold, which a path tracer finds well, are
-the whole.
+Photon mapping (Jensen 1996) is used for light that path tracing finds only by chance. Photons start at the sun.
+Gold reflects them as in `caustic`, and matt surfaces reflect them with Lambert's distribution. They are kept at
+each matt surface that they meet after gold. All light is the sum of this light and the light of paths without
+gold, which a path tracer finds well.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _MOST_BOUNCES = 32
 _CHUNK = 100_000
 _OFFSET_MM = 0.05
 _SAME_SIDE = 0.5
-"""Cosine between the normals of an eye's hit and of a photon that it gathers, at least."""
+"""Least cosine between the normals of an eye's hit and of a photon that it gathers."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Mirror:
     corners_mm: Array
     """[triangles, 3, 3]."""
     reflectance: Reflectance
-    """Function that gives the reflectance [n, 81] of cosines [n]."""
+    """Function that returns the reflectance [n, 81] for cosines [n]."""
     roughness: float
 
 
@@ -45,19 +45,19 @@ class Matt:
 
 @dataclass(frozen=True)
 class Hits:
-    """Ends of rays; those that miss everything have surface -1."""
+    """Ends of rays. Rays that meet nothing have surface -1."""
 
     surface: NDArray[np.int64]
     """[n], the number of the surface."""
     places_mm: Array
     """[n, 3]."""
     normals: Array
-    """[n, 3], towards where the ray came from."""
+    """[n, 3], on the side from which the ray came."""
 
 
 @dataclass(frozen=True)
 class Kept:
-    """Photons at matt surfaces, after gold."""
+    """Photons that reached matt surfaces after a reflection at gold."""
 
     places_mm: Array
     """[n, 3]."""
@@ -96,7 +96,7 @@ class Room:
             ]
         )
         self.box_mm = np.stack([mirrors.min(axis=0), mirrors.max(axis=0)])
-        """[2, 3], about the mirrors."""
+        """[2, 3], bounds of the mirrors."""
 
     def hits(self, starts: Array, ways: Array) -> Hits:
         hit = self._tree.run(starts.astype(np.float32), ways.astype(np.float32), output=True)
@@ -112,7 +112,8 @@ class Room:
 
 
 def photons(room: Room, sun: Sun, bands: Sequence[int], count: int, seed: tuple[int, ...]) -> Iterator[Kept]:
-    """`count` photons from the sun onto the mirrors and what is near, in parts; powers are for all `count`."""
+    """Yield, in parts, `count` photons from the sun onto the mirrors and their surroundings. The photons of all
+    parts together have the full power."""
     random = np.random.default_rng(seed)
     middle = room.box_mm.mean(axis=0)
     radius_mm = 0.75 * float(np.linalg.norm(room.box_mm[1] - room.box_mm[0]))
@@ -175,7 +176,8 @@ def _trace_photons(
 
 
 def _scatter_diffusely(normals: Array, reflectance: Array, random: np.random.Generator) -> tuple[Array, Array]:
-    """Lambert's directions [n, 3], and shares [n, bands]: 0 for those that Russian roulette ends."""
+    """Return Lambertian directions [n, 3], and shares of power [n, bands], which are 0 for photons that Russian
+    roulette ends."""
     n, lives = len(normals), float(min(1.0, max(reflectance.max(), 0.0)))
     ball = random.normal(size=(n, 3))
     ways = normals + ball / np.linalg.norm(ball, axis=1, keepdims=True)
@@ -185,7 +187,7 @@ def _scatter_diffusely(normals: Array, reflectance: Array, random: np.random.Gen
 
 
 class Gathering:
-    """Irradiance by photons at hits of an eye's rays, summed over parts of the photons."""
+    """Irradiance from photons at the hits of an eye's rays, summed over parts of the photons."""
 
     def __init__(self, hits: Hits, is_matt: NDArray[np.bool_], bands: int, radius_mm: float) -> None:
         from scipy.spatial import cKDTree
@@ -228,8 +230,8 @@ def seen_by_gold(
     seed: int,
     progress: Progress,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return for rays of an eye (starts [n, 3], ways [n, 3]): radiance [n, bands] of matt surfaces by light that
-    came over gold, in W/(m^2 sr nm), and which rays meet gold first [n]."""
+    """Return, for rays of an eye (starts [n, 3], directions [n, 3]), the radiance [n, bands] of matt surfaces from
+    light that gold reflected, in W/(m^2 sr nm). Return also a mask [n] of the rays that meet gold first."""
     hits = room.hits(*rays)
     albedo = np.stack(
         [surface.reflectance if isinstance(surface, Matt) else np.zeros(81) for surface in room.surfaces]

@@ -24,7 +24,7 @@ SYNTHETIC = "simulated: computed by spectral path tracing, not a photograph"
 
 
 def eye_of(scene: PlainScene, folder: Path) -> colour.Eye:
-    """The scene's observer, used to the first light; spectra of several lights count alike."""
+    """Return the scene's observer, adapted to the first light; spectra of several lights have equal weight."""
     powers = [power(light.spectrum, folder) for light in scene.lights]
     mixture = np.sum([scaled_power(light_power, 1.0) for light_power in powers], axis=0)
     return colour.eye(scene.observer, mixture, powers[0], scene.bands.step_nm)
@@ -39,10 +39,11 @@ def write(
     written_by: str,
     with_spectra: bool = True,
 ) -> dict[str, Any]:
-    """Write `stem`.exr (unless not `with_spectra`) and `stem`.png, with polarisation also `stem`-polarisation.png;
-    returns their summary.
+    """Write `stem`.exr (if `with_spectra`) and `stem`.png, with polarisation also `stem`-polarisation.png. Return
+    their summary.
 
-    `eye` is whose colours are shown, `written_by` names renderer and variant. Raises OSError, InputError.
+    `eye` is the observer of the shown colours, `written_by` names renderer and variant. Raises OSError,
+    InputError.
     """
     xyz = eye.tristimulus(spectral_picture.radiance)
     shown_white = scene.display.white_cd_m2 or float(np.quantile(xyz[..., 1], 1.0 - scene.display.clipped))
@@ -80,7 +81,8 @@ def write(
 
 
 def write_png(path: Path, picture: NDArray[np.uint8], about: str, more: Mapping[str, str] | None = None) -> None:
-    """An sRGB picture [h, w, 3], or a grey one [h, w], that says what it is; `more` texts by their keywords."""
+    """Write an sRGB picture [h, w, 3], or a grey one [h, w], with texts that describe it; `more` are texts by
+    their keywords."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
@@ -101,8 +103,8 @@ def write_exr(
     about: str,
     more: Mapping[str, str] | None = None,
 ) -> None:
-    """Channels and attributes of Fichet et al., "An OpenEXR Layout for Spectral Images", JCGT 10(3), 2021, and
-    `more` attributes. Raises OSError, InputError."""
+    """Write channels and attributes by Fichet et al., "An OpenEXR Layout for Spectral Images", JCGT 10(3), 2021,
+    and `more` attributes. Raises OSError, InputError."""
     import mitsuba
 
     mi: Any = mitsuba

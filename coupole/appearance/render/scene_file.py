@@ -27,7 +27,7 @@ Pixels = Annotated[int, Field(ge=4, le=8192)]
 class FieldOfView(Model):
     kind: Literal["field"]
     degrees: Annotated[float, Field(gt=0, lt=170)]
-    """Across the picture's width."""
+    """Field of view across the picture's width, degrees."""
 
 
 class Lens(Model):
@@ -55,14 +55,14 @@ class Camera(Model):
         return self
 
     def field_deg(self) -> float:
-        """Across the picture's width."""
+        """Field of view across the picture's width, degrees."""
         if isinstance(self.optics, FieldOfView):
             return self.optics.degrees
         half_mm = 0.5e-3 * self.width_px * self.optics.pixel_pitch_um
         return float(np.degrees(2.0 * np.arctan(half_mm / self.optics.focal_length_mm)))
 
     def narrowed_to(self, width_px: int) -> Camera:
-        """The same view with fewer pixels; one that is not wider stays as it is."""
+        """Return the same view with fewer pixels; a camera that is not wider stays as it is."""
         if width_px >= self.width_px:
             return self
         optics = FieldOfView(kind="field", degrees=self.field_deg())
@@ -80,12 +80,13 @@ class Display(Model):
     """Conversion of XYZ to sRGB."""
 
     white_cd_m2: Positive | None = None
-    """Luminance that is shown as white; none: the level exceeded by the share `clipped`."""
+    """Luminance that is shown as white. By default it is the level that the share `clipped` of the pixels
+    exceeds."""
     clipped: Annotated[float, Field(ge=0, lt=0.5)] = 0.005
     adaptation: Literal["CAT16", "Bradford", "none"] = "CAT16"
-    """Adaptation from the white of the first light to D65; none shows the light's own colour."""
+    """Adaptation from the white of the first light to D65; `none` shows the light's own colour."""
     denoised: bool = False
-    """True if the PNG, and it alone, is denoised by Open Image Denoise."""
+    """True if the PNG, but no other file, is denoised by Open Image Denoise."""
 
 
 class Outputs(Model):
@@ -103,16 +104,17 @@ class Caustic(Model):
 
 
 class Gathered(Model):
-    """Sunlight that gold sends onto matt surfaces, by photons gathered by the eye, in place of paths."""
+    """Sunlight that gold reflects onto matt surfaces, by photons that the eye gathers, instead of by paths."""
 
     photons: Annotated[int, Field(ge=1000, le=100_000_000)] = 2_000_000
-    """Number of photons of each sun."""
+    """Number of photons for each sun."""
     radius_mm: Positive = 4.0
-    """Radius about what the eye sees: less is sharper, and needs more photons."""
+    """Radius, around each place that the eye sees, in which photons are gathered. A smaller radius is sharper, and
+    needs more photons."""
 
 
 class Film(Model):
-    """A picture for each time from `begins` to `ends`; all have the white of the first."""
+    """A film with a picture for each time from `begins` to `ends`; all have the white of the first picture."""
 
     begins: AwareDatetime
     ends: AwareDatetime
@@ -132,11 +134,12 @@ class Film(Model):
 
 
 class Turntable(Model):
-    """A picture for each step of a turn of all objects but planes about the scene's z axis; lights stand still."""
+    """A film with a picture for each step of a turn about the scene's z axis. All objects except planes turn;
+    lights stand still."""
 
     frames: Annotated[int, Field(ge=2, le=1000)] = 48
     degrees: Annotated[float, Field(ge=-3600, le=3600)] = 360.0
-    """Angle from the first picture to the one that would follow the last."""
+    """Angle from the first picture to the picture that would follow the last one."""
     frames_per_s: Annotated[int, Field(ge=1, le=60)] = 12
 
     def angles_deg(self) -> list[float]:
@@ -144,7 +147,7 @@ class Turntable(Model):
 
 
 class Scene(Model):
-    """One scene; all cameras see the same."""
+    """One scene; all its cameras see the same objects and lights."""
 
     schema_version: Literal[1]
     name: Name
@@ -154,14 +157,14 @@ class Scene(Model):
     observer: Literal["10 deg", "2 deg"] = "10 deg"
     bands: Bands = Bands()
     samples: Annotated[int, Field(ge=1, le=1_000_000)] = 64
-    """Paths through each pixel; at most, where a `noise` is wanted."""
+    """Number of paths through each pixel; if a `noise` is given, the largest number."""
     noise: Annotated[float, Field(gt=0, lt=1)] | None = None
-    """Relative standard error of luminance that half of the pixels shall have at most."""
+    """Largest relative standard error of luminance in half of the pixels."""
     depth: Annotated[int, Field(ge=1, le=100)] = 8
-    """Surfaces that a path meets at most."""
+    """Largest number of surfaces that a path meets."""
     seed: Annotated[int, Field(ge=0, le=2**31)] = 1
     polarisation: bool = False
-    """Stokes vectors of every band; four times the work, and slower."""
+    """True for Stokes vectors of every band. This is four times the work, and slower."""
     display: Display = Display()
     outputs: Outputs = Outputs()
     caustic: Caustic | None = None
@@ -192,7 +195,7 @@ class Scene(Model):
         return self
 
     def at(self, when: datetime) -> Scene:
-        """The scene with its daylight at another time."""
+        """Return the scene with its daylight at another time."""
         moved_lights = tuple(
             light.model_copy(update={"when": when}) if isinstance(light, Daylight) else light
             for light in self.lights
@@ -200,7 +203,7 @@ class Scene(Model):
         return self.model_copy(update={"lights": moved_lights})
 
     def turned_about_z(self, angle_deg: float) -> Scene:
-        """The scene with all objects but planes turned about its z axis, anticlockwise from above."""
+        """Return the scene with all objects except planes turned about its z axis, anticlockwise from above."""
         about_z = transform(abc_deg=(angle_deg, 0.0, 0.0))
 
         def turn_object(thing: Object) -> Object:
@@ -214,19 +217,19 @@ class Scene(Model):
 
 
 class PlainScene(Scene):
-    """A scene whose daylight has become sun and sky."""
+    """A scene in which daylight has been replaced by sun and sky."""
 
     lights: Annotated[tuple[PlainLight, ...], Field(min_length=1)]
 
 
 def with_plain_lights(scene: Scene, folder: Path) -> PlainScene:
-    """Raises InputError where sun and sky cannot be computed."""
+    """Return the scene with sun and sky instead of daylight. Raises InputError if they cannot be computed."""
     fields = {name: getattr(scene, name) for name in Scene.model_fields}
     return PlainScene.model_construct(**{**fields, "lights": plain(scene.lights, folder)})
 
 
 def files(part: Any, at: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Path]]:
-    """All paths that a scene names, with the keys that lead to them."""
+    """Yield all paths that a scene names, with the keys that lead to them."""
     if isinstance(part, Path):
         yield at, part
     elif isinstance(part, BaseModel):
@@ -238,7 +241,7 @@ def files(part: Any, at: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str
 
 
 def remarks(scene: Scene) -> list[str]:
-    """Return remarks that the scene's maker must know, one sentence each."""
+    """Return remarks for the author of the scene, one sentence each."""
     shape_remarks = [shape.remark() for shape in _shapes(scene)]
     return list(dict.fromkeys(remark for remark in shape_remarks if remark))
 

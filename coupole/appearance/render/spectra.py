@@ -26,23 +26,24 @@ _SUN_K = 5778.0
 
 
 class Constant(Model):
-    """The same at all wavelengths."""
+    """The same value at all wavelengths."""
 
     kind: Literal["constant"]
     value: Share
 
 
 class Shape(Model):
-    """An assumed spectrum of `coupole.appearance.matter.typical`, opaque, inside its binder: no measured pigment.
+    """An assumed spectrum from `coupole.appearance.matter.typical`, of an opaque layer inside its binder; it is no
+    measured pigment.
 
-    `kind: pigment` and pigments' names are from before version 0.2, and still read, with a remark.
+    `kind: pigment` and names of pigments come from before version 0.2; they are still read, with a remark.
     """
 
     kind: Literal["shape", "pigment"]
     name: str
 
     def remark(self) -> str:
-        """Return what the scene's maker must know of a former name; empty if there is none."""
+        """Return a remark for the author of the scene about a former name; empty if there is none."""
         now = typical.FORMER_NAMES.get(self.name)
         if now is None:
             return ""
@@ -56,7 +57,7 @@ class Bole(Model):
 
 
 class Measured(Model):
-    """A spectrophotometer's export (docs/reference/materials.md); bands beyond it keep its ends."""
+    """A spectrophotometer's export (docs/reference/materials.md); beyond its ends, the last values are used."""
 
     kind: Literal["file"]
     path: Path
@@ -67,14 +68,14 @@ class Measured(Model):
 
 
 class MeasuredPaint(Model):
-    """K and S of a paint in a file, as `coupole layer` writes it (`coupole.appearance.matter.paint_file`)."""
+    """K and S of a paint in a file from `coupole layer` (`coupole.appearance.matter.paint_file`)."""
 
     kind: Literal["paint_file"]
     path: Path
 
 
 class MeasuredPower(Model):
-    """Power of a light by wavelength, measured."""
+    """Measured power of a light by wavelength."""
 
     kind: Literal["file"]
     path: Path
@@ -116,7 +117,7 @@ class Values(Model):
 
     kind: Literal["values"]
     name: str = "given"
-    """Name as pictures and pages show it."""
+    """Name in pictures and pages."""
     values: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=BANDS, max_length=BANDS)]
 
 
@@ -139,7 +140,8 @@ Power = Annotated[
 
 
 def internal(spectrum: Reflectance, folder: Path, index: ArrayLike) -> InternalReflectance:
-    """[81], under a face of real index `index`, where a measured spectrum was seen through such a face.
+    """[81] reflectance under a face of real index `index`. A measured spectrum is converted, because it was
+    measured through such a face.
 
     Constants, shapes and the bole are internal reflectances already. Paths are relative to `folder`. Raises
     InputError.
@@ -160,7 +162,8 @@ def internal(spectrum: Reflectance, folder: Path, index: ArrayLike) -> InternalR
 
 
 def coefficients(paint: MeasuredPaint, folder: Path, *, needs_mm: bool) -> Pigment:
-    """K and S [81], ends held. Raises InputError, also if they are not per mm where they must be."""
+    """Return K and S [81], constant beyond the file's ends. Raises InputError, also if they must be per mm and are
+    not."""
     paint_file = read_paint(folder / paint.path)
     if needs_mm and paint_file.unit != "per mm":
         raise InputError(
@@ -171,7 +174,7 @@ def coefficients(paint: MeasuredPaint, folder: Path, *, needs_mm: bool) -> Pigme
 
 
 def matt(spectrum: Reflectance, folder: Path) -> MeasuredReflectance:
-    """[81], of something without a face. Raises InputError."""
+    """[81] reflectance of a material without a face. Raises InputError."""
     return BARE.reflectance_in_air(internal(spectrum, folder, 1.0))
 
 
@@ -205,12 +208,12 @@ def power(spectrum: Power, folder: Path) -> Array:
 
 
 def luminous(spectral: Array) -> Array:
-    """cd/m^2 of W/(m^2 sr nm) [..., 81], or lux of irradiance; V(lambda) is that of the CIE 1931 observer."""
+    """Return cd/m^2 of W/(m^2 sr nm) [..., 81], or lux of irradiance, with V(lambda) of the CIE 1931 observer."""
     return np.asarray(LM_PER_W * STEP_NM * (spectral @ light.observer("2 deg")[1]))
 
 
 def scaled_power(relative: Array, photometric: float) -> Array:
-    """Spectral power per nm [81] of the shape `relative` whose photometric amount is `photometric`."""
+    """Return the spectral power per nm [81] with the shape `relative` and the photometric amount `photometric`."""
     return np.asarray(relative * (photometric / luminous(relative)))
 
 

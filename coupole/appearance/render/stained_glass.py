@@ -14,18 +14,18 @@ from coupole.appearance.shapes.triangles import grid_faces
 from coupole.appearance.spectra.grid import Array
 
 OPEN = "."
-"""Sign in a layout: no glass."""
+"""Sign for an opening without glass in a layout."""
 
 
 class Glazing(Model):
     """Panes in rows and columns."""
 
     layout: Annotated[tuple[Annotated[str, Field(min_length=1, max_length=200)], ...], Field(min_length=1)]
-    """Rows from the top, a letter for each pane; a dot is left open."""
+    """Rows from the top, with a letter for each pane; a dot is an opening without glass."""
     panes: dict[Annotated[str, Field(min_length=1, max_length=1)], Colour]
     """The glass of each letter."""
     came_mm: Positive = 8.0
-    """Width of the lead between panes, half of it around."""
+    """Width of the lead between panes; around the window it is half of this."""
 
     @model_validator(mode="after")
     def _check_layout(self) -> Glazing:
@@ -53,7 +53,7 @@ def window(glazing: Glazing, width_mm: float, height_mm: float) -> tuple[Mapping
 
 
 def _edges(length_mm: float, parts: int, half_mm: float) -> Array:
-    """[2 (parts + 1)], where cames begin and end: half ones at both ends."""
+    """[2 (parts + 1)] places where cames begin and end; the cames at both ends have half the width."""
     middles = np.linspace(0.0, length_mm, parts + 1)
     edges = np.stack([middles - half_mm, middles + half_mm], axis=1).ravel()
     edges[0], edges[-1] = 0.0, length_mm

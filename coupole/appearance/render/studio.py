@@ -18,7 +18,7 @@ from coupole.appearance.render.spectra import power
 from coupole.intake.plain_data import read_json
 
 Progress = Callable[[str, int, int], None]
-"""Camera, passes done, passes in all."""
+"""Function that takes the camera, the number of finished passes, and of all passes."""
 
 
 def reduced_scene(
@@ -29,7 +29,7 @@ def reduced_scene(
     step_nm: int | None = None,
     noise: float | None = None,
 ) -> Scene:
-    """The scene with fewer samples, narrower pictures or coarser bands, for a quick look."""
+    """Return the scene with fewer samples, narrower pictures or coarser bands, for a quick preview."""
     cameras = [camera.narrowed_to(width_px) if width_px else camera for camera in scene.cameras]
     fields = {**scene.model_dump(mode="json"), "cameras": [camera.model_dump() for camera in cameras]}
     if samples:
@@ -47,7 +47,8 @@ def variant_of(scene: Scene) -> str:
 
 
 def render(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[str, Any]:
-    """Render all cameras into the folder `out`; returns the summary. The scene's paths are relative to `folder`.
+    """Render all cameras into the folder `out`, and return the summary. The scene's paths are relative to
+    `folder`.
 
     Raises InputError for an inconsistent scene or a missing library, OSError for files.
     """
@@ -106,9 +107,10 @@ def _moves(scene: Scene) -> _Moves | None:
 
 
 def _film(scene: Scene, moves: _Moves, folder: Path, out: Path, progress: Progress) -> dict[str, Any]:
-    """A PNG and its summary for each camera and step, then the film; pictures of the same scene stay as they are.
+    """Write a PNG and its summary for each camera and step, then the film. Existing pictures of the same scene are
+    kept.
 
-    All have the scene's `white_cd_m2`, or the level that the first of each camera has by itself.
+    All pictures have the scene's `white_cd_m2` as white, or the white of the first picture of each camera.
     """
     count, summaries, written_by = len(moves.steps), {}, ""
     for camera in scene.cameras:
@@ -141,7 +143,7 @@ def _film(scene: Scene, moves: _Moves, folder: Path, out: Path, progress: Progre
 
 
 def _frame(scene: Scene, folder: Path, stem: Path) -> dict[str, Any]:
-    """One picture of a film, unless it is there; a film that was interrupted goes on where it was."""
+    """Make one picture of a film, unless it exists, so that an interrupted film continues."""
     summary_path = stem.with_suffix(".json")
     digest = sha256(f"{scene.model_dump_json()} {variant_of(scene)}".encode()).hexdigest()
     if summary_path.exists():

@@ -1,4 +1,4 @@
-"""Urushi on bodies of any shape: makie drawn on their skin, nashiji under it (seed 002, sections 4 and 5)."""
+"""Urushi on bodies of any shape: makie on the surface, nashiji under it (seed 002, sections 4 and 5)."""
 
 from __future__ import annotations
 
@@ -23,21 +23,22 @@ from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
 _CLEAR_MM = 0.01
-"""Gap between flakes and both faces of the lacquer, whose triangles lie as much below the curved surface."""
+"""Gap between flakes and both faces of the lacquer; the triangles of the faces lie about as far below the curved
+surface."""
 _MOST_GRAINS = 6_000_000
 _MOST_FLAKES = 400_000
 
 
 class Turned(Model):
-    """Turned on a lathe: `shapes.turned.turned`."""
+    """A body turned on a lathe: `shapes.turned.turned_body`."""
 
     kind: Literal["turned"]
     profile_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=3)] = turned.BOWL_MM
-    """Radius and height, from the middle of the inside over the rim to that of the foot."""
+    """Radius and height of points, from the middle of the inside over the rim to the middle of the foot."""
 
 
 class Box(Model):
-    """It rests on z = 0."""
+    """A box that rests on z = 0."""
 
     kind: Literal["box"]
     size_mm: tuple[Positive, Positive, Positive]
@@ -61,29 +62,30 @@ class MotifDrawing(Model):
     name: makie_drawing.Motif
     period_mm: Positive = 24.0
     edge_mm: Positive = 0.5
-    """Distance over which the powder thins out."""
+    """Distance over which the powder becomes sparse."""
 
 
 class PictureDrawing(Model):
-    """White, or opaque where the picture has an alpha channel, is metal."""
+    """A drawing from a picture. White parts are metal; if the picture has an alpha channel, opaque parts are
+    metal."""
 
     kind: Literal["picture"]
     path: Path
     width_mm: Positive
-    """Width of the picture. Under `uv` the picture covers the texture's square, whatever is here."""
+    """Width of the picture. With `uv` the picture covers the texture's square, and this value is not used."""
 
 
 class Makie(Pose):
-    """Powder of metal, sprinkled in a drawing on a body of lacquer; `raised_mm` makes it takamakie."""
+    """Metal powder, sprinkled in a drawing on a body of lacquer; `raised_mm` makes it takamakie."""
 
     kind: Literal["makie"]
     body: Body
     drawing: Annotated[MotifDrawing | PictureDrawing, Field(discriminator="kind")]
     wrapped: sprinkled.Wrapping = "sides"
     grain_mm: Positive = 0.35
-    """Longest side of a grain, which is powder or bare."""
+    """Longest side of a grain; a grain is either powder or bare."""
     density: Share = 0.95
-    """Share of powder where the drawing is full."""
+    """Share of powder where the drawing's share is 1."""
     raised_mm: Annotated[float, Field(ge=0, le=5)] = 0.0
     metal: Metal = Metal(kind="metal", roughness=0.25)
     lacquer: Lacquer = Lacquer(kind="lacquer")
@@ -91,7 +93,7 @@ class Makie(Pose):
 
 
 class Nashiji(Pose):
-    """Metal flakes in absorbing lacquer all over a body, at their depths and tilts under its curved face."""
+    """Metal flakes in absorbing lacquer all over a body, each with its depth and tilt under the curved face."""
 
     kind: Literal["nashiji"]
     body: Body
@@ -100,7 +102,8 @@ class Nashiji(Pose):
     flakes_per_mm2: Positive = 3.0
     flake_radius_mm: Positive = 0.16
     tilt_deg: Annotated[float, Field(ge=0, lt=45)] = 8.0
-    """Root mean square, to the surface there; a flake too steep for the lacquer is less tilted."""
+    """Root mean square tilt of the flakes to the surface; a flake that is too steep for the lacquer is tilted
+    less."""
     metal: Metal = Metal(kind="metal", gold=0.8, roughness=0.08)
     absorption: Absorption = Urushi(kind="urushi")
     ground: Material = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.006))
@@ -109,7 +112,7 @@ class Nashiji(Pose):
 
 
 def body_corners(body: Body, folder: Path) -> Array:
-    """[n, 3, 3] in mm; paths are relative to `folder`. Raises InputError."""
+    """[n, 3, 3] corners of the body in mm; paths are relative to `folder`. Raises InputError."""
     match body:
         case Turned():
             return turned.turned_body(body.profile_mm)
@@ -122,7 +125,7 @@ def body_corners(body: Body, folder: Path) -> Array:
 
 
 def makie_grains(thing: Makie, folder: Path) -> sprinkled.Grains:
-    """The body's skin in grains, with the drawing's share on each. Raises InputError."""
+    """Return the body's surface, cut into grains, with the drawing's share on each. Raises InputError."""
     uv: Array | None = None
     if thing.wrapped == "uv":
         if not isinstance(thing.body, MeshBody):
@@ -144,7 +147,7 @@ def makie_grains(thing: Makie, folder: Path) -> sprinkled.Grains:
 
 
 def makie_pieces(thing: Makie, folder: Path) -> list[Piece]:
-    """Powder and bare lacquer, in the object's frame. Raises InputError."""
+    """Return powder and bare lacquer, in the object's frame. Raises InputError."""
     grains = makie_grains(thing, folder)
     powder = np.random.default_rng(thing.seed).random(len(grains.share)) < thing.density * grains.share
     parts = ((powder, thing.metal, False), (~powder, thing.lacquer, True))
@@ -156,7 +159,8 @@ def makie_pieces(thing: Makie, folder: Path) -> list[Piece]:
 
 
 def nashiji_pieces(thing: Nashiji, folder: Path) -> list[Piece]:
-    """Body, flakes, and the lacquer as a closed refracting and absorbing body around both, in the object's frame.
+    """Return the body, the flakes, and the lacquer as a closed refracting and absorbing body around both, in the
+    object's frame.
 
     Raises InputError.
     """

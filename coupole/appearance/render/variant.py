@@ -12,26 +12,26 @@ from typing import Any
 from coupole.errors import InputError
 
 LEAST_LLVM = 19
-"""LLVM 15 and 16 abort the interpreter; they are not tried."""
+"""Least version of LLVM: versions 15 and 16 abort the interpreter, so they are not tried."""
 
 
 def mitsuba(variant: str) -> Any:
-    """The module, set to `variant`. Raises InputError if it is not installed."""
+    """Return Mitsuba's module, set to `variant`. Raises InputError if it is not installed."""
     module = import_extra("mitsuba")
     module.set_variant(variant)
     return module
 
 
 def load_scene(mi: Any, description: Any) -> Any:
-    """Mitsuba's scene of a description, with lights in the given order.
+    """Return Mitsuba's scene from a description, with lights in the given order.
 
-    With parallel loading or merging of equal parts, the order of lights varies and with it their random numbers.
+    With parallel loading, or merging of equal parts, the order of lights would vary, and their random numbers too.
     """
     return mi.load_dict(description, parallel=False, optimize=False)
 
 
 def import_extra(name: str, extra: str = "mitsuba,materials") -> Any:
-    """An optional module. Raises InputError if it is not installed, with the extra that has it."""
+    """Import an optional module. Raises InputError, with the extra that has it, if it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -41,7 +41,7 @@ def import_extra(name: str, extra: str = "mitsuba,materials") -> Any:
 
 
 def spectral(*, is_polarised: bool) -> str:
-    """Name of the spectral variant: LLVM if a suitable library is found, otherwise scalar."""
+    """Return the name of the spectral variant: LLVM if a suitable library is found, otherwise scalar."""
     library = os.environ.get("DRJIT_LIBLLVM_PATH") or ctypes.util.find_library("LLVM") or ""
     kind = "scalar"
     if llvm_version(library) >= LEAST_LLVM:
@@ -51,7 +51,7 @@ def spectral(*, is_polarised: bool) -> str:
 
 
 def llvm_version(library: str) -> int:
-    """Major version of an LLVM library from its file name, after following links; 0 if unknown.
+    """Return the major version of an LLVM library from its file name, after following links; 0 if unknown.
 
     The library is not loaded, because an old one would abort the process.
     """

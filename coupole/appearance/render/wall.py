@@ -1,4 +1,4 @@
-"""The back wall of a scene's arcature under its sun: light by photons (`caustic`), as a picture."""
+"""A picture of the back wall of a scene's arcature under its sun, with light by photons (`caustic`)."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ _PART = 500_000
 def write_wall(
     scene: PlainScene, folder: Path, stem: Path, white_power: Array, progress: Callable[[int, int], None]
 ) -> dict[str, Any]:
-    """Write `stem`.png, the colour of a white wall, with the brightest 0.5 % of the cells shown as white; returns
+    """Write `stem`.png, the colour of a white wall, with the brightest 0.5 % of the cells shown as white. Return
     figures.
 
-    Sunlight only: no sky, and no inter-reflection between stones. Raises InputError, OSError.
+    The light is sunlight only, without sky and without inter-reflection between stones. Raises InputError,
+    OSError.
     """
     assert scene.caustic is not None
     thing = next(thing for thing in scene.objects if isinstance(thing, Arcature))
@@ -59,9 +60,10 @@ def _lit(
     sun: caustic.Sun,
     progress: Callable[[int, int], None],
 ) -> tuple[Array, float]:
-    """Irradiance [rows, columns, 81] of the wall, and the luminous share of the light that reached stone by gold.
+    """Return the irradiance [rows, columns, 81] of the wall, and the luminous share of the light that reached
+    stone by way of gold.
 
-    In parts, as a photon takes 324 bytes.
+    It is computed in parts, because a photon takes 324 bytes.
     """
     sides, top_mm = (-thing.radius_mm, thing.radius_mm), thing.height_mm + thing.radius_mm
     counts = [min(_PART, settings.photons - first) for first in range(0, settings.photons, _PART)]

@@ -1,4 +1,4 @@
-"""Meshes that say at each vertex how much of a layer is worn off, and how much dust lies there."""
+"""Meshes with two numbers at each vertex: how much of a layer is worn off, and how much dust lies there."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
 _FINE = 2.0
-"""Edges of triangles in the width of a crack."""
+"""Number of triangles' edges in the width of a crack."""
 _FINE_EDGE = 5.0
-"""... in the reach of an edge."""
+"""Number of triangles' edges in the `reach_mm` of a worn edge."""
 _MOST_OFF = 0.01
 
 
 def write(corners_mm: Array, material: Weathered, path: Path, *, smooth: bool) -> None:
-    """Triangles [n, 3, 3] as a PLY file for Mitsuba. Raises InputError for a share that it cannot have."""
+    """Write triangles [n, 3, 3] as a PLY file for Mitsuba. Raises InputError for an impossible share."""
     mesh = weathered_triangles(corners_mm, material, smooth=smooth)
     numbers = {WORN: np.repeat(mesh.off.astype(float), 3)}
     if isinstance(material, Dusty):
@@ -39,7 +39,7 @@ def write(corners_mm: Array, material: Weathered, path: Path, *, smooth: bool) -
 
 
 def weathered_triangles(corners_mm: Array, material: Weathered, *, smooth: bool) -> Divided:
-    """Triangles, divided as the pattern needs, with its mask. Raises InputError."""
+    """Return triangles, divided as finely as the pattern needs, with its mask. Raises InputError."""
     normals = _corner_normals(corners_mm, smooth=smooth)
     wear = material.over if isinstance(material, Dusty) else material
     if not isinstance(wear, Worn) or isinstance(wear.pattern, Uniform):
@@ -67,7 +67,7 @@ def weathered_triangles(corners_mm: Array, material: Weathered, *, smooth: bool)
 
 
 def _corner_normals(corners_mm: Array, *, smooth: bool) -> Array:
-    """[n, 3, 3]; smooth ones are means over the triangles at a point, by their area."""
+    """[n, 3, 3] normals; smooth normals are means over the triangles at a point, weighted by area."""
     flat = flat_normals(corners_mm)
     if not smooth:
         return np.repeat(flat[:, None], 3, axis=1)
@@ -81,7 +81,8 @@ def _corner_normals(corners_mm: Array, *, smooth: bool) -> Array:
 
 
 def _write_ply(divided_mesh: Divided, numbers: dict[str, Array], path: Path) -> None:
-    """Binary, three vertices for each triangle; Mitsuba names a number `worn_0` of vertices `vertex_worn`."""
+    """Write a binary file with three vertices for each triangle. Mitsuba reads the vertex property `worn_0` as
+    `vertex_worn`."""
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"{name}_0" for name in numbers)]
     columns = [divided_mesh.corners_mm.reshape(-1, 3), divided_mesh.normals.reshape(-1, 3)]
     vertices = np.concatenate([*columns, *(column[:, None] for column in numbers.values())], axis=1).astype("<f4")

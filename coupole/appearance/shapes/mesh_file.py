@@ -14,7 +14,8 @@ _UNIT_MM = {"mm": 1.0, "m": 1000.0, "um": 1e-3}
 
 
 def mesh_corners(path: Path, unit: str) -> Array:
-    """Corners [triangles, 3, 3] in mm of any mesh that trimesh reads; no vertex is merged. Raises InputError."""
+    """Return the corners [triangles, 3, 3], in mm, of any mesh that trimesh reads; no vertices are merged. Raises
+    InputError."""
     mesh = _load_mesh(path)
     corners: Array = np.asarray(mesh.vertices)[np.asarray(mesh.faces)] * _UNIT_MM[unit]
     return corners

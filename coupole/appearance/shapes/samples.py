@@ -1,4 +1,4 @@
-"""Bodies whose faces are of several materials: a panel of fields, a drawing of sprinkled powder."""
+"""Bodies with faces of several materials: a panel of fields, a drawing of sprinkled powder."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from coupole.appearance.shapes.triangles import Array, cells_for, rectangle, skirt
 
 GILT_NM = (0.0, 10.0, 20.0, 40.0, 70.0, 100.0, 150.0, 250.0)
-"""Steps of a wedge of gold leaf, from bare bole to bulk gold; a beaten leaf has some 100 nm."""
+"""Steps of a wedge of gold leaf, from bare bole to bulk gold; a beaten leaf has about 100 nm."""
 PAINT_MM = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
 """Steps of a wedge of paint."""
 _PANEL_MM = 8.0
@@ -27,7 +27,7 @@ class SteppedPanel:
 
 
 def stepped_panel(rows: int, steps: int, step_mm: float, row_mm: float) -> SteppedPanel:
-    """A panel of `rows` by `steps` fields, 8 mm thick, about the z axis."""
+    """Return a panel of `rows` by `steps` fields, 8 mm thick, around the z axis."""
     fields = []
     for row in range(rows):
         for step in range(steps):
@@ -50,8 +50,8 @@ class MakieTile:
 
 
 def makie_tile(side_mm: float, triangles: int, petals: int, seed: int) -> MakieTile:
-    """The share of powder falls from 95 % inside the drawing to none over its edge: each triangle of the face is
-    powder with that probability, ground otherwise (seed 002, section 4)."""
+    """Return a tile. The share of powder falls over the edge of the drawing from 95 % inside to none outside. Each
+    triangle of the face is powder with this probability, else ground (seed 002, section 4)."""
     columns, rows = cells_for(triangles, side_mm, side_mm)
     face = rectangle(side_mm, side_mm, columns, rows, z_mm=_TILE_MM)
     share = _drawing(face.mean(axis=1)[:, :2] / (0.5 * side_mm), petals)
@@ -60,7 +60,8 @@ def makie_tile(side_mm: float, triangles: int, petals: int, seed: int) -> MakieT
 
 
 def _drawing(place: Array, petals: int) -> Array:
-    """Share of powder [n] at places [n, 2] of the face, -1 to 1: a flower, its heart and a rim."""
+    """Return the share of powder [n] at places [n, 2] of the face, which has coordinates -1 to 1. The drawing is a
+    flower, its heart and a rim."""
     r, phi = np.hypot(*place.T), np.arctan2(*place.T[::-1])
     edge = 0.45 + 0.25 * np.abs(np.cos(0.5 * petals * phi))
     flower = (r > 0.16) & (r < edge) | (r < 0.10)

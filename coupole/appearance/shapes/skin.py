@@ -1,4 +1,4 @@
-"""The skin of a body: points with normals, to coat it, to scatter things over it, to draw on it."""
+"""The skin of a body: points with normals, used to coat the body, to scatter things over it, and to draw on it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coupole.errors import InputError
 
 @dataclass(frozen=True)
 class Skin:
-    """Triangles whose points have normals."""
+    """Triangles with a normal at each point."""
 
     points_mm: Array
     """[n, 3]."""
@@ -34,8 +34,8 @@ class Skin:
 
 
 def skin_of(corners_mm: Array) -> Skin:
-    """Return the skin of corners [m, 3, 3]; a point's normal is the mean of its triangles' by their angles
-    (Thuermer 1998)."""
+    """Return the skin of corners [m, 3, 3]. A point's normal is the mean of its triangles' normals, weighted by
+    their angles (Thuermer 1998)."""
     points, faces = weld_corners(corners_mm)
     sides = corners_mm[:, [1, 2, 0]] - corners_mm
     length = np.maximum(np.linalg.norm(sides, axis=2, keepdims=True), 1e-300)
@@ -50,7 +50,7 @@ def skin_of(corners_mm: Array) -> Skin:
 
 
 def grown(skin: Skin, by_mm: float) -> Skin:
-    """The skin moved outwards along its normals. Raises InputError where it would fold."""
+    """Return the skin moved outwards along its normals. Raises InputError if it would fold."""
     grown_skin = Skin(skin.points_mm + by_mm * skin.normals, skin.faces, skin.normals)
     facing = np.sum(flat_normals(grown_skin.corners_mm) * flat_normals(skin.corners_mm), axis=1)
     if folds := int(np.count_nonzero((facing < 0.0) & (skin.areas_mm2() > 1e-9))):
@@ -62,8 +62,8 @@ def grown(skin: Skin, by_mm: float) -> Skin:
 
 
 def scatter_points(skin: Skin, count: int, random: np.random.Generator) -> tuple[Array, Array]:
-    """`count` points [count, 3], evenly by area, and the frames [count, 3, 3] there: normals are the third
-    columns, the first ones lie anywhere in the surface."""
+    """Return `count` points [count, 3], evenly by area, and the frames [count, 3, 3] there. Their third columns
+    are normals; their first columns are arbitrary directions in the surface."""
     areas = skin.areas_mm2()
     triangles = random.choice(len(areas), count, p=areas / areas.sum())
     root, second = np.sqrt(random.random(count)), random.random(count)

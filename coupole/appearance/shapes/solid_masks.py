@@ -1,7 +1,7 @@
-"""Masks that say where on a surface a layer is worn off: by fields in space, without texture coordinates.
+"""Masks of the parts of a surface where a layer is worn off, by fields in space, without texture coordinates.
 
-A field is a number at each point of a surface with its normal; where it is below a level, the layer is off.
-Triangles are divided where the level may cross them, until they are as small as the pattern needs.
+A field is a number for each point of a surface and its normal. The layer is missing where this number is below a
+level. Triangles are divided where the level may cross them, until they are as small as the pattern needs.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
 Field = Callable[[Array, Array], Array]
-"""Function of points [n, 3] in mm and normals [n, 3]. It gives [n] in mm, which change by no more than the way
-between points."""
+"""Function of points [n, 3] in mm and normals [n, 3]. It returns numbers [n] in mm, which change by no more than
+the distance between points."""
 SAMPLES = 40_000
-"""Points by which the level of a share is found."""
+"""Number of points by which the level of a share is found."""
 MOST_TRIANGLES = 2_000_000
 
 
@@ -32,18 +32,18 @@ class Divided:
     normals: Array
     """[n, 3, 3] of the corners."""
     off: NDArray[np.bool_]
-    """[n]"""
+    """[n] True for triangles without the layer."""
 
     @property
     def share(self) -> float:
-        """Share of the area that is off."""
+        """Share of the area without the layer."""
         areas = _areas(self.corners_mm)
         return float(areas[self.off].sum() / areas.sum())
 
 
 def cracks(points_mm: Array, cell_mm: float, seed: int) -> Field:
-    """Distance to the nearest face between Voronoi's cells of points jittered in a grid of `cell_mm`, about a
-    surface by its points [n, 3]."""
+    """Return a field: the distance to the nearest face between Voronoi cells. The cells belong to jittered points
+    of a grid of `cell_mm`, around a surface that is given by its points [n, 3]."""
     from scipy.spatial import KDTree
 
     near = np.array([[x, y, z] for x in range(-2, 3) for y in range(-2, 3) for z in range(-2, 3)])
@@ -63,7 +63,8 @@ def cracks(points_mm: Array, cell_mm: float, seed: int) -> Field:
 
 
 def edges(points_mm: Array, normals: Array, reach_mm: float) -> Field:
-    """Less on edges and convex places: minus the height over the mean of what lies within some `reach_mm`."""
+    """Return a field that is lower on edges and convex places: minus the height over the mean of the surface
+    within about `reach_mm`."""
     from scipy.spatial import KDTree
 
     tree = KDTree(points_mm)
@@ -81,7 +82,7 @@ def edges(points_mm: Array, normals: Array, reach_mm: float) -> Field:
 
 
 def spread_points(corners_mm: Array, normals: Array, seed: int, count: int = SAMPLES) -> tuple[Array, Array]:
-    """Points [n, 3] spread evenly over the area of triangles, and their normals."""
+    """Return points [n, 3] spread evenly over the area of triangles, and their normals."""
     random = np.random.default_rng(seed)
     areas = _areas(corners_mm)
     triangles = np.searchsorted(np.cumsum(areas) / areas.sum(), random.random(count)).clip(0, len(areas) - 1)
@@ -91,17 +92,17 @@ def spread_points(corners_mm: Array, normals: Array, seed: int, count: int = SAM
 
 
 def level_of(field: Field, share: float, points_mm: Array, normals: Array) -> float:
-    """The level below which a share of the points lies."""
+    """Return the level below which a share of the points lies."""
     return float(np.quantile(field(points_mm, normals), share))
 
 
 def divide_triangles(
     corners_mm: Array, normals: Array, field: Field, level_mm: float, finest_mm: float, share: float | None = None
 ) -> Divided:
-    """Triangles halved along their longest edges where the level may cross them, to edges of `finest_mm`.
+    """Halve triangles at their longest edges where the level may cross them, until edges have `finest_mm`.
 
-    With a `share` the level is moved a little, to have that share of the area. Raises InputError for more than
-    `MOST_TRIANGLES`.
+    With a `share`, the level is moved a little so that this share of the area is below it. Raises InputError for
+    more than `MOST_TRIANGLES`.
     """
     finished_parts: list[tuple[Array, Array]] = []
     corners, ways = np.asarray(corners_mm, dtype=float), np.asarray(normals, dtype=float)
@@ -132,7 +133,8 @@ def divide_triangles(
 
 
 def _halved_triangles(corners: Array, edge: NDArray[np.int64]) -> Array:
-    """[2n, 3, 3] of [n, 3, 3], by the middle of the edge that begins at the corner `edge` [n]."""
+    """[2n, 3, 3] halves of triangles [n, 3, 3], divided at the middle of the edge that begins at the corner `edge`
+    [n]."""
     rows = np.arange(len(corners))
     begin, end, apex = (corners[rows, (edge + step) % 3] for step in range(3))
     middle = 0.5 * (begin + end)

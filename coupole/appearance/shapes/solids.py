@@ -9,7 +9,7 @@ from coupole.appearance.shapes.triangles import Array, cells_for, heightfield, s
 
 
 def unit_sphere(n: int) -> Array:
-    """Corners [20 n^2, 3, 3] on the unit sphere about the origin, outwards counter-clockwise."""
+    """Return corners [20 n^2, 3, 3] on the unit sphere around the origin, counter-clockwise seen from outside."""
     points, faces = _icosahedron()
     a, b, c = (points[faces[:, k]][:, None, :] for k in range(3))
     # Steps (i, j) towards b and c on the flat face, then lifted onto the sphere.
@@ -28,9 +28,10 @@ def unit_sphere(n: int) -> Array:
 
 
 def relief(size_mm: float, triangles: int, depth_mm: float, seed: int) -> Array:
-    """Corners of a carved square tile that rests on z = 0: a boss of petals in a frame, and tool marks; closed.
+    """Return corners of a closed, carved square tile that rests on z = 0: a boss of petals in a frame, and tool
+    marks.
 
-    About `triangles` triangles, most of them in the carved top. Each seed gives a different tile.
+    The tile has about `triangles` triangles, most of them in the carved top. Each seed gives a different tile.
     """
     columns, rows = cells_for(triangles, size_mm, size_mm)
     random = np.random.default_rng(seed)
@@ -63,7 +64,7 @@ def _smooth(t: Array) -> Array:
 
 
 def _icosahedron() -> tuple[Array, NDArray[np.int64]]:
-    """Points [12, 3] on the unit sphere and faces [20, 3], outwards counter-clockwise."""
+    """Return points [12, 3] on the unit sphere and faces [20, 3], counter-clockwise seen from outside."""
     latitude = np.arctan(0.5)
     ring = np.arange(5) * 0.4 * np.pi
     flat, up = np.cos(latitude), np.sin(latitude)

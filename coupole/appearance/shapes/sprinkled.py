@@ -1,4 +1,4 @@
-"""A drawing of powder on a body: its skin cut into grains, each with the drawing's share."""
+"""A drawing of powder on a body: the body's skin is cut into grains, each with the drawing's share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coupole.appearance.shapes.triangles import Array
 
 Wrapping = Literal["sides", "above", "around", "uv"]
 """Ways in which a flat drawing lies on the body. `sides`: projected onto each of six sides, by the normal;
-`above`: along z; `around`: rolled around z; `uv`: by the mesh's texture coordinates, less their middle (0.5,
+`above`: along z; `around`: rolled around z; `uv`: by the mesh's texture coordinates, minus their middle (0.5,
 0.5)."""
 
 
@@ -25,11 +25,12 @@ class Grains:
     corners_mm: Array
     """[n, 3, 3]."""
     share: Array
-    """[n], of the drawing at their middles."""
+    """[n], the drawing's share at the middles of the triangles."""
 
 
 def parts_of(corners_mm: Array, grain_mm: float) -> NDArray[np.int64]:
-    """[triangles]: into how many parts the sides of each are cut, so that none is longer than `grain_mm`."""
+    """[triangles] number of parts into which the sides of each triangle are cut, so that no part is longer than
+    `grain_mm`."""
     longest = np.linalg.norm(corners_mm - corners_mm[:, [1, 2, 0]], axis=2).max(axis=1)
     return np.asarray(np.maximum(1, np.ceil(longest / grain_mm)), dtype=np.int64)
 
@@ -43,9 +44,9 @@ def grains(
     wrapping: Wrapping,
     raised_mm: float,
 ) -> Grains:
-    """The body's triangles [m, 3, 3], each cut into the square of its number in `parts` [m] grains. Grains are
-    raised
-    by `raised_mm` where the drawing is full. `uv` [m, 3, 2] is needed for that wrapping alone."""
+    """Cut each of the body's triangles [m, 3, 3] into grains; their number is the square of the triangle's number
+    in `parts` [m]. Grains are raised by `raised_mm` times the drawing's share. `uv` [m, 3, 2] is needed only for
+    the wrapping `uv`."""
     skin = skin_of(corners_mm)
     middle = 0.5 * (skin.points_mm.min(axis=0) + skin.points_mm.max(axis=0))
     normals = skin.normals[skin.faces]
@@ -69,7 +70,8 @@ def grains(
 
 
 def _cut_triangles(corners: Array, count: int) -> Array:
-    """[m count^2, 3, k] of triangles with values [m, 3, k] at their corners."""
+    """[m count^2, 3, k] values at the corners of the parts, from values [m, 3, k] at the corners of the
+    triangles."""
     i, j = (index.ravel() for index in np.meshgrid(np.arange(count), np.arange(count), indexing="ij"))
     is_upright, is_inverted = i + j < count, i + j < count - 1
     a, b, c = (
@@ -90,7 +92,7 @@ def _cut_triangles(corners: Array, count: int) -> Array:
 
 
 def _project_on_drawing(place: Array, normal: Array, wrapping: Wrapping) -> Array:
-    """[n, 2] in mm on the drawing; +y is up on walls."""
+    """[n, 2] places on the drawing in mm; +y is up on walls."""
     x, y, z = place.T
     if wrapping == "above":
         return np.stack([x, y], axis=1)

@@ -20,7 +20,7 @@ def flat_normals(corners_mm: Array) -> Array:
 
 
 def grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
-    """[2 rows columns, 3] corners of a grid of `rows` by `columns` cells, whose points are numbered row by row.
+    """[2 rows columns, 3] corners of a grid of `rows` by `columns` cells, with points numbered row by row.
 
     The two triangles of a cell follow each other. Rows go along y and columns along x: seen from above they are
     counter-clockwise.
@@ -31,7 +31,7 @@ def grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
 
 
 def rectangle(width_mm: float, depth_mm: float, columns: int = 1, rows: int = 1, *, z_mm: float = 0.0) -> Array:
-    """Corners of a flat sheet of cells about the z axis, facing up."""
+    """Return corners of a flat sheet of cells around the z axis, facing up."""
     return heightfield(width_mm, depth_mm, columns, rows, lambda x, _: np.full_like(x, z_mm))
 
 
@@ -51,7 +51,8 @@ def heightfield(
 
 
 def cells_for(triangles: int, width_mm: float, depth_mm: float) -> tuple[int, int]:
-    """Columns and rows of nearly square cells that make up at most about `triangles` triangles."""
+    """Return the number of columns and rows of nearly square cells that have at most about `triangles`
+    triangles."""
     columns = max(1, round(np.sqrt(triangles / 2 * width_mm / depth_mm)))
     return columns, max(1, int(triangles / 2 / columns))
 
@@ -80,7 +81,8 @@ def skirt(top: Array, bottom_mm: float = 0.0) -> Array:
 
 
 def weld_corners(corners_mm: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Points [n, 3] and triangles [m, 3] of corners; points that are equal to the nanometre are one."""
+    """Return points [n, 3] and triangles [m, 3] from corners; points that are equal to the nanometre are
+    merged."""
     keys, faces = np.unique(np.round(corners_mm.reshape(-1, 3), 6) + 0.0, axis=0, return_inverse=True)
     return keys, faces.reshape(-1, 3)
 

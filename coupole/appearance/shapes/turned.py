@@ -21,9 +21,9 @@ BOWL_MM = (
 def turned_body(profile_mm: Sequence[tuple[float, float]], *, around: int = 256, step_mm: float = 0.5) -> Array:
     """Corners [n, 3, 3] of a closed body turned about z.
 
-    `profile_mm` has radius and height of points of its outline, from the axis to the axis, the body on the right
-    of the way: from the middle of a bowl's inside over the rim to that of its foot. Between them goes Akima's
-    curve (JACM 17(4), 1970), by the length of the chords. Raises InputError.
+    `profile_mm` has radius and height of points of its outline, from the axis to the axis, with the body on the
+    right: for a bowl, from the middle of its inside over the rim to the middle of its foot. Between the points the
+    outline is Akima's curve (JACM 17(4), 1970), by the length of the chords. Raises InputError.
     """
     from scipy.interpolate import Akima1DInterpolator
 
@@ -53,7 +53,8 @@ def turned_body(profile_mm: Sequence[tuple[float, float]], *, around: int = 256,
 
 
 def rounded_box(size_mm: tuple[float, float, float], edge_mm: float, *, step_mm: float = 4.0) -> Array:
-    """Corners [n, 3, 3] of a closed box about the z axis that rests on z = 0, its edges rounded by `edge_mm`."""
+    """Return corners [n, 3, 3] of a closed box around the z axis that rests on z = 0, with edges rounded by
+    `edge_mm`."""
     half = 0.5 * np.asarray(size_mm, dtype=float)
     if edge_mm <= 0.0 or edge_mm >= half.min():
         raise InputError(
@@ -78,7 +79,7 @@ def rounded_box(size_mm: tuple[float, float, float], edge_mm: float, *, step_mm:
 
 
 def _lines(half_mm: float, edge_mm: float, step_mm: float) -> Array:
-    """Places of grid lines over a side: dense where it is round."""
+    """Return places of grid lines over a side, dense where it is round."""
     flat_mm = half_mm - edge_mm
     arc = flat_mm + edge_mm * np.tan(np.linspace(0.0, 0.25 * np.pi, _EDGE_STEPS + 1))
     middle = np.linspace(-flat_mm, flat_mm, max(2, int(2.0 * flat_mm / step_mm)) + 1)

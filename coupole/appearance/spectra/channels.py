@@ -1,4 +1,4 @@
-"""Convert spectra to a camera's channel values, normalised by a white tile as in the instrument.
+"""Converts spectra to a camera's channel values, normalised by a white tile as in the instrument.
 
 The true value of a frame's channel c is f_c = integral(E S_c f)/integral(E S_c), with the light's spectrum E and
 the camera's sensitivity S_c: a weighted mean of the BRDF, not a colorimetric value.

@@ -12,9 +12,9 @@ from coupole.appearance.spectra.measured import Measured
 from coupole.errors import InputError
 
 B_PER_NM = 0.0115
-"""CIE 157:2004: oil paint on canvas, and water-colours on rag paper."""
+"""Exponent b by CIE 157:2004, for oil paint on canvas and for water-colours on rag paper."""
 COVERED_NM = (400.0, 700.0)
-"""A spectrum that ends before would leave out damage, or light."""
+"""Range that a spectrum must cover, so that neither damage nor light is left out."""
 LM_PER_W = 683.0
 """Luminous efficacy at 555 nm (CIE 18)."""
 # fmt: off
@@ -32,10 +32,10 @@ _V = (
 
 
 def damage_w_per_lm(spectrum: Measured) -> float:
-    """Damaging power of light with this spectrum (relative power against nm), in W for each lumen: lux hours
-    times this are the radiant exposure weighted by damage, in W h/m2.
+    """Return the damaging power of light with this spectrum (relative power against nm), in W for each lumen. Lux
+    hours times this number are the radiant exposure weighted by damage, in W h/m2.
 
-    All of the spectrum that is given counts, ultraviolet too. Raises InputError for one that does not cover
+    The whole given spectrum is used, including ultraviolet. Raises InputError for a spectrum that does not cover
     `COVERED_NM`, or has no visible light.
     """
     nm, power = spectrum.wavelengths_nm, spectrum.values

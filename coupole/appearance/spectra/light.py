@@ -66,7 +66,7 @@ def led(name: str) -> Array:
 def camera(name: str = "Nikon 5100 (NPL)") -> Array:
     """Relative sensitivities [3, 81] (red, green, blue) of a camera that colour-science knows.
 
-    Measured by the NPL; used in place of a sensor whose curves have not been measured.
+    They were measured by the NPL, and replace the curves of a sensor that has not been measured.
     """
     sensitivities = _on_grid(_choose(_colour().MSDS_CAMERA_SENSITIVITIES, "camera", name)).T.copy()
     sensitivities.setflags(write=False)
@@ -88,7 +88,8 @@ def lab(xyz: Array, white: Array) -> Array:
 
 
 def linear_srgb(xyz: Array) -> Array:
-    """Linear sRGB [..., 3] of XYZ (white D65, 2-degree observer); outside 0 to 1 for colours outside the gamut."""
+    """Linear sRGB [..., 3] of XYZ (white D65, 2-degree observer). Values are outside 0 to 1 for colours outside
+    the gamut."""
     return np.asarray(np.asarray(xyz, dtype=float) @ _SRGB_FROM_XYZ.T)
 
 

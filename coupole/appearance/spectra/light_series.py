@@ -1,7 +1,7 @@
-"""A light's spectra at several times, measured: `wavelength_nm` and a column for each time, absolute.
+"""A light's measured spectra at several times: `wavelength_nm` and a column for each time, in absolute units.
 
-The first line names the columns: the wavelength, then times in ISO 8601 with their offset from UTC, rising. Values
-are spectral irradiances in W/(m^2 nm) on a surface that faces the light.
+The first line names the columns: the wavelength, then times in ISO 8601 with their offset from UTC, in rising
+order. Values are spectral irradiances in W/(m^2 nm) on a surface that faces the light.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ _FORM = "ISO 8601 times with their offset from UTC"
 class LightSeries:
     file: str
     times: tuple[datetime, ...]
-    """Rising."""
+    """Times in rising order."""
     irradiances: Array
     """[times, 81], W/(m^2 nm)."""
 
     def at(self, when: datetime) -> Array:
-        """[81], linearly between the two neighbours in time. Raises InputError outside the series."""
+        """[81] irradiance, interpolated linearly between the two neighbours in time. Raises InputError outside the
+        series."""
         first, last = self.times[0], self.times[-1]
         if not first <= when <= last:
             raise InputError(
@@ -43,7 +44,7 @@ class LightSeries:
 
 
 def read_series(path: Path) -> LightSeries:
-    """Raises InputError with file and line."""
+    """Read a file of spectra. Raises InputError with file and line."""
     text = path.read_text("utf-8-sig")
     header = text.split("\n", 1)[0].strip()
     mark = next((mark for mark in ("\t", ";", ",") if mark in header), None)

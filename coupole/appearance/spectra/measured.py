@@ -1,9 +1,9 @@
 """Spectra from the exports of spectrophotometers.
 
-Accepted are lines of numbers, the wavelength in nm first, separated by tabs, semicolons, commas or blanks, with
-decimal points or decimal commas, ascending or descending; as percent, as fraction, or as power of a light. Lines
-without a number among their fields are comments anywhere; so are lines that begin with `#`, and all text before
-the first row. Ambiguous input is refused, with the line.
+The reader accepts lines of numbers, the wavelength in nm first, separated by tabs, semicolons, commas or blanks.
+Numbers have decimal points or decimal commas; wavelengths ascend or descend. Values are in percent, fractions, or
+the power of a light. Lines without a number among their fields are comments. Lines that begin with `#`, and all
+text before the first row, are comments too. Ambiguous input is refused, and the line is named.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ _SEPARATORS = (("tab", "\t"), ("semicolon", ";"), ("comma", ","), ("blank", None
 _LEAST_ROWS = 3
 _NM = (150.0, 3000.0)
 _FRACTION_AT_MOST = 1.05
-"""A white tile may read a little above 1. Percent values all below this would be read as fractions: give `unit`
-for black samples of such instruments."""
+"""A white tile may read a little above 1. Values in percent that are all below this would be read as fractions.
+Give `unit` for black samples of such instruments."""
 _PERCENT_AT_LEAST = 2.5
 _REFLECTANCE = (-0.02, 1.5)
-"""Noise goes below 0, fluorescence and gloss above 1; values beyond these limits are not reflectances."""
+"""Limits of reflectance. Noise can give values below 0, fluorescence and gloss can give values above 1; values
+beyond the limits are not reflectances."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Measured:
 
     name: str
     wavelengths_nm: Array
-    """[n], rising."""
+    """[n], in rising order."""
     values: Array
     """[n]; reflectance as a fraction, or power."""
     remarks: tuple[str, ...]
@@ -60,15 +61,15 @@ class _Table:
 
 
 def read_spectrum(path: Path, *, unit: Unit = "auto", column: int | None = None) -> Measured:
-    """The spectrum in a file. `column` (from 1, after the wavelength) is needed where there are several."""
+    """Read the spectrum in a file. `column` (from 1, after the wavelength) is needed if there are several."""
     return parse_spectrum(decode_text(path.read_bytes()), str(path), name=path.stem, unit=unit, column=column)
 
 
 def parse_spectrum(
     text: str, file: str, *, name: str = "", unit: Unit = "auto", column: int | None = None
 ) -> Measured:
-    """Read a spectrum as `read_spectrum`, from text; `file` is the name in errors. Raises InputError for ambiguous
-    input."""
+    """Read a spectrum from text, as `read_spectrum` does from a file; `file` is the name in errors. Raises
+    InputError for ambiguous input."""
     table = _table(text, file)
     rows = table.rows
     _check_columns(table, file)
@@ -89,7 +90,7 @@ def parse_spectrum(
 
 
 def decode_text(raw: bytes) -> str:
-    """Text of an instrument: UTF-16 or UTF-8 by its mark, otherwise UTF-8, otherwise Latin-1."""
+    """Return an instrument's text: UTF-16 or UTF-8 by its byte order mark, otherwise UTF-8, otherwise Latin-1."""
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         return raw.decode("utf-16")
     try:
@@ -100,7 +101,7 @@ def decode_text(raw: bytes) -> str:
 
 
 def _table(text: str, file: str) -> _Table:
-    """Rows of numbers with the separator that gives the most rows, and the file's other information."""
+    """Return rows of numbers, by the separator that gives the most rows, and the file's other information."""
     lines = [(number, line.strip(" \r")) for number, line in enumerate(text.split("\n"), start=1) if line.strip()]
     counts = {name: sum(_is_row(_fields(line, mark)) for _, line in lines) for name, mark in _SEPARATORS}
     separator = max(counts, key=lambda name: counts[name])

@@ -29,14 +29,14 @@ class OnGrid:
     error: float
     """Estimate of the largest error that resampling makes, in the unit of the values.
 
-    Interpolated: a quarter of the largest error with which every other sample is found from its neighbours,
-    because PCHIP's error falls at least as the square of the spacing. Averaged: the largest difference between the
-    band mean and the sampled curve at the band's centre, noise included.
+    For interpolated samples, it is a quarter of the largest error with which every other sample is found from its
+    neighbours, because PCHIP's error falls at least as the square of the spacing. For averaged samples, it is the
+    largest difference between the band mean and the sampled curve at the band's centre, including noise.
     """
 
 
 def on_grid(spectrum: Measured) -> OnGrid:
-    """`spectrum` on the grid. Bands outside its range, or in a gap wider than 20 nm, are NaN."""
+    """Return `spectrum` on the grid. Bands outside its range, or in a gap wider than 20 nm, are NaN."""
     result, error = resample(spectrum, WAVELENGTHS_NM, STEP_NM)
     if not np.isfinite(result).any():
         nm = spectrum.wavelengths_nm
@@ -48,8 +48,8 @@ def on_grid(spectrum: Measured) -> OnGrid:
 
 
 def resample(spectrum: Measured, bands_nm: Array, step_nm: float) -> tuple[Array, float]:
-    """`spectrum` at rising `bands_nm` [n], NaN outside its range and in gaps wider than 20 nm, and the error as in
-    `OnGrid`. Samples coarser than `step_nm` are interpolated, finer ones averaged."""
+    """Return `spectrum` at `bands_nm` [n] in rising order, NaN outside its range and in gaps wider than 20 nm; and
+    the error as in `OnGrid`. Samples coarser than `step_nm` are interpolated, finer samples are averaged."""
     nm, values = spectrum.wavelengths_nm, spectrum.values
     bands = np.array(bands_nm)
     result = np.full(bands.shape, np.nan)
@@ -69,7 +69,7 @@ def resample(spectrum: Measured, bands_nm: Array, step_nm: float) -> tuple[Array
 def fill_missing(spectrum: OnGrid) -> Array:
     """[81] with missing ends filled by the nearest measured value, and gaps by straight lines.
 
-    That is a guess; rendering needs one, identification does not.
+    The filled values are guesses. Rendering needs them, identification does not.
     """
     is_known = np.isfinite(spectrum.values)
     return np.interp(WAVELENGTHS_NM, WAVELENGTHS_NM[is_known], spectrum.values[is_known])

@@ -2,9 +2,9 @@
 
 A row is a name, then numbers, separated by tabs, semicolons or commas. The wavelengths in nm are in the first
 line, after any name, or in a file `spectra.txt` beside the table. A row with as many numbers as wavelengths is a
-reflectance, one with twice as many is absorption K, then scattering S of Kubelka and Munk. All other files are
-read as `measured` reads them. Values are percent if the highest of the file is 2.5 or more, fractions if it is
-1.05 or less.
+reflectance. A row with twice as many has absorption K, then scattering S of Kubelka and Munk. All other files are
+read as by `measured`. Values are in percent if the highest value of the file is 2.5 or more, and fractions if it
+is 1.05 or less.
 """
 
 from __future__ import annotations
@@ -32,25 +32,28 @@ _LEAST_BANDS = 3
 
 @dataclass(frozen=True)
 class LibrarySpectrum:
-    """One spectrum with its place in a file."""
+    """One spectrum and its place in a file."""
 
     name: str
     file: str
     line: int
-    """0 if the file holds this spectrum only."""
+    """Line in the file; 0 if the file holds only this spectrum."""
     wavelengths_nm: Array
-    """[n], rising."""
+    """[n], in rising order."""
     reflectance: Array
-    """[n], fraction. For K and S it is that of an opaque layer; NaN where K is negative or S not positive."""
+    """[n], fraction. For K and S it is the reflectance of an opaque layer; NaN where K is negative or S is not
+    positive."""
     absorption: Array | None = None
-    """K [n] in the file's unit, the same as of S; None if reflectance was measured."""
+    """K [n] in the file's unit, which S has too; None if reflectance was measured."""
     scattering: Array | None = None
 
 
 def read_library(path: Path, *, unit: Unit = "auto") -> tuple[LibrarySpectrum, ...]:
-    """All spectra of a table, of a file with one spectrum, or of a folder of such files (not of folders in it).
+    """Read all spectra of a table, of a file with one spectrum, or of a folder of such files (without its
+    subfolders).
 
-    Raises InputError, with file and line, for what cannot be read without guessing, and for names that come twice.
+    Raises InputError, with file and line, for content that cannot be read without guessing, and for names that
+    occur twice.
     """
     if path.is_dir():
         files = sorted(f for f in path.iterdir() if f.suffix.lower() in _ENDINGS and f.name != WAVELENGTHS)
@@ -106,7 +109,7 @@ def _spectrum(path: Path, nm: Array, values: Array, line: int, name: str) -> Lib
 
 
 def _parse_row(line: str) -> tuple[str, list[str]]:
-    """Name and fields of a row. Tabs may be several, to align columns; of other separators each begins a field."""
+    """Return name and fields of a row. Several tabs may align a column; each other separator begins a field."""
     quote = re.match(r'"([^"]*)"', line)
     rest = line[quote.end() :] if quote else line
     separator = next((mark for mark in "\t;," if mark in rest), None)
@@ -126,7 +129,7 @@ Row = tuple[int, str, list[str]]
 
 
 def _wavelengths(path: Path, rows: list[Row]) -> tuple[Array, list[Row]]:
-    """Wavelengths [n] from the first line or the file beside, and the rows of spectra."""
+    """Return the wavelengths [n] from the first line or from the file `spectra.txt`, and the rows of spectra."""
     number, _, fields = rows[0]
     beside = path.parent / WAVELENGTHS
     first = np.array([_value(field) for field in fields]) if _are_numbers(fields) else np.zeros(0)

@@ -1,8 +1,8 @@
 """The sun's place, its direct light and the light of a clear sky, from date, time and place.
 
-Place: NREL's algorithm (Reda and Andreas, Solar Energy 76, 577, 2004) with its refraction. Spectra: Bird and
-Riordan, J. Climate Appl. Meteorol. 25, 87, 1986 (SPECTRL2), over the air mass of Kasten and Young at the refracted
-elevation. Both as in pvlib, which is imported on first use (seconds).
+The place is by NREL's algorithm (Reda and Andreas, Solar Energy 76, 577, 2004) with its refraction. The spectra
+are by Bird and Riordan, J. Climate Appl. Meteorol. 25, 87, 1986 (SPECTRL2), over the air mass of Kasten and Young
+at the refracted elevation. Both are computed by pvlib, which is imported on first use (this takes seconds).
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ WIDTH_DEG = 0.533
 
 @dataclass(frozen=True)
 class SunPlace:
-    """Place of the sun for an observer. Azimuths count from north by east."""
+    """Place of the sun for an observer. Azimuths are counted from north towards east."""
 
     refracted_elevation_deg: float
-    """Elevation of the disk's centre, as seen through the air: light comes from there."""
+    """Elevation of the disk's centre as seen through the air, from which the light comes."""
     azimuth_deg: float
     day_of_year: int
     pressure_pa: float
     """Pressure of the standard atmosphere at the observer's altitude."""
 
     def direction(self, y_azimuth_deg: float) -> Array:
-        """[3], unit: in which light travels, in a frame whose z is up and whose y points to `y_azimuth_deg`."""
+        """[3], unit vector in which light travels, in a frame with z up and y towards `y_azimuth_deg`."""
         up = np.radians(self.refracted_elevation_deg)
         right_of_y = np.radians(self.azimuth_deg - y_azimuth_deg)
         level = np.cos(up)
@@ -41,7 +41,7 @@ class SunPlace:
 
 @dataclass(frozen=True)
 class Air:
-    """Contents of a clear atmosphere; defaults are those of ASTM G173, except for a cleaner aerosol."""
+    """Contents of a clear atmosphere. Defaults are those of ASTM G173, except for a thinner aerosol."""
 
     aerosol_depth_500nm: float = 0.1
     """Optical depth of the aerosol at 500 nm (rural; exponent 1.14): 0.05 very clear, 0.4 hazy."""
@@ -57,7 +57,7 @@ class ClearSky:
     sun: Array
     """Direct light on a surface that faces the sun."""
     sky: Array
-    """Light of the sky on a level surface."""
+    """Light of the sky on a horizontal surface."""
 
 
 def place(when: datetime, latitude_deg: float, longitude_deg: float, altitude_m: float = 0.0) -> SunPlace:
@@ -84,9 +84,10 @@ def place(when: datetime, latitude_deg: float, longitude_deg: float, altitude_m:
 
 
 def clear_sky(sun: SunPlace, air: Air) -> ClearSky:
-    """Light under a sky without clouds.
+    """Return the light under a sky without clouds.
 
-    The model was compared with measurements up to some six air masses (10 degrees); below, it is extrapolated.
+    The model was compared with measurements up to about six air masses (10 degrees). At lower elevations it is
+    extrapolated.
     """
     pvlib, _ = _pvlib()
     zenith_deg = 90.0 - sun.refracted_elevation_deg

@@ -33,6 +33,6 @@ def spectral_power(spectrum: LedSpectrum) -> Array:
 
 
 def _band(centre_nm: float, fwhm_nm: float) -> Array:
-    """A Gaussian on the grid; its sum is 1."""
+    """Return a Gaussian on the grid; its sum is 1."""
     curve = np.exp(-4.0 * np.log(2.0) * ((WAVELENGTHS_NM - centre_nm) / fwhm_nm) ** 2)
     return np.asarray(curve / curve.sum())

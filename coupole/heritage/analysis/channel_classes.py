@@ -1,8 +1,9 @@
-"""Classes that three or so numbers of a camera leave possible: few can be told apart, and that is the answer.
+"""Classes of pigments that agree with the few channel values of a camera. Few classes can be distinguished, and
+the answer says so.
 
-A camera's channel is the mean of reflectance over its sensitivity and the light (`spectra.channels`). Every
-reference is seen at every concentration, K/S by factors of 1/4 to 16; classes that meet the channels within their
-uncertainty cannot be told apart by them.
+A camera's channel value is the mean of reflectance, weighted by the channel's sensitivity and the light
+(`spectra.channels`). Every reference is tried at many concentrations, with factors of 1/4 to 16 on K/S. Classes
+that agree with the channels within their uncertainty cannot be distinguished by the channels.
 """
 
 from __future__ import annotations
@@ -24,28 +25,28 @@ from coupole.heritage.analysis.spectral_features import BANDS_NM, STEP_NM
 _FACTORS = np.geomspace(0.25, 16.0, 61)
 _COVERED = 0.9
 _SPREAD = 0.05
-"""Relative, of channels between batches of one pigment at the same concentration (assumed)."""
+"""Assumed relative spread of channels between batches of one pigment at the same concentration."""
 _WITHIN = {1: 3.84, 2: 5.99, 3: 7.81}
 """95th percentile of chi squared by degrees of freedom."""
 
 
 @dataclass(frozen=True)
 class ChannelFinding:
-    """Classes that the channels leave possible."""
+    """Classes that are possible by the channels."""
 
     candidates: tuple[Candidate, ...]
     """Nearest reference of each class, best first; probabilities among the library's classes."""
     not_told_apart: tuple[str, ...]
-    """Classes that meet the channels, best first; none if the library has no such colour."""
+    """Classes that agree with the channels, best first; none if the library has no such colour."""
 
 
 def classes_of_channels(
     channels: Array, u_channels: Array, light: Measured, sensitivities: list[Measured], references: References
 ) -> ChannelFinding:
-    """`channels` [c] are diffuse reflectances by channel with relative standard uncertainties `u_channels` [c];
-    `light` is the LEDs' power, `sensitivities` [c] the sensor's.
+    """Find the classes. `channels` [c] are diffuse reflectances by channel with relative standard uncertainties
+    `u_channels` [c]; `light` is the LEDs' power, `sensitivities` [c] are the sensor's.
 
-    Raises InputError for channels that are not positive, or that see light where the library was not measured.
+    Raises InputError for channels that are not positive, or that are sensitive where the library was not measured.
     """
     if not np.all(np.isfinite(channels) & (channels > 0.0)):
         raise InputError(f"the spot: expected positive reflectances, found {channels}; choose another spot")

@@ -1,12 +1,12 @@
-"""Probabilities of classes, and of none of them, from a library of spectra.
+"""Probabilities of classes of pigments, and of none of these classes, from a library of spectra.
 
 A Gaussian process regresses the membership of each class (Rasmussen and Williams, Gaussian Processes for Machine
 Learning, 2006, section 6.5) with a Matern 3/2 kernel on the distances of `spectral_features.features`; the median
-distance is its length. Each reference is in it in several appearances. Leaving out a reference, or a class with
-all its members, has a closed form (there, Eq. 5.12). Memberships m become probabilities exp(b m_c)/Z, that of
-none of the classes exp(b (t0 + t1 v))/Z, v being the process's variance; log b, t0 and t1 are those that make the
-references most probable, each left out with the answer its class, and with its class left out with the answer
-none.
+distance is its length. Each reference is used in several appearances. Leaving out a reference, or a class with all
+its members, has a closed form (in the same book, Eq. 5.12). Memberships m become probabilities exp(b m_c)/Z. The
+probability of none of the classes is exp(b (t0 + t1 v))/Z, where v is the process's variance. log b, t0 and t1
+make the correct answers most probable. For a reference that is left out, the correct answer is its class; if its
+class is left out too, it is none.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from coupole.heritage.analysis.spectral_features import appearances, features
 
 _NOISE = 0.4
 _MOST_KNOWN = 0.05
-"""Share of the references that may seem known with their class left out."""
+"""Share of the references that may count as known when their class is left out."""
 _LEAST_KNOWN = 0.6
 _SURE = 0.8
 _START = (2.0, 0.55, 0.75)
@@ -31,16 +31,17 @@ _START = (2.0, 0.55, 0.75)
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Probabilities of the references, each as if the library lacked it."""
+    """Probabilities of the references, each computed as if it were not in the library."""
 
     probabilities: Array
-    """[n, classes + 1], the last that of none; without the reference itself."""
+    """[n, classes + 1], without the reference itself; the last one is the probability of none."""
     without_class: Array
-    """[n, classes + 1]; without its whole class."""
+    """[n, classes + 1], without the reference's whole class."""
 
 
 class ClassModel:
-    """Classes of references `reflectance` [n, bands] without gaps; `classes` [n] are their numbers."""
+    """Classes of the references `reflectance` [n, bands], which have no gaps; `classes` [n] are the numbers of
+    their classes."""
 
     def __init__(self, reflectance: Array, classes: NDArray[np.intp], class_names: tuple[str, ...]) -> None:
         looks = appearances(reflectance)
@@ -58,19 +59,20 @@ class ClassModel:
         self._weights = self._precision @ self._members
 
     def probabilities(self, reflectance: Array) -> Array:
-        """[q, classes + 1] probability of each class for spectra [q, bands]; the last one is that of no class."""
+        """[q, classes + 1] probability of each class for spectra [q, bands]; the last one is the probability of no
+        class."""
         near = self._kernel(_squared_distances(features(reflectance), self._rows))
         variance = 1.0 - np.einsum("qr,rs,qs->q", near, self._precision, near)
         return _probabilities(np.column_stack([near @ self._weights, variance]), self._scale)
 
     def nearest(self, reflectance: Array) -> Array:
-        """[q, n] distance of spectra [q, bands] to each reference in its most similar appearance."""
+        """[q, n] distance of spectra [q, bands] from each reference in its most similar appearance."""
         squared_distances = _squared_distances(features(reflectance), self._rows)
         nearest: Array = np.sqrt(squared_distances.reshape(len(squared_distances), self._count, -1).min(axis=1))
         return nearest
 
     def is_known(self, probabilities: Array) -> NDArray[np.bool_]:
-        """Tell whether the library has the class, for rows [q, classes + 1]."""
+        """Tell, for rows of probabilities [q, classes + 1], whether the library has the class."""
         is_known: NDArray[np.bool_] = 1.0 - probabilities[:, -1] >= self.threshold
         return is_known
 
@@ -81,7 +83,7 @@ class ClassModel:
 
     @cached_property
     def held_out(self) -> HeldOut:
-        """Held-out probabilities of the references as they were measured."""
+        """Held-out probabilities of the references in their measured appearance."""
         without_row, all_of_class = (
             _probabilities(predictions[: len(self._classes)], self._scale) for predictions in self._left_out
         )
@@ -89,8 +91,9 @@ class ClassModel:
 
     @cached_property
     def threshold(self) -> float:
-        """Probability that the class is in the library, from which it counts as known: only a share of 0.05 of the
-        references whose class is left out, and that no family (`pigment_classes`) speaks against, reach it."""
+        """Least probability that the class is in the library, for it to count as known. If their class is left
+        out, only a share of 0.05 of the references reach it; references that a family (`pigment_classes`) excludes
+        count as not reaching it."""
         probabilities = self.held_out.without_class
         known_probability = 1.0 - probabilities[:, -1]
         for row, number in enumerate(self._classes):
@@ -101,7 +104,8 @@ class ClassModel:
 
     @cached_property
     def _left_out(self) -> tuple[Array, Array]:
-        """Memberships and variance [appearances x n, classes + 1], without the reference, or without its class."""
+        """Memberships and variance [appearances x n, classes + 1], once without the reference, once without its
+        class."""
         numbers = np.arange(len(self._classes))
         return self._without(np.tile(numbers, self._count)), self._without(np.tile(self._classes, self._count))
 
@@ -116,7 +120,7 @@ class ClassModel:
 
     @cached_property
     def _scale(self) -> Array:
-        """log b, t0 and t1; a reference alone in its class can only be left out with it."""
+        """log b, t0 and t1. A reference that is alone in its class can only be left out with the class."""
         from scipy.optimize import minimize
 
         without_row, all_of_class = self._left_out

@@ -19,7 +19,8 @@ class Match:
     light: str
     delta_e00: float
     metamerism: float
-    """The difference that is left here after the pair is made equal under the first light; 0 for that light."""
+    """The remaining difference under this light, after the pair is made equal under the first light; 0 for the
+    first light."""
     target_xyz: Array
     recipe_xyz: Array
     white_xyz: Array
@@ -28,10 +29,11 @@ class Match:
 def matches(
     target: Array, recipe: Array, lights: Sequence[str], observer: light.Observer = "10 deg"
 ) -> tuple[Match, ...]:
-    """Compare reflectances [81], as seen in air, under each light. Ends that are NaN have the nearest known value.
+    """Compare reflectances [81], as measured in air, under each light. Ends that are NaN take the nearest known
+    value.
 
     The special index (CIE 15:2004, 9.2.2.3) corrects the recipe's XYZ by the ratios that make it equal to the
-    target under the first light. CIEDE2000 is colour-science's. Raises InputError for an unknown light.
+    target under the first light. CIEDE2000 is computed by colour-science. Raises InputError for an unknown light.
     """
     functions = light.observer(observer)
     a, b = (_fill_missing(values) for values in (target, recipe))

@@ -1,14 +1,14 @@
 """Four fluxes of a film from its spectra under diffuse and under directional light (seed 000, section 3.4).
 
-K and S come from the diffuse spectra (`layer_fit`). Directional light that enters is scattered into diffuse
-light, up R_b and down T_cd, or reaches the ground as it came, Tr = exp(-mu h). Over a diffusing ground g this
-gives
+K and S come from the diffuse spectra (`layer_fit`). Entering directional light is scattered into diffuse light,
+upwards R_b and downwards T_cd, or reaches the ground unscattered, Tr = exp(-mu h). Over a diffusing ground g the
+reflectance is
 
     R_cd(g) = R_b + tau g (T_cd + Tr)/(1 - rho g)
 
-inside the binder: two grounds give R_b and T_cd + Tr, the collimated transmittance Tr gives the rest. R_b and
-T_cd are linear in the scattering coefficients s_i and s_j at a given mu; k = mu - s_i - s_j. The paper's p and q
-are the same two numbers, and diverge where mu = b S; these equations do not.
+inside the binder. Two grounds give R_b and T_cd + Tr; the collimated transmittance Tr gives T_cd. R_b and T_cd are
+linear in the scattering coefficients s_i and s_j at a given mu; k = mu - s_i - s_j. The paper's p and q are the
+same two numbers, and diverge where mu = b S; the equations here do not diverge.
 """
 
 from __future__ import annotations
@@ -34,32 +34,32 @@ class Directional:
     over_black: Array
     over_white: Array
     transmittance: Array
-    """Collimated, of the film inside its binder: what passes without being scattered."""
+    """Collimated transmittance of the film inside its binder: the share of light that passes unscattered."""
 
 
 @dataclass(frozen=True, eq=False)
 class FourFlux:
-    """Coefficients for directional light, [n] per mm or of the layer, with standard uncertainties."""
+    """Coefficients for directional light, [n] per mm or for the layer, with standard uncertainties."""
 
     direct_absorption: Array
-    """k."""
+    """k: absorption of directional light."""
     forward: Array
-    """s_i."""
+    """s_i: scattering of directional light forwards."""
     backward: Array
-    """s_j."""
+    """s_j: scattering of directional light backwards."""
     u_direct_absorption: Array
     u_forward: Array
     u_backward: Array
 
 
 def fit(black: Film, white: Film, directional: Directional, face: Face, noise: float, seed: int = 1) -> FourFlux:
-    """Fit the four fluxes of one film over two grounds. Thickness, grounds and their uncertainties are those of
+    """Fit the four fluxes of one film over two grounds. Thickness, grounds and their uncertainties are taken from
     the diffuse `Film`s."""
     rng = np.random.default_rng(seed)
     n = len(black.reflectance)
 
     def with_draws(values: Array, u: Array | float) -> Array:
-        """[(1 + DRAWS) n]: as measured, then as it might have been."""
+        """[(1 + DRAWS) n] values: as measured, then with random errors."""
         std = np.broadcast_to(np.asarray(u, dtype=float), n)
         noisy = values + std * rng.standard_normal((DRAWS, n))
         return np.concatenate([values[None], noisy]).ravel()
@@ -100,7 +100,7 @@ def _repeat_face(face: Face, times: int) -> Face:
 
 
 def _solve_layer(coefficients: Coefficients, films: list[Film], light: Directional, face: Face) -> Array:
-    """k, s_i, s_j [3, n] of the whole layer."""
+    """Return k, s_i, s_j [3, n] for the whole layer."""
     k, s = np.maximum(coefficients.absorption, 0.0), coefficients.scattering
     rho, tau = kubelka_munk.layer(k, s, 1.0)
     inside = []

@@ -1,9 +1,15 @@
-"""Identification of the class of pigments that a reflectance spectrum shows; the library may have none for it.
+"""Identification of the class of pigments in a reflectance spectrum; the library may lack this class.
 
-The library's classes have probabilities, and so has none of them (`class_model`). "match": the class is in the
-library, and it is this one; "ambiguous": it is one of several; "mixture": two references explain the spectrum
-together, and none alone (`unmixing`); "unknown": all else. The library itself says what the verdict is
-worth: `references.HeldOutRates`.
+
+Each class of the library has a probability, and so has the answer "none of them" (`class_model`). The verdicts
+are:
+
+- "match": the class is in the library, and it is this one;
+- "ambiguous": it is one of several classes;
+- "mixture": two references explain the spectrum together, and none does alone (`unmixing`);
+- "unknown": all other cases.
+
+The library itself gives the reliability of the verdict: `references.HeldOutRates`.
 """
 
 from __future__ import annotations
@@ -22,12 +28,12 @@ from coupole.heritage.analysis.unmixing import Unmixed, unmix
 
 Verdict = Literal["match", "mixture", "ambiguous", "unknown"]
 _FLAT = 0.1
-"""Standard deviation of log(K/S) below which a spectrum has no bands: level decides alone."""
+"""Standard deviation of log(K/S) below which a spectrum has no bands, so that only its level decides."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A class with the reference of it that is nearest."""
+    """A class with its nearest reference."""
 
     name: str
     class_name: str
@@ -54,12 +60,12 @@ class Evidence:
     reflectance: Array
     """[n] of the spectrum."""
     best: Array
-    """[n] reflectance of the nearest reference of the first class, with K/S by the factor that suits best."""
+    """[n] reflectance of the nearest reference of the first class, with K/S scaled by the best factor."""
     runner_up: Array
-    """[n] the same of the second class."""
+    """[n] the same for the second class."""
     log_odds: Array
     """[n] for the first class against the second: positive where the spectrum is nearer to the first, in units of
-    the spread within classes. Bands are correlated: their sum exaggerates."""
+    the spread within classes. Bands are correlated, so their sum is too large."""
 
 
 @dataclass(frozen=True)
@@ -71,13 +77,14 @@ class PigmentFinding:
     verdict: Verdict
     """`match`, `mixture`, `ambiguous` or `unknown`."""
     class_name: str
-    """The first candidate's (of a mixture, the larger share's), whether or not the verdict trusts it."""
+    """Class of the first candidate (for a mixture, of the larger share), whether or not the verdict confirms
+    it."""
     reason: str
     """Reason of the verdict, as a sentence."""
     candidates: tuple[Candidate, ...]
-    """One of each class, best first."""
+    """Candidates, one for each class, best first."""
     not_in_library: float
-    """Probability; with the candidates' it sums to 1."""
+    """Probability that the class is not in the library; with the candidates' probabilities it sums to 1."""
     parts: tuple[Part, ...]
     """Two pigments, if it is a mixture."""
     evidence: Evidence
@@ -87,13 +94,13 @@ class PigmentFinding:
     remarks: tuple[str, ...]
     """Remarks about the spectrum, such as bands that were left out."""
     rates: HeldOutRates
-    """Shares of the library's own spectra, each left out, about which it is right."""
+    """Shares of correct verdicts on the library's own spectra, each left out in turn."""
 
 
 def identify(spectrum: Measured, references: References) -> PigmentFinding:
-    """Compare a reflectance spectrum with the library, in the bands that both have.
+    """Compare a reflectance spectrum with the library, in the bands of both.
 
-    Raises InputError if these are fewer than 16 bands of 10 nm.
+    Raises InputError if both have fewer than 16 bands of 10 nm in common.
     """
     values, left_out = references.without_stray_light(on_bands(spectrum))
     of_bands = references.of_bands(spectrum.name, values)

@@ -1,13 +1,13 @@
-"""K and S of a paint from films of it over grounds, with uncertainties (Kubelka and Munk 1931; seed 000, Eqs 5-7).
+"""K and S of a paint from its films over grounds, with uncertainties (Kubelka and Munk 1931; seed 000, Eqs 5-7).
 
-Each spectrum of a film is one equation for each band, in what the instrument sees: two grounds, an opaque and a
+Each spectrum of a film is one equation for each band, in the measured reflectance. Two grounds, an opaque and a
 thin sample, or a series of thicknesses are the same problem, solved by weighted least squares. With alpha = (K+S)
 h, sigma = S h, x^2 = alpha^2 - sigma^2 and beta = x coth x, a film over a ground g reflects
 
     R = (sigma - g (alpha - beta))/(alpha + beta - g sigma)
 
-inside the binder, and (sigma)/(alpha + x) if it is opaque. This continues to K a little below 0, where noise puts
-the estimates of a white: they are not clipped, so that intervals hold.
+inside the binder, and (sigma)/(alpha + x) if it is opaque. The formula also holds for K a little below 0, as noise
+can give for a white paint. Such estimates are not clipped, so that intervals hold.
 
 Uncertainties are propagated linearly (JCGM 100): noise of each spectrum, of each ground, and the thicknesses,
 which are common to all bands and to all films of the same thickness.
@@ -28,9 +28,10 @@ from coupole.errors import InputError
 COVERAGE_FACTOR = 1.96
 """Coverage factor of 95 %."""
 LEAST_DETERMINED = 0.2
-"""Relative standard uncertainty of S beyond which a band's S is called undetermined: the film hides its ground."""
+"""Relative standard uncertainty of S above which a band's S counts as undetermined, because the film hides its
+ground."""
 _LEAST_UNLIKE = 40.0
-"""Squared standard uncertainties that films must differ by, for their difference to be more than noise."""
+"""Least difference of films that is more than noise, in squared standard uncertainties."""
 _STEPS = 60
 _LEAST_S = 1e-6
 
@@ -42,13 +43,13 @@ class Film:
     reflectance: Array
     """[n], in air."""
     ground: Array | None
-    """[n], inside the binder; None of an opaque film."""
+    """[n], inside the binder; None for an opaque film."""
     ground_name: str = ""
-    """Films over the same ground share its error."""
+    """Name of the ground; films over the same ground share its error."""
     u_ground: Array | float = 0.0
     """[n], standard uncertainty inside the binder."""
     thickness_mm: float = 1.0
-    """1 if it is not known: K and S are then of the whole layer."""
+    """Thickness; 1 if it is not known, and K and S are then for the whole layer."""
     u_thickness_mm: float = 0.0
 
 
@@ -57,15 +58,15 @@ class Coefficients:
     """K and S for each band."""
 
     absorption: Array
-    """[n] per mm, or of the layer."""
+    """[n] per mm, or for the layer."""
     scattering: Array
     covariance: Array
-    """[n, 2, 2] of K and S."""
+    """[n, 2, 2] covariance of K and S."""
     chi2: Array
-    """[n], squared residuals over their variances; expected is the number of spectra less 2."""
+    """[n], squared residuals over their variances. The expected value is the number of spectra minus 2."""
     unlike: Array
     """[n], squared differences of the spectra from their mean, or from their grounds if that is less, over the
-    noise's variance: near 0 of films that hide, and of films that are hardly there."""
+    noise's variance. They are near 0 for films that hide their ground, and for nearly invisible films."""
     spectra: int
 
     @property
@@ -80,14 +81,14 @@ class Coefficients:
 
     @property
     def determined_bands(self) -> NDArray[np.bool_]:
-        """[n] of bool: whether the films show their grounds enough to tell S."""
+        """[n] True for bands in which the films show their grounds enough to determine S."""
         is_determined = self.u_scattering < LEAST_DETERMINED * self.scattering
         return np.asarray(is_determined & (self.unlike > _LEAST_UNLIKE))
 
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """Spectrum that a film would show, with the standard uncertainty."""
+    """Predicted spectrum of a film, with its standard uncertainty."""
 
     seen: Array
     u_seen: Array
@@ -96,8 +97,8 @@ class Predicted:
 def reflectance_inside(
     absorption: Array, scattering: Array, thickness_mm: float, ground: Array | float | None
 ) -> Array:
-    """Return the reflectance of a film over a ground, or of an opaque one (None); see the module's text. K may be
-    slightly negative."""
+    """Return the reflectance of a film over a ground, or of an opaque film (ground None), by the module's formula.
+    K may be slightly negative."""
     h = 1.0 if ground is None else thickness_mm
     alpha, sigma = (absorption + scattering) * h, scattering * h
     square = alpha**2 - sigma**2
@@ -113,9 +114,10 @@ def reflectance_inside(
 
 
 def fit(films: Sequence[Film], face: Face, noise: float) -> Coefficients:
-    """K and S of every band from two or more films; `noise` is the standard uncertainty of a spectrum's value.
+    """Fit K and S of every band to two or more films; `noise` is the standard uncertainty of a spectrum's value.
 
-    Raises InputError for films that cannot tell K from S: fewer than two, or alike in ground and thickness.
+    Raises InputError for films that do not distinguish K from S: fewer than two films, or films with the same
+    ground and thickness.
     """
     _check(films)
     k, s = _start(films, face)
@@ -147,7 +149,7 @@ def fit(films: Sequence[Film], face: Face, noise: float) -> Coefficients:
 def predict(
     coefficients: Coefficients, face: Face, thickness_mm: float, ground: Array | float | None
 ) -> Predicted:
-    """Predict what a film of a thickness over a ground (inside the binder, known exactly) would show."""
+    """Predict the spectrum of a film with a thickness over a ground (inside the binder, known exactly)."""
     k, s = coefficients.absorption, coefficients.scattering
     films = [Film(k, None if ground is None else np.broadcast_to(ground, k.shape), thickness_mm=thickness_mm)]
     slope = _jacobian(k, s, films, face)[:, 0]
@@ -171,7 +173,8 @@ def _check(films: Sequence[Film]) -> None:
 
 
 def _start(films: Sequence[Film], face: Face) -> tuple[Array, Array]:
-    """The best of a grid over K/S and S: far enough down the right valley for what follows."""
+    """Return the best point of a grid over K/S and S, which is near enough to the minimum for the following
+    steps."""
     thickest = max((film.thickness_mm for film in films if film.ground is not None), default=1.0)
     y = np.stack([film.reflectance for film in films], axis=1)
     best = np.full(len(y), np.inf)
@@ -187,7 +190,7 @@ def _start(films: Sequence[Film], face: Face) -> tuple[Array, Array]:
 
 
 def _film_reflectances(k: Array, s: Array, films: Sequence[Film], face: Face) -> Array:
-    """[n, films], as instruments see them."""
+    """[n, films] reflectances as instruments measure them."""
     return np.stack([_one_seen(k, s, film, face, film.thickness_mm, film.ground) for film in films], axis=1)
 
 
@@ -197,7 +200,7 @@ def _one_seen(k: Array, s: Array, film: Film, face: Face, h: float, ground: Arra
 
 
 def _jacobian(k: Array, s: Array, films: Sequence[Film], face: Face) -> Array:
-    """[n, films, 2], by K and S."""
+    """[n, films, 2] derivatives by K and S."""
     step = 1e-5 * (np.abs(k) + s)
     return np.stack(
         [
@@ -211,7 +214,8 @@ def _jacobian(k: Array, s: Array, films: Sequence[Film], face: Face) -> Array:
 
 
 def _effects(k: Array, s: Array, films: Sequence[Film], face: Face) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Return what one standard uncertainty of each ground, and of each thickness, does to each film [n, films]."""
+    """Return the changes of each film [n, films] from one standard uncertainty of each ground, and of each
+    thickness."""
     grounds: dict[str, Array] = {}
     thicknesses: dict[str, Array] = {}
     for number, film in enumerate(films):
@@ -247,7 +251,7 @@ def _unlike(y: Array, films: Sequence[Film], face: Face) -> Array:
 
 
 def _inverse(matrices: Array) -> Array:
-    """Return the inverses of symmetric matrices [n, 2, 2]; zeros for one that has none."""
+    """Return the inverses of symmetric matrices [n, 2, 2]; zeros for a matrix that has none."""
     a, b, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
     determinant = a * d - b * b
     usable = determinant > 1e-300

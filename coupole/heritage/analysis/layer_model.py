@@ -1,11 +1,12 @@
-"""Choice of the model that a paint layer deserves, and the size of its grains (seed 000, sections 3.4 and 3.5).
+"""Choice of the model that a paint layer needs, and the size of its grains (seed 000, sections 3.4 and 3.5).
 
-Two fluxes hold for light that is diffuse inside the layer: under diffuse illumination, or where the layer
+Two fluxes are valid for light that is diffuse inside the layer: under diffuse illumination, or where the layer
 scatters so much that nothing reaches its ground unscattered. A thin or clear layer under directional light (a
-dome's LEDs, 45:0) needs four; one that hides its ground needs K/S only, from R_inf. Where spectra under
+dome's LEDs, 45:0) needs four fluxes. A layer that hides its ground needs K/S only, from R_inf. If spectra under
 directional light were measured, they decide. Otherwise the film is computed with four fluxes for grains that
-scatter to all sides alike, for which K = 2 k and S = 3 s/4 (Mudgett and Richards, Appl. Opt. 10, 1485, 1971): two
-fluxes suffice if what is seen of the ground by light that reached it unscattered is no more than twice the noise.
+scatter equally to all sides, for which K = 2 k and S = 3 s/4 (Mudgett and Richards, Appl. Opt. 10, 1485, 1971).
+Two fluxes are enough if the light that reaches the ground unscattered changes the reflectance by at most twice the
+noise.
 """
 
 from __future__ import annotations
@@ -26,19 +27,19 @@ Model = Literal["two fluxes", "four fluxes", "K/S only"]
 
 @dataclass(frozen=True)
 class Deserved:
-    """The verdict, and what it rests on."""
+    """The verdict and its reasons."""
 
     model: Model
     because: str
     difference: float
-    """Largest difference over bands and grounds between what the two models show under directional light."""
+    """Largest difference, over bands and grounds, between the two models under directional light."""
     unscattered_share: float
-    """Largest share over the bands of directional light that reaches the ground unscattered."""
+    """Largest share, over the bands, of directional light that reaches the ground unscattered."""
 
 
 @dataclass(frozen=True)
 class GrainRatio:
-    """Mean size of one grinding's grains over another's."""
+    """Mean grain size of one grinding over that of another."""
 
     ratio: float
     u_ratio: float
@@ -93,11 +94,12 @@ def deserved_by_measurement(
 
 
 def grain_ratio(first: tuple[Array, Array], second: tuple[Array, Array]) -> GrainRatio:
-    """d1/d2 of two grindings of one pigment at the same concentration, from S and its uncertainty [n] of each.
+    """Return d1/d2 of two grindings of one pigment at the same concentration, from S and its uncertainty [n] for
+    each.
 
-    Grains larger than the wavelength scatter by their cross-sections: per volume of pigment S is proportional to
-    1/d. The papers say that K and S depend on the grains and give no formula; this holds for grains above some 2
-    um. Raises InputError if no band is known well in both.
+    Grains larger than the wavelength scatter by their cross-sections, so S per volume of pigment is proportional
+    to 1/d. The papers say that K and S depend on the grains, and give no formula. This one is valid for grains
+    above about 2 um. Raises InputError if no band is known well for both grindings.
     """
     (s1, u1), (s2, u2) = first, second
     relative = np.hypot(u1 / s1, u2 / s2)

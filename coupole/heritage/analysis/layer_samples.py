@@ -1,4 +1,5 @@
-"""Read spectra of a paint's films and their grounds as films for `layer_fit`; write its result as a paint file."""
+"""Reads spectra of a paint's films and their grounds as films for `layer_fit`; writes the fit's result as a paint
+file."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ from coupole.heritage.analysis.four_flux_fit import Directional, FourFlux
 from coupole.heritage.analysis.layer_fit import Coefficients, Film
 
 _BEYOND = 5.0
-"""Standard uncertainties beyond which a contradiction is no noise."""
+"""Number of standard uncertainties above which a contradiction is not noise."""
 _LEAST_BANDS = 3
 
 
@@ -33,19 +34,19 @@ class FilmGiven(_Given):
 
     spectrum: Path
     over: Path | None = None
-    """Spectrum of the ground; none of an opaque film."""
+    """Spectrum of the ground; none for an opaque film."""
     thickness_um: Annotated[float, Field(gt=0)] | None = None
     u_thickness_um: Annotated[float, Field(ge=0)] = 0.0
-    """Standard uncertainty."""
+    """Standard uncertainty of the thickness."""
 
 
 class DirectionalGiven(_Given):
-    """The same film over the same two grounds under light along the normal."""
+    """Spectra of the same film over the same two grounds, under light along the normal."""
 
     over_black: Path
     over_white: Path
     transmittance: Path
-    """Collimated, of the film without its faces."""
+    """Collimated transmittance of the film without its faces."""
 
 
 class LayerGiven(_Given):
@@ -53,10 +54,11 @@ class LayerGiven(_Given):
 
     name: str = "paint"
     binder_index: Annotated[float, Field(ge=1, le=3)] = 1.5
-    """1: the paint has no glossy face."""
+    """Index of the binder; 1 for a paint without glossy face."""
     geometry: Geometry = "gloss excluded"
     grounds: Literal["coated", "bare"] = "coated"
-    """Grounds as they were measured: under the same glossy face, as varnished cards, or without one."""
+    """Measurement of the grounds: `coated` under the same glossy face, as varnished cards, or `bare` without a
+    face."""
     noise: Annotated[float, Field(gt=0, le=0.1)] = 0.005
     """Standard uncertainty of a spectrum's value, as a fraction."""
     films: Annotated[tuple[FilmGiven, ...], Field(min_length=2)]
@@ -65,7 +67,7 @@ class LayerGiven(_Given):
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Films at the bands that all spectra cover."""
+    """Films in the bands that all spectra cover."""
 
     wavelengths_nm: Array
     """[n] of 380 to 780 by 5 nm."""
@@ -76,8 +78,8 @@ class Samples:
 
 
 def read_samples(layer_file: LayerGiven, folder: Path) -> Samples:
-    """The spectra, their paths relative to `folder`. Raises InputError with the file for what contradicts
-    itself."""
+    """Read the spectra; their paths are relative to `folder`. Raises InputError, with the file, for contradictory
+    input."""
     films = layer_file.films
     has_thickness = [film.thickness_um is not None for film in films if film.over is not None]
     if any(has_thickness) != all(has_thickness):
@@ -113,9 +115,9 @@ def read_samples(layer_file: LayerGiven, folder: Path) -> Samples:
 def paint_file(
     layer_file: LayerGiven, samples: Samples, coefficients: Coefficients, four: FourFlux | None
 ) -> PaintFile:
-    """The result to keep. Where the films hide their grounds S is drawn straight between bands that tell it, with
-    an uncertainty of 100 %; if they do so in all bands, K and S are relative to a scattering of 1. K below 0 is
-    kept as 0. The head says where."""
+    """Return the result as a paint file. Where the films hide their grounds, S is interpolated linearly between
+    bands that determine it, with an uncertainty of 100 %. If they hide their grounds in all bands, K and S are
+    relative to a scattering of 1. K below 0 is stored as 0. The head names these bands."""
     nm, sure = samples.wavelengths_nm, coefficients.determined_bands
     ratio = np.maximum(coefficients.absorption, 0.0) / coefficients.scattering
     unit: Literal["per mm", "per layer", "relative"] = "per mm" if samples.is_per_mm else "per layer"
@@ -149,7 +151,7 @@ def paint_file(
 
 
 def spectrum_on_grid(path: Path) -> Array:
-    """[81], NaN outside the measurement. Raises InputError for gaps."""
+    """[81] spectrum, NaN outside the measurement. Raises InputError for gaps."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a spectrum")
     values = resampling.on_grid(measured.read_spectrum(path)).values
@@ -198,7 +200,7 @@ def _check_level(reflectance: Array, path: Path, nm: Array, binder_face: Face, n
 
 
 def _check_order(films: Sequence[Film], film_entries: Sequence[FilmGiven], nm: Array, noise: float) -> None:
-    """Raises InputError for a film that is darker over the lighter of two grounds."""
+    """Raise InputError for a film that is darker over the lighter of two grounds."""
     for (a, told_a), (b, told_b) in combinations(zip(films, film_entries, strict=True), 2):
         if a.ground is None or b.ground is None or a.thickness_mm != b.thickness_mm:
             continue

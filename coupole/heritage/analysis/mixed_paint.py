@@ -1,4 +1,4 @@
-"""The mixture of a recipe as a paint file, which scenes and restorations take as they take a measured paint."""
+"""The mixture of a recipe as a paint file, which scenes and restorations use like a measured paint."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def expect_paint_name(path: Path) -> None:
 def write_mixture(path: Path, recipe: Recipe, palette: Sequence[Paint], binder_index: float, colour: str) -> None:
     """Write K and S of a recipe's mixture, sums by share (Duncan 1949), in the bands that all its paints have.
 
-    The uncertainties are those of the paints' K and S. Those of the shares are in the head: they go together, so
-    that they change K and S less than each alone would. Raises InputError if the paints share too few bands,
-    StorageError.
+    The uncertainties are those of the paints' K and S. The uncertainties of the shares are in the head. They are
+    correlated, so that together they change K and S less than each alone. Raises InputError if the paints share
+    too few bands, StorageError.
     """
     paints = {paint.name: paint for paint in palette if paint.name in recipe.shares}
     unit: Unit = "per mm" if next(iter(paints.values())).unit == "per mm" else "relative"
@@ -62,5 +62,5 @@ def _on_one_line(numbers: Mapping[str, float]) -> CommentedMap:
 
 
 def _sum_by_share(values: Sequence[Array], weights: Array) -> Array:
-    """Sum [81] by weights; NaN where a paint is not known."""
+    """Return a weighted sum [81]; NaN where a paint is not known."""
     return np.asarray(np.sum([weight * value for weight, value in zip(weights, values, strict=True)], axis=0))

@@ -1,11 +1,12 @@
-"""A film's spectrum at another thickness than the measured one, with the error of the two-flux model.
+"""A film's spectrum at a thickness other than the measured one, with the error of the two-flux model.
 
 Over another ground the two fluxes are exact: they define a film's reflectance and transmittance for diffuse light,
-and a diffusing ground makes all light diffuse. At another thickness they are a model: light inside a layer is not
-diffuse near its faces. Radiative transfer tells how far they may be off. Two other layers, one with grains that
-scatter evenly to all sides and one with grains that scatter forward, are given the reflectance and the
-transmittance of the measured film, and are made as thick as asked. The largest difference of these two from two
-fluxes is taken as the half width of a rectangular distribution about two fluxes (JCGM 100, 4.3.7).
+and a diffusing ground makes all light diffuse. At another thickness they are only a model, because light inside a
+layer is not diffuse near its faces. Radiative transfer gives the possible error. Two other layers are computed:
+one has grains that scatter evenly to all sides, the other has grains that scatter forward. Both get the
+reflectance and the transmittance of the measured film, and then the requested thickness. The largest difference of
+these layers from the two fluxes is the half width of a rectangular distribution around the two fluxes (JCGM 100,
+4.3.7).
 """
 
 from __future__ import annotations
@@ -24,22 +25,23 @@ from coupole.heritage.analysis import layer_fit
 from coupole.heritage.analysis.layer_fit import Coefficients, Film
 
 MEAN_COSINES = (0.0, 0.8)
-"""Grains that scatter evenly, and grains larger than the wavelength in a binder: 0.7 to 0.9 by Mie's theory."""
+"""Mean cosines of grains that scatter evenly, and of grains larger than the wavelength in a binder; these have 0.7
+to 0.9 by Mie's theory."""
 _ROUNDS, _STEP = 12, 1e-4
 _THINNEST, _THICKEST = -14.0, 7.0
-"""ln of optical depths between which a layer is looked for."""
+"""Bounds of the logarithms of optical depths in which a layer is searched."""
 _LEAST_TRANSMITTANCE = 1e-9
-"""Less is rounding."""
+"""Least transmittance; smaller values are rounding errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class FilmAtThickness:
-    """Spectrum that a film would show; NaN in bands in which the measured films do not tell S."""
+    """Predicted spectrum of a film; NaN in bands in which the measured films do not determine S."""
 
     thickness_mm: float
     ground_name: str
     reflectance: Array
-    """[n], as the instrument sees it."""
+    """[n], as the instrument would measure it."""
     u_measured: Array
     """[n], standard uncertainty from noise, grounds and thicknesses of the measured films."""
     u_model: Array
@@ -47,15 +49,15 @@ class FilmAtThickness:
 
     @property
     def u_reflectance(self) -> Array:
-        """[n], standard uncertainty of both."""
+        """[n], standard uncertainty from both parts."""
         return np.hypot(self.u_measured, self.u_model)
 
 
 def films_at(
     coefficients: Coefficients, films: Sequence[Film], face: Face, thicknesses_mm: Sequence[float]
 ) -> list[FilmAtThickness]:
-    """Predict the film at each thickness over each ground that was measured. Raises InputError if no film over a
-    ground was."""
+    """Predict the film at each thickness over each measured ground. Raises InputError if no film over a ground was
+    measured."""
     grounds = {film.ground_name: film for film in films if film.ground is not None}
     if thicknesses_mm and not grounds:
         raise InputError("expected a film over a ground, whose thickness is known; found opaque ones only")
@@ -69,7 +71,7 @@ def films_at(
 def film_at(
     coefficients: Coefficients, films: Sequence[Film], face: Face, thickness_mm: float, over: Film
 ) -> FilmAtThickness:
-    """Predict the film of a thickness over the ground of one of the measured films."""
+    """Predict the film with a thickness over the ground of one of the measured films."""
     background = np.asarray(over.ground, float)
     reference_mm = _nearest_mm(films, thickness_mm)
     prediction = layer_fit.predict(coefficients, face, thickness_mm, background)
@@ -95,7 +97,7 @@ def film_at(
 
 
 def _nearest_mm(films: Sequence[Film], thickness_mm: float) -> float:
-    """The thickness of a film over a ground that is nearest by ratio."""
+    """Return the thickness, nearest by ratio, of a film over a ground."""
     measured_mm = [film.thickness_mm for film in films if film.ground is not None]
     return min(measured_mm, key=lambda thickness: abs(np.log(thickness / thickness_mm)))
 
@@ -108,9 +110,10 @@ def _film_reflectance(rho: Array, tau: Array, ground: Array, face: Face) -> Arra
 def _matching_depths(
     rho: Array, tau: Array, two_fluxes: tuple[Array, Array], thickness_mm: float, mean_cosine: float
 ) -> tuple[Array, Array]:
-    """Optical depths [n] of absorption and of scattering of the layer that reflects rho and transmits tau.
+    """Return the optical depths [n] of absorption and of scattering of the layer that reflects rho and transmits
+    tau.
 
-    K = 2 k and S = 3/4 s (1 - mean cosine), which hold for thick layers, are where Newton's steps begin.
+    Newton's steps begin at K = 2 k and S = 3/4 s (1 - mean cosine), which hold for thick layers.
     """
     k, s = two_fluxes
     start = np.stack([0.5 * k * thickness_mm, 4.0 / 3.0 * s * thickness_mm / (1.0 - mean_cosine)])
@@ -130,7 +133,7 @@ def _matching_depths(
 
 
 def _newton_step(off: Callable[[Array], Array], logs: Array) -> Array:
-    """[2, n], at most a factor of e in each."""
+    """[2, n] step, at most a factor of e in each unknown."""
     here = off(logs)
     slopes = np.stack([(off(logs + _STEP * unit) - here) / _STEP for unit in np.eye(2)[:, :, None]], axis=1)
     matrices = np.moveaxis(slopes, -1, 0)

@@ -1,4 +1,4 @@
-"""Paints to mix with: paint files of `coupole layer`, and libraries of K and S."""
+"""Paints for mixtures: paint files of `coupole layer`, and libraries of K and S."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from coupole.errors import InputError
 
 _LIBRARIES = {".rs", ".tsv"}
 _ALIKE = 1e-3
-"""Relative difference of K and S below which two paints are one."""
+"""Relative difference of K and S below which two paints count as the same."""
 _RELATIVE = "relative"
 
 
 @dataclass(frozen=True, eq=False)
 class Paint:
-    """One paint; [81], NaN in bands where it is not known."""
+    """One paint; arrays are [81], NaN in bands where the paint is not known."""
 
     name: str
     source: str
-    """File, with the line if there are several."""
+    """File, with the line if it has several paints."""
     unit: str
     absorption: Array
     scattering: Array
@@ -37,7 +37,8 @@ class Paint:
 
 
 def read_palette(sources: Sequence[Path]) -> tuple[Paint, ...]:
-    """All paints of files and folders. Raises InputError for what cannot be mixed: doublets, different units."""
+    """Read all paints of files and folders. Raises InputError for paints that cannot be mixed: duplicates,
+    different units."""
     paints: list[Paint] = []
     for source in sources:
         for path in _files(source):
@@ -95,7 +96,7 @@ def _of_library(path: Path) -> list[Paint]:
 
 
 def _of_row(row: LibrarySpectrum) -> Paint:
-    """A paint is not known in bands where a library has K below 0 or S not above 0."""
+    """Return the paint of a library's row. It is not known in bands with K below 0 or S not above 0."""
     place = f"{row.file}:{row.line}"
     if row.absorption is None or row.scattering is None:
         raise InputError(f"{place}: {row.name}: expected K and S, found a reflectance; leave the row out")

@@ -1,4 +1,5 @@
-"""Classes of pigments by colouring matter: tables that name them, and classes that have one colouring matter."""
+"""Classes of pigments by colouring matter: tables that name them, and families of classes with one colouring
+matter."""
 
 from __future__ import annotations
 
@@ -17,9 +18,9 @@ FAMILIES: tuple[frozenset[str], ...] = (
     frozenset({"carbon black", "manganese oxide", "organic brown"}),
     frozenset({"cobalt glass", "cobalt blue"}),
 )
-"""Classes whose bands are of the same kind: haematite and goethite, which heat turns into each other; black and
-brown without bands; cobalt(II) among four oxygens. One of them is known only beside the others: a library that
-lacks a class of a family cannot decide for another."""
+"""Families of classes with bands of the same kind: haematite and goethite, which heat converts into each other;
+black and brown without bands; cobalt(II) among four oxygens. A class of a family is identified only by comparison
+with the others, so a library that lacks one class of a family cannot decide for another."""
 _COLUMNS = ("name", "class", "colour_index")
 
 
@@ -28,14 +29,14 @@ class PigmentClass:
     """Entry of a table for one spectrum."""
 
     class_name: str
-    """Empty for mixtures and products of unknown composition."""
+    """Name of the class; empty for mixtures and products of unknown composition."""
     colour_index: str
     """Generic name without dots and blanks (PR101), or empty."""
 
 
 def read_classes(path: Path) -> dict[str, PigmentClass]:
-    """A table of name, class and, if known, Colour Index name, separated by commas, semicolons or tabs; a first
-    line with these words is not needed. Raises InputError with file and line."""
+    """Read a table of name, class and, if known, Colour Index name, separated by commas, semicolons or tabs. A
+    first line with these words may be missing. Raises InputError with file and line."""
     try:
         text = decode_text(path.read_bytes())
     except OSError as error:
@@ -44,7 +45,7 @@ def read_classes(path: Path) -> dict[str, PigmentClass]:
 
 
 def shipped_classes(spectra: Sequence[LibrarySpectrum]) -> dict[str, PigmentClass]:
-    """The tables that come with Coupole for the files of these spectra, found by the files' names."""
+    """Return the tables shipped with Coupole for the files of these spectra, found by the files' names."""
     folder = resources.files(__package__).joinpath("classes")
     classes: dict[str, PigmentClass] = {}
     for stem in {Path(spectrum.file).stem for spectrum in spectra}:
@@ -55,7 +56,7 @@ def shipped_classes(spectra: Sequence[LibrarySpectrum]) -> dict[str, PigmentClas
 
 
 def lacking(class_name: str, known_classes: Collection[str]) -> list[str]:
-    """Classes of the same family that `known_classes` lacks."""
+    """Return the classes of the same family that are not among `known_classes`."""
     return sorted(
         sibling
         for family in FAMILIES

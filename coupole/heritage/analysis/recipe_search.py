@@ -1,9 +1,10 @@
-"""The recipe of a colour: shares of paints whose opaque mixture is seen as a target (Duncan 1949).
+"""The recipe of a colour: shares of paints with an opaque mixture that matches a target (Duncan 1949).
 
 K and S of a mixture are sums by share. Subsets of the palette are compared by the linear problem sum c_i (K_i - Q
-S_i) = 0 with Q the target's K/S, weighted to residuals of what is seen; the best few are refined by least squares
-on what is seen itself, with shares not negative. Up to `_EXHAUSTIVE` subsets of a size all are tried, beyond that
-the best subset grows paint by paint, with exchanges.
+S_i) = 0, where Q is the target's K/S; it is weighted so that its residuals are those of measured reflectance. The
+best few subsets are refined by least squares on the measured reflectance itself, with shares that are not
+negative. If there are at most `_EXHAUSTIVE` subsets of a size, all are tried. Otherwise the best subset grows
+paint by paint, with exchanges.
 """
 
 from __future__ import annotations
@@ -26,13 +27,15 @@ from coupole.heritage.analysis.palette import Paint
 _EXHAUSTIVE = 5000
 _REFINED = 6
 _WORTH = 16.0
-"""Squared standard uncertainties by which one paint more must improve a recipe to be worth it."""
+"""Least improvement of a recipe by a further paint, in squared standard uncertainties, that is worth this
+paint."""
 _UNTOLD = 6.0
-"""Squared standard uncertainties within which two recipes are not told apart: 95 % of a chi-square of two."""
+"""Difference, in squared standard uncertainties, up to which two recipes are not distinguished: 95 % of a
+chi-square of two."""
 TOLD_WITHIN = 0.02
-"""Accuracy of a share that is asked of a recipe."""
+"""Accuracy of a share that a recipe should have."""
 _EXPLAINED = 1.5
-"""Greatest root mean square residual, divided by its uncertainty, of a recipe that explains the target."""
+"""Largest root mean square residual, divided by its uncertainty, with which a recipe explains the target."""
 _LEAST_BANDS = 10
 _DARKEST = 1e-4
 
@@ -46,47 +49,47 @@ class Recipe:
     half_widths: dict[str, float]
     """Half widths of the 95 % intervals of the shares."""
     reflectance: Array
-    """[81], what the mixture shows, NaN in bands that were not compared."""
+    """[81], reflectance of the mixture, NaN in bands that were not compared."""
     rms: float
-    """Root mean square of what it misses."""
+    """Root mean square of its residual."""
     misfit: float
-    """The same over what noise and the uncertainty of the paints' K and S explain."""
+    """The same residual, divided by the part that noise and the uncertainty of the paints' K and S explain."""
     worst: float
-    """Largest difference, recipe less target, of the mean over five bands."""
+    """Largest difference, recipe minus target, of the mean over five bands."""
     worst_nm: float
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Recipes of 1, 2, ... paints, and which of them is worth its paints."""
+    """Recipes of 1, 2, ... paints, and the one that is worth its number of paints."""
 
     recipes: tuple[Recipe, ...]
     chosen_index: int
     """Index in `recipes`."""
     target: Array
-    """[81], seen."""
+    """[81], as measured."""
     bands: NDArray[np.bool_]
     noise: float
     rivals: tuple[dict[str, float], ...] = ()
-    """Shares of other mixtures that the target does not distinguish from the recipe. With as many paints or fewer,
-    they agree within noise. With one paint more, they are nearer by more than noise, but not by enough to be
-    preferred."""
+    """Shares of other mixtures that the target does not distinguish from the recipe. Mixtures with as many paints
+    or fewer agree within noise. Mixtures with one paint more are nearer by more than noise, but not by enough to
+    be preferred."""
 
     def told_within(self, name: str) -> float:
-        """Return the bound within which a share of the best recipe is known: by its 95 % interval, and by what
-        rivals have instead."""
+        """Return the bound within which a share of the best recipe is known, by its 95 % interval, and by the
+        shares in its rivals."""
         share = self.best.shares[name]
         apart = [abs(rival.get(name, 0.0) - share) for rival in self.rivals]
         return max(self.best.half_widths[name], *apart, 0.0)
 
     @property
     def best(self) -> Recipe:
-        """The one to mix."""
+        """The recipe to mix."""
         return self.recipes[self.chosen_index]
 
     @property
     def is_explained(self) -> bool:
-        """True if noise, and K and S of the paints, explain what the best recipe misses."""
+        """True if noise, and the uncertainty of the paints' K and S, explain the residual of the best recipe."""
         return self.best.misfit <= _EXPLAINED
 
     def verdict(self) -> str:
@@ -106,9 +109,9 @@ class Found:
 
 
 def find(target: Array, palette: Sequence[Paint], face: Face, noise: float, at_most: int) -> Found:
-    """Recipes of up to `at_most` paints for `target`, [81] as seen in air, NaN where it was not measured.
+    """Find recipes of up to `at_most` paints for `target`, [81] as measured in air, NaN where it was not measured.
 
-    Raises InputError for a target that no paint under the face can show, or without bands that all paints have.
+    Raises InputError for a target that no paint under the face can reach, and if no band is known for all paints.
     """
     bands = np.isfinite(target) & np.all(
         [np.isfinite(paint.absorption) & np.isfinite(paint.scattering) for paint in palette], axis=0
@@ -140,7 +143,8 @@ def _rivals(
     scale: float,
     palette: Sequence[Paint],
 ) -> tuple[dict[str, float], ...]:
-    """Shares of the recipes tried that are not told from the best one of a size, the nearest first."""
+    """Return the shares of tried recipes that are not distinguished from the best one of a size, the nearest
+    first."""
     best = min(cost for cost, subset, _ in tried_recipes if len(subset) == size)
     rivals = []
     for cost, subset, shares in sorted(tried_recipes, key=lambda one: one[0]):
@@ -168,7 +172,8 @@ def _subsets(count: int, size: int, before: Sequence[tuple[int, ...]]) -> Iterab
 
 
 def _choose_recipe(recipes: Sequence[Recipe], bands: int) -> int:
-    """The fewest to which one more paint adds nothing beyond noise, or what no palette explains."""
+    """Return the index of the first recipe that a further paint does not improve beyond noise. If the largest
+    recipe does not explain the target, its misfit counts as the noise."""
     scale = max(1.0, recipes[-1].misfit)
     for number, (recipe, more) in enumerate(pairwise(recipes)):
         if bands * (recipe.misfit**2 - more.misfit**2) / scale**2 < _WORTH:
@@ -203,7 +208,7 @@ class _Problem:
         self.system = slope[:, None] * (self.k - q[:, None] * self.s)
 
     def roughly(self, subset: tuple[int, ...]) -> float:
-        """Root mean square residual of the linear problem's mixture."""
+        """Root mean square residual of the mixture from the linear problem."""
         shares = self._linear(subset)
         return float(np.mean((self._mixture_reflectance(subset, shares) - self.target) ** 2))
 
@@ -269,7 +274,7 @@ class _Problem:
         return self.face.reflectance_in_air(InternalReflectance(kubelka_munk.opaque(k / s))).values
 
     def _uncertainty(self, subset: tuple[int, ...], shares: Array, variance: Array) -> Array:
-        """Standard uncertainty of the shares, from the variance [bands] of recipe less target."""
+        """Standard uncertainty of the shares, from the variance [bands] of recipe minus target."""
         count = len(subset)
         if count == 1:
             return np.zeros(1)
@@ -290,7 +295,7 @@ class _Problem:
         return np.asarray(np.sqrt(np.einsum("ib,b,ib->i", gain, variance, gain)))
 
     def _of_palette(self, subset: tuple[int, ...], shares: Array) -> Array:
-        """Variance [bands] of what is seen from K and S of the paints."""
+        """Variance [bands] of the measured reflectance from K and S of the paints."""
         columns = list(subset)
         k, s = self.k[:, columns] @ shares, self.s[:, columns] @ shares
         variance = np.zeros(len(k))

@@ -1,4 +1,4 @@
-"""A library with its classes, made ready for comparison, and how often it misleads."""
+"""A library with its classes, prepared for comparison, and its error rates."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from coupole.heritage.analysis.spectral_features import BANDS_NM, log_k_over_s, 
 LEAST_BANDS = 16
 _LEAST_CLASSES, _LEAST_SPECTRA = 2, 4
 _COVERED = 0.9
-"""Share of the references that must have been measured in a band for it to count."""
+"""Share of the references that must have been measured in a band for the band to be used."""
 _SAME = 1e-4
 _WIDEST_GAP_NM = 20.0
 _VIOLET_NM = 460.0
 _RISE_BEYOND, _RISE_BY = 0.1, 0.005
-"""Limits of the rise over 20 nm: of the logarithm of reflectance, beyond that of the references; of
+"""Limits of the rise over 20 nm: for the logarithm of reflectance, beyond the rise of the references; for
 reflectance."""
 
 
 @dataclass(frozen=True)
 class Rate:
-    """`count` of `of`, with its interval of 95 % (Clopper and Pearson, Biometrika 26, 404, 1934)."""
+    """`count` out of `of`, with its interval of 95 % (Clopper and Pearson, Biometrika 26, 404, 1934)."""
 
     count: int
     of: int
@@ -54,16 +54,17 @@ class Rate:
 
 @dataclass(frozen=True)
 class HeldOutRates:
-    """Rates of verdicts on the library's own spectra, each identified as if the library lacked it."""
+    """Rates of verdicts on the library's own spectra, each identified as if it were not in the library."""
 
     right: Rate
-    """The first candidate has the right class; of spectra with others of their class in the library."""
+    """Rate at which the first candidate has the right class, among spectra with others of their class in the
+    library."""
     matches: Rate
-    """Verdict `match` with the right class; of the same spectra."""
+    """Rate of the verdict `match` with the right class, among the same spectra."""
     false_matches: Rate
-    """Verdict `match` with a wrong class; of the same spectra."""
+    """Rate of the verdict `match` with a wrong class, among the same spectra."""
     unknown: Rate
-    """Verdict `unknown` after the whole class is left out; of all spectra."""
+    """Rate of the verdict `unknown` after the whole class is left out, among all spectra."""
 
 
 @dataclass
@@ -81,7 +82,7 @@ class OfBands:
 
     @cached_property
     def rates(self) -> HeldOutRates:
-        """Error rates, found by leaving out each spectrum and each class. Mixtures are not searched for."""
+        """Error rates, found by leaving out each spectrum and each class. Mixtures are not searched."""
         model, classes = self.model, self.classes
         several = np.bincount(classes)[classes] > 1
         probabilities, none = model.held_out.probabilities, model.held_out.without_class
@@ -103,7 +104,7 @@ class OfBands:
 
     @cached_property
     def reference_spread(self) -> Array:
-        """[bands] rms difference of log(K/S), less its mean, between references of a class that are most alike."""
+        """[bands] rms difference of log(K/S), minus its mean, between the most similar references of a class."""
         log_ratio = log_k_over_s(self.reflectance)
         shape = log_ratio - log_ratio.mean(axis=1, keepdims=True)
         differences = []
@@ -124,15 +125,15 @@ class References:
 
     names: tuple[str, ...]
     class_of: tuple[str, ...]
-    """[n] class of each."""
+    """[n] class of each spectrum."""
     reflectance: Array
     """[n, 221] at `BANDS_NM`; NaN where it was not measured."""
     remarks: tuple[str, ...]
-    """Remarks on what was left out, and why."""
+    """Remarks on spectra that were left out, with the reasons."""
     _of_bands_cache: dict[bytes, OfBands] = field(default_factory=dict)
 
     def of_bands(self, spectrum_name: str, reflectance: Array) -> OfBands:
-        """The references in the bands in which a spectrum [221] and nine of ten references were measured.
+        """Return the references in the bands in which a spectrum [221] and nine of ten references were measured.
 
         Raises InputError if the bands are fewer than 16.
         """
@@ -161,10 +162,11 @@ class References:
         return self._of_bands_cache[key]
 
     def without_stray_light(self, reflectance: Array) -> tuple[Array, str]:
-        """A spectrum [221] without a violet end that rises as no reference does, and what was left out, if
-        anything.
+        """Return a spectrum [221] without a violet end that rises more than any reference, and a remark about the
+        omitted part, if any.
 
-        Pigments absorb more towards the ultraviolet; instruments have least light there, and stray light shows.
+        Pigments absorb more towards the ultraviolet. Instruments have least light there, so stray light becomes
+        visible.
         """
         violet = np.flatnonzero(BANDS_NM < _VIOLET_NM)
         with np.errstate(invalid="ignore"):
@@ -181,7 +183,7 @@ class References:
         return reliable, f"below {BANDS_NM[last + 1]:g} nm it rises as no reference does (stray light?): left out"
 
     def without_class(self, class_name: str) -> References:
-        """The library as if it had never had a class."""
+        """Return the library without one of its classes."""
         rows = [row for row, name in enumerate(self.class_of) if name != class_name]
         return References(
             tuple(self.names[row] for row in rows),
@@ -192,9 +194,9 @@ class References:
 
 
 def trimmed_spectrum(spectrum: LibrarySpectrum) -> Measured:
-    """A spectrum of a file for identification, without the bands that it lacks at its ends.
+    """Return a file's spectrum for identification, without missing bands at its ends.
 
-    Raises InputError, with file and line, for gaps wider than 20 nm, which resampling leaves open.
+    Raises InputError, with file and line, for gaps wider than 20 nm, which resampling does not fill.
     """
     is_known = np.isfinite(spectrum.reflectance)
     nm = spectrum.wavelengths_nm[is_known]
@@ -216,8 +218,8 @@ def trimmed_spectrum(spectrum: LibrarySpectrum) -> Measured:
 
 
 def make_references(spectra: Sequence[LibrarySpectrum], classes: Mapping[str, PigmentClass]) -> References:
-    """The library with the classes of a table. Spectra without a class are left out; of a spectrum under two
-    names one is kept, or none if the two have different classes; `remarks` say so.
+    """Return the library with the classes of a table. Spectra without a class are left out. If a spectrum occurs
+    under two names, one is kept, or none if the two have different classes; `remarks` say so.
 
     Raises InputError for a library without classes, or with fewer than two, and for spectra with gaps.
     """

@@ -1,6 +1,6 @@
-"""Features by which reflectance spectra are compared, and how the same paint may look to another instrument.
+"""Features by which reflectance spectra are compared, and appearances of the same paint in other measurements.
 
-Bands are every 10 nm, ultraviolet to near infrared; those that were not measured are NaN.
+Bands are every 10 nm, ultraviolet to near infrared; bands that were not measured are NaN.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ BANDS_NM: Array = np.arange(300.0, 2500.0 + STEP_NM / 2, STEP_NM)
 BANDS_NM.setflags(write=False)
 NEAR_INFRARED_NM = 780.0
 _DARKEST, _LIGHTEST = 0.008, 0.99
-"""K/S beyond them is mostly the instrument's stray light, or its white."""
+"""Limits of reflectance; beyond them K/S depends mostly on the instrument's stray light, or on its white."""
 _SLOPE_BANDS = 2
 _SLOPE, _REFLECTANCE, _LEVEL = 3.0, 0.5, 0.3
 _APPEARANCES = (
@@ -40,15 +40,14 @@ def on_bands(spectrum: Measured) -> Array:
 
 
 def log_k_over_s(reflectance: Array) -> Array:
-    """log(K/S) of an opaque layer, any shape; reflectances are limited to 0.008 and 0.99."""
+    """Return log(K/S) of an opaque layer, for arrays of any shape; reflectances are limited to 0.008 to 0.99."""
     return np.log(kubelka_munk.k_over_s(np.clip(reflectance, _DARKEST, _LIGHTEST)))
 
 
 def appearances(reflectance: Array) -> Array:
-    """[a, n, bands]: spectra [n, bands] as they are, then tinted, in oil, under gloss, with light from the
-    surface.
+    """[a, n, bands]: spectra [n, bands] unchanged, then tinted, in oil, under gloss, with light from the surface.
 
-    Binder and white change K/S by a factor; a surface acts as Saunderson described (`glossy_face.Face`).
+    Binder and white change K/S by a factor; a surface acts by Saunderson's equation (`glossy_face.Face`).
     """
     ratio = kubelka_munk.k_over_s(np.clip(reflectance, _DARKEST, _LIGHTEST))
     looks = []
@@ -63,11 +62,17 @@ def appearances(reflectance: Array) -> Array:
 
 
 def features(reflectance: Array) -> Array:
-    """[n, f] of spectra [n, bands], all measured in all bands, whose Euclidean distances are compared.
+    """[n, f] features of spectra [n, bands], which are measured in all bands. Euclidean distances of features are
+    compared.
 
-    Deviation of log(K/S) from its mean, which a factor on K/S leaves; its slope over 20 nm times 3; reflectance
-    and its slope, each reduced to unit deviation, times 0.5; and the level (means of log(K/S), logarithm and
-    value of the highest reflectance) times 0.3 and the root of the number of bands.
+
+    The features are:
+
+    - the deviation of log(K/S) from its mean, which a factor on K/S does not change;
+    - its slope over 20 nm, times 3;
+    - reflectance and its slope, each scaled to unit deviation, times 0.5;
+    - the level (means of log(K/S), logarithm and value of the highest reflectance), times 0.3 and the root of the
+      number of bands.
     """
     log_ratio = log_k_over_s(reflectance)
     slope = log_ratio[:, _SLOPE_BANDS:] - log_ratio[:, :-_SLOPE_BANDS]

@@ -1,9 +1,9 @@
-"""Two references that explain a spectrum together better than any one of them.
+"""Pairs of references that explain a spectrum better than any single reference.
 
-K/S of an opaque mixture is the weighted sum of its pigments' K/S where all scatter alike (Duncan 1949), and white
-only scales it. Weights are least squares of the relative residual; two references count against one by Schwarz's
-criterion (Ann. Stat. 6, 461, 1978), with the logarithm of the number of choices added for the search (Chen and
-Chen, Biometrika 95, 759, 2008).
+K/S of an opaque mixture is the weighted sum of its pigments' K/S if all scatter alike (Duncan 1949), and white
+only scales it. Weights come from least squares of the relative residual. Two references are compared with one by
+Schwarz's criterion (Ann. Stat. 6, 461, 1978). The logarithm of the number of choices is added for the search (Chen
+and Chen, Biometrika 95, 759, 2008).
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ _LEAST_SHARE = 0.15
 _MOST_RESIDUAL = 0.02
 _LEAST_GAIN = 20.0
 _MODEL, _NOISE = 0.01, 0.001
-"""Relative error of K/S by additivity, and noise of reflectance."""
+"""Relative error of K/S from the assumption of additivity, and noise of reflectance."""
 _INDEPENDENT_EVERY = 3
-"""Bands of 10 nm; reflectances of neighbours are correlated."""
+"""Number of bands of 10 nm for one independent value; reflectances of neighbours are correlated."""
 
 
 @dataclass(frozen=True)
@@ -30,16 +30,16 @@ class Unmixed:
     """The best pair of references of different classes."""
 
     references: tuple[int, int]
-    """Their numbers, the larger share first."""
+    """Numbers of the references, the larger share first."""
     shares: tuple[float, float]
     """Shares of the mixture's K/S, mean over the bands; they sum to 1."""
     residual: float
     """Relative residual of K/S, rms."""
     gain: float
-    """Schwarz's criterion of the best single reference less that of the pair; above 10 is very strong evidence
-    (Kass and Raftery 1995)."""
+    """Schwarz's criterion of the best single reference minus that of the pair; more than 10 is very strong
+    evidence (Kass and Raftery 1995)."""
     lead: float
-    """Schwarz's criterion of the best pair of other classes less that of this pair."""
+    """Schwarz's criterion of the best pair of other classes minus that of this pair."""
 
     @property
     def is_settled(self) -> bool:
@@ -48,8 +48,8 @@ class Unmixed:
 
 
 def unmix(reflectance: Array, references: Array, classes: NDArray[np.intp]) -> Unmixed | None:
-    """The pair of `references` [n, bands] of different `classes` [n] that a spectrum [bands] is a mixture of;
-    None if no pair has two shares of 0.15 or more."""
+    """Return the pair of `references` [n, bands], of different `classes` [n], whose mixture is nearest to a
+    spectrum [bands]; None if no pair has two shares of 0.15 or more."""
     weight = _weight(reflectance)
     relative = np.exp(log_k_over_s(references) - log_k_over_s(reflectance)) * weight
     count, bands = relative.shape
@@ -97,7 +97,8 @@ def unmix(reflectance: Array, references: Array, classes: NDArray[np.intp]) -> U
 
 
 def _weight(reflectance: Array) -> Array:
-    """[bands] near 1 where the model limits how well K/S is known, less where noise of reflectance does."""
+    """[bands] weights: near 1 where the model limits the accuracy of K/S, less where noise of reflectance limits
+    it."""
     r = np.clip(reflectance, 0.008, 0.99)
     noise = _NOISE * (1.0 + r) / (r * (1.0 - r))
     weight: Array = _MODEL / np.sqrt(_MODEL**2 + noise**2)

@@ -1,1 +1,1 @@
-"""Two states of an object compared: what changed in shape and colour, and how surely."""
+"""Comparison of two states of an object: changes in shape and colour, with their significance."""

@@ -1,8 +1,8 @@
-"""The surface of a state near given places: a quadric through its nearest points, and how well it is known there.
+"""The surface of a state near given places: a quadric through its nearest points, with its uncertainty.
 
 The idea is that of M3C2 (Lague, Brodu, Leroux, ISPRS J. 82, 2013): distances between local surfaces along the
-local normal, with an uncertainty from the scatter of the points about each; here the surfaces may be curved, and
-colours are fitted with the shape.
+local normal, with an uncertainty from the scatter of the points about each surface. Here the surfaces may be
+curved, and colours are fitted with the shape.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ NEIGHBOURS = 24
 _TERMS, _PLANE_TERMS = 6, 3
 _FREEDOM_ALONE = NEIGHBOURS - _TERMS
 FREEDOM = 3 * _FREEDOM_ALONE
-"""Degrees of freedom of a scatter: fits next to each other share most of their points."""
+"""Degrees of freedom of a scatter. They are few, because neighbouring fits share most of their points."""
 _BATCH = 50_000
 _MOST_BESIDE = 0.6
-"""Middle of the neighbours beside the place, over their extent: more is a rim, where the surface ends."""
+"""Largest distance of the neighbours' middle from the place, over their extent. If it is larger, the place is at a
+rim, where the surface ends."""
 _LEAST_COSINE, _BESIDE_LINE, _NEXT_TO_LINE = 0.5, 2.0, 6
-"""A surface is seen at a place if a point that faces as the place does lies within so many spacings of the line
-along the normal, and the next points to this line do so in the mean."""
+"""Least cosine between normals, largest distance in spacings, and number of points. A surface is seen at a place
+if a point with a similar normal lies near the line along the place's normal, and if the points next to this line
+have similar normals on average."""
 _RIDGE = 1e-9
 
 
@@ -38,17 +40,18 @@ class SurfacePoints:
     normals: Floats
     """[m, 3] unit."""
     is_outward: bool
-    """False if it is not known to which side of the surface the normals point."""
+    """False if the side to which the normals point is not known."""
     spacing_mm: float
-    """Distance of neighbours."""
+    """Distance between neighbouring points."""
 
     def only(self, point_mask: NDArray[np.bool_]) -> SurfacePoints:
-        """Return some of the points, [m] True."""
+        """Return some of the points, given by a mask [m]."""
         return replace(self, points_mm=self.points_mm[point_mask], normals=self.normals[point_mask])
 
     def is_seen(self, near: NDArray[np.int64], from_line_mm: Floats, normals: Floats) -> NDArray[np.bool_]:
-        """[n] tell whether the points `near` [n, k] places with normals [n, 3], so far from the lines along these
-        [n, k], are the surface there: in a hollow whose ground was not seen they are those of another wall."""
+        """[n] True if the points `near` [n, k] places with normals [n, 3] are the surface there. `from_line_mm`
+        [n, k] are their distances from the lines along the normals. In a hollow, if its ground was not measured,
+        the nearest points belong to another wall."""
         cosines = np.einsum("nka,na->nk", self.normals[near], normals)
         if not self.is_outward:
             cosines = np.abs(cosines)
@@ -63,18 +66,19 @@ class LocalFits:
     """Values of a state's surface at places."""
 
     values: Floats
-    """[n, c] height along the normal in mm, by a quadric, then the points' own, by a plane; NaN where there is no
-    surface."""
+    """[n, c] height along the normal in mm, by a quadric, then the points' own values, by a plane; NaN where there
+    is no surface."""
     scatter: Floats
-    """[n, c, c] covariance of a point's values about the quadric, the mean of that here and next to here."""
+    """[n, c, c] covariance of a point's values about the quadric, as the mean over this place and the places next
+    to it."""
     leverage: Floats
-    """[n, c] variance of a value, divided by that of one point."""
+    """[n, c] variance of a value, divided by the variance of one point."""
     is_seen: NDArray[np.bool_]
-    """[n] whether the state's points near a place are the surface there, and not that of another wall."""
+    """[n] True if the state's points near a place are the surface there, and not the surface of another wall."""
 
     @property
     def covariance(self) -> Floats:
-        """[n, c, c] of the values."""
+        """[n, c, c] covariance of the values."""
         root = np.sqrt(self.leverage)
         return np.asarray(self.scatter * root[:, :, None] * root[:, None, :])
 
@@ -140,7 +144,7 @@ def _fit_batch(
 
 
 def _least_squares(design: Floats, observations: Floats) -> tuple[Floats, Floats, Floats]:
-    """Values [n, c] at the middle, what is left [n, k, c], and leverage [n], of designs [n, k, t] and values
+    """Return values [n, c] at the middle, residuals [n, k, c], and leverage [n], for designs [n, k, t] and values
     [n, k, c]."""
     normal = np.einsum("nki,nkj->nij", design, design) + _RIDGE * NEIGHBOURS * np.eye(design.shape[2])
     inverse = np.linalg.inv(normal)

@@ -1,7 +1,7 @@
 """A result of `coupole reflectance` as a state: its mesh, and the colours of its fitted diffuse parts.
 
-Colours are CIELAB under D65 of pi kd, whose channels are taken as linear sRGB, as in the exports. Covariances are
-those of kd by channel, of its triangle's pixels, and of the LEDs' power, carried over by derivatives.
+Colours are CIELAB under D65 of pi kd; its channels are taken as linear sRGB, as in the exports. Covariances come
+from kd by channel, from its triangle's pixels, and from the LEDs' power, propagated by derivatives.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from coupole.heritage.comparison.state_files import Colours, Floats, State
 from coupole.scan.registration.prepared_scan import spacing
 
 _STEP = 1e-4
-"""Relative, for derivatives."""
+"""Relative step for derivatives."""
 _DARKEST = 1e-6
 
 
 def read_result_state(folder: Path) -> State:
-    """The mesh's triangles as points, at their middles. Raises InputError if there is no result with
-    uncertainties, ExtraMissing."""
+    """Read the mesh's triangles as points, at their middles. Raises InputError if there is no result with
+    uncertainties, and ExtraMissing."""
     surface = read_surface(folder)
     corners = surface.vertices_mm[surface.triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -53,7 +53,8 @@ def read_result_state(folder: Path) -> State:
 
 
 def _uncertainties(path: Path, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Relative standard uncertainties of kd: [n, 3] of each channel by itself, and [n] what all have in common."""
+    """Return relative standard uncertainties of kd: [n, 3] for each channel alone, and [n] for the part that all
+    channels share."""
     with h5py.File(path, "r") as file:
         alone = red_green_blue(file["u_kd"][()].astype(np.float64))[rows]
         common = np.hypot(file["u_triangle"][()].astype(np.float64), float(file["u_shared"][()]))[rows]
@@ -61,7 +62,7 @@ def _uncertainties(path: Path, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
 
 
 def lab_of_kd(kd: Floats, u_alone: Floats, u_common: Floats) -> tuple[Floats, Floats]:
-    """CIELAB [n, 3] of kd [n, 3] in 1/sr, and covariances [n, 3, 3]; uncertainties are relative. Raises
+    """Return CIELAB [n, 3] of kd [n, 3] in 1/sr, and covariances [n, 3, 3]; uncertainties are relative. Raises
     ExtraMissing."""
     linear = np.maximum(np.pi * kd, _DARKEST)
     lab = _lab(linear)

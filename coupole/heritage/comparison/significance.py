@@ -1,10 +1,11 @@
-"""Significance of many differences: p-values with a noise that the data themselves confirm, and false discoveries.
+"""Significance of many differences: p-values with a noise estimated from the data, and a limit on false
+discoveries.
 
 If noise is correlated from point to point, or surfaces are sampled unevenly, differences scatter more than local
-fits say. Most of an object does not change, so the bulk of all differences shows their true scatter (an empirical
-null: Efron, J. American Statistical Association 99, 2004); uncertainties are enlarged to it, never reduced. At
-most 5 % of the marked points are expected to be unchanged (Benjamini, Hochberg, J. Royal Statistical Society B
-57(1), 1995).
+fits predict. Most of an object does not change, so the bulk of all differences shows their true scatter (an
+empirical null: Efron, J. American Statistical Association 99, 2004). Uncertainties are enlarged to this scatter,
+never reduced. At most 5 % of the marked points are expected to be unchanged (Benjamini, Hochberg, J. Royal
+Statistical Society B 57(1), 1995).
 """
 
 from __future__ import annotations
@@ -18,20 +19,21 @@ from coupole.heritage.comparison.state_files import Floats
 
 FALSE_SHARE = 0.05
 _BULK = 0.5
-"""Quantile of the differences by which their scatter is judged: changes beyond half of an object mislead it."""
+"""Quantile of the differences from which their scatter is estimated. If more than half of an object has changed,
+the estimate is wrong."""
 
 
 def of_lengths(differences: Floats, u: Floats, freedom: float) -> tuple[Floats, float]:
-    """Two-sided p-values of differences [n] with standard uncertainties [n]; and the factor that enlarges
-    these."""
+    """Return two-sided p-values of differences [n] with standard uncertainties [n], and the factor that enlarges
+    the uncertainties."""
     ratio = np.abs(differences) / u
     factor = max(1.0, float(np.nanquantile(ratio, _BULK) / t.ppf((1 + _BULK) / 2, freedom)))
     return np.asarray(2 * stdtr(freedom, -ratio / factor)), factor
 
 
 def of_vectors(differences: Floats, covariances: Floats, freedom: float) -> tuple[Floats, float]:
-    """p-values of differences [n, c] with covariances [n, c, c] (Hotelling's T2), and the factor that enlarges
-    uncertainties."""
+    """Return p-values of differences [n, c] with covariances [n, c, c] (Hotelling's T2), and the factor that
+    enlarges the uncertainties."""
     dimensions = differences.shape[1]
     statistic = np.full(len(differences), np.nan)
     is_known = np.isfinite(differences).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
@@ -47,8 +49,8 @@ def of_vectors(differences: Floats, covariances: Floats, freedom: float) -> tupl
 
 
 def discoveries(p: Floats, false_share: float = FALSE_SHARE) -> NDArray[np.bool_]:
-    """Mark those of the p-values [n] that are significant, so that at most this share of them is expected to be
-    false; NaN is not marked."""
+    """Return a mask of the significant p-values [n], for which at most the given share is expected to be false.
+    NaN is not significant."""
     finite_rows = np.flatnonzero(np.isfinite(p))
     order = finite_rows[np.argsort(p[finite_rows])]
     under = p[order] <= false_share * np.arange(1, len(order) + 1) / max(1, len(order))

@@ -1,4 +1,5 @@
-"""Compares two states of an object: aligned by what did not change, then point by point in shape and colour."""
+"""Compares two states of an object: aligns them by the unchanged parts, then compares shape and colour at each
+point."""
 
 from __future__ import annotations
 
@@ -30,15 +31,17 @@ from coupole.scan.registration.viewpoint import Viewpoint
 
 Say = Callable[[str, int, int], None]
 _REACH_SHARE, _REACH_SPACINGS = 0.02, 6.0
-"""Greatest distance of surfaces that are compared: the larger of this share of the size, and so many spacings."""
+"""Largest distance of surfaces that are compared: this share of the size, or so many spacings, whichever is
+larger."""
 _LEAST_REGION = 3
 _SMALLEST_SPREAD = 1e-4
-"""Smallest spread of Lab values: finer than 8 bits tell, so that equal colours have an uncertainty too."""
+"""Smallest spread of Lab values. It is finer than the steps of 8 bits, and gives equal colours an uncertainty
+too."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """A region: marked points that are connected."""
+    """A region of connected marked points."""
 
     points: int
     middle_mm: Floats
@@ -46,9 +49,9 @@ class Region:
     middle_in_after_mm: Floats
     """[3] in the frame of the second state."""
     across_mm: float
-    """Largest extent."""
+    """Largest extent of the region."""
     distance_mm: float
-    """Mean of the surface's distances; positive: outwards, material was added."""
+    """Mean of the surface's distances. Positive means outwards, so that material was added."""
     de00: float
     """Mean colour difference; NaN without colours."""
 
@@ -66,20 +69,20 @@ class Comparison:
     normals: Floats
     """[n, 3] outward unit normals of the first state."""
     distance_mm: Floats
-    """[n] along the normals, outwards positive; NaN where the other state has no surface that faces as this one,
-    such as the ground of a hollow that was not seen."""
+    """[n] along the normals, outwards positive. NaN where the other state has no surface with a similar normal,
+    for example in a hollow with a ground that was not measured."""
     u_mm: Floats
     """[n] standard uncertainty."""
     moved_points: NDArray[np.bool_]
-    """[n] significantly."""
+    """[n] True where the distance is significant."""
     noise_factor: float
-    """Factor by which the scatter enlarged all uncertainties of distances."""
+    """Factor by which all uncertainties of distances were enlarged, from the scatter."""
     de00: Floats | None
-    """[n] CIEDE2000 under D65."""
+    """[n] CIEDE2000 differences under D65."""
     recoloured_points: NDArray[np.bool_] | None
     """[n] True where the colour differs significantly; None without colours."""
     colour_factor: float
-    """Factor by which the scatter enlarged all uncertainties of colours."""
+    """Factor by which all uncertainties of colours were enlarged, from the scatter."""
     shape_regions: tuple[Region, ...]
     """Regions of `moved_points`, the largest first."""
     colour_regions: tuple[Region, ...]
@@ -87,8 +90,8 @@ class Comparison:
 
     @property
     def upright_axes(self) -> Floats | None:
-        """[3, 3] x, y and z, as columns, of a state's frame in which z is up, seen in the frame of the first
-        state; None if no state has one."""
+        """[3, 3] axes x, y and z, as columns, of a state's frame with z up, in the frame of the first state; None
+        if no state has such a frame."""
         if self.before.is_upright:
             return np.eye(3)
         return self.alignment.before_from_after[:3, :3] if self.after.is_upright else None
@@ -98,7 +101,7 @@ def compare(
     before_path: Path, after_path: Path, unit: str, noise_mm: float | None, *, is_aligned: bool, say: Say
 ) -> Comparison:
     """Compare two files, or folders of `coupole reflectance`. `noise_mm` is the standard deviation of a point;
-    with None it is estimated from the scatter. With `is_aligned`, both files are in one frame already. Raises
+    with None it is estimated from the scatter. With `is_aligned`, both files already have the same frame. Raises
     InputError, ExtraMissing."""
     say("reading", 0, 2)
     before = _load_state(before_path, unit)
@@ -180,7 +183,7 @@ def _has_outward(state: State) -> bool:
 def _fits(
     surface: SurfacePoints, colours: Colours | None, places_mm: Floats, normals: Floats, reach_mm: float
 ) -> LocalFits:
-    """Local fits of shape by all points of a state, and of colour by those that have one."""
+    """Return local fits of shape from all points of a state, and of colour from the points that have one."""
     if colours is None:
         return fit_locally(surface, None, places_mm, normals, reach_mm)
     there = np.asarray(np.isfinite(colours.lab).all(axis=1))
@@ -195,8 +198,8 @@ def _fits(
 
 
 def _of_result(points_mm: Floats, colours: Colours, places_mm: Floats) -> Floats:
-    """[n, 3, 3] covariance of a result's colour at places: that of the nearest point that has one. It is not
-    divided by the number of points around: what they have in common is most of it."""
+    """[n, 3, 3] covariance of a result's colour at places, from the nearest point that has one. It is not divided
+    by the number of points around, because they share most of it."""
     if colours.covariance is None:
         return np.zeros((len(places_mm), 3, 3))
     there = np.isfinite(colours.lab).all(axis=1)
@@ -205,8 +208,8 @@ def _of_result(points_mm: Floats, colours: Colours, places_mm: Floats) -> Floats
 
 
 def _normals(state: State) -> Floats:
-    """[n, 3] normals from the triangles. Without triangles they come from neighbours, and their sign is
-    unknown."""
+    """[n, 3] normals from the triangles. Without triangles the normals come from neighbouring points, and their
+    sign is unknown."""
     if state.outward is not None and _has_outward(state):
         return state.outward
     cloud = thinned_cloud(state.points_mm, state.spacing_mm, Viewpoint("none"), state.outward)
@@ -220,7 +223,7 @@ def de00_of(lab: Floats, other_lab: Floats) -> Floats:
 
 
 def _regions(comparison: Comparison, point_mask: NDArray[np.bool_]) -> tuple[Region, ...]:
-    """The largest first; a few single points are left out."""
+    """Return the regions, the largest first; single points and groups of a few points are left out."""
     numbers = np.flatnonzero(point_mask)
     if not len(numbers):
         return ()
@@ -249,7 +252,7 @@ def _regions(comparison: Comparison, point_mask: NDArray[np.bool_]) -> tuple[Reg
 
 
 def about(comparison: Comparison) -> dict[str, Any]:
-    """The content of `comparison.json`."""
+    """Return the content of `comparison.json`."""
 
     def region_entries(regions: tuple[Region, ...]) -> list[dict[str, Any]]:
         return [

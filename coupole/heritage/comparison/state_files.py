@@ -19,12 +19,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Colours:
-    """Colours of a state's points, as CIELAB under D65."""
+    """Colours of a state's points, in CIELAB under D65."""
 
     lab: Floats
     """[n, 3]; NaN where a point has none."""
     covariance: Floats | None = None
-    """[n, 3, 3]; None if it is not known: it is then estimated from the scatter from point to point."""
+    """[n, 3, 3]; None if it is not known. It is then estimated from the scatter between points."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class State:
     points_mm: Floats
     """[n, 3]"""
     triangles: NDArray[np.int64]
-    """[m, 3], none of a cloud."""
+    """[m, 3]; empty for a cloud of points."""
     outward: Floats | None
-    """[n, 3] normals by the triangles."""
+    """[n, 3] normals from the triangles."""
     colours: Colours | None
     spacing_mm: float
     is_upright: bool = False
@@ -50,7 +50,7 @@ class State:
 
 
 def read_state(path: Path, unit: str) -> State:
-    """A file of a scan, with its colours. Raises InputError, ExtraMissing."""
+    """Read the file of a scan, with its colours. Raises InputError, ExtraMissing."""
     sources = sources_of([path])
     if len(sources) != 1:
         raise InputError(
@@ -76,7 +76,8 @@ def read_state(path: Path, unit: str) -> State:
 
 
 def _is_on_site(path: Path) -> bool:
-    """True if `coupole register` merged the file in the frame of its control points, by the record beside it."""
+    """Tell, by the record beside the file, whether `coupole register` merged it in the frame of its control
+    points."""
     record = path.with_name("registration.json")
     if not record.is_file():
         return False
@@ -93,7 +94,7 @@ def lab_of(srgb: NDArray[np.uint8]) -> Floats:
 
 
 def colour_library() -> Any:
-    """`skimage.color`. Raises ExtraMissing."""
+    """Import `skimage.color`. Raises ExtraMissing."""
     try:
         from skimage import color
     except ImportError as error:

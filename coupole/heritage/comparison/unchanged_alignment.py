@@ -1,7 +1,7 @@
-"""Brings a state onto another by what did not change: points that disagree more than noise does lose all weight.
+"""Aligns a state with another by the unchanged parts: points that disagree by more than noise lose all weight.
 
-Points to planes (Chen, Medioni, 1992) with Tukey's biweight, whose influence falls to nothing beyond 4.685
-standard deviations (Beaton, Tukey, Technometrics 16(2), 1974), the standard deviation being that of the median
+Points to planes (Chen, Medioni, 1992) with Tukey's biweight, which has no influence beyond 4.685 standard
+deviations (Beaton, Tukey, Technometrics 16(2), 1974). The standard deviation is estimated from the median
 residual.
 """
 
@@ -20,7 +20,8 @@ from coupole.scan.registration.viewpoint import Viewpoint
 
 _COARSE_POINTS, _FINE_POINTS = 4_000, 60_000
 _ALIGNED_SHARE, _LEAST_SHARE = 0.6, 0.3
-"""Share of the coarse points that lie on the other state: if the two are aligned already, and if they can be."""
+"""Least share of the coarse points that lie on the other state: for states that are already aligned, and for
+states that can be aligned."""
 _TUKEY = 4.685
 _MOST_ROUNDS, _SETTLED = 60, 1e-6
 _CELLS_ACROSS = 12
@@ -29,7 +30,7 @@ _FEATURES_AGREED = 5
 
 @dataclass(frozen=True)
 class Alignment:
-    """`before_from_after`, 4x4 mm."""
+    """Motion `before_from_after`, 4x4 in mm, with its covariance."""
 
     before_from_after: Floats
     covariance: Floats
@@ -38,7 +39,7 @@ class Alignment:
     noise_mm: float
     """Robust standard deviation of distances along normals."""
     is_given: bool
-    """True if the states lay on each other in their files already."""
+    """True if the states were already aligned in their files."""
 
     def uncertainty_mm(self, points_mm: Floats, normals: Floats) -> Floats:
         """[n] standard uncertainty of distances along normals [n, 3] at points [n, 3]."""
@@ -76,7 +77,8 @@ def _thin_state(state: State, pitch_mm: float, most: int) -> Cloud:
 
 
 def _share(before: Cloud, after: Cloud, motion: Floats, pitch_mm: float) -> float:
-    """Return the share of the after's points that lie on the other state, within half a cell along its normals."""
+    """Return the share of the points of the second state that lie on the first state, within half a cell along its
+    normals."""
     moved_mm = moved_points(motion, after.points_mm)
     away, nearest = before.tree.query(moved_mm, distance_upper_bound=1.5 * pitch_mm)
     hit = np.isfinite(away)

@@ -1,1 +1,2 @@
-"""Virtual restoration: what a statue or a part of a building may have looked like, by stated hypotheses."""
+"""Virtual restoration: the possible former appearance of a statue or a part of a building, by stated
+hypotheses."""

@@ -1,4 +1,4 @@
-"""Colour difference of two hypotheses: CIEDE2000 of each pixel of the object, and over each part."""
+"""Colour difference of two hypotheses: CIEDE2000 for each pixel of the object, and for each part."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coupole.appearance.spectra import light
 _LIGHT, _STRONG = np.array([0.93, 0.93, 0.91]), np.array([0.35, 0.0, 0.35])
 _AROUND = np.array([0.16, 0.16, 0.17])
 FULL_DE00 = 50.0
-"""Shown at full strength."""
+"""Colour difference that is shown at full strength."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Difference:
     de00: NDArray[np.float64]
     """[h, w], NaN where the object is not seen."""
     of_parts: dict[str, dict[str, Any]]
-    """Figures of each part that is seen: `pixels`, `mean_de00` over them (noise adds to it), `de00_of_means`, the
+    """Figures of each visible part: `pixels`, `mean_de00` over them (noise increases it), and `de00_of_means`, the
     difference of the mean colours."""
 
 
@@ -36,11 +36,11 @@ def compare_pictures(
     eye: Eye,
     white_cd_m2: float,
 ) -> Difference:
-    """Compare two pictures [h, w, 3] in cd/m^2 for an eye that is used to `white_cd_m2` of the first light's
+    """Compare two pictures [h, w, 3] in cd/m^2 for an eye that is adapted to `white_cd_m2` of the first light's
     colour.
 
     `part_of_pixel` [h, w] are rows of `names`, negative where the object is not seen. CIEDE2000 (Luo, Cui, Rigg,
-    Color Res. Appl. 26(5), 2001) is colour-science's.
+    Color Res. Appl. 26(5), 2001) is computed by colour-science.
     """
     de00 = np.full(part_of_pixel.shape, np.nan)
     on = part_of_pixel >= 0
@@ -62,7 +62,8 @@ def compare_pictures(
 
 
 def difference_picture(de00: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """[h, w, 3]: light where nothing differs, violet at `FULL_DE00`, dark where the object is not seen."""
+    """[h, w, 3] picture: light where there is no difference, violet at `FULL_DE00`, dark where the object is not
+    seen."""
     share = np.clip(np.nan_to_num(de00) / FULL_DE00, 0.0, 1.0)[..., None]
     colours = np.where(np.isnan(de00)[..., None], _AROUND, _LIGHT + share * (_STRONG - _LIGHT))
     return np.rint(255.0 * colours).astype(np.uint8)

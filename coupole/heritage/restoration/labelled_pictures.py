@@ -1,4 +1,5 @@
-"""Every picture of a hypothesis says so: in a strip below it, and in its metadata."""
+"""Labels for pictures of hypotheses: each picture says, in a strip below it and in its metadata, that it shows a
+hypothesis."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ _XMP_KEYWORD = "XML:com.adobe.xmp"
 
 
 def metadata_texts(hypotheses: Sequence[Hypothesis]) -> dict[str, str]:
-    """Texts for metadata by their keywords, of a picture of one or more hypotheses."""
+    """Return texts for the metadata of a picture of one or more hypotheses, by their keywords."""
     names = "; ".join(f"{hypothesis.name}: {hypothesis.title}" for hypothesis in hypotheses)
     several = len(hypotheses) > 1
     sources = "\n".join(
@@ -38,12 +39,12 @@ def metadata_texts(hypotheses: Sequence[Hypothesis]) -> dict[str, str]:
 
 
 def for_png(texts: Mapping[str, str]) -> dict[str, str]:
-    """The same, and as XMP (ISO 16684-1: Dublin Core's title, description and source)."""
+    """Return the same texts, also as XMP (ISO 16684-1: Dublin Core's title, description and source)."""
     return {**texts, "Title": f"Hypothesis: {texts['Hypothesis']}", _XMP_KEYWORD: _xmp(texts)}
 
 
 def for_exr(texts: Mapping[str, str]) -> dict[str, str]:
-    """The same, with names of EXR attributes."""
+    """Return the same texts, with names of EXR attributes."""
     return {keyword.lower(): words for keyword, words in texts.items()}
 
 
@@ -62,13 +63,13 @@ def restamp_exr(path: Path, attributes: Mapping[str, str]) -> None:
 
 
 def captioned_picture(picture: Picture, hypothesis: Hypothesis, lines: int | None = None) -> Picture:
-    """The picture [h, w, 3] with a strip below it: the word, title and references; of some number of lines."""
+    """Return the picture [h, w, 3] with a strip of some lines below it: the word, title and references."""
     caption = caption_lines(picture.shape[1], hypothesis)
     return with_strip(picture, caption, lines or len(caption))
 
 
 def caption_lines(width_px: int, hypothesis: Hypothesis) -> list[str]:
-    """The words of the strip, broken for a picture of this width; what is left out, the last line says."""
+    """Return the lines of the strip, broken for a picture of this width. The last line tells what is left out."""
     references = "; ".join(dict.fromkeys(source.reference for source in hypothesis.sources))
     words = [f"Hypothesis: {hypothesis.title} (simulated)", f"Sources: {references}"]
     lines = [line for paragraph in words for line in break_lines(paragraph, width_px)]
@@ -78,7 +79,7 @@ def caption_lines(width_px: int, hypothesis: Hypothesis) -> list[str]:
 
 
 def with_strip(picture: Picture, lines: Sequence[str], room: int) -> Picture:
-    """The picture with lines of text below it, and room for so many."""
+    """Return the picture with lines of text below it, and room for the given number of lines."""
     from PIL import Image, ImageDraw
 
     height, width = picture.shape[:2]
@@ -100,7 +101,7 @@ def _size(width_px: int) -> int:
 
 
 def _font(size: int) -> Any:
-    """DejaVu Sans, which matplotlib carries: it has the letters of most European languages."""
+    """Return DejaVu Sans from matplotlib, which has the letters of most European languages."""
     import matplotlib
     from PIL import ImageFont
 
@@ -108,7 +109,7 @@ def _font(size: int) -> Any:
 
 
 def break_lines(words: str, width_px: int) -> list[str]:
-    """Lines that a strip has room for; a word that is longer than a line is broken."""
+    """Return lines that fit the strip; a word that is longer than a line is broken."""
     size = _size(width_px)
     font, room = _font(size), max(width_px - 2 * size, 4 * size)
     lines = [""]

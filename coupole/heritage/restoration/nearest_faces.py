@@ -1,4 +1,4 @@
-"""Assignment of triangles to those of another mesh of the same surface on which they lie."""
+"""Assignment of a mesh's triangles to the triangles of another mesh of the same surface."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from coupole.heritage.restoration.painted_mesh import Floats, PaintedMesh
 _CANDIDATES = 12
 _CHUNK = 200_000
 _SAME_SHARE = 1e-6
-"""Share of the mesh's size: corners that differ by less are the same."""
+"""Share of the mesh's size; corners with a smaller distance count as the same."""
 
 
 def nearest_faces(mesh: PaintedMesh, vertices_mm: Floats, triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """[m] for each triangle of `mesh` the nearest of `triangles` [k, 3] of `vertices_mm` [n, 3], by its middle.
+    """[m] number of the nearest of `triangles` [k, 3], with vertices `vertices_mm` [n, 3], for the middle of each
+    triangle of `mesh`.
 
-    Distances count the difference of unit normals as well, times the median edge: a thin wall keeps its two
-    sides. A mesh with the same triangles in the same order is taken one by one.
+    Distances include the difference of unit normals, times the median edge, so that the two sides of a thin wall
+    stay separate. If a mesh has the same triangles in the same order, each triangle is assigned to its
+    counterpart.
     """
     corners, mesh_corners_mm = vertices_mm[triangles], mesh.corners_mm
     size_mm = float(np.ptp(mesh.vertices_mm, axis=0).max())

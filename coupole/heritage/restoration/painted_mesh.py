@@ -1,4 +1,5 @@
-"""A mesh with what may tell its parts: colours of its vertices, a picture and where each corner lies in it."""
+"""A mesh with data that may define its parts: colours of its vertices, or a picture and the places of the corners
+in it."""
 
 from __future__ import annotations
 
@@ -31,7 +32,7 @@ class PaintedMesh:
     uv: Floats | None = None
     """[n, 2] places in the picture, v upwards; None without them."""
     texture: NDArray[np.uint8] | None = None
-    """[h, w, 3] the picture that the file names."""
+    """[h, w, 3] the picture named in the file."""
 
     @property
     def corners_mm(self) -> Floats:
@@ -40,20 +41,22 @@ class PaintedMesh:
 
     @property
     def middles_mm(self) -> Floats:
-        """[m, 3] of the triangles."""
+        """[m, 3] middles of the triangles."""
         return np.asarray(self.corners_mm.mean(axis=1))
 
     def digest(self) -> str:
-        """Return the digest of its shape, whatever its colours."""
+        """Return the digest of the mesh's shape, without its colours."""
         hasher = hashlib.sha256(np.ascontiguousarray(self.vertices_mm).tobytes())
         hasher.update(np.ascontiguousarray(self.triangles).tobytes())
         return hasher.hexdigest()
 
 
 def read_painted(path: Path, unit: str = "mm") -> PaintedMesh:
-    """PLY, OBJ, STL, GLB, glTF or OFF by trimesh, no vertex merged; colours and texture where the file has them.
+    """Read PLY, OBJ, STL, GLB, glTF or OFF by trimesh, without merging vertices, with colours and texture if the
+    file has them.
 
-    Raises InputError: no such file, no triangles, coordinates that are not finite, an unknown unit.
+    Raises InputError for a missing file, for a file without triangles, for coordinates that are not finite, and
+    for an unknown unit.
     """
     import trimesh
 
@@ -78,7 +81,8 @@ def read_painted(path: Path, unit: str = "mm") -> PaintedMesh:
 
 
 def _colours(visual: Any, count: int) -> tuple[NDArray[np.uint8] | None, Floats | None, NDArray[np.uint8] | None]:
-    """Colours of vertices, places in the picture, the picture; None for what is not there."""
+    """Return the colours of vertices, the places in the picture, and the picture; None for each that is
+    missing."""
     srgb = uv = texture = None
     if visual.kind == "vertex":
         srgb = np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8)

@@ -30,14 +30,15 @@ Labels = NDArray[np.int16]
 NONE = -1
 _SHOWN = 5
 _TRIED = 2000
-"""Number of points of a painted mesh by which its frame is tried."""
+"""Number of points of a painted mesh with which its frame is checked."""
 _NEAR_SHARE, _MOST_FAR = 0.05, 0.5
-"""Share of the mesh's size within which a painted mesh lies on it; share of the points that may lie farther."""
+"""Distance, as a share of the mesh's size, within which a painted mesh lies on it; and share of the points that
+may lie farther away."""
 
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Every triangle's part."""
+    """The part of every triangle."""
 
     names: tuple[str, ...]
     labels: Labels
@@ -45,14 +46,14 @@ class Parts:
     remarks: tuple[str, ...] = ()
 
     def counts(self) -> dict[str, int]:
-        """Triangles of each part."""
+        """Number of triangles of each part."""
         label_counts = np.bincount(self.labels, minlength=len(self.names))
         return {name: int(count) for name, count in zip(self.names, label_counts, strict=True)}
 
 
 def parts_of(mesh: PaintedMesh, document: Document, parts_file: PartsFile) -> Parts:
-    """Raises InputError with all problems: what the mesh does not have, parts without a triangle,
-    triangles without a part."""
+    """Assign all triangles to parts. Raises InputError with all problems: data that the mesh lacks, parts without
+    a triangle, triangles without a part."""
     names: list[str] = []
     labels: Labels = np.full(len(mesh.triangles), NONE, np.int16)
     places: dict[str, int] = {}
@@ -110,7 +111,7 @@ def _with_rest(
 
 
 def _overlaps(names: list[str], before: Labels, after: Labels, number: int) -> list[str]:
-    """A sentence for each part that a rule takes triangles from."""
+    """Return a sentence for each part that loses triangles to a later rule."""
     is_taken = (before >= 0) & (after != before)
     pairs, counts = np.unique(np.stack([before[is_taken], after[is_taken]]), axis=1, return_counts=True)
     return [
@@ -120,7 +121,8 @@ def _overlaps(names: list[str], before: Labels, after: Labels, number: int) -> l
 
 
 def _by_rule(mesh: PaintedMesh, rule: Rule, document: Document) -> tuple[list[str], NDArray[np.int64], str]:
-    """Names, for each triangle a row of them or `NONE`, and what is to be said of colours without a part."""
+    """Return the names, the index of a name or `NONE` for each triangle, and a remark about colours without a
+    part."""
     match rule:
         case VertexColours():
             if mesh.srgb is None:
@@ -163,7 +165,8 @@ def _expect_one_frame(mesh: PaintedMesh, picked_parts: Picked, path: Path) -> No
 
 
 def _by_colour(srgb: NDArray[np.uint8], table: dict[str, str], tolerance: float) -> tuple[NDArray[np.int64], str]:
-    """Return for each colour [n, 3] the nearest row of the table, or `NONE`; and which colours have none."""
+    """Return for each colour [n, 3] the nearest row of the table, or `NONE`; and a remark about colours without a
+    row."""
     part_colours = np.array([list(bytes.fromhex(code[1:])) for code in table.values()], float)
     colours, colour_rows, counts = np.unique(srgb, axis=0, return_inverse=True, return_counts=True)
     distance = np.full(len(colours), np.inf)
@@ -186,7 +189,7 @@ def _by_colour(srgb: NDArray[np.uint8], table: dict[str, str], tolerance: float)
 
 
 def _majority(corners: NDArray[np.int64]) -> NDArray[np.int64]:
-    """[m] of what the corners [m, 3] have: what two of them have; of three different ones the first that is
+    """[m] value that two of the three corners [m, 3] have. If all three differ, it is the first one that is
     known."""
     a, b, c = corners.T
     first = np.where(a >= 0, a, np.where(b >= 0, b, c))
@@ -194,7 +197,7 @@ def _majority(corners: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _texture_colours(mesh: PaintedMesh, rule: Texture, document: Document) -> NDArray[np.uint8]:
-    """[m, 3] the picture's colour at the middle of each triangle, of the nearest pixel."""
+    """[m, 3] the picture's colour at the middle of each triangle, from the nearest pixel."""
     picture = mesh.texture if rule.image is None else _picture(document.resolve(rule.image))
     if mesh.uv is None:
         raise InputError(f"{mesh.path}: its corners have no places in a picture (UV); choose another kind of rule")

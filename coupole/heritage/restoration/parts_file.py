@@ -1,4 +1,5 @@
-"""The parts file: which triangles of a mesh are hair, robe, stone (docs/reference/restorations.md).
+"""The parts file, which assigns the triangles of a mesh to parts such as hair, robe and stone
+(docs/reference/restorations.md).
 
 Rules are applied in their order, and later ones win. Lengths are mm in the mesh's own frame.
 """
@@ -30,7 +31,7 @@ _MOST_BYTES = 64 * 1024**2
 
 
 class VertexColours(Model):
-    """A triangle is of the part whose colour most of its corners have."""
+    """A rule: a triangle belongs to the part with the colour that most of its corners have."""
 
     kind: Literal["vertex_colours"]
     colours: Annotated[dict[PartName, Colour], Field(min_length=1)]
@@ -38,17 +39,17 @@ class VertexColours(Model):
 
 
 class Texture(Model):
-    """A triangle is of the part whose colour the picture has at its middle."""
+    """A rule: a triangle belongs to the part with the colour of the picture at the triangle's middle."""
 
     kind: Literal["texture"]
     colours: Annotated[dict[PartName, Colour], Field(min_length=1)]
     image: Path | None = None
-    """Picture in place of the one that the mesh names."""
+    """Picture that is used instead of the one named in the mesh."""
     tolerance: Tolerance = 8.0
 
 
 class Box(Model):
-    """Triangles whose middle is inside."""
+    """A rule for triangles with their middle inside a box."""
 
     kind: Literal["box"]
     part: PartName
@@ -63,7 +64,7 @@ class Box(Model):
 
 
 class HalfSpace(Model):
-    """Triangles whose middle is on the side of a plane to which its normal points."""
+    """A rule for triangles with their middle on the side of a plane to which the plane's normal points."""
 
     kind: Literal["plane"]
     part: PartName
@@ -78,7 +79,7 @@ class HalfSpace(Model):
 
 
 class PickedFile(Model):
-    """A file that the page of `coupole restore pick` gave."""
+    """A file from the page of `coupole restore pick`."""
 
     kind: Literal["picked"]
     path: Path
@@ -91,7 +92,7 @@ class PartsFile(Model):
     schema_version: Literal[1]
     rules: Annotated[tuple[Rule, ...], Field(min_length=1)]
     rest: PartName | None = None
-    """The part of all triangles that no rule names; none: there must be no such triangle."""
+    """The part of all triangles that no rule names. Without it, each triangle must be named by a rule."""
 
 
 class PickedParts(Model):
@@ -105,7 +106,7 @@ class PickedParts(Model):
     triangles: str
     """uint32 [m, 3]"""
     parts: str
-    """uint8 [m]: 0 not painted, k the k-th name."""
+    """uint8 [m]: 0 for not painted, k for the k-th name."""
 
     @field_validator("names")
     @classmethod
@@ -117,7 +118,7 @@ class PickedParts(Model):
 
 @dataclass(frozen=True, eq=False)
 class Picked:
-    """Parts that a page gave, in numbers."""
+    """Parts from a page, as numbers."""
 
     names: tuple[str, ...]
     vertices_mm: NDArray[np.float32]
@@ -126,7 +127,7 @@ class Picked:
 
 
 def read_parts(path: Path) -> tuple[Document, PartsFile]:
-    """A parts file, or a picked one as its only rule. Raises InputError with its place."""
+    """Read a parts file, or a picked file as its only rule. Raises InputError with its place."""
     if path.suffix.lower() == ".json":
         document = _read_json(path)
         if document.data.get("kind") == "picked parts":
@@ -137,7 +138,8 @@ def read_parts(path: Path) -> tuple[Document, PartsFile]:
 
 
 def read_picked(path: Path) -> Picked:
-    """Raises InputError if it is no such file, or its numbers do not fit together."""
+    """Read a picked file. Raises InputError if the file is of another kind, or if its numbers do not fit
+    together."""
     picked_parts = _read_json(path).validate(PickedParts)
     vertices = _numbers(path, "vertices_mm", picked_parts.vertices_mm, "<f4").reshape(-1, 3)
     triangles = _numbers(path, "triangles", picked_parts.triangles, "<u4").reshape(-1, 3)
@@ -158,7 +160,7 @@ def read_picked(path: Path) -> Picked:
 
 
 def _read_json(path: Path) -> Document:
-    """JSON as a document: problems have the file's first line, and the key."""
+    """Read JSON as a document; its problems have the file's first line and the key."""
     try:
         if not path.is_file():
             raise InputError(f"{path}: no such file")

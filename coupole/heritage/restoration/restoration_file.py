@@ -1,7 +1,7 @@
-"""The restoration file: hypotheses with their sources and materials, and how they are shown
+"""The restoration file: hypotheses with their sources and materials, and the settings of their pictures
 (docs/reference/restorations.md).
 
-Lengths are mm, angles degrees; z is up in the scene, and the object's front looks to -y.
+Lengths are mm, angles degrees; z is up in the scene, and the object's front faces -y.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ SourceText = Annotated[str, Field(min_length=1, max_length=2000)]
 
 
 class Source(Model):
-    """Source of a hypothesis: who or what says so."""
+    """Source of a hypothesis: a person, publication or analysis."""
 
     says: SourceText
-    """Statement of the source, in one's own words."""
+    """Statement of the source, in the author's own words."""
     reference: SourceText
-    """Publication, archive, analysis or person, as one would cite it."""
+    """Citation of a publication, archive, analysis or person."""
 
     def __str__(self) -> str:
         return f"{self.reference}: {self.says}"
@@ -64,7 +64,7 @@ class Hypothesis(Model):
 
 
 class Turntable(Model):
-    """Cameras about the object, as far as it takes to see all of it; the first sees its front."""
+    """Cameras around the object, far enough to see all of it; the first one sees its front."""
 
     kind: Literal["turntable"]
     views: Annotated[int, Field(ge=1, le=360)] = 8
@@ -87,7 +87,7 @@ class Cameras(Model):
 
 
 class Auto(Model):
-    """Views from the front, and turned by 35 degrees."""
+    """Views from the front, and from a direction turned by 35 degrees."""
 
     kind: Literal["auto"]
     width_px: Pixels = 800
@@ -98,7 +98,7 @@ Views = Literal["auto"] | Annotated[Turntable | Cameras | Auto, Field(discrimina
 
 
 class OtherLights(Model):
-    """Lights that may be taken in place of `lights`."""
+    """Lights that may be used instead of `lights`."""
 
     name: Name
     lights: Annotated[tuple[Light, ...], Field(min_length=1)]
@@ -110,13 +110,13 @@ class RestorationFile(Model):
     object: Pose = Pose()
     """Pose of the mesh in the scene."""
     smooth: bool = True
-    """Shaded smoothly, also across the borders of parts."""
+    """True for smooth shading, also across the borders of parts."""
     hypotheses: Annotated[tuple[Hypothesis, ...], Field(min_length=1)]
     views: Views = "auto"
-    """`auto` alone is its kind with nothing else."""
+    """Views. The word `auto` alone means the kind `auto` with its defaults."""
     lights: Annotated[tuple[Light, ...], Field(min_length=1)]
     other_lights: tuple[OtherLights, ...] = ()
-    """The same hypotheses under other lights, each set by its name."""
+    """Other sets of lights for the same hypotheses, each with a name."""
     surroundings: tuple[Object, ...] = ()
     """Other things of the scene: a floor, a niche."""
     observer: Literal["10 deg", "2 deg"] = "10 deg"
@@ -126,7 +126,7 @@ class RestorationFile(Model):
     depth: Annotated[int, Field(ge=1, le=100)] = 6
     seed: Annotated[int, Field(ge=0, le=2**31)] = 1
     display: Display = Display()
-    """The same for all pictures: without `white_cd_m2` one level for all hypotheses and views."""
+    """Display of all pictures. Without `white_cd_m2`, one level is used for all hypotheses and views."""
     outputs: Outputs = Outputs()
 
     @model_validator(mode="after")
@@ -143,13 +143,14 @@ class RestorationFile(Model):
 
 
 class Stage(Scene):
-    """A scene whose restored object is given as pieces, so that it need not have another."""
+    """A scene that may have no objects, because the restored object is given as pieces."""
 
     objects: tuple[Object, ...] = ()
 
 
 def read_restoration(path: Path) -> tuple[Document, RestorationFile]:
-    """Checked; the files that it names are there. Raises InputError with file:line:column."""
+    """Read and check a file, and the existence of the files that it names. Raises InputError with
+    file:line:column."""
     document = yamlfile.read_document(path)
     restoration = document.validate(RestorationFile)
     missing = [
@@ -164,10 +165,10 @@ def read_restoration(path: Path) -> tuple[Document, RestorationFile]:
 
 @dataclass(frozen=True)
 class Choice:
-    """Part of a restoration file that is rendered, and its fineness."""
+    """The part of a restoration file to render, and its fineness."""
 
     hypotheses: tuple[str, ...] = ()
-    """Names; none: all."""
+    """Names of hypotheses; all if empty."""
     lights: str | None = None
     """Name of a set of `other_lights`."""
     samples: int | None = None
@@ -197,15 +198,15 @@ def chosen_file(document: Document, restoration_file: RestorationFile, choice: C
 
 
 def named_files(restoration_file: RestorationFile, document: Document) -> tuple[Path, ...]:
-    """All that it names, each once."""
+    """Return all files that a restoration file names, each once."""
     return tuple(dict.fromkeys(document.resolve(named_path) for _, named_path in _files(restoration_file)))
 
 
 def chosen_hypotheses(
     document: Document, restoration_file: RestorationFile, names: Sequence[str]
 ) -> tuple[Hypothesis, ...]:
-    """Return the hypotheses with these names, in the file's order; all without names. Raises InputError for an
-    unknown name."""
+    """Return the hypotheses with these names, in the file's order; all if no names are given. Raises InputError
+    for an unknown name."""
     known_names = [hypothesis.name for hypothesis in restoration_file.hypotheses]
     if unknown := [name for name in names if name not in known_names]:
         raise InputError(f"--hypothesis {unknown[0]}: expected one of {', '.join(known_names)} of {document.path}")
@@ -213,7 +214,7 @@ def chosen_hypotheses(
 
 
 def names_of_parts(restoration_file: RestorationFile) -> list[str]:
-    """Names of the parts to which hypotheses give materials, in the file's order."""
+    """Return the names of the parts with materials in the hypotheses, in the file's order."""
     return list(dict.fromkeys(name for hypothesis in restoration_file.hypotheses for name in hypothesis.materials))
 
 
@@ -237,7 +238,7 @@ def expect_parts(document: Document, restoration_file: RestorationFile, names: S
 
 
 def cameras_of(restoration_file: RestorationFile, low_mm: Floats, high_mm: Floats) -> tuple[Camera, ...]:
-    """The cameras for an object with this box in the scene's frame."""
+    """Return the cameras for an object with this box in the scene's frame."""
     match _in_full(restoration_file.views):
         case Cameras() as given:
             return given.cameras
@@ -270,7 +271,7 @@ def _narrowed_views(views: Turntable | Cameras | Auto, width_px: int) -> Turntab
 
 
 def _about(name: str, turn_deg: float, table: Turntable, corners: Floats) -> Camera:
-    """A camera that sees all corners [8, 3], turned from -y towards +x."""
+    """Return a camera that sees all corners [8, 3], turned from -y towards +x."""
     turn, height = np.radians([turn_deg, table.height_deg])
     back = np.array([np.sin(turn) * np.cos(height), -np.cos(turn) * np.cos(height), np.sin(height)])
     right = np.array([np.cos(turn), np.sin(turn), 0.0])

@@ -1,4 +1,4 @@
-"""Spectral pictures of a mesh with its parts and hypotheses; those that are there already are not made again."""
+"""Spectral pictures of a mesh with its parts and hypotheses. Existing pictures are not made again."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Say = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Restoration:
-    """All that pictures follow from."""
+    """All data from which pictures are made."""
 
     mesh: PaintedMesh
     parts: Parts
@@ -48,7 +48,7 @@ class Restoration:
     restoration_file: RestorationFile
     hypotheses: tuple[Hypothesis, ...]
     lights_name: str | None = None
-    """Name of the set of the file's `other_lights` that is used, if any."""
+    """Name of the set of `other_lights` that is used; None for `lights`."""
 
     @property
     def folder(self) -> Path:
@@ -88,7 +88,7 @@ class Restoration:
 
     @cached_property
     def lit(self) -> PlainScene:
-        """Raises InputError where sun and sky cannot be computed."""
+        """The scene with sun and sky instead of daylight. Raises InputError if they cannot be computed."""
         return with_plain_lights(self.stage, self.folder)
 
     @cached_property
@@ -108,7 +108,7 @@ class Restoration:
         return smooth_normals(self.mesh.corners_mm) if self.restoration_file.smooth else None
 
     def painted_parts(self, hypothesis: Hypothesis) -> list[Piece]:
-        """The object's parts in the scene's frame."""
+        """Return the object's parts in the scene's frame."""
         corners, painted_pieces = self.mesh.corners_mm, []
         for row, name in enumerate(self.parts.names):
             of_part = self.parts.labels == row
@@ -119,7 +119,7 @@ class Restoration:
 
     @cached_property
     def _digest(self) -> str:
-        """Digest of what all pictures share: shape, parts, the scene but for display and cameras, files,
+        """Digest of the data that all pictures share: shape, parts, the scene without display and cameras, files,
         renderer."""
         hasher = hashlib.sha256(
             f"{self.mesh.digest()} {self.parts.names} {variant.spectral(is_polarised=False)}".encode()
@@ -134,7 +134,7 @@ class Restoration:
         return hasher.hexdigest()
 
     def digest(self, hypothesis: Hypothesis, camera: Camera) -> str:
-        """Return the digest of what one picture follows from."""
+        """Return the digest of the data from which one picture is made."""
         materials = {name: material.model_dump(mode="json") for name, material in hypothesis.materials.items()}
         description = f"{self._digest} {camera.model_dump_json()} {json.dumps(materials, sort_keys=True)}"
         return hashlib.sha256(description.encode()).hexdigest()
@@ -164,9 +164,9 @@ class Made:
 
 
 def render_all(restoration: Restoration, out: Path, say: Say) -> list[Made]:
-    """Spectral pictures of each hypothesis from each camera in `out`/HYPOTHESIS/CAMERA.exr.
+    """Make and return spectral pictures of each hypothesis from each camera, in `out`/HYPOTHESIS/CAMERA.exr.
 
-    Raises InputError for what cannot be rendered, StorageError if nothing can be written.
+    Raises InputError for a scene that cannot be rendered, StorageError if the disk cannot be written.
     """
     renderings: list[Made] = []
     try:
@@ -178,7 +178,7 @@ def render_all(restoration: Restoration, out: Path, say: Say) -> list[Made]:
 
 
 def smooth_normals(corners_mm: Floats) -> Floats:
-    """[triangles, 3, 3] unit normals at the corners: means over all triangles at a place, by their areas."""
+    """[triangles, 3, 3] unit normals at the corners: means over all triangles at a place, weighted by area."""
     points, faces = weld_corners(corners_mm)
     cross = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     sums = np.stack([np.bincount(faces.ravel(), np.repeat(column, 3), len(points)) for column in cross.T], axis=1)
@@ -228,7 +228,7 @@ def _of_one(restoration: Restoration, hypothesis: Hypothesis, folder: Path, say:
 def _noted_summary(
     restoration: Restoration, hypothesis: Hypothesis, camera: Camera, folder: Path
 ) -> dict[str, Any] | None:
-    """Return what is noted of the same picture, if it is there."""
+    """Return the noted summary of the same picture, if the picture exists."""
     path = folder / f"{camera.name}.json"
     if not path.is_file() or not path.with_suffix(".exr").is_file():
         return None
@@ -267,7 +267,8 @@ def _write(
 
 
 def common_white(restoration: Restoration, made_pictures: Sequence[Made]) -> float:
-    """The luminance in cd/m^2 that all pictures show as white. Raises InputError if they are black."""
+    """Return the luminance in cd/m^2 that all pictures show as white. Raises InputError if the pictures are
+    black."""
     display = restoration.restoration_file.display
     if display.white_cd_m2 is not None:
         return display.white_cd_m2

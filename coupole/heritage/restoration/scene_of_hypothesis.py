@@ -1,7 +1,7 @@
-"""Each hypothesis as a scene that `coupole show` and `coupole render` take, with all files that it names.
+"""Each hypothesis as a scene for `coupole show` and `coupole render`, with all files that the scene names.
 
-`parts/PART.ply` holds the triangles of a part in the mesh's frame, `files/` copies of spectra, paints and maps,
-and `HYPOTHESIS/scene.yaml` names them by relative paths: the folder can be moved and sent.
+`parts/PART.ply` has the triangles of a part in the mesh's frame, and `files/` has copies of spectra, paints and
+maps. `HYPOTHESIS/scene.yaml` names them by relative paths, so that the folder can be moved and sent.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ PARTS, FILES = "parts", "files"
 
 
 def write_scenes(restoration: Restoration, white_cd_m2: float, out: Path) -> None:
-    """Write all of it into `out`; scenes have the white of the restoration's pictures. Raises StorageError."""
+    """Write all scenes and files into `out`; scenes have the white of the restoration's pictures. Raises
+    StorageError."""
     try:
         for name, triangles in _triangles_of_parts(restoration):
             (out / PARTS).mkdir(exist_ok=True)
@@ -43,14 +44,14 @@ def write_scenes(restoration: Restoration, white_cd_m2: float, out: Path) -> Non
 
 
 class _Copies:
-    """Files that scenes name, each copied once into `FILES` under a name of its own."""
+    """Files that scenes name, each copied once into `FILES` under a unique name."""
 
     def __init__(self, folder: Path, out: Path) -> None:
         self._folder, self._out = folder, out
         self._names: dict[Path, str] = {}
 
     def relative(self, named_path: Path) -> str:
-        """Return the path of a file's copy, as a scene in a folder of a hypothesis names it."""
+        """Return the path of a file's copy, relative to the scene in a hypothesis's folder."""
         path = (self._folder / named_path).resolve()
         if path not in self._names:
             used_names = set(self._names.values())
@@ -81,7 +82,7 @@ def _write_part(path: Path, vertices_mm: NDArray[np.float64], triangles: NDArray
 
 
 def _scene_text(restoration: Restoration, hypothesis: Hypothesis, white_cd_m2: float, copies: _Copies) -> str:
-    """The scene as YAML, with the hypothesis and its sources as comments."""
+    """Return the scene as YAML, with the hypothesis and its sources as comments."""
     pose = restoration.restoration_file.object.model_dump(mode="json", exclude_defaults=True)
     stage = _named_anew(restoration.stage, copies) | {
         "schema_version": 1,
@@ -111,7 +112,7 @@ def _scene_text(restoration: Restoration, hypothesis: Hypothesis, white_cd_m2: f
 
 
 def _named_anew(model: BaseModel, copies: _Copies) -> dict[str, Any]:
-    """A model as plain data without its defaults, with the paths of copies in place of those that it names."""
+    """Return a model as plain data without its defaults; its paths are replaced by the paths of the copies."""
     plain = model.model_dump(mode="json", exclude_defaults=True)
     for at, path in files(model):
         holder: Any = plain

@@ -1,4 +1,4 @@
-"""Part of the object that each pixel of a camera shows, by a ray through its middle."""
+"""Part of the object that each pixel of a camera shows, found by a ray through the pixel's middle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from coupole.heritage.restoration.painted_mesh import Floats
 
 NOTHING = -1
 _BALL = 12
-"""Triangles of a ball: 20 times its square."""
+"""Number of parts n into which edges of a ball are divided; the ball has 20 n^2 triangles."""
 
 
 class SeenParts:
@@ -38,7 +38,7 @@ class SeenParts:
         self._mesh = TriangleMesh(self._tree, corners.astype(np.float32))
 
     def part_of_pixel(self, camera: Camera) -> NDArray[np.int16]:
-        """[h, w] rows of parts, `NOTHING` where the object is not seen."""
+        """[h, w] rows of parts; `NOTHING` where the object is not seen."""
         ways = rays(camera).reshape(-1, 3)
         starts = np.broadcast_to(np.asarray(camera.position_mm, float), ways.shape)
         hit_rows = self._tree.run(starts.astype(np.float32), ways.astype(np.float32))

@@ -1,4 +1,5 @@
-"""Pictures of hypotheses for the eye: one white for all, words below each, side by side, and their differences."""
+"""Pictures of hypotheses for the eye, with one white for all and words below each; pictures side by side, and
+differences."""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ _GAP_PX = 6
 
 @dataclass(frozen=True)
 class Shown:
-    """Files and figures that are written of one view."""
+    """Files and figures that are written for one view."""
 
     camera: str
     pictures: dict[str, Path]
@@ -43,11 +44,12 @@ class Shown:
     side_by_side: Path | None
     differences: dict[tuple[str, str], Path]
     of_parts: dict[tuple[str, str], dict[str, dict[str, Any]]]
-    """Figures of the parts, as `hypotheses_compared.Difference.of_parts`."""
+    """Figures of the parts, in the form of `hypotheses_compared.Difference.of_parts`."""
 
 
 def show_all(restoration: Restoration, made_pictures: Sequence[Made], out: Path, say: Say) -> dict[str, Any]:
-    """Write PNG pictures, side by side, differences and `result.json`; what that holds.
+    """Write PNG pictures, pictures side by side, differences and `result.json`; return the content of
+    `result.json`.
 
     Raises InputError if all is black or the denoiser is missing, StorageError.
     """
@@ -67,7 +69,8 @@ def show_all(restoration: Restoration, made_pictures: Sequence[Made], out: Path,
 
 
 def refuse_other_lights(out: Path, lights: str | None) -> None:
-    """Raise InputError if `out` has the pictures of a restoration under other lights: they would be lost."""
+    """Raise InputError if `out` has the pictures of a restoration under other lights, because they would be
+    lost."""
     path = out / RESULT
     earlier = read_json(path, allow_nan=True) if path.is_file() else None
     if isinstance(earlier, dict) and "hypotheses" in earlier and earlier.get("lights") != lights:
@@ -149,7 +152,8 @@ def _write_difference(de00: NDArray[np.float64], pair: tuple[Made, Made], path: 
 
 
 def _facts(hypothesis: Hypothesis, folder: Path) -> dict[str, Any]:
-    """Return a hypothesis with what its materials are computed from: defaults too, where they have an effect."""
+    """Return a hypothesis with the values from which its materials are computed, including defaults that have an
+    effect."""
     materials = {part: used_values(material, folder) for part, material in hypothesis.materials.items()}
     return {**hypothesis.model_dump(mode="json", exclude={"materials"}), "materials": materials}
 

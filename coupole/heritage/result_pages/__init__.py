@@ -1,1 +1,1 @@
-"""Pages of results, beside what they show."""
+"""Pages that show results, stored beside the results."""

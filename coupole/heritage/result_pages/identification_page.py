@@ -1,4 +1,4 @@
-"""`identification.html`: what identified spectra show, and which bands say so."""
+"""`identification.html`: findings about identified spectra, with the evidence of each band."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def _worth(rates: HeldOutRates) -> Section:
 
 
 def _shapes(evidence: Evidence) -> list[Shape]:
-    """Three curves above, a bar for each band below, and their scales."""
+    """Return three curves at the top, a bar for each band below, and their scales."""
     nm = evidence.wavelengths_nm
     curves = (evidence.reflectance, evidence.best, evidence.runner_up)
     highest = max(0.1, 1.05 * max(float(curve.max()) for curve in curves))

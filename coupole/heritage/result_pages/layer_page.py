@@ -1,4 +1,4 @@
-"""The page of a paint layer: K and S with their bands, spectra as measured and as fitted, and what they tell."""
+"""The page of a paint layer: K and S with their bands, measured and fitted spectra, and conclusions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def layer_page(
     four: FourFlux | None,
     predicted_films: Sequence[FilmAtThickness] = (),
 ) -> str:
-    """HTML."""
+    """Return the page as HTML."""
     nm, sure = samples.wavelengths_nm, fit.determined_bands
     unit = "per mm" if samples.is_per_mm else "of the layer"
     told_bands = f"{int(sure.sum())} of {len(nm)} bands"
@@ -69,7 +69,7 @@ def layer_page(
 
 
 def _coefficients(nm: Array, fit: Coefficients, unit: str) -> Sequence[Plot]:
-    """K and S where both are told."""
+    """Return K and S in the bands where both are determined."""
     sure = fit.determined_bands
     if sure.sum() < 2:
         return []
@@ -103,7 +103,7 @@ def _four_fluxes(nm: Array, four: FourFlux | None, unit: str) -> Sequence[Plot]:
 
 
 def _other_thicknesses(nm: Array, films: Sequence[FilmAtThickness]) -> Sequence[Plot]:
-    """One drawing for each thickness, of the bands that are known."""
+    """Return one drawing for each thickness, of the known bands."""
     plots = []
     for thickness_mm in dict.fromkeys(film.thickness_mm for film in films):
         same = [film for film in films if film.thickness_mm == thickness_mm]

@@ -16,7 +16,7 @@ from coupole.pages.page_rendering import render
 
 
 def recipe_page(name: str, search: Found, matches: Sequence[Sequence[Match]]) -> str:
-    """HTML; `matches` are those of each of `search.recipes` under each light."""
+    """Return the page as HTML; `matches` are the matches of each of `search.recipes` under each light."""
     best, under = search.best, matches[search.chosen_index]
     bands = search.bands
     curves = [Curve("target", search.target[bands]), Curve("recipe", best.reflectance[bands], is_dashed=True)]

@@ -1,4 +1,4 @@
-"""`report.html` of a restoration: hypotheses side by side, sources, materials, and how they differ."""
+"""`report.html` of a restoration: hypotheses side by side, their sources, materials and differences."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from coupole.pages.page_rendering import render
 
 REPORT = "report.html"
 _MOST_VIEWS = 4
-"""Embedded; of more the files are named."""
+"""Largest number of embedded views; for further views the files are named."""
 
 
 def write(result: Mapping[str, Any], folder: Path) -> None:
-    """Write the page of a `result.json` beside it; its pictures are inside. Raises OSError."""
+    """Write the page of a `result.json` beside it; the page contains its pictures. Raises OSError."""
     views = result["views"][:_MOST_VIEWS]
     title = f"{result['restoration']}: {len(result['hypotheses'])} hypotheses"
     page = Page(
@@ -41,7 +41,7 @@ def write(result: Mapping[str, Any], folder: Path) -> None:
 
 
 def _quality(views: Sequence[Mapping[str, Any]]) -> str:
-    """Say how far the hypotheses are apart where they differ most."""
+    """Return a sentence about the largest difference between the hypotheses."""
     apart = [
         (of["de00_of_means"], part, entry["hypotheses"])
         for view in views
@@ -68,7 +68,8 @@ def _picture(path: Path, title: str) -> Picture:
 
 
 def _view(view: Mapping[str, Any], result: Mapping[str, Any], folder: Path, *, is_first: bool) -> Section:
-    """Pictures of a view, those of the first at the top of the page, and how far hypotheses are apart in it."""
+    """Return the pictures of a view and the differences between hypotheses in it. The pictures of the first view
+    are at the top of the page."""
     name = anchor(f"view-{view['view']}")
     head = ("part", "mean dE00", "dE00 of mean colours", "pixels")
     pairs = []
@@ -109,7 +110,7 @@ def _hypothesis(hypothesis: Mapping[str, Any]) -> Section:
 
 
 def flat(material: Any) -> str:
-    """A material as one reads it: `kind` first, then what it is given, `{...}` around parts."""
+    """Return a material as readable text: `kind` first, then its given values, with `{...}` around parts."""
     if isinstance(material, Mapping):
         kind = [str(material["kind"])] if "kind" in material else []
         rest = [f"{key} {flat(value)}" for key, value in material.items() if key != "kind" and value is not None]
@@ -130,7 +131,7 @@ def _lights(result: Mapping[str, Any]) -> str:
 
 
 def scene_uses(result: Mapping[str, Any]) -> str:
-    """Return the commands that take a hypothesis as a scene: a page has no near lights, such as candles."""
+    """Return the commands that take a hypothesis as a scene. A page has no near lights, such as candles."""
     if result["lights"] is None:
         return "coupole show and coupole render"
     return "coupole render, and for coupole show if its lights are far away"

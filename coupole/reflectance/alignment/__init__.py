@@ -1,1 +1,1 @@
-"""Views of an object brought to agree on its surface: poses, lens and mesh refined together from the frames."""
+"""Refinement of poses, lens and mesh from the frames, so that all views agree on the object's surface."""

@@ -1,5 +1,5 @@
-"""Cameras and images of a model of COLMAP's, of its text or its binary files (its documentation, "Output Format";
-the order of models and parameters is that of its `sensor/models.h`)."""
+"""Cameras and images of a COLMAP model, read from its text or binary files (COLMAP's documentation, "Output
+Format"). Models and parameters have the order of COLMAP's `sensor/models.h`."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ MODELS = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-"""COLMAP's camera models that equal our lens model or a part of it, with their parameters."""
+"""COLMAP's camera models that equal our lens model or a special case of it, with their parameters."""
 _NUMBERS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV", 6: "FULL_OPENCV"}
 _PLACES = (".", "sparse/0", "sparse", "0")
 _UNIT = 1e-3
-"""A quaternion's length may be off by this."""
+"""Allowed difference of a quaternion's length from 1."""
 
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """A lens and its picture."""
+    """A lens and the size of its picture."""
 
     model: str
     size_px: tuple[int, int]
@@ -43,18 +43,18 @@ class ColmapCamera:
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """A picture that was posed."""
+    """A picture with its pose."""
 
     name: str
     """Name of the image's file."""
     camera: int
     camera_from_world: Floats
-    """[4, 4] x right, y down, z forward; in the model's unit."""
+    """[4, 4] with x right, y down, z forward, in the model's unit."""
 
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """Model that was read; `path` is the file of the images."""
+    """A model; `path` is the file of its images."""
 
     path: Path
     cameras: dict[int, ColmapCamera]
@@ -62,8 +62,8 @@ class ColmapModel:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Read the model of a folder that has `cameras` and `images` as .bin or .txt, directly or in `sparse/0`;
-    binary files come first, as COLMAP has it. Raises InputError for another folder, and for damaged files."""
+    """Read the model of a folder. The folder or its `sparse/0` holds `cameras` and `images` as .bin or .txt;
+    binary files come first, as in COLMAP. Raises InputError for another folder, and for damaged files."""
     for place in _PLACES:
         for suffix, cameras, images in (
             (".bin", _binary_cameras, _binary_images),
@@ -90,7 +90,7 @@ def _camera(path: Path, model: str, size_px: tuple[int, int], parameters: list[f
 
 
 def _image(path: Path, name: str, camera: int, pose: list[float]) -> ColmapImage:
-    """`pose` is a quaternion, w first, and a translation."""
+    """Return the record of a picture; `pose` is a quaternion, w first, and a translation."""
     w, x, y, z, *shift = pose
     if not np.isfinite(pose).all() or abs(math.hypot(w, x, y, z) - 1.0) > _UNIT:
         raise InputError(f"{path}: image {name}: expected a unit quaternion and a translation; found {pose}")
@@ -104,7 +104,7 @@ def _image(path: Path, name: str, camera: int, pose: list[float]) -> ColmapImage
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    """Lines with their numbers, without comments."""
+    """Return the lines with their numbers, without comments."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -150,8 +150,8 @@ Record = TypeVar("Record")
 
 
 def _records(path: Path, read_record: Callable[[bytes, int], tuple[Record, int]]) -> Iterator[Record]:
-    """Yield each record that `read_record` makes of the data from a place on; `read_record` also returns where the
-    next one begins."""
+    """Yield each record that `read_record` makes of the data at a place. `read_record` also returns the place of
+    the next record."""
     try:
         data = path.read_bytes()
         (count,), at = struct.unpack_from("<Q", data), 8

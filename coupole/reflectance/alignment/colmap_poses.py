@@ -1,10 +1,10 @@
-"""Cameras' poses of a run by a model of COLMAP's, instead of those by its records.
+"""Camera poses of a run from a COLMAP model, instead of the poses from the run's records.
 
 A bundle adjustment may move, turn and scale its model. With three views or more a similarity brings the cameras'
-centres onto those of the records by least squares (Umeyama, PAMI 13(4), 1991); with one or two the model is taken
-as it is, in the frame of `coupole export RUN --to colmap`: the support's, in mm. Poses that are farther from the
-records than `MOST_APART` times the records' standard uncertainty are refused, and so are other lenses than the
-records': their uncertainties are what the poses have then, since COLMAP's files state none.
+centres onto the centres of the records by least squares (Umeyama, PAMI 13(4), 1991). With one or two views the
+model is taken as it is, in the frame of `coupole export RUN --to colmap`: the support frame, in mm. Poses that are
+farther from the records than `MOST_APART` times the records' standard uncertainty are refused. A lens that is not
+the records' lens is refused too. COLMAP's files state no uncertainties, so the poses take those of the records.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from coupole.storage.durable import sha256
 LEAST_FITTED = 3
 """Least number of views that fix a similarity."""
 _TO_CENTRE_PX = 0.5
-"""Shift from our pixel coordinates to COLMAP's, px: there the first pixel ends at 1."""
+"""Shift from our pixel coordinates to COLMAP's, px. In COLMAP the first pixel ends at 1."""
 _SAME = 1e-6
-"""Allowed difference of lens parameters that the record does not estimate, as a share of the larger of their value
-and 1."""
+"""Allowed difference of lens parameters that the record does not estimate, as a share of the larger of 1 and their
+value."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class ColmapPoses:
     base_from_camera: Floats
     """[v, 4, 4] mm, in the order of the run's views."""
     scale: float
-    """mm for a unit of the model."""
+    """Number of mm in one unit of the model."""
     steps_from_records: Floats
-    """[v, 6] from the records' poses: mm, and rad in the camera's frame."""
+    """[v, 6] from the records' poses to these poses: mm, and rad in the camera's frame."""
     over_u: Floats
-    """[v, 2] shift and turn over the records' standard uncertainty."""
+    """[v, 2] shift and turn, divided by the records' standard uncertainty."""
 
     def of(self, measured_run: MeasuredRun) -> MeasuredRun:
         """Return the run with these poses."""
@@ -56,7 +56,7 @@ class ColmapPoses:
         )
 
     def summary(self) -> dict[str, Any]:
-        """Return what a result says of these poses."""
+        """Return the entry about these poses for a result's summary."""
         shift_mm = np.linalg.norm(self.steps_from_records[:, :3], axis=1)
         turn_deg = np.degrees(np.linalg.norm(self.steps_from_records[:, 3:], axis=1))
         return {
@@ -70,8 +70,9 @@ class ColmapPoses:
 
 
 def read_poses(folder: Path, measured_run: MeasuredRun) -> ColmapPoses:
-    """Read the poses of a run, given by its records, from a folder of COLMAP's. Raises InputError: no model, a
-    view that it lacks or has twice, another lens, centres on a line, poses that the records do not allow."""
+    """Read the poses of a run, given by its records, from a COLMAP folder. Raises InputError if there is no model,
+    a view is missing or appears twice, the lens is another one, the centres lie on a line, or the records do not
+    allow the poses."""
     model = read_model(folder)
     camera_from_world = _of_views(model, measured_run)
     recorded_poses = np.stack([view.base_from_camera for view in measured_run.views])
@@ -92,7 +93,8 @@ def read_poses(folder: Path, measured_run: MeasuredRun) -> ColmapPoses:
 
 
 def similarity(of_points: Floats, to_points: Floats) -> tuple[float, Floats]:
-    """Scale s and transform [4, 4] of points [n, 3] to others, T (s p), by least squares (Umeyama)."""
+    """Return scale s and transform T [4, 4], by which T (s p) brings points p [n, 3] onto other points by least
+    squares (Umeyama)."""
     middle_of, middle_to = of_points.mean(axis=0), to_points.mean(axis=0)
     of, to = of_points - middle_of, to_points - middle_to
     covariance = to.T @ of
@@ -105,7 +107,8 @@ def similarity(of_points: Floats, to_points: Floats) -> tuple[float, Floats]:
 
 
 def _of_views(model: ColmapModel, measured_run: MeasuredRun) -> Floats:
-    """[v, 4, 4] camera_from_world of the run's views. Raises InputError for one without, or of another lens."""
+    """[v, 4, 4] camera_from_world of the run's views. Raises InputError for a view without a pose or with another
+    lens."""
     stems = [Path(image.name).stem for image in model.images]
     by_name = dict(zip(stems, model.images, strict=True))
     camera_from_world = []
@@ -125,7 +128,7 @@ def _of_views(model: ColmapModel, measured_run: MeasuredRun) -> Floats:
 
 
 def _refuse_other_lens(path: Path, number: int, camera: ColmapCamera, measured_run: MeasuredRun) -> None:
-    """Poses hold for the lens with which they were found."""
+    """Raise InputError for another lens: poses hold only for the lens with which they were found."""
     where = f"{path.with_stem('cameras')}: camera {number}"
     if camera.size_px != measured_run.frames.size_px:
         raise InputError(f"{where}: expected pictures of {measured_run.frames.size_px} px; found {camera.size_px}")

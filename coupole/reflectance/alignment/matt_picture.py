@@ -1,9 +1,9 @@
-"""A picture of each view in which a place of the surface looks the same from everywhere.
+"""One picture for each view, in which a place of the surface looks the same from all views.
 
-Object and LEDs stand still while the camera goes round, so a matt surface has the same radiance in all views under
-the same LED, whatever its shape, its shadows and the LEDs' power are. What differs is gloss, which makes some LEDs
-brighter than the rest, and the arm's shadow, which makes some darker. So a picture is the mean of the middle ranks
-of the same LEDs in all views: no mesh is needed for it, and errors of the mesh cannot get into it.
+Object and LEDs stand still while the camera goes round. So a matt surface has the same radiance in all views under
+the same LED, whatever its shape, its shadows and the LEDs' power are. Only gloss and the arm's shadow differ:
+gloss makes some LEDs brighter than the rest, and the shadow makes some darker. So the picture is the mean of the
+middle ranks of the same LEDs in all views. It needs no mesh, and errors of the mesh do not affect it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FEWEST_LEDS = 5
 LOW_RANK, HIGH_RANK = 0.2, 0.6
 """Ranks of an LED's brightness at a place, 0 for the darkest, between which the mean is taken."""
 ALL_BUT = 1e-3
-"""Share of a picture's blocks that may be clipped without a look at a shorter exposure."""
+"""Share of a picture's blocks that may be clipped before a shorter exposure is used."""
 GREEN = "G"
 Said = Callable[[str, int, int], None]
 
@@ -44,9 +44,10 @@ def common_leds(views: Sequence[MeasuredView]) -> list[int]:
 def matt_picture(
     measured_run: MeasuredRun, radiometry: Radiometry, view: MeasuredView, leds: Sequence[int], say: Said
 ) -> NDArray[np.float32]:
-    """[h / 2, w / 2] mean of green DN per microsecond over the flat field, of blocks of 2 x 2 pixels, each by the
-    longest exposure that does not clip it. A block that all exposures of an LED clip counts as brighter than
-    under the others; NaN where that reaches the ranks that are used. Raises StorageError for a damaged frame."""
+    """[h / 2, w / 2] mean of green DN per microsecond over the flat field, in blocks of 2 x 2 pixels. Each block
+    is from the longest exposure that does not clip it. If all exposures of an LED clip a block, the block counts
+    as brighter than under the other LEDs. The mean is NaN if such LEDs are among the ranks that are used. Raises
+    StorageError for a damaged frame."""
     green = radiometry.channel == measured_run.channels.index(GREEN)
     height, width = green.shape
     stack = np.full((len(leds), height // 2, width // 2), np.inf, np.float32)
@@ -66,8 +67,8 @@ def matt_picture(
 
 @numba.njit(cache=True, nogil=True)
 def _green_blocks(raw, dark, flat, green, top_dn, exposure_us, means):  # type: ignore[no-untyped-def]
-    """Fill `means` [h / 2, w / 2] with the green signal of blocks, where they are infinite and the frame is below
-    `top_dn`. The two greens of a block lie evenly about its middle."""
+    """Fill `means` [h / 2, w / 2] with the green signal of blocks, where `means` is infinite and the frame is
+    below `top_dn`. The two greens of a block lie evenly about its middle."""
     for row in range(means.shape[0]):
         for column in range(means.shape[1]):
             if not np.isinf(means[row, column]):

@@ -1,4 +1,4 @@
-"""`coupole reflectance refine`: from runs to a folder with refined poses, lens and mesh, and what was found."""
+"""`coupole reflectance refine`: from runs to a folder with refined poses, lens and mesh, and a summary."""
 
 from __future__ import annotations
 
@@ -45,14 +45,15 @@ class RefineRequest:
     calibrations: tuple[Path, ...] = ()
     doubts: Doubts = STATED
     search_mm: float = 3.0
-    """The farthest that views may disagree."""
+    """The largest disagreement of views that is searched, mm."""
 
 
 def refine_runs(request: RefineRequest, out: Path, say: Said) -> dict[str, Any]:
-    """Refine, and write the folder; what `refined.json` says.
+    """Refine, write the folder, and return the content of `refined.json`.
 
-    Raises InputError: fewer than two views, records of different cameras, views without common LEDs or texture, an
-    `out` that is a file or not empty; StorageError if a frame is damaged or the disk takes nothing.
+    Raises InputError for fewer than two views, records of different cameras, views without common LEDs or texture,
+    and an `out` that is a file or not empty. Raises StorageError if a frame is damaged or the disk cannot be
+    written.
     """
     begun_s = time.monotonic()
     if out.exists() and not out.is_dir():
@@ -92,7 +93,7 @@ def refine_runs(request: RefineRequest, out: Path, say: Said) -> dict[str, Any]:
 
 
 def given_by(runs: Sequence[MeasuredRun], doubts: Doubts) -> Given:
-    """Geometry of the runs of one camera and object, as records and scan have it."""
+    """Return the geometry of the runs of one camera and object, as records and scan state it."""
     first, prior = runs[0], runs[0].camera
     if prior.axis_sensitivity is not None:
         sensitivities = [measured_run.camera.axis_sensitivity for measured_run in runs]
@@ -111,7 +112,7 @@ def given_by(runs: Sequence[MeasuredRun], doubts: Doubts) -> Given:
 
 
 def _refuse_other_cameras(measured_runs: Sequence[MeasuredRun]) -> None:
-    """Raises InputError for runs with different records of the camera."""
+    """Raise InputError for runs with different records of the camera."""
     first = measured_runs[0]
     for other_run in measured_runs[1:]:
         if sha256(first.records["hand-eye"]) != sha256(other_run.records["hand-eye"]):
@@ -122,8 +123,8 @@ def _refuse_other_cameras(measured_runs: Sequence[MeasuredRun]) -> None:
 
 
 def _write_mesh(refinement: Refined, measured_run: MeasuredRun, path: Path) -> None:
-    """Write the refined mesh in the unit and frame of the mesh that was given, without the vertices that no
-    triangle uses."""
+    """Write the refined mesh in the unit and frame of the given mesh, without the vertices that no triangle
+    uses."""
     plan = read_plan(measured_run.run.plan_path, measured_run.run.rig_path).plan
     assert plan.object is not None  # read_measured_run refuses runs without
     base_from_object = measured_run.base_from_support @ plan.object.support_from_object.matrix()
@@ -203,5 +204,5 @@ def _mean_edge_mm(prior_geometry: Given) -> float:
 
 
 def _mm_deg(six: Floats) -> list[float]:
-    """Steps or uncertainties in mm and degrees."""
+    """Return steps or uncertainties in mm and degrees."""
     return [*map(float, six[:3]), *map(float, np.degrees(six[3:]))]

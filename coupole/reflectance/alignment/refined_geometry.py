@@ -1,4 +1,4 @@
-"""The file of a refinement, `refined.h5`, and a run with its geometry."""
+"""The file of a refinement, `refined.h5`, and how a run gets its geometry."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ class RefinedGeometry:
     inputs: dict[str, dict[str, str]]
     """Name and SHA-256 of the files that were read, by run."""
     pointings: dict[tuple[str, str], Pointing]
-    """Uncertainty of where the cameras look, by run and view."""
+    """Uncertainty of the directions in which the cameras look, by run and view."""
 
     def of(self, measured_run: MeasuredRun) -> MeasuredRun:
         """Return a run with this geometry. Raises InputError for a run, view or mesh that was not refined, and for
-        a run that has changed since."""
+        a run that has changed since the refinement."""
         if sha256(measured_run.mesh_path) != self.mesh_sha256:
             raise InputError(
                 f"{self.path}: a mesh other than {measured_run.mesh_path} was refined; name that with --mesh"
@@ -93,7 +93,8 @@ class RefinedGeometry:
 
 
 def read_refined(folder: Path) -> RefinedGeometry:
-    """Read the geometry from a folder of `coupole reflectance refine`. Raises InputError if it holds none."""
+    """Read the geometry from a folder of `coupole reflectance refine`. Raises InputError if the folder holds
+    none."""
     path = folder / REFINED
     if not path.exists():
         raise InputError(f"{path}: is not there; `coupole reflectance refine RUN... --out {folder}` makes it")
@@ -115,7 +116,8 @@ def read_refined(folder: Path) -> RefinedGeometry:
 
 
 def what_was_refined(folder: Path) -> dict[str, Any]:
-    """Return what a result says of the refinement it was made with. Raises InputError if there is none."""
+    """Return the entry of a result about the refinement that it was made with. Raises InputError if there is
+    none."""
     return {"sha256": sha256(folder / REFINED), "disagreement": _stored_entry(folder, "disagreement")}
 
 
@@ -127,7 +129,7 @@ def write_refined(
     mesh_sha256: str,
     is_simulated: bool,
 ) -> None:
-    """`views` are names of run and view."""
+    """Write the file; `views` are names of run and view."""
     unknowns, steps = refinement.unknowns, refinement.steps
     values = {
         "lens": unknowns.lens_at(steps).vector(),
@@ -162,7 +164,8 @@ def write_refined(
 def _pointings(
     names: list[str], covariance: Floats, middle_mm: Floats, views: Sequence[tuple[str, str]]
 ) -> dict[tuple[str, str], Pointing]:
-    """Return how well it is known where the cameras look, from the covariance of the unknowns of these names."""
+    """Return the uncertainty of the directions in which the cameras look, from the covariance of the unknowns of
+    these names."""
     of_lens = [place for place, name in enumerate(names) if name.removesuffix("_px") in NAMES]
     of_mesh = [place for place, name in enumerate(names) if name.startswith("mesh.")]
     free = tuple(names[place].removesuffix("_px") for place in of_lens)
@@ -175,7 +178,7 @@ def _pointings(
 
 
 def _stored_entry(folder: Path, name: str) -> Any:
-    """Return what `refined.json` says under a name."""
+    """Return the entry of `refined.json` with this name."""
     path = folder / ABOUT
     try:
         return read_json(path, allow_nan=True)[name]

@@ -1,10 +1,10 @@
-"""Poses, lens and mesh from what views disagree about, held by what records and scan state.
+"""Adjustment of poses, lens and mesh to the disagreement of views; records and scan limit the steps.
 
-A match says at which block of a second view the spot appears that a first view shows at one of its blocks. By the
-geometry it appears where the first view's ray meets the surface. When the first camera takes a step a and the
-surface moves by s along its normal n, that place moves by dP, with J dP = -(d block / d a) a and n dP = s, where
-J = d block / d place of the first camera. Matches have variances of their own, and one factor on all of them that
-the adjustment estimates; gross errors are rejected (`calibration.adjustment`).
+A match names a block of one view and the block of a second view that shows the same spot. The geometry predicts
+the spot where the first view's ray meets the surface. If the first camera takes a step a and the surface moves by
+s along its normal n, that place moves by dP, with J dP = -(d block / d a) a and n dP = s, where J = d block / d
+place of the first camera. Each match has its own variance. The adjustment estimates one factor on all these
+variances; gross errors are rejected (`calibration.adjustment`).
 """
 
 from __future__ import annotations
@@ -33,32 +33,32 @@ Said = Callable[[str, int, int], None]
 
 ROUNDS = 4
 SETTLED_MM = 0.005
-"""Change of the median disagreement from round to round below which matches are not made anew."""
+"""Change of the median disagreement from round to round below which the matches are not made again."""
 SEARCH_SHRINKS = 3.0
 LEAST_SEARCH_MM = 0.3
-"""Below which a search is not narrowed."""
+"""A search is not narrowed below this."""
 FEWEST_MATCHES = 30
 MATCHES, STATED = "matches", "records and scan"
 _GROUPS = (Group(MATCHES, is_estimated=True, rejects=2), Group(STATED, is_estimated=False))
 _TOGETHER = 1 << 16
-"""Vertices."""
+"""Number of vertices that are processed together."""
 
 
 @dataclass(frozen=True)
 class Refined:
-    """Geometry that the pictures agree with, its covariance, and the matches before and after."""
+    """Geometry that agrees with the pictures, its covariance, and the matches before and after."""
 
     unknowns: Unknowns
     steps: Floats
-    """[count] from what records and scan say."""
+    """[count] steps from the values of records and scan."""
     covariance: Floats
     """[count, count]"""
     before: Matches
     after: Matches
     noise_factor: float
-    """Noise of the matches, as a multiple of what noise and texture alone would leave."""
+    """Noise of the matches, as a multiple of the noise that noise and texture alone would leave."""
     rejected_count: int
-    """Matches that did not count, in the last adjustment."""
+    """Number of matches that the last adjustment rejected."""
 
     @cached_property
     def uncertainties(self) -> Floats:
@@ -67,8 +67,8 @@ class Refined:
 
     @property
     def chi2_of_steps(self) -> float:
-        """Square of the steps over the records' covariance: near `determined_count` if records and scan state
-        their uncertainties well."""
+        """Square of the steps over the records' covariance. It is near `determined_count` if records and scan
+        state their uncertainties well."""
         return float(self.steps @ np.linalg.solve(self.unknowns.covariance, self.steps))
 
     def vertex_u_mm(self, vertex_numbers: NDArray[np.int64] | slice = slice(None)) -> Floats:
@@ -85,8 +85,8 @@ class Refined:
 
     @property
     def determined_count(self) -> float:
-        """Number of unknowns that the pictures determine: each counts by the share of its information that they
-        gave."""
+        """Number of unknowns that the pictures determine. Each unknown counts by the share of its information that
+        the pictures give."""
         return self.unknowns.count - float(np.trace(np.linalg.solve(self.unknowns.covariance, self.covariance)))
 
 
@@ -98,7 +98,7 @@ def refine(
     threads: int,
     say: Said,
 ) -> Refined:
-    """Match the views, adjust, and match anew with what was found, until disagreement no longer falls.
+    """Match the views, adjust, and match again with the adjusted geometry, until the disagreement no longer falls.
 
     Raises InputError if the views have too little in common, or the object is too large for the field's scale.
     """
@@ -124,7 +124,7 @@ def refine(
 def surfaces_of(
     unknowns: Unknowns, steps: Floats, pictures: list[NDArray[np.float32]], threads: int
 ) -> list[ViewSurface]:
-    """Return what all views show of the mesh, by the geometry after some steps."""
+    """Return the surface that each view sees of the mesh, with the geometry after some steps."""
     corners = unknowns.vertices_at(steps)[unknowns.prior_geometry.triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
@@ -155,7 +155,7 @@ def _find_matches(
 
 
 def _adjust(unknowns: Unknowns, steps: Floats, matches: Matches) -> Adjusted[Floats]:
-    """All steps from what the records say, by matches that were made after `steps`."""
+    """Return all steps from the records' values, by matches that were made after `steps`."""
     lines = match_lines(unknowns, steps, matches)
     lower = np.linalg.cholesky(unknowns.covariance)
     inverse = solve_triangular(lower, np.eye(unknowns.count), lower=True)
@@ -179,7 +179,7 @@ def _adjust(unknowns: Unknowns, steps: Floats, matches: Matches) -> Adjusted[Flo
 
 
 def match_lines(unknowns: Unknowns, steps: Floats, matches: Matches) -> list[Block]:
-    """Residuals and derivatives of the matches of each pair of views, whitened by their covariances."""
+    """Return residuals and derivatives of the matches of each pair of views, whitened by their covariances."""
     views = range(len(unknowns.prior_geometry.base_from_camera))
     lens, cameras = unknowns.lens_at(steps), unknowns.cameras_at(steps)
     surface = np.arange(unknowns.mesh.start, unknowns.count)
@@ -228,7 +228,7 @@ class _Seen:
 
 
 def _sight_of_points(camera: Floats, lens: optics.Intrinsics, unknowns: Unknowns, points_mm: Floats) -> _Seen:
-    """`lens` is of pixels; a block is two of them."""
+    """Return the blocks of places and their derivatives; `lens` is in pixels, and a block is two pixels wide."""
     turn, place = camera[:3, :3], camera[:3, 3]
     inside = (points_mm - place) @ turn
     projection = optics.project(inside, lens.vector())

@@ -1,13 +1,13 @@
-"""Unknowns of the refinement: one vector of steps from what the records say, with its covariance before the
-pictures count.
+"""Unknowns of the refinement: one vector of steps from the records' values, with its covariance before the
+pictures are used.
 
-In this order: the lens's estimated parameters; six steps for each view's camera (mm along the base's axes, rad
-about the camera's, as `rotations.moved`); six of the whole mesh (mm along the base's axes, rad about axes through
-its middle); and the displacement of the surface along its normals at control points, mm.
+The vector holds, in this order: the lens's estimated parameters; six steps for each view's camera (mm along the
+base's axes, rad about the camera's, as `rotations.moved`); six of the whole mesh (mm along the base's axes, rad
+about axes through its middle); and the displacement of the surface along its normals at control points, mm.
 
-Hand-eye and axis zeros move all cameras together: their covariance is in that of the cameras' steps, beside the
-arm's own scatter in each view. The displacement is a Gaussian process over space: control points are correlated
-by exp(-r^2 / 2 scale^2), and between them it is what they predict (Rasmussen and Williams 2006, Eq. 2.25).
+Hand-eye and axis zeros move all cameras together: the covariance of the cameras' steps contains theirs, and the
+arm's own scatter in each view. The displacement is a Gaussian process over space: control points are correlated by
+exp(-r^2 / 2 scale^2), and they predict the values between them (Rasmussen and Williams 2006, Eq. 2.25).
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from coupole.reflectance.extraction.pointing import Doubts
 Floats = NDArray[np.float64]
 MOST_CONTROLS = 600
 _TOGETHER = 1 << 16
-"""Vertices."""
+"""Number of vertices that are processed together."""
 _NUGGET = 1e-6
-"""Share of a control point's variance that it has in common with no other: keeps the covariance's inverse
+"""Share of a control point's variance that it shares with no other point: it keeps the covariance's inverse
 exact."""
 
 
 @dataclass(frozen=True)
 class Given:
-    """Geometry as records and scan have it."""
+    """Geometry as records and scan state it."""
 
     lens: Intrinsics
     free: tuple[str, ...]
     base_from_camera: Floats
     """[views, 4, 4] mm."""
     camera_covariance: Floats
-    """[free + 6 views, free + 6 views] of the lens and the cameras' steps."""
+    """[free + 6 views, free + 6 views] covariance of the lens and the cameras' steps."""
     vertices_mm: Floats
-    """[n, 3] those that triangles use, base frame."""
+    """[n, 3] vertices that triangles use, base frame."""
     triangles: NDArray[np.uint32]
     """[m, 3] as `renumbered_triangles` gives them."""
 
@@ -94,13 +94,13 @@ class Unknowns:
 
     @cached_property
     def covariance(self) -> Floats:
-        """[count, count] by records and doubts."""
+        """[count, count] covariance from records and doubts."""
         mesh = self.doubts.mesh_covariance
         return np.asarray(block_diag(self.prior_geometry.camera_covariance, mesh, self._shape_covariance))
 
     @cached_property
     def middle_mm(self) -> Floats:
-        """[3] about which the mesh turns."""
+        """[3] point about which the mesh turns."""
         return np.asarray(self.prior_geometry.vertices_mm.mean(axis=0))
 
     def lens_at(self, steps: Floats) -> Intrinsics:
@@ -126,19 +126,20 @@ class Unknowns:
         return turned_mm
 
     def by_surface(self, points_mm: Floats, normals: Floats) -> Floats:
-        """[n, 6 + controls] how far the surface moves along its normal at places, by steps of mesh and shape."""
+        """[n, 6 + controls] movement of the surface along its normal at places, for each step of mesh and
+        shape."""
         arms = np.cross(points_mm - self.middle_mm, normals)
         return np.concatenate([normals, arms, self.weights(points_mm)], axis=1)
 
     def weights(self, points_mm: Floats) -> Floats:
-        """[n, controls] of the control points' displacements in that of a place."""
+        """[n, controls] weights of the control points' displacements in the displacement of a place."""
         near = self._kernel(points_mm, self.controls_mm)
         weights: Floats = cho_solve(cho_factor(self._shape_covariance), near.T).T
         return weights
 
     @cached_property
     def normals(self) -> Floats:
-        """[n, 3] of the given vertices, by the areas of their triangles."""
+        """[n, 3] normals of the given vertices, weighted by the areas of their triangles."""
         return vertex_normals(self.prior_geometry.vertices_mm, self.prior_geometry.triangles)
 
     @cached_property
@@ -157,7 +158,7 @@ class Unknowns:
 
 
 def vertex_normals(vertices_mm: Floats, triangles: NDArray[np.uint32]) -> Floats:
-    """[n, 3] unit; means of the triangles', weighted by their areas."""
+    """[n, 3] unit; means of the triangles' normals, weighted by their areas."""
     corners = vertices_mm[triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     corner_normals = np.repeat(across, 3, axis=0)
@@ -168,8 +169,9 @@ def vertex_normals(vertices_mm: Floats, triangles: NDArray[np.uint32]) -> Floats
 
 
 def control_points(points_mm: Floats, spacing_mm: float) -> Floats:
-    """Some of points [n, 3], each the farthest from those before it, until all others are within `spacing_mm` of
-    one. Raises InputError if that takes more than `MOST_CONTROLS`."""
+    """Return some of the points [n, 3]. Each next point is the farthest from the points before it. The choice ends
+    when all other points are within `spacing_mm` of a chosen one. Raises InputError if more than `MOST_CONTROLS`
+    are needed."""
     middle = int(np.argmin(np.sum((points_mm - points_mm.mean(axis=0)) ** 2, axis=1)))
     indices: list[int] = []
     for index, far_mm in farthest_first(points_mm, middle):
@@ -185,14 +187,15 @@ def control_points(points_mm: Floats, spacing_mm: float) -> Floats:
 
 
 def renumbered_triangles(triangles: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """[m, 3] places of triangles' corners among the vertices that triangles use, which keep their order."""
+    """[m, 3] corners of triangles, as places among the vertices that triangles use; these vertices keep their
+    order."""
     in_use = np.zeros(int(triangles.max()) + 1, np.bool_)
     in_use[triangles] = True
     return (np.cumsum(in_use) - 1)[triangles].astype(np.uint32)
 
 
 def welded_vertices(corners_mm: Floats, triangles: NDArray[np.uint32]) -> Floats:
-    """[n, 3] vertices of triangles of `renumbered_triangles`, whose corners [m, 3, 3] are known."""
+    """[n, 3] vertices of the triangles of `renumbered_triangles`, from their corners [m, 3, 3]."""
     vertices = np.zeros((int(triangles.max()) + 1, 3))
     vertices[triangles] = corners_mm
     return vertices

@@ -1,8 +1,9 @@
-"""Disagreement of two views on where a spot of the surface is: registration of their pictures on the mesh.
+"""Disagreement of two views about the place of a spot on the surface, by registration of their pictures on the
+mesh.
 
-A window of one view's picture is compared with the other's picture as the mesh says that the first would show it.
-The best whole shift is that of the greatest correlation; Gauss-Newton steps with gain and offset make it finer
-(Lucas and Kanade, IJCAI 1981), and give its covariance from the window's gradients and the residual.
+A window of one view's picture is compared with the other view's picture, warped by the mesh into the first view.
+The best whole shift has the greatest correlation. Gauss-Newton steps with gain and offset refine it (Lucas and
+Kanade, IJCAI 1981). They also give its covariance, from the window's gradients and the residual.
 """
 
 from __future__ import annotations
@@ -22,46 +23,48 @@ Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]
 
 SMALLEST_HALF, LARGEST_HALF, WINDOWS_ACROSS = 6, 16, 64
-"""A window has 2 half + 1 blocks on a side: so that 64 of `half` are a picture's width, within bounds."""
+"""A window has 2 half + 1 blocks on a side. `half` is 1/64 of a picture's width, within bounds."""
 MOST_PLACES = 4000
 MOST_REACH = 48
-"""Blocks that are searched in each direction."""
+"""Number of blocks that are searched in each direction."""
 LEAST_CORRELATION = 0.7
 _LEAST_SHARE = 0.8
 """Least share of a window's blocks that both views must show."""
 _MARGIN = 3
-"""Blocks around what is searched, for interpolation."""
+"""Blocks around the searched area, for interpolation."""
 _HIDDEN_BEYOND = 4.0
-"""Distance of a place from what the other view sees there, in blocks that face it: farther, it is hidden."""
+"""Distance between a place and the surface that the other view sees there, in blocks that face the view. Beyond
+this distance the place is hidden."""
 _STEPS = 25
 _SETTLED = 1e-3
 _MOST_FINER = 1.5
-"""Blocks from the best whole shift to the finer one."""
+"""Largest distance in blocks from the best whole shift to the refined one."""
 _WORST_U = 0.5
-"""Blocks: a window whose shift is less certain, in its worst direction, has too little to compare."""
+"""Largest standard uncertainty of a shift in its worst direction, in blocks. A window above it has too little
+texture."""
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Spots of the surface, each seen by a reference view and another one."""
+    """Spots of the surface, each seen by a reference view and another view."""
 
     reference: NDArray[np.int64]
     other: NDArray[np.int64]
     """[n] numbers of views."""
     blocks: Floats
-    """[n, 2] of the spot in the reference's picture."""
+    """[n, 2] block of the spot in the reference's picture."""
     points_mm: Floats
-    """[n, 3] where the reference puts it: on a plane through the mesh around it, base frame."""
+    """[n, 3] place of the spot by the reference, on a plane through the mesh around it, base frame."""
     normals: Floats
     """[n, 3] of these planes."""
     matched_blocks: Floats
     """[n, 2] block of the other view that shows the spot."""
     expected_blocks: Floats
-    """[n, 2] block of the other view that should show the spot."""
+    """[n, 2] block of the other view that shows the spot by the geometry."""
     covariance: Floats
-    """[n, 2, 2] of `matched_blocks`, blocks squared, from noise and texture."""
+    """[n, 2, 2] covariance of `matched_blocks`, in squared blocks, from noise and texture."""
     shifts_mm: Floats
-    """[n, 3] from where the reference puts the spot to where the other does."""
+    """[n, 3] from the spot's place by the reference to its place by the other view."""
 
     @property
     def apart_mm(self) -> Floats:
@@ -74,8 +77,8 @@ class Matches:
 
 
 def match_views(views: Sequence[ViewSurface], search_mm: float, threads: int, say: Said) -> Matches:
-    """Compare all views with the one that sees a place in the greatest detail, place by place, over shifts of up
-    to `search_mm`. Windows of a view do not overlap."""
+    """Compare, at each place, all views with the view that sees it in the greatest detail, over shifts of up to
+    `search_mm`. The windows of a view do not overlap."""
     half = int(np.clip(views[0].picture.shape[1] / WINDOWS_ACROSS, SMALLEST_HALF, LARGEST_HALF))
     places = [_places(number, views, half) for number in range(len(views))]
     total = sum(len(part.blocks) for part in places)
@@ -92,10 +95,10 @@ def match_views(views: Sequence[ViewSurface], search_mm: float, threads: int, sa
 
 @dataclass(frozen=True)
 class _Places:
-    """Windows of a view that no other view sees in more detail."""
+    """Windows of a view at places that no other view sees in more detail."""
 
     blocks: NDArray[np.int64]
-    """[n, 2] middles: column, row."""
+    """[n, 2] middles of windows: column, row."""
     points_mm: Floats
     normals: Floats
     detail: Floats
@@ -106,7 +109,7 @@ class _Places:
 
 
 def _places(number: int, views: Sequence[ViewSurface], half: int) -> _Places:
-    """Windows side by side, each with the plane through the mesh in it."""
+    """Return windows side by side, each with the plane through the mesh in it."""
     view, side = views[number], 2 * half + 1
     height, width = view.picture.shape
     blocks, middles, normals = [], [], []
@@ -130,7 +133,7 @@ def _places(number: int, views: Sequence[ViewSurface], half: int) -> _Places:
 
 
 def _on_planes(view: ViewSurface, blocks: Floats, points_mm: Floats, normals: Floats) -> Floats:
-    """[n, 3] where rays of blocks meet planes through points."""
+    """[n, 3] points where rays of blocks meet planes through points."""
     ways, eye = view.rays(blocks), view.base_from_camera[:3, 3]
     far = np.sum((points_mm - eye) * normals, axis=1) / np.sum(ways * normals, axis=1)
     places_mm: Floats = eye + far[:, None] * ways
@@ -165,8 +168,8 @@ def _match_pair(
 def _shift(
     first: ViewSurface, second: ViewSurface, middle: NDArray[np.int64], half: int, reach: int
 ) -> tuple[Floats, Floats] | None:
-    """[2] by how many blocks a window of the first view is shifted in the second, and its covariance [2, 2]; None
-    if they are too unlike, or too plain."""
+    """[2] shift in blocks of a window of the first view in the second view, and its covariance [2, 2]; None if the
+    windows are too unlike or have too little texture."""
     column, row = map(int, middle)
     window = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
     template, points_mm = first.picture[window], first.points_mm[(*window, 0)]
@@ -187,7 +190,7 @@ def _shift(
 
 @numba.njit(cache=True, nogil=True)
 def _warped_picture(points, row, column, half, other_picture, other_points, pose, lens):  # type: ignore[no-untyped-def]
-    """[side, side] what the other view shows at the places of the first one's blocks; NaN where it does not."""
+    """[side, side] values of the other view at the places of the first view's blocks; NaN where it has none."""
     side = 2 * half + 1
     values, inside = np.full((side, side), np.nan), np.empty(3)
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = lens
@@ -219,7 +222,7 @@ def _warped_picture(points, row, column, half, other_picture, other_points, pose
 
 @numba.njit(cache=True, nogil=True)
 def _cubic(values, x, y):  # type: ignore[no-untyped-def]
-    """Interpolated by Keys' kernel (IEEE Trans. ASSP 29, 1981; a = -1/2) from 4 x 4 values."""
+    """Interpolate by Keys' kernel (IEEE Trans. ASSP 29, 1981; a = -1/2) from 4 x 4 values."""
     left_column, top = int(np.floor(x)) - 1, int(np.floor(y)) - 1
     total = 0.0
     for j in range(4):
@@ -240,7 +243,7 @@ def _keys(far):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _best_shift(template, reference_points_mm, warped_picture, reach):  # type: ignore[no-untyped-def]
-    """Greatest correlation over whole shifts, and the shift."""
+    """Return the greatest correlation over whole shifts, and its shift."""
     side = len(template)
     best, right, down = -1.0, 0, 0
     for dy in range(-reach, reach + 1):

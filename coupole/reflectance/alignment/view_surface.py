@@ -1,4 +1,4 @@
-"""Places on the mesh at which a view's blocks of 2 x 2 pixels look, and the block from which a place is seen."""
+"""Places on the mesh that a view's blocks of 2 x 2 pixels show, and the block that shows a place."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from coupole.reflectance.extraction.seen_surface import directions_of_rows, seen
 
 Floats = NDArray[np.float64]
 _SAME_PLACE = 3.0
-"""Greatest distance of a place from the surface that a view sees there, in blocks, at which both are the same."""
+"""Largest distance, in blocks, between a place and the surface that a view sees there. Up to this distance, the
+view sees the place."""
 
 
 def block_lens(lens: Intrinsics) -> Intrinsics:
@@ -26,19 +27,19 @@ def block_lens(lens: Intrinsics) -> Intrinsics:
 
 @dataclass(frozen=True)
 class ViewSurface:
-    """A view's picture, and the place of the mesh that each of its blocks shows."""
+    """A view's picture, and the place on the mesh that each of its blocks shows."""
 
     picture: NDArray[np.float32]
     """[h, w]; NaN where it is clipped."""
     points_mm: NDArray[np.float32]
-    """[h, w, 3] base frame; NaN beside the object, at silhouettes, where it is seen at a grazing angle, and
-    where the picture is clipped."""
+    """[h, w, 3] base frame; NaN beside the object, at silhouettes, at grazing angles, and where the picture is
+    clipped."""
     base_from_camera: Floats
     lens: Intrinsics
     """Lens in units of blocks."""
 
     def project(self, points_mm: Floats) -> Floats:
-        """[n, 2] blocks of places [n, 3]."""
+        """[n, 2] blocks that show the places [n, 3]."""
         inside = apply(inverse(self.base_from_camera), points_mm)
         blocks: Floats = optics.project(inside, self.lens.vector()).pixels
         return blocks
@@ -49,7 +50,7 @@ class ViewSurface:
         return directions
 
     def detail(self, points_mm: Floats, normals: Floats) -> Floats:
-        """[n] blocks per square millimetre of the surface at places; 0 where the view does not see them."""
+        """[n] blocks per square millimetre of the surface at places; 0 for places that the view does not see."""
         height, width = self.picture.shape
         way = points_mm - self.base_from_camera[:3, 3]
         distance = np.linalg.norm(way, axis=1)
@@ -74,7 +75,7 @@ def view_surface(
     base_from_camera: Floats,
     threads: int,
 ) -> ViewSurface:
-    """Return the surface that a view sees, by rays to a mesh whose triangles have `normals` [n, 3]; `lens` is of
+    """Return the surface that a view sees, by rays to a mesh with triangle `normals` [n, 3]; `lens` is in
     pixels."""
     height, width = picture.shape
     blocks = block_lens(lens)

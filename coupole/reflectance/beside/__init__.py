@@ -1,1 +1,1 @@
-"""Processing of a run beside its acquisition, in a process of its own that reads the run's folder alone."""
+"""Processing of a run beside its acquisition, in a separate process that only reads the run's folder."""

@@ -1,4 +1,4 @@
-"""Reasons against a result that shall be made beside an acquisition: known from plan, rig and records before
+"""Reasons why a result cannot be made beside an acquisition. They are found in plan, rig and records before
 anything moves."""
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ _CHECKED: tuple[Kind, ...] = ("dark", "response", "flat-field", "glare")
 
 
 def reasons_against(plan: Path, rig: Path | None, result: Path | None, run: Path | None) -> list[str]:
-    """List why `coupole reflectance RUN` could not make a result of this plan's run, with the place in the plan
-    and the remedy; `result` is the folder, if one is named, and `run` that of the run, if it is resumed."""
+    """List the reasons why `coupole reflectance RUN` could not make a result of this plan's run. Each has the
+    place in the plan and the remedy. `result` is the folder, if one is named; `run` is the run's folder, if the
+    run is resumed."""
     try:
         files = read_plan(plan, rig)
         return [*_of_folder(result, run), *_of_mesh(files), *_of_records(files)]
@@ -62,15 +63,15 @@ def _of_folder(result: Path | None, run: Path | None) -> Iterator[str]:
 
 
 def _other_result(run: Run, result: Path | None) -> Path | None:
-    """The folder of the result that stands for discarded frames of a run, if it is another."""
+    """Return the folder of a different result that stands for discarded frames of the run, if there is one."""
     named = (result or default_result(run.folder)).resolve()
     places = (place_of_result(run, event) for event in discarded_views(run).values())
     return next((place for place in places if place.resolve() != named), None)
 
 
 def _why_not_made(folder: Path, existing: Path) -> str:
-    """Make the folder, and take it away again. Return why that failed, or nothing; `existing` is the last of its
-    parents that exists."""
+    """Make the folder and remove it again. Return the reason if this failed, else nothing; `existing` is the
+    nearest parent that exists."""
     why = ""
     try:
         folder.mkdir(parents=True)
@@ -112,7 +113,7 @@ def _of_records(files: PlanFiles) -> Iterator[str]:
 
 
 def _check_camera(files: PlanFiles, by_kind: dict[str, Path]) -> None:
-    """Raise InputError for records that do not hold for the rig's camera as it is set."""
+    """Raise InputError for records that do not match the settings of the rig's camera."""
     rig = files.cell.rig
     about, size_px = _about(files), (rig.sensor.width_px, rig.sensor.height_px)
     read_posed_camera(by_kind["hand-eye"], by_kind.get("camera"), about, size_px)
@@ -128,7 +129,7 @@ def _check_camera(files: PlanFiles, by_kind: dict[str, Path]) -> None:
 
 
 def _about(files: PlanFiles) -> About:
-    """Describe the camera as the rig has it; which one it is, is known when it is open."""
+    """Describe the camera by the rig; the camera's identity is known only when it is open."""
     rig, lens = files.cell.rig, files.cell.rig.lens
     return About(
         is_simulated=in_world(rig, dry_run=False),
@@ -140,7 +141,7 @@ def _about(files: PlanFiles) -> About:
 
 
 def _check_leds(files: PlanFiles, by_kind: dict[str, Path]) -> None:
-    """Raise InputError if the plan lights no single LEDs, or some that the record does not have."""
+    """Raise InputError if the plan lights no single LEDs, or LEDs that the record does not have."""
     base_from_support = files.cell.rig.support.base_from_support.matrix()
     rows = leds_of_plan(files.plan, files.cell.leds, base_from_support)
     planned_leds = set(map(int, files.cell.leds.ids[rows]))

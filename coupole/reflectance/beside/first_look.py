@@ -1,7 +1,7 @@
 """A first look at a view while its run goes on: normals and diffuse colour by a quick fit to some of its samples.
 
-It is no part of the result: one view alone, few triangles and LEDs, and light that came by way of other surfaces
-is still in the samples.
+It is not part of the result. It uses one view alone and few triangles and LEDs, and its samples still contain
+light that was reflected by other surfaces.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _SCAN_NOISE_UM = 30.0
 
 
 def write_normals(result: Path, view: str, path: Path) -> None:
-    """Write a picture of a view, normals left (x, y, z of the base frame as red, green, blue) and diffuse colour
-    right; black where nothing is known. Raises OSError."""
+    """Write a picture of a view: normals on the left (x, y, z of the base frame as red, green, blue), diffuse
+    colour on the right, and black where nothing is known. Raises OSError."""
     samples_of_view = read_view_samples(result / "samples" / f"{view}.h5")
     rows = slice(0, None, -(-len(samples_of_view.triangles) // _MOST_TRIANGLES))
     led_mask = np.zeros(len(samples_of_view.leds), np.bool_)
@@ -53,7 +53,7 @@ def _for_the_eye(kd: NDArray[np.float64]) -> NDArray[np.float64]:
 def _picture(
     places: NDArray[np.int32], nearest: NDArray[np.int64], colours: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """[h, w, 3] of what pixels see, by the rows of `colours` that are nearest to their triangles."""
+    """[h, w, 3] colours of pixels; each pixel takes the row of `colours` that is nearest to its triangle."""
     picture = np.zeros((*places.shape, 3), np.uint8)
     seen_mask = places >= 0
     shares = np.nan_to_num(colours[nearest[places[seen_mask]]])

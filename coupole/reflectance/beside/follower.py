@@ -1,5 +1,5 @@
-"""Follows a run by its journal: takes the samples of each view as soon as it is complete, makes a result of the
-views so far while it waits for the next, and the result after the last."""
+"""Follows a run by its journal. It takes the samples of each view as soon as the view is complete. While it waits
+for the next view, it makes a result of the views so far. After the last view it makes the final result."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ Say = Callable[[dict[str, Any]], object]
 
 
 def process_run(folder: Path, result: Path, say: Say) -> bool:
-    """Process a run into its result, while it is acquired and after it; True if the result is whole. `say` is
-    given the progress, and `times` at the end. Failures are reported, and existing results stay."""
+    """Process a run into its result, during its acquisition and after it; True if the result is complete. `say`
+    receives the progress, and `times` at the end. Failures are reported, and existing results stay."""
     teller = _Teller(result, say)
     try:
         with hold_result(result):
@@ -44,11 +44,11 @@ def process_run(folder: Path, result: Path, say: Say) -> bool:
 
 
 class _ViewsCameError(Exception):
-    """A result of the views so far is given up: there are more of them now."""
+    """Ends a result of the views so far, because there are more views now."""
 
 
 class _Teller:
-    """Tells the progress in the result's folder and to whoever began the process, seldom enough."""
+    """Reports the progress to the result's folder and to the parent process, at a limited rate."""
 
     def __init__(self, result: Path, say: Say) -> None:
         self._result, self.say = result, say
@@ -56,7 +56,7 @@ class _Teller:
         self._told_s = -_TELL_EVERY_S
 
     def tell(self, **changes: Any) -> None:
-        """Tell it now."""
+        """Report it now."""
         self._progress = self._progress.model_copy(update=changes)
         self._told_s = time.monotonic()
         with contextlib.suppress(OSError):  # also when the result is whole, and the folder gone
@@ -64,11 +64,11 @@ class _Teller:
         self.say({"progress": self._progress.model_dump()})
 
     def step(self, step: Step, **changes: Any) -> None:
-        """Tell that another step begins."""
+        """Report that another step begins."""
         self.tell(**{"step": step, "detail": "", "done_count": 0, "of": 0} | changes)
 
     def part(self, detail: str, done_count: int, of: int) -> None:
-        """Tell how much of a part of the step is done, if nothing was told for a moment."""
+        """Report the progress of the step, unless something was reported a moment ago."""
         if detail != self._progress.detail or time.monotonic() - self._told_s > _TELL_EVERY_S:
             self.tell(detail=detail, done_count=done_count, of=of)
 
@@ -77,7 +77,7 @@ class _Teller:
 
 
 class _Follower:
-    """One run, and how far its result is."""
+    """One run, and the progress of its result."""
 
     def __init__(self, run: Run, result: Path, teller: _Teller) -> None:
         self._run, self._result, self._teller = run, result, teller
@@ -86,22 +86,24 @@ class _Follower:
         self._taken: set[str] = set()
         """Views whose samples are there."""
         self._safe: dict[str, str] = {}
-        """Digests of samples that were read back, of views of which is not told yet if they are discarded."""
+        """Digests of samples that were read back, by view, until it is known whether the view's frames are
+        discarded."""
         self._is_done = False
-        """The newest session has ended with all frames."""
+        """True if the newest session has ended with all frames."""
         self._last_frame = ""
         """Time of the newest proven frame, UTC."""
         self._looks = True
-        """A view may be complete that was not before."""
+        """True if a view may have become complete since the last look."""
         self._newest_view, self._begun_view = "", ""
-        """View of the newest proven frame; the same if what it sees was not computed yet, else empty."""
+        """View of the newest proven frame; and the view whose visible surface is to be computed next, or an empty
+        text."""
         self._tried_views: tuple[str, ...] = ()
-        """Views of the last result so far that was made or tried."""
+        """Views of the newest partial result that was made or tried."""
         self._may_give_up = True
-        """The newest result of the views so far was not given up: the next one may be."""
+        """True if the newest result of the views so far was not given up, so that the next one may be."""
 
     def to_the_end(self) -> None:
-        """Raises as `reflectance_of`."""
+        """Follow the run until its result is made. Raises as `reflectance_of`."""
         self._teller.step("waiting", views=len(self._run.about["views"]))
         while True:
             self._read_news()
@@ -124,7 +126,7 @@ class _Follower:
         )
 
     def _read_news(self) -> None:
-        """Read what the journal has gained, and whether a view may be complete by now."""
+        """Read the new lines of the journal, and note whether a view may now be complete."""
         for event in self._journal.news():
             match event:
                 case FrameProven():
@@ -139,7 +141,7 @@ class _Follower:
                     pass
 
     def _take_samples(self) -> bool:
-        """Take the samples of the first complete view that lacks them; False if there is none."""
+        """Take the samples of the first complete view without samples; False if there is no such view."""
         remaining_views = self._remaining_views()
         if not remaining_views:
             return False
@@ -158,7 +160,8 @@ class _Follower:
         return [view for view in self._run.complete_views() if view not in self._taken]
 
     def _look_ahead(self) -> bool:
-        """Find what the view sees whose frames come now, once; False if there is nothing to do."""
+        """Find the surface that the present view sees, once, while its frames arrive; False if there is nothing to
+        do."""
         if not self._begun_view or self._begun_view in self._taken:
             return False
         view, self._begun_view = self._begun_view, ""
@@ -167,9 +170,10 @@ class _Follower:
         return True
 
     def _grow(self) -> bool:
-        """Make a result of the views so far, if there are more than in the newest; False if there is nothing to
-        do, or where LEDs are chosen in the run: those that are left out change with them. When the next view is
-        complete it is given up, but not twice in turn: of short views none would be made."""
+        """Make a result of the views so far, if it has more views than the newest one; False if there is nothing
+        to do. None is made if LEDs are chosen in the run, because the left-out LEDs change with them. When the
+        next view is complete this result is given up, but not twice in turn: with short views none would ever be
+        made."""
         if self._run.is_open:
             return False
         of = len(self._run.about["views"])
@@ -193,7 +197,7 @@ class _Follower:
         return True
 
     def _has_samples(self, view: str) -> bool:
-        """False for a view of dark frames or panels alone, too."""
+        """Tell whether the view has samples; False also for a view that has only dark frames or panels."""
         return view in self._taken and (self._result / "samples" / f"{view}.json").exists()
 
     def _part_of_growth(self, detail: str, done_count: int, of: int) -> None:
@@ -203,8 +207,8 @@ class _Follower:
         self._teller.part(detail, done_count, of)
 
     def _offer_safe(self) -> None:
-        """Tell the acquisition, which holds the run, of the frames that may be discarded now. What it does not do,
-        because it has ended, is done when the result is made."""
+        """Tell the acquisition, which holds the run's lock, which frames may be discarded now. If the acquisition
+        has ended before it discards them, they are discarded when the result is made."""
         for view, digest in list(self._safe.items()):
             why = reason_to_keep(self._run, view)
             if why == NOT_YET:
@@ -216,7 +220,7 @@ class _Follower:
             )
 
     def _seconds_since_last_frame(self) -> float | None:
-        """None if no frame's time is known."""
+        """Return the seconds since the last frame; None if no frame's time is known."""
         if not self._last_frame:
             return None
         return round((datetime.now(UTC) - datetime.fromisoformat(self._last_frame)).total_seconds(), 3)

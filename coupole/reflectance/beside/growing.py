@@ -1,8 +1,8 @@
 """A result of the views so far, while the run goes on: fits, check and report of the samples that are there.
 
-Its samples are those of the result that is made at the end: links to its files, which are never written to but
-replaced whole. So it can be given up at any time, and nothing that it does changes that result. It leaves the
-kernels of all fits compiled, and what does not depend on views to come is remembered for the end.
+It uses the samples of the final result through links to their files. These files are only replaced whole, never
+changed. So this result can be given up at any time, and it does not change the final result. It leaves the kernels
+of all fits compiled. Steps that do not depend on later views are remembered for the final result.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from coupole.storage import so_far
 from coupole.storage.run import Run
 
 _COPIES = 3
-"""Room on the disk, in sizes of the samples: each view's file is replaced twice, and old and new stand side by
-side."""
+"""Space needed on the disk, in sizes of the samples: each view's file is replaced twice, while old and new file
+exist side by side."""
 _FREE_BYTES = 2**30
-"""More than what a rig keeps free by default (`reserve_bytes`)."""
+"""Free space that must remain: more than a rig keeps free by default (`reserve_bytes`)."""
 
 
 @dataclass(frozen=True)
@@ -47,22 +47,22 @@ class Growth:
 
     run: Path
     result: Path
-    """Folder of the result at the end, which has the samples."""
+    """Folder of the final result, which has the samples."""
     views: tuple[str, ...]
     """Views whose samples are there, in the plan's order."""
     of: int
-    """Views of the plan."""
+    """Number of views of the plan."""
     folder: Path
-    """Folder in which it is made: a new one."""
+    """New folder in which this result is made."""
 
     @classmethod
     def of_views(cls, run: Path, result: Path, views: tuple[str, ...], of: int) -> Growth:
         return cls(run, result, views, of, so_far.new_folder(result, run.name, len(views), of))
 
     def has_room(self) -> bool:
-        """Tell whether the disk has room for it, for `_FREE_BYTES`, and for frames and samples of the views to
-        come, as large as those of the largest view and of the mean one. Never for a run that discards frames: its
-        disk is small. Raises OSError."""
+        """Tell whether the disk has room for this result, for `_FREE_BYTES`, and for the frames and samples of
+        later views. Later views are taken to be as large as the largest view and as the mean view. False for a run
+        that discards frames, because its disk is small. Raises OSError."""
         run = Run(self.run)
         if run.discards:
             return False
@@ -75,8 +75,8 @@ class Growth:
 
 
 def fit_so_far(growth: Growth, memory_bytes: int, say: Said, ahead: Ahead) -> None:
-    """Make it, and put it in its place when it is whole. What `say` raises ends it, and nothing is left but what
-    `ahead` remembers. Raises as `reflectance_of`."""
+    """Make the result, and move it to its place when it is complete. An error that `say` raises ends it; then only
+    the contents of `ahead` remain. Raises as `reflectance_of`."""
     so_far.remove_halves(growth.result)
     try:
         _begin(growth)
@@ -99,7 +99,7 @@ def _begin(growth: Growth) -> None:
 
 
 def _settings(growth: Growth) -> dict[str, Any]:
-    """Settings of a result of these views, and of how many they are."""
+    """Return the settings of a result of these views, with their number."""
     try:
         (measured_run,) = read_runs(RunRequest((growth.run,)), token := uuid4().hex)
         views = tuple(view for view in measured_run.views if view.name in growth.views)

@@ -1,4 +1,4 @@
-"""Lowest priority for a process that works beside an acquisition, and its end with whoever began it."""
+"""Lowest priority for a process beside an acquisition; it ends when its parent ends."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import sys
 from pathlib import Path
 
 _IOPRIO_SET = {"x86_64": 251, "aarch64": 30}
-"""Number of the system call, which C's library has no name for (ioprio_set(2))."""
+"""Number of the system call, for which the C library has no name (ioprio_set(2))."""
 _IOPRIO_WHO_PROCESS, _IDLE_CLASS = 1, 3 << 13
 _PR_SET_PDEATHSIG = 1
 
 
 def yield_to_all_others() -> None:
-    """Take processors and disk only while nobody else wants them, and be the first to die when memory is short.
-    Threads that begin later inherit it. Each of the four is done where the system has it."""
+    """Use processors and disk only while no other process wants them, and be the first to be ended if memory is
+    short. Threads that begin later inherit this. Each of the four measures is taken where the system has it."""
     if sys.platform != "linux":
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, 0, 19)
@@ -36,8 +36,8 @@ def yield_to_all_others() -> None:
 
 
 def end_with(parent: int) -> None:
-    """End by SIGKILL when the thread ends that has begun this process, also while this is stopped (prctl(2)).
-    Where the system has no such thing, the end of its input tells."""
+    """Let the system end this process by SIGKILL when the thread that began it ends, even while it is stopped
+    (prctl(2)). On systems without this call, the process learns it from the end of its input."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:  # it has died before

@@ -1,8 +1,9 @@
 """The process beside an acquisition: `python -m coupole.reflectance.beside.process PARENT`.
 
-It is told by lines of JSON on its input: first plan, rig and result, to which it answers with the `reasons`
-against a result; then the run's folder and the result's. From then on it follows the run's journal, and tells its
-progress in lines on its output. It ends with its input: whoever has begun it has died, or wants no more.
+It reads lines of JSON from its input. The first names plan, rig and result; the process answers with the `reasons`
+against a result. The next names the run's folder and the result's folder. From then on the process follows the
+run's journal, and reports its progress in lines on its output. It ends when its input ends: then its parent has
+died, or does not need it any more.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from coupole.reflectance.beside.lowest_priority import end_with, yield_to_all_ot
 
 
 def main() -> None:
-    """Run to the end of the result, or of the input."""
+    """Run until the result is complete or the input ends."""
     end_with(int(sys.argv[1]))
     for number in (signal.SIGINT, signal.SIGHUP):  # Ctrl-C is for the acquisition, which ends this
         signal.signal(number, signal.SIG_IGN)
@@ -37,7 +38,7 @@ def main() -> None:
 
 
 def _reasons(request: dict[str, Any]) -> list[str]:
-    """Reasons against a result; among them a library that is missing, with its extra's name by whoever asked."""
+    """Return the reasons against a result; a missing library is one of them, with the extra that installs it."""
     try:
         from coupole.reflectance.beside import follower
         from coupole.reflectance.beside.beforehand import reasons_against

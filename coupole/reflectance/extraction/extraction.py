@@ -1,4 +1,5 @@
-"""Samples of reflectance of every triangle under every LED, view by view, on disk: one pass over the frames."""
+"""Samples of reflectance of every triangle under every LED, written to disk view by view, in one pass over the
+frames."""
 
 from __future__ import annotations
 
@@ -34,22 +35,22 @@ from coupole.storage.array_digest import ArrayDigest
 Floats = NDArray[np.float64]
 
 _PATCHES_BESIDE = 9
-"""A patch and those around it."""
+"""Number of patches: a patch and those around it."""
 MOST_BLUR_PX = 2.0
-"""Diameter of the circle of confusion."""
+"""Largest diameter of the circle of confusion of a pixel that is used, px."""
 Say = Callable[[str, int, int], None]
 _newest_surface: Remembered[SeenSurface] = Remembered(1)
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """The object's triangles as all views share them."""
+    """The object's triangles, shared by all views."""
 
     mesh: PacketMesh
     facets: Facets
 
     def of(self, triangles: NDArray[np.int64]) -> Facets:
-        """Return the facets of the triangles that a view sees, given by their rising numbers."""
+        """Return the facets of the triangles that a view sees, given by their numbers in rising order."""
         place = np.full(len(self.facets.centres_mm), -1)
         place[triangles] = np.arange(len(triangles))
         sides = self.facets.neighbours[triangles]
@@ -76,8 +77,8 @@ def extract_view(
     *,
     threads: int | None = None,
 ) -> tuple[dict[str, Any], str]:
-    """Write a view's samples to an HDF5 file, whole or not at all; what the report says of them, and the digest of
-    what was written (`coupole.storage.array_digest`)."""
+    """Write a view's samples to an HDF5 file, complete or not at all. Return the report's entry about them, and
+    the digest of the written arrays (`coupole.storage.array_digest`)."""
     threads = threads or len(os.sched_getaffinity(0))
     work, surface = view_pass(measured_run, geometry, radiometry, view, threads)
     codes_of = shadows_of(work, geometry)
@@ -126,8 +127,8 @@ def extract_view(
 def view_pass(
     measured_run: MeasuredRun, geometry: Geometry, radiometry: Radiometry, view: MeasuredView, threads: int
 ) -> tuple[ViewPass, SeenSurface]:
-    """Return the pass of a view, ready for its frames, and what the view sees. Raises InputError if it sees
-    nothing of the mesh."""
+    """Return the pass of a view, ready for its frames, and the surface that the view sees. Raises InputError if
+    the view sees nothing of the mesh."""
     surface = surface_of(measured_run, geometry, view, threads)
     if not len(surface.triangles):
         raise InputError(
@@ -139,8 +140,8 @@ def view_pass(
 
 
 def surface_of(measured_run: MeasuredRun, geometry: Geometry, view: MeasuredView, threads: int) -> SeenSurface:
-    """Return what a view sees, by its pose alone: computed before the view's frames are all there, it is not
-    computed again."""
+    """Return the surface that a view sees. It depends on the pose alone, so it can be computed before the view's
+    frames are complete; the newest surface is remembered."""
     focal_mm, focus_mm, f_number = measured_run.optics
     size_px = measured_run.frames.size_px
 
@@ -161,7 +162,8 @@ def surface_of(measured_run: MeasuredRun, geometry: Geometry, view: MeasuredView
 
 
 def shadows_of(work: ViewPass, geometry: Geometry) -> Callable[[slice, Executor], NDArray[np.uint8]]:
-    """A function that gives the codes [leds, triangles] of some of the view's LEDs: what object and cell hide."""
+    """Return a function that gives the codes [leds, triangles] of some of the view's LEDs: they say what object
+    and cell hide."""
     hidden_by_cell = _hidden_by_cell(work)
 
     def codes_of(part: slice, pool: Executor) -> NDArray[np.uint8]:
@@ -175,8 +177,9 @@ def shadows_of(work: ViewPass, geometry: Geometry) -> Callable[[slice, Executor]
 
 
 def _hidden_by_cell(work: ViewPass) -> Callable[[NDArray[np.int64]], NDArray[np.bool_]] | None:
-    """A function of some LEDs, [leds, triangles] what the run says that arm or tool hide from the nearest patch of
-    the object or one beside it, since edges of their shadows lie between patches; None if it says nothing."""
+    """Return a function that gives a mask [leds, triangles] for some LEDs. The mask is True where, by the run, arm
+    or tool hide the LED from the triangle's nearest patch or one beside it, since edges of shadows lie between
+    patches. None if the run says nothing about shadows."""
     measured_run = work.measured_run
     with h5py.File(measured_run.run.view_path(work.view.name), "r") as file:
         if "entry/shadow/codes" not in file:
@@ -242,7 +245,7 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface, digest: A
 
 
 def _dn_share(measured_run: MeasuredRun, view: MeasuredView, led: int) -> Floats:
-    """[channels] share of the camera's range that f cos_i E/Phi of 1 gives."""
+    """[channels] share of the camera's range for f cos_i E/Phi = 1."""
     frame = max(view.by_led[led], key=lambda frame: frame.exposure_us)
     range_dn = measured_run.frames.white_dn - measured_run.frames.black_dn
     share: Floats = measured_run.power_of(frame) * frame.exposure_us * 1e-6 / range_dn
@@ -255,7 +258,8 @@ def _dataset(file: h5py.File, name: str, values: NDArray[Any], description: str,
 
 
 def _begin_samples(file: h5py.File, work: ViewPass) -> dict[str, h5py.Dataset]:
-    """`f`, `u_own` [triangles, leds, channels] and `codes` [triangles, leds], in chunks as they come."""
+    """Create `f`, `u_own` [triangles, leds, channels] and `codes` [triangles, leds], in chunks as the samples
+    arrive."""
     (count, channels), leds = work.reader.pixels.shape, len(work.leds)
     codes = ", ".join(f"{code} {name}" for name, code in CODES.items())
     kinds: dict[str, tuple[Any, tuple[int, ...], str]] = {
@@ -274,7 +278,8 @@ def _begin_samples(file: h5py.File, work: ViewPass) -> dict[str, h5py.Dataset]:
 
 
 def _write_chunk(data: h5py.Dataset, some: Samples, values: NDArray[Any]) -> None:
-    """Straight to its place in the file, but for the last LEDs and triangles, which are less than a chunk."""
+    """Write a chunk directly to its place in the file. The last LEDs and triangles may not fill a chunk; they are
+    written in the ordinary way."""
     if values.shape == data.chunks:
         data.id.write_direct_chunk((some.rows.start, some.leds.start, 0)[: values.ndim], values.tobytes())
     else:

@@ -1,6 +1,6 @@
-"""Frames in the order in which they are wanted, read ahead into memory that is used again and again.
+"""Frames in the order in which they are needed, read ahead into memory that is reused.
 
-However many frames there are, memory holds those that are worked on and a few that are being read.
+However many frames there are, memory holds only those that are worked on and a few that are being read.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from coupole.calibration.light.frames import LightFrame
 
 READERS = 2
-"""Threads, and slots besides those of the frames that are worked on."""
+"""Number of threads that read; also the number of slots in addition to those of the frames that are worked on."""
 _SECTOR = 512
-"""Bytes; where memory for a direct read may begin."""
+"""Bytes. Memory for a direct read begins at a multiple of this."""
 
 
 class FrameRing:
-    """`with FrameRing(...)` begins to read; errors of a frame are raised where it is taken."""
+    """`with FrameRing(...)` begins to read. Errors of a frame are raised when the frame is taken."""
 
     def __init__(self, frames: Sequence[LightFrame], size_px: tuple[int, int], together: int) -> None:
         """Prepare the ring; at most `together` frames are worked on at a time."""
@@ -32,7 +32,7 @@ class FrameRing:
         memory = np.empty(slots * stride + _SECTOR, np.uint8)
         begin = -memory.ctypes.data % _SECTOR
         self.pixels: NDArray[np.uint16] = memory[begin : begin + slots * stride].view(np.uint16).reshape(slots, -1)
-        """[slots, memory of a frame] row by row; what is behind a frame means nothing."""
+        """[slots, memory of a frame] row by row; the numbers after a frame's pixels mean nothing."""
         self._readers = ThreadPoolExecutor(READERS)
         self._wanted = iter(frames)
         self._ahead: deque[Future[int]] = deque()
@@ -45,12 +45,12 @@ class FrameRing:
         self._readers.shutdown(cancel_futures=True)
 
     def take(self) -> int:
-        """The slot of the next frame, which is kept until it is given back. Raises StorageError, and
-        ChecksumMismatch if the frame is not what was proven."""
+        """Return the slot of the next frame; the slot is kept until it is given back. Raises StorageError, and
+        ChecksumMismatch if the frame differs from the proven one."""
         return self._ahead.popleft().result()
 
     def give_back(self, slots: Iterable[int]) -> None:
-        """Slots whose frames are done with: the next frames are read into them."""
+        """Give back slots whose frames are no longer needed: the next frames are read into them."""
         for slot, frame in zip(slots, self._wanted, strict=False):
             self._ahead.append(self._readers.submit(self._read_frame, frame, slot))
 

@@ -1,5 +1,5 @@
-"""The veil of glare in frames of one LED, from their own pixels: of several exposures, each pixel by the longest
-that does not clip it. On blocks of pixels, since a veil is smooth.
+"""The veil of glare in frames of one LED, from their own pixels. Each pixel is taken from the longest exposure
+that does not clip it. The veil is computed on blocks of pixels, since it is smooth.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from coupole.calibration.light.veil import light_of_blocks
 Floats = NDArray[np.float64]
 
 GLARE, U_GLARE = "glare", "led_u_glare"
-"""Names in a view's file of samples: the veil that was taken off over what is left, and its relative
+"""Names in a view's file of samples: the subtracted veil over the remaining signal, and its relative
 uncertainty."""
 
 
@@ -28,7 +28,7 @@ class Veils(NamedTuple):
     rates: NDArray[np.float32]
     """[channels block rows block columns, 8] DN/s; empty without a record of the glare."""
     grid: NDArray[np.int64]
-    """[4] side of a block, rows and columns of blocks, width of a frame in pixels."""
+    """[4] side of a block, number of rows and of columns of blocks, width of a frame in pixels."""
 
 
 NO_VEILS = Veils(np.zeros((0, 8), np.float32), np.ones(4, np.int64))
@@ -36,7 +36,7 @@ NO_VEILS = Veils(np.zeros((0, 8), np.float32), np.ones(4, np.int64))
 
 @dataclass(frozen=True)
 class FrameVeils:
-    """All that gives the veil of frames of one view."""
+    """The data that give the veil of frames of one view."""
 
     glare: GlareCorrection
     channel: NDArray[np.int8]
@@ -46,7 +46,7 @@ class FrameVeils:
     top_dn: float
     """Upper end of the camera's range that is used."""
     darks: Mapping[float, NDArray[np.float32]]
-    """[channels, block rows, block columns] mean of what frames of an exposure (us) have without light, DN."""
+    """[channels, block rows, block columns] mean of frames of an exposure (us) without light, DN."""
 
     @property
     def grid(self) -> NDArray[np.int64]:
@@ -60,8 +60,8 @@ class FrameVeils:
 
     def of_led(self, frames: Sequence[tuple[float, NDArray[np.uint16]]]) -> tuple[Floats, Floats]:
         """[channels, block rows, block columns] veil, DN/s, in frames of one LED, each with its exposure in us and
-        its pixels [h w]; and its relative standard uncertainty [channels]. Clipped pixels have more light than is
-        known: their share of the light is added to the uncertainty."""
+        its pixels [h w]; and the veil's relative standard uncertainty [channels]. Clipped pixels have an unknown
+        amount of light: their share of the light is added to the uncertainty."""
         longest_first = sorted(frames, key=lambda frame: -frame[0])
         times_s = np.array([1e-6 * exposure_us for exposure_us, _ in longest_first])
         channels, block_px = len(self.glare.channels), self.glare.block_px
@@ -91,8 +91,8 @@ def dark_of_blocks(
 
 @numba.njit(cache=True, nogil=True)
 def _add_light(frames, times_s, darks, channel, curve, top_dn, block_px, light, clipped_light):  # type: ignore[no-untyped-def]
-    """Add each pixel's linear signal, DN/s, to its block of `light` [channels, block rows, block columns]; what
-    pixels have that all exposures clip is added to `clipped_light` [channels] too."""
+    """Add each pixel's linear signal, DN/s, to its block of `light` [channels, block rows, block columns]. Add the
+    signal of pixels that all exposures clip to `clipped_light` [channels] too."""
     height, width = channel.shape
     for row in range(height):
         block_row = row // block_px

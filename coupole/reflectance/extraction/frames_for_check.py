@@ -1,7 +1,7 @@
 """Frames of LEDs that are kept for the check, as pictures: one value for each block of 2 x 2 pixels and channel.
 
-In a block, one pixel of each channel counts, so that green does not count twice (seed 003, 6.3). Pixels are
-linear, in shares of the camera's range, dark and flat field taken out, as the samples are.
+In a block, one pixel of each channel is used, so that green does not count twice (seed 003, 6.3). Pixels are
+linear, as shares of the camera's range, with dark and flat field removed, as in the samples.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from coupole.reflectance.extraction.radiance import RANGE_LEFT_OUT, Radiometry
 from coupole.reflectance.extraction.sample_codes import REACHED
 
 MOST_FRAMES = 12
-"""Largest number of frames of a view; more LEDs than that are thinned out evenly."""
+"""Largest number of frames of a view; if more LEDs are kept, they are thinned out evenly."""
 
 
 def write_frames(
@@ -35,8 +35,8 @@ def write_frames(
     threads: int | None,
     to: Path,
 ) -> None:
-    """Write the pictures of some of the LEDs `left_out`, the longest exposure of each. `samples` is the view's
-    file; a block has a value where all its pixels see triangles that the LED reaches, unclipped. Raises
+    """Write the pictures of some of the LEDs `left_out`, each from its longest exposure. `samples` is the view's
+    file. A block has a value if all its pixels are unclipped and see triangles that the LED reaches. Raises
     StorageError."""
     leds = [led for led in view.by_led if led in set(left_out)]
     leds = leds[:: -(-len(leds) // MOST_FRAMES)] if leds else []
@@ -84,7 +84,7 @@ def _picture(
     is_lit: NDArray[np.bool_],
     offsets: NDArray[np.int64],
 ) -> tuple[NDArray[np.float32], float]:
-    """One LED's picture, and its mean absolute error by noise."""
+    """Return one LED's picture, and its mean absolute error from noise."""
     height, width = place_of_pixel.shape
     range_dn = radiometry.white_dn - radiometry.black_dn
     top_dn = radiometry.white_dn - RANGE_LEFT_OUT * range_dn
@@ -106,8 +106,8 @@ def _veil_picture(
     exposure_us: float,
     offsets: NDArray[np.int64],
 ) -> NDArray[np.float32]:
-    """[h / 2, w / 2, channels] glare in an exposure of one LED, as the shares of `_picture`, from all its
-    frames."""
+    """[h / 2, w / 2, channels] glare in an exposure of one LED, from all its frames, in the shares of
+    `_picture`."""
     veil, _ = veils.of_led([(frame.exposure_us, frame.read().ravel()) for frame in frames])
     height, width = radiometry.flat.shape
     share = np.empty((height // 2, width // 2, len(offsets)), np.float32)

@@ -1,6 +1,7 @@
-"""LEDs that light each triangle, and how much: shadows of the object, their penumbrae, irradiance.
+"""The LEDs that light each triangle, and its irradiance from them: shadows of the object, penumbrae, irradiance.
 
-From a triangle's centre rays go to the centres of all LEDs, and near the edges of shadows to the LEDs' corners.
+Rays go from a triangle's centre to the centres of all LEDs. Near the edges of shadows rays also go to the LEDs'
+corners.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Facets:
     normals: Floats
     """[n, 3] unit, outward."""
     neighbours: NDArray[np.int64]
-    """[n, 3] places in these arrays, or -1."""
+    """[n, 3] places of the neighbours in these arrays, or -1."""
 
     @cached_property
     def ray_starts_mm(self) -> NDArray[np.float32]:
@@ -45,16 +46,16 @@ class Facets:
 
 
 def lamp_codes(mesh: PacketMesh, facets: Facets, leds: Positions, pool: Executor) -> NDArray[np.uint8]:
-    """[leds, triangles] codes, LED by LED in the threads of a pool; `mesh` is what throws shadows."""
+    """[leds, triangles] codes, computed LED by LED in the threads of a pool; `mesh` throws the shadows."""
     facets.ray_starts_mm  # noqa: B018  made once, before threads want it
     rows = pool.map(first_alone(lambda led: _codes_of_led(mesh, facets, leds, led)), range(len(leds.ids)))
     return np.stack(list(rows))
 
 
 def _codes_of_led(mesh: PacketMesh, facets: Facets, leds: Positions, led: int) -> NDArray[np.uint8]:
-    """[triangles] codes, found in three steps: the shadow of the LED's centre; the triangles beside it, which the
-    shadow's edge may cross; then, ring by ring, triangles that only a part of the LED reaches, until there are
-    none."""
+    """[triangles] codes, found in three steps: first the shadow of the LED's centre; then the triangles beside it,
+    which the shadow's edge may cross; then, ring by ring, the triangles that only a part of the LED reaches, until
+    a ring has none."""
     centre_mm, normal = leds.centres_mm[led], leds.normals[led]
     codes = np.empty(len(facets.centres_mm), np.uint8)
     _away(facets.centres_mm, facets.normals, centre_mm, normal, np.cos(np.radians(MOST_INCIDENCE_DEG)), codes)
@@ -77,7 +78,7 @@ def _codes_of_led(mesh: PacketMesh, facets: Facets, leds: Positions, led: int) -
 
 @numba.njit(cache=True, nogil=True)
 def _darken_beside(triangles, neighbours, codes):  # type: ignore[no-untyped-def]
-    """Give the lit neighbours of some triangles the code of a penumbra; which they are."""
+    """Give the lit neighbours of some triangles the code of a penumbra, and return these neighbours."""
     dark_neighbours = np.empty(3 * len(triangles), np.int64)
     count = 0
     for triangle in triangles:
@@ -103,10 +104,11 @@ def _away(centres, normals, led_centre, led_normal, least_cosine, codes):  # typ
 
 @numba.njit(cache=True, nogil=True)
 def lit_by(centre, led_centre, led_normal, paper, towards):  # type: ignore[no-untyped-def]
-    """E / Phi in m^-2 on a surface at `centre` that faces the LED, whose direction is written to `towards` [3].
+    """E / Phi in m^-2 on a surface at `centre` that faces the LED. The direction to the LED is written to
+    `towards` [3].
 
-    That of a small Lambertian emitter, cos / (pi d^2): at 0.5 m, that of a square of 7 mm differs by 7e-5. `paper`
-    has the emitter's cosine twice (seed 003, Eq. 2).
+    The LED is a small Lambertian emitter, cos / (pi d^2). At 0.5 m, a square of 7 mm differs from it by 7e-5. With
+    `paper` the emitter's cosine counts twice (seed 003, Eq. 2).
     """
     for k in range(3):
         towards[k] = led_centre[k] - centre[k]
@@ -122,7 +124,7 @@ def lit_by(centre, led_centre, led_normal, paper, towards):  # type: ignore[no-u
 
 @numba.njit(cache=True, nogil=True)
 def lit_on(centres, led_centres, led_normals, paper):  # type: ignore[no-untyped-def]
-    """[triangles, leds] of `lit_by`."""
+    """[triangles, leds] values of `lit_by`."""
     lit, towards = np.empty((len(centres), len(led_centres))), np.empty(3)
     for triangle in range(len(centres)):
         for led in range(len(led_centres)):
@@ -131,7 +133,7 @@ def lit_on(centres, led_centres, led_normals, paper):  # type: ignore[no-untyped
 
 
 def neighbours_of(triangles: NDArray[np.uint32]) -> NDArray[np.int64]:
-    """[m, 3] the triangle across each side of triangles [m, 3] (rows of vertices), -1 where there is none."""
+    """[m, 3] the neighbour across each side of triangles [m, 3] (rows of vertices), -1 where there is none."""
     count = len(triangles)
     sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
     key = sides[:, 0] * (int(triangles.max()) + 1) + sides[:, 1]

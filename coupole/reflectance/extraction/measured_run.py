@@ -1,7 +1,6 @@
-"""Data with which a run was measured: its frames, the object's triangles, and the calibrations that give them
-units.
+"""Data of a measured run: its frames, the object's triangles, and the calibrations that give them units.
 
-The run's own folder is enough: plan, rig, mesh and records are kept in it.
+The run's own folder is sufficient, because it holds plan, rig, mesh and records.
 """
 
 from __future__ import annotations
@@ -40,12 +39,12 @@ Floats = NDArray[np.float64]
 NEEDED = ("hand-eye", "leds", "led-power")
 USED = (*NEEDED, "dark", "response", "flat-field", "glare", "camera", "drift")
 U_SIGNAL = {"response": "uncertainty of linearity", "flat-field": "uncertainty", "drift": "uncertainty"}
-"""Records of what makes all samples uncertain alike, and how the limit that says how much begins."""
+"""Kinds of records with an uncertainty that all samples share, and the first words of the limit that states it."""
 TYPICAL_PER_K = -0.003
 """Relative change of the power of white LEDs with temperature, per K."""
 SAME_GAIN_DB = 0.01
 MOST_MOVED_MM = 0.1
-"""Largest movement within a view; an arm comes back to a pose within less when a run is resumed."""
+"""Largest movement within a view. When a run is resumed, an arm returns to a pose within less than this."""
 _HOW = (
     "name them with --calibrations, or make them: `coupole calibrate all --rig RIG`; --uncalibrated gives "
     "relative values of single pixels without them"
@@ -58,14 +57,14 @@ class MeasuredView:
 
     name: str
     base_from_camera: Floats
-    """[4, 4] mm, by the hand-eye's record, the arm's axis zeros applied."""
+    """[4, 4] mm, from the hand-eye record, with the arm's axis zeros applied."""
     frames: tuple[LightFrame, ...]
     pointing: Pointing
-    """Uncertainty of where the camera looks."""
+    """Uncertainty of the direction in which the camera looks."""
 
     @cached_property
     def by_led(self) -> dict[int, list[LightFrame]]:
-        """Frames of each LED, LEDs rising."""
+        """Frames of each LED, in rising order of LEDs."""
         frames_of_led: dict[int, list[LightFrame]] = {}
         for frame in self.frames:
             if frame.led is not None:
@@ -75,24 +74,24 @@ class MeasuredView:
 
 @dataclass(frozen=True)
 class Powers:
-    """Power of the LEDs of a record, by channel."""
+    """Power of the LEDs in a record, by channel."""
 
     ids: NDArray[np.int64]
     power: Floats
-    """[leds, channels] DN s^-1 m^2 sr; NaN or 0 where there is none."""
+    """[leds, channels] DN s^-1 m^2 sr; NaN or 0 for an LED without power."""
     board_c: Floats
     """[leds] temperature of the board for which the power holds."""
     u_own: Floats
     """[leds, channels] relative standard uncertainty that an LED shares with no other."""
     u_shared: Floats
-    """[leds, channels] relative, of what all LEDs share: the tile, its place."""
+    """[leds, channels] relative standard uncertainty that all LEDs share: of the tile and its place."""
 
     @cached_property
     def _row(self) -> dict[int, int]:
         return {int(led): number for number, led in enumerate(self.ids)}
 
     def of(self, leds: NDArray[np.int64]) -> Powers:
-        """Return the powers of some LEDs; NaN for those that the record does not have."""
+        """Return the powers of some LEDs; NaN for LEDs that are not in the record."""
         rows = np.array([self._row.get(int(led), -1) for led in leds])
 
         def values_of_leds(values: Floats) -> Floats:
@@ -105,7 +104,8 @@ class Powers:
 
 @dataclass(frozen=True)
 class Drift:
-    """Power of the LEDs over their calibrated power: ln = level + rate_per_h (t - start_s) / 3600 + per_k dT."""
+    """Power of the LEDs over their calibrated power: its logarithm is level + rate_per_h (t - start_s) / 3600 +
+    per_k dT."""
 
     level: float = 0.0
     rate_per_h: float = 0.0
@@ -113,14 +113,14 @@ class Drift:
     start_s: float = 0.0
 
     def factor(self, warmer_k: float, t_s: float) -> float:
-        """1 for a temperature that is not known."""
+        """Return the factor of the power; a temperature that is not known counts as no change."""
         hours = (t_s - self.start_s) / 3600.0
         return float(np.exp(self.level + self.rate_per_h * hours + self.per_k * np.nan_to_num(warmer_k)))
 
 
 @dataclass(frozen=True)
 class MeasuredRun:
-    """A run with all that turns its DN into reflectance."""
+    """A run with all data that turn its DN into reflectance."""
 
     run: Run
     frames: LightFrames
@@ -134,23 +134,24 @@ class MeasuredRun:
     powers: Powers
     emission: Emission
     records: Mapping[str, Path]
-    """Files of the records, by kind."""
+    """Files of the calibration records, by kind."""
     led_u_mm: float
-    """Standard uncertainty of each coordinate of an LED's place, as the record has it for the median LED."""
+    """Standard uncertainty of each coordinate of an LED's place, from the record, for the median LED."""
     mesh_path: Path
     optics: tuple[float, float, float]
     """Focal length and focus distance in mm, f-number."""
     base_from_support: Floats
     drift: Drift
     direct_light_alone: bool
-    """True if the cell is simulated without light from surface to surface."""
+    """True if the cell is simulated without inter-reflection."""
     camera: CameraPrior
-    """Lens and hand-eye with their covariance; `axis_sensitivity` is that of `views`, in their order."""
+    """Lens and hand-eye with their covariance; `axis_sensitivity` has the order of `views`."""
     u_signal: float = 0.0
-    """Relative standard uncertainty that all samples share, of response, fall-off and drift."""
+    """Relative standard uncertainty that all samples share, from response, fall-off and drift."""
 
     def power_of(self, frame: LightFrame) -> Floats:
-        """[channels] power of the LED of a frame at its board's temperature and time; NaN where there is none."""
+        """[channels] power of a frame's LED at the frame's time and the temperature of its board; NaN where there
+        is none."""
         powers = self.powers.of(np.array([frame.led]))
         warmer_k = frame.temperature_c - float(powers.board_c[0])
         power: Floats = powers.power[0] * self.drift.factor(warmer_k, frame.t_s)
@@ -162,8 +163,9 @@ class MeasuredRun:
 
 
 def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[Path] = ()) -> MeasuredRun:
-    """A run with the records that are named here, else by its plan. Raises InputError with the remedy: no mesh, a
-    record that lacks or does not belong to the run, no proven frame under single LEDs."""
+    """Return a run with the records that are named here, else with the records of its plan. Raises InputError with
+    the remedy if there is no mesh, a record is missing or does not belong to the run, or no frame under a single
+    LED is proven."""
     run = Run(folder)
     files = read_plan(run.plan_path, run.rig_path)
     mesh_path = mesh or files.mesh_path
@@ -209,20 +211,21 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
 
 
 def _direct_light_alone(rig: Rig) -> bool:
-    """Tell whether light is direct alone, by the settings of the simulated world, as docs/reference/rig.md has
-    them."""
+    """Tell whether the simulated world has direct light only, by its settings (docs/reference/rig.md)."""
     world = {} if rig.world is None else rig.world.settings
     interreflection = world.get("interreflection")
     return world.get("shading") == "flat" if interreflection is None else interreflection is False
 
 
 def emission_of(record: Record) -> Emission:
-    """The emission that a record's powers were fitted with; the same must turn them into irradiance."""
+    """Return the emission with which a record's powers were fitted; the same emission must turn them into
+    irradiance."""
     return "paper" if any("emission profile `paper`" in remark for remark in record.remarks) else "lambertian"
 
 
 def read_powers(path: Path, channels: Sequence[str]) -> Powers:
-    """The table beside a record of the kind `led-power`. Raises InputError for a record of other channels."""
+    """Read the table beside a record of the kind `led-power`. Raises InputError for a record with other
+    channels."""
     record = read_accepted(path, "led-power")
     table = path.parent / record.files[0].name
     lines = [line for line in table.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
@@ -240,7 +243,7 @@ def read_powers(path: Path, channels: Sequence[str]) -> Powers:
 
 
 def refuse_different(measured_runs: Sequence[MeasuredRun]) -> None:
-    """Raises InputError for two runs of one name, and for runs of different objects or sensors."""
+    """Raise InputError for two runs with one name, and for runs with different objects or sensors."""
     first = measured_runs[0]
     names = [measured_run.run.folder.name for measured_run in measured_runs]
     if twice := next((name for name in names if names.count(name) > 1), None):
@@ -259,7 +262,7 @@ def refuse_different(measured_runs: Sequence[MeasuredRun]) -> None:
 
 
 def refuse_other_gain(path: Path, record: Record, gain_db: float) -> None:
-    """Raise InputError for a record of powers that was made at another gain than that of the frames."""
+    """Raise InputError for a record of powers that was made at a different gain from the frames."""
     record_db = record.fixed.get("gain_db", 0.0)
     if abs(record_db - gain_db) > SAME_GAIN_DB:
         raise InputError(
@@ -274,8 +277,8 @@ def _refuse_unknown_leds(path: Path, leds: Positions, views: Sequence[MeasuredVi
 
 
 def _drift(path: Path | None) -> Drift:
-    """Return the drift by a record of the run's own drift; without one, by white LEDs' usual loss of light with
-    warmth."""
+    """Return the drift from a record of the run's own drift. Without a record, use the usual loss of power of
+    white LEDs with temperature."""
     if path is None:
         return Drift()
     record = read_accepted(path, "drift")
@@ -283,8 +286,8 @@ def _drift(path: Path | None) -> Drift:
 
 
 def u_signal_of(records: Mapping[str, Path]) -> float:
-    """Return the uncertainty of the signal, from the figures with which records of the kinds in `U_SIGNAL` were
-    accepted."""
+    """Return the uncertainty of the signal, from the acceptance figures of the records of the kinds in
+    `U_SIGNAL`."""
     square = 0.0
     for kind, prefix in U_SIGNAL.items():
         if kind in records:
@@ -295,7 +298,8 @@ def u_signal_of(records: Mapping[str, Path]) -> float:
 
 
 def records_by_kind(paths: Sequence[Path]) -> dict[str, Path]:
-    """Records by their kind, those that are not used left out. Raises InputError for two of a kind."""
+    """Return the records by their kind, without those that are not used. Raises InputError for two records of a
+    kind."""
     path_of_kind: dict[str, Path] = {}
     for path in paths:
         kind = read_record(path).kind
@@ -309,7 +313,8 @@ def records_by_kind(paths: Sequence[Path]) -> dict[str, Path]:
 def _views(
     run: Run, frames: LightFrames, hand_eye: Path, rig: Rig, prior: CameraPrior, middle_mm: Floats
 ) -> tuple[tuple[MeasuredView, ...], CameraPrior]:
-    """Frames by view of an object, with the camera's pose by the record; and the record for these views."""
+    """Return the frames of an object by view, with the camera's pose from the record; and the record for these
+    views."""
     lit: dict[str, list[LightFrame]] = {}
     for frame in frames.lit:
         if frame.led is not None:
@@ -335,7 +340,8 @@ def _views(
 
 
 def _only_pose(run: Run, view: str, frames: Sequence[LightFrame]) -> Floats:
-    """[4, 4] base_from_flange. Raises InputError if the arm was moved within the view, as after a fault."""
+    """[4, 4] base_from_flange. Raises InputError if the arm was moved within the view, for example after a
+    fault."""
     first = frames[0].base_from_flange
     off_mm = max(float(np.linalg.norm(frame.base_from_flange[:3, 3] - first[:3, 3])) for frame in frames)
     if off_mm > MOST_MOVED_MM:

@@ -1,4 +1,4 @@
-"""Uncertainty of what a pixel looks at: lens, camera and mesh with their covariance."""
+"""Uncertainty of the places that a pixel looks at, from lens, camera and mesh with their covariance."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from coupole.calibration.rotations import moved_transforms, rotation, skew
 Floats = NDArray[np.float64]
 
 _SMALL = 1e-3
-"""Steps of the differences that stand for derivatives, as a share of a standard uncertainty."""
+"""Steps of the differences that approximate derivatives, as a share of a standard uncertainty."""
 _POINTS = 100
-"""Places on the object that stand for all of a view."""
+"""Number of places on the object that represent all places of a view."""
 
 
 @dataclass(frozen=True)
@@ -32,21 +32,22 @@ class Doubts:
     """Standard uncertainty of the mesh's place in the base frame, in each direction."""
     mesh_deg: float = 0.02
     shape_mm: float = 0.03
-    """Standard uncertainty of the surface along its normals, alike over `scale_mm`."""
+    """Standard uncertainty of the surface along its normals, the same over `scale_mm`."""
     scale_mm: float = 20.0
 
     @property
     def mesh_covariance(self) -> Floats:
-        """[6, 6] of the mesh's steps, mm and rad."""
+        """[6, 6] covariance of the mesh's steps, mm and rad."""
         return np.diag(np.repeat([self.mesh_mm**2, np.radians(self.mesh_deg) ** 2], 3))
 
 
 STATED = Doubts()
-"""Uncertainties that hold unless a user states others."""
+"""Uncertainties that are used unless a user states others."""
 
 
 def camera_covariance(prior: CameraPrior, base_from_camera: Floats, doubts: Doubts) -> Floats:
-    """[free + 6 views, free + 6 views] of lens and cameras' steps: hand-eye, axis zeros, the arm's scatter."""
+    """[free + 6 views, free + 6 views] covariance of lens and cameras' steps, from hand-eye, axis zeros and the
+    arm's scatter."""
     lens, count = len(prior.free), len(base_from_camera)
     flange_from_camera = prior.flange_from_camera
     base_from_flange = base_from_camera @ np.linalg.inv(flange_from_camera)
@@ -67,18 +68,18 @@ def camera_covariance(prior: CameraPrior, base_from_camera: Floats, doubts: Doub
 
 @dataclass(frozen=True)
 class Pointing:
-    """Steps of lens, camera and mesh that are uncertain in one view."""
+    """Uncertain steps of lens, camera and mesh in one view."""
 
     free: tuple[str, ...]
     """Parameters of the lens."""
     covariance: Floats
-    """[free + 12, free + 12] of the lens, the camera's steps and the mesh's, as `unknowns` has them."""
+    """[free + 12, free + 12] covariance of the lens, the camera's steps and the mesh's steps, as in `unknowns`."""
     middle_mm: Floats
-    """[3] about which the mesh turns."""
+    """[3] point about which the mesh turns."""
 
     def u_lateral_mm(self, lens: Intrinsics, base_from_camera: Floats, points_mm: Floats) -> float:
-        """Standard uncertainty, across the line of sight and in each direction, of where on the object pixels
-        look: root of the mean square over some of `points_mm` [n, 3], which the view sees."""
+        """Return the standard uncertainty of the places that pixels look at, in each direction across the line of
+        sight. It is the root mean square over some of `points_mm` [n, 3], which the view sees."""
         points_mm = points_mm[:: max(1, len(points_mm) // _POINTS)]
 
         def pixels_after(steps: Floats) -> Floats:
@@ -106,8 +107,9 @@ class Pointing:
 
 
 def pointings(prior: CameraPrior, base_from_camera: Floats, middle_mm: Floats) -> tuple[Pointing, ...]:
-    """Return the pointings of the views of an object from poses [v, 4, 4], by a camera's records and what no
-    record states: each view alone, so that no last bit depends on how many there are."""
+    """Return the pointings of the views of an object from poses [v, 4, 4], by a camera's records and the
+    uncertainties that no record states. Each view is computed alone, so that even the last bit does not depend on
+    the number of views."""
     view_pointings = []
     for view in range(len(base_from_camera)):
         alone, sensitivity = slice(view, view + 1), prior.axis_sensitivity

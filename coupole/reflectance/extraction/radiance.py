@@ -1,4 +1,4 @@
-"""Conversion of DN to linear signal over the flat field, and the pixels that each triangle has."""
+"""Conversion of DN to linear signal over the flat field, and the pixels of each triangle."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RANGE_LEFT_OUT = 0.02
 
 
 class Radiometry:
-    """Data that turn the DN of a run's frames into linear signal, read once for all its views."""
+    """Data that convert the DN of a run's frames to linear signal, read once for all its views."""
 
     def __init__(self, measured_run: MeasuredRun) -> None:
         frames, records = measured_run.frames, measured_run.records
@@ -44,13 +44,13 @@ class Radiometry:
             self.u_pixel = np.full(self.channels, u_pixel)
 
     def dark(self, frame: LightFrame) -> NDArray[np.float32]:
-        """[h, w] DN that a frame has without light, by the record, or by the dark frames of its view and of those
-        before it. Later views have no say: a view's samples are the same whether they are taken as soon as it is
-        complete or when the run has ended."""
+        """[h, w] DN of a frame without light, by the record, or by the dark frames of its view and of the views
+        before it. Later views are not used. So a view's samples are the same, whether they are taken as soon as
+        the view is complete or after the run."""
         return self._dark_of_view(frame.view)(frame)
 
     def veils(self, frames: Sequence[LightFrame]) -> FrameVeils | None:
-        """All that gives the glare of frames of one view; None without a record of it."""
+        """Return the data that give the glare of frames of one view; None without a record of glare."""
         if self.glare is None:
             return None
         alike = {frame.exposure_us: frame for frame in frames}
@@ -67,10 +67,10 @@ class PixelLists(NamedTuple):
     """Pixels of one view in the order of triangles and channels, for compiled code."""
 
     starts: NDArray[np.int64]
-    """[triangles channels + 1] first place of each triangle's channel in the arrays below; the last one is their
-    length."""
+    """[triangles channels + 1] first place of each triangle's channel in the arrays below; the last number is the
+    length of these arrays."""
     places: NDArray[np.int32]
-    """[pixels] in a frame, row by row."""
+    """[pixels] places in a frame, counted row by row."""
     even: NDArray[np.float32]
     """[pixels] 1 over the flat field."""
 
@@ -79,17 +79,17 @@ class Response(NamedTuple):
     """Response of the camera's channels, for compiled code."""
 
     curve: NDArray[np.float32]
-    """[channels, 2] of the square and the cube of a signal in DN."""
+    """[channels, 2] coefficients of the square and the cube of a signal in DN."""
     noise: NDArray[np.float32]
-    """[channels, 2] variance in the dark, DN^2, and gain, DN/e; NaN where it is not known."""
+    """[channels, 2] variance in the dark, DN^2, and gain, DN/e; NaN if they are not known."""
     top_dn: np.float32
     """Upper end of the range that is used."""
     least_dn: np.float32
-    """Least mean of a triangle, above the dark."""
+    """Least mean of a triangle above the dark signal."""
 
 
 class SignalReader:
-    """Pixels of one view by triangles and channels, and what they mean in its frames."""
+    """Pixels of one view by triangles and channels, and their means in the view's frames."""
 
     def __init__(self, radiometry: Radiometry, surface: SeenSurface) -> None:
         self._radiometry = radiometry
@@ -99,7 +99,8 @@ class SignalReader:
         _count(surface.places, radiometry.channel, self.pixels)
         root_counts = np.sqrt(np.maximum(self.pixels, 1))
         self.u_response = np.where(self.pixels > 0, radiometry.u_pixel / root_counts, np.inf)
-        """[triangles, channels] relative standard uncertainty that all means share, of pixels' responses."""
+        """[triangles, channels] relative standard uncertainty that all means share, from the responses of
+        pixels."""
         starts = np.concatenate([[0], np.cumsum(self.pixels.ravel(), dtype=np.int64)])
         places = np.empty(starts[-1], np.int32)
         _list(surface.places, radiometry.channel, channels, starts[:-1].copy(), places)
@@ -116,14 +117,14 @@ class SignalReader:
         self.exposures: dict[float, int] = {}
         """Rows of `darks`, by exposures in us."""
         self.darks = np.empty((0, len(places)), np.float32)
-        """[exposures, pixels] what frames have without light, DN, in the order of the lists."""
+        """[exposures, pixels] DN of frames without light, in the order of the lists."""
         self.veils: FrameVeils | None = None
-        """All that gives the frames' glare; None without a record of it."""
+        """The data that give the frames' glare; None without a record of glare."""
         self.u_glare: dict[int, NDArray[np.float64]] = {}
         """[channels] relative standard uncertainty of the glare in the frames of each LED that were read."""
 
     def prepare(self, frames: Sequence[LightFrame]) -> None:
-        """Set `exposures`, `darks` and `veils`: what frames of these exposures have without light, and by
+        """Set `exposures`, `darks` and `veils` for frames of these exposures: the signal without light, and the
         glare."""
         self.veils = self._radiometry.veils(frames)
         alike = {frame.exposure_us: frame for frame in frames}
@@ -141,8 +142,8 @@ def _dark_in_view(
 
 def _response(measured_run: MeasuredRun) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """[channels, 3] c2, c3 and range of the response, [channels, 2] variance in the dark (DN^2) and gain (DN/e),
-    [channels] relative spread of pixels' own responses (0 where the scene did not let it be measured); without a
-    record a straight line, and NaN."""
+    [channels] relative spread of pixels' own responses (0 if the scene did not allow its measurement). Without a
+    record the response is a straight line, and the other values are NaN."""
     path, channels = measured_run.records.get("response"), measured_run.channels
     curve, noise = np.zeros((len(channels), 3)), np.full((len(channels), 2), np.nan)
     u_pixel = np.full(len(channels), np.nan)
@@ -158,8 +159,8 @@ def _response(measured_run: MeasuredRun) -> tuple[NDArray[np.float64], NDArray[n
 
 
 def _flat_field(measured_run: MeasuredRun) -> tuple[NDArray[np.float32], float]:
-    """[h, w] fall-off and response of each pixel, and the latter's relative standard uncertainty: their spread,
-    where a record does not say how well they were measured."""
+    """[h, w] fall-off and response of each pixel, and the relative standard uncertainty of the responses. If a
+    record does not state this uncertainty, it is the spread of the responses."""
     path, frames = measured_run.records["flat-field"], measured_run.frames
     fall_off, response = (map_beside(path, "flat-field", name, frames) for name in ("g", "pixel_response"))
     record = read_earlier(path, "flat-field", frames.about, frames.size_px)
@@ -176,7 +177,8 @@ def _count(triangle, channel, pixels):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _list(triangle, channel, channels, next_place, places):  # type: ignore[no-untyped-def]
-    """Fill `places` with the numbers of pixels; `next_place` [triangles channels] is where a list goes on."""
+    """Fill `places` with the numbers of pixels; `next_place` [triangles channels] is the place at which each list
+    continues."""
     width = triangle.shape[1]
     for row in range(triangle.shape[0]):
         for column in range(width):

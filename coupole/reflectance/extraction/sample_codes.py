@@ -1,13 +1,15 @@
-"""Codes of a triangle and an LED: whether there is a sample, or why not."""
+"""Codes of a triangle and an LED: they say whether there is a sample, or why there is none."""
 
 from __future__ import annotations
 
 REACHED, AWAY, SHADED, PENUMBRA = range(4)
-"""Codes that the object's own shape gives; AWAY: beyond `lamp_sight.MOST_INCIDENCE_DEG`, or behind the LED."""
+"""Codes from the object's own shape. AWAY: the incidence is beyond `lamp_sight.MOST_INCIDENCE_DEG`, or the
+triangle is behind the LED."""
 BY_CELL = PENUMBRA + 1
-"""Arm, camera or tool may hide them from each other."""
+"""Arm, camera or tool may hide the LED from the triangle."""
 BY_UNKNOWN = BY_CELL + 1
-"""The sample contradicts those beside it (`contradictions`): a thing that nobody described shades it."""
+"""The sample contradicts the samples beside it (`contradictions`), because a thing that nobody described shades
+it."""
 CODES = {
     "reached": REACHED,
     "away": AWAY,

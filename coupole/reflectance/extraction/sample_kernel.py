@@ -1,7 +1,7 @@
 """Samples of reflectance from the pixels of up to eight frames at once, in compiled code.
 
-The lists of pixels are read once for eight frames, whose sums are the lanes of a vector. Single precision is
-enough: directions of 1e-7, where float16 has steps of 5e-4.
+The lists of pixels are read once for eight frames; the sums of the frames are the lanes of a vector. Single
+precision is enough: its directions are exact to 1e-7, and float16 has steps of 5e-4.
 """
 
 from __future__ import annotations
@@ -28,28 +28,29 @@ from coupole.reflectance.lanes import (
 Singles = NDArray[np.float32]
 
 MOST_F = 6e4
-"""1/sr: the most that float16 has is 65504."""
+"""Largest value, 1/sr: float16 ends at 65504."""
 NO_VALUE = 0x7E00
-"""NaN, as the bits of a float16."""
+"""NaN as the bits of a float16."""
 _NAN = np.float32(np.nan)
 _SQUARE_MM = np.float32(1e6 / np.pi)
 
 
 class Shots(NamedTuple):
-    """Frames of up to eight LEDs, one lane each, in passes: one frame of each LED, all of one exposure."""
+    """Frames of up to eight LEDs, one lane for each LED, in passes. A pass has one frame of each LED, all with one
+    exposure."""
 
     frames: NDArray[np.uint16]
     """[slots, memory of a frame]"""
     slots: NDArray[np.int64]
     """[passes, 8]"""
     there: NDArray[np.uint8]
-    """[passes, 8] 1 where there is such a frame; else the slot means nothing."""
+    """[passes, 8] 1 where there is a frame; else the slot means nothing."""
     times_s: Singles
     """[passes] exposures."""
     exposures: NDArray[np.int64]
-    """[passes] rows of the dark signals."""
+    """[passes] rows of the dark signals for these exposures."""
     veils: Veils = NO_VEILS
-    """Glare of the LEDs' frames."""
+    """Glare in the frames of these LEDs."""
 
 
 class Lamps(NamedTuple):
@@ -68,9 +69,9 @@ class Lamps(NamedTuple):
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normals, codes, f, u_own, glare):  # type: ignore[no-untyped-def]
     """Fill `f` and `u_own` [b, leds, channels], bits of float16, with the samples of b triangles from the `first`
-    on, where `codes` [b, 8] say that light has reached them, and `glare` [b, leds, channels], which may be empty,
-    with the veil that was taken off, over what is left; `lists` are the view's PixelLists, `darks` [exposures,
-    pixels] what its frames have without light, `response` the camera's."""
+    on, where `codes` [b, 8] say that light has reached them. Fill `glare` [b, leds, channels], which may be empty,
+    with the subtracted veil over the remaining signal. `lists` are the view's PixelLists, `darks` [exposures,
+    pixels] the DN of its frames without light, `response` the camera's response."""
     bits = np.empty((3, 8), np.uint16)
     for row in range(len(f)):
         if REACHED not in codes[row]:
@@ -100,14 +101,14 @@ def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normal
 def fill_pixels(  # type: ignore[no-untyped-def]
     first_entry, entry_ends, lists, response, darks, shots, lamps, places_mm, codes, direct, values, root_share
 ):
-    """Fill `values` [pixels, leds], bits of float16, with S / (P E/Phi) of single pixels, 1/sr: f times the cosine
-    of incidence, whatever the normal is. Noise lowers the mean of their square roots; the share `root_share`
-    (float32) of this loss is added.
+    """Fill `values` [pixels, leds], bits of float16, with S / (P E/Phi) of single pixels, 1/sr. This is f times
+    the cosine of incidence, whatever the normal is. Noise lowers the mean of their square roots; the share
+    `root_share` (float32) of this loss is added.
 
     The pixels are those of the lists from the `first_entry` on, up to `entry_ends` [b, channels] of each of b
-    triangles; `places_mm` [pixels, 3] is what they see, `codes` [b, 8] says where light has reached the triangle,
-    `direct` [b, leds, channels] how much of its light came straight from the LED. For the others see
-    `fill_samples`.
+    triangles. `places_mm` [pixels, 3] are the places that they see, and `codes` [b, 8] say where light has reached
+    the triangle. `direct` [b, leds, channels] is the share of its light that came directly from the LED. For the
+    other arguments see `fill_samples`.
     """
     bits, straight = np.empty(8, np.uint16), np.empty((1, 8), np.float32)
     pixel = first_entry
@@ -133,8 +134,8 @@ def fill_pixels(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _lost_by_root(u_signal):  # type: ignore[no-untyped-def]
-    """Share of a signal that brings back what the mean of its square root has lost: u^2 / 4 to second order, less
-    where noise is as large as the signal; 0 if noise is not known."""
+    """Return the share of a signal that must be added because noise lowers the mean of its square root. It is u^2
+    / 4 to second order, and less if noise is as large as the signal; 0 if noise is not known."""
     half, none = np.float32(0.5), np.float32(0.0)
     smaller = if_less(u_signal, half, u_signal * u_signal, half * u_signal)
     return np.float32(0.25) * if_less(u_signal, np.float32(1e6), smaller, none)
@@ -142,7 +143,7 @@ def _lost_by_root(u_signal):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _per_normal_irradiance(place_mm, lamps):  # type: ignore[no-untyped-def]
-    """1 over E / Phi of the lamps on a surface that faces them."""
+    """Return 1 over E / Phi of the lamps on a surface that faces them."""
     square, leaving = lanes(np.float32(0.0)), lanes(np.float32(0.0))
     for k in range(3):
         way = load_row(lamps.centres_mm, k) - np.float32(place_mm[k])
@@ -158,7 +159,7 @@ def _per_normal_irradiance(place_mm, lamps):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _per_irradiance(centre_mm, normal, lamps):  # type: ignore[no-untyped-def]
-    """1 over cos_i E / Phi (`lit_by` of lamp_sight) of the lamps."""
+    """Return 1 over cos_i E / Phi (`lit_by` of lamp_sight) of the lamps."""
     square, leaving, arriving = lanes(np.float32(0.0)), lanes(np.float32(0.0)), lanes(np.float32(0.0))
     for k in range(3):
         way = load_row(lamps.centres_mm, k) - np.float32(centre_mm[k])
@@ -174,8 +175,8 @@ def _per_irradiance(centre_mm, normal, lamps):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _signal(begin, end, channel, lists, response, darks, shots):  # type: ignore[no-untyped-def]
-    """Mean of linear signal over the flat field, DN/s, without glare; its relative uncertainty by noise; and the
-    glare. Passes are weighted by their variances; by their times where noise is not known."""
+    """Return the mean of linear signal over the flat field, DN/s, without glare; its relative uncertainty from
+    noise; and the glare. Passes are weighted by their variances, or by their times if noise is not known."""
     veil = _veil(begin, end, channel, lists, shots.veils)
     total, weights = lanes(np.float32(0.0)), lanes(np.float32(0.0))
     noisy = not np.isnan(response.noise[channel, 0])
@@ -194,8 +195,8 @@ def _signal(begin, end, channel, lists, response, darks, shots):  # type: ignore
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _veil(begin, end, channel, lists, veils):  # type: ignore[no-untyped-def]
-    """Mean over pixels of the veil over the flat field, DN/s: linear between the middles of blocks. 0 without
-    one."""
+    """Return the mean over pixels of the veil over the flat field, DN/s. The veil is linear between the middles of
+    blocks; 0 without a veil."""
     none, unity, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     total = lanes(none)
     if len(veils.rates) == 0:
@@ -220,8 +221,8 @@ def _veil(begin, end, channel, lists, veils):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mean(begin, end, channel, lists, response, darks, shots, number):  # type: ignore[no-untyped-def]
-    """Return the mean of one pass, and its variance. NaN where no pixel is, where one is at the range's top, where
-    the mean is at its bottom."""
+    """Return the mean of one pass, and its variance. They are NaN without pixels, with a pixel at the top of the
+    range, or with a mean at its bottom."""
     none, unity = np.float32(0.0), np.float32(1.0)
     square, cube = response.curve[channel, 0], response.curve[channel, 1]
     in_dark, gain = response.noise[channel, 0], response.noise[channel, 1]

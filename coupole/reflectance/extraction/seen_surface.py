@@ -1,8 +1,8 @@
 """Triangle that each pixel of a view sees, and pixels that must not be used.
 
 A ray goes through the centre of each pixel, by the lens of the camera's record, to the first triangle that it
-meets (Embree). Left out: pixels at a silhouette, where a neighbour sees another surface or none, and what is out
-of focus.
+meets (Embree). Pixels out of focus are left out, and pixels at a silhouette, where a neighbour sees another
+surface or none.
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ from coupole.reflectance.parts_in_threads import first_alone
 Floats = NDArray[np.float64]
 
 _GRID_PX = 8
-"""Directions are computed for every eighth pixel, and interpolated: distortion bends them by less than 0.01 px."""
+"""Directions are computed for every eighth pixel and interpolated, because distortion bends them by less than 0.01
+px between these."""
 _ROWS = 128
-"""Rows of pixels that are traced together."""
+"""Number of rows of pixels that are traced together."""
 _MOST_STEP = 5.0
-"""Largest step of the surface from pixel to pixel, over that of the plane that the pixel sees: beyond it is a
-silhouette."""
+"""Largest step of the surface from pixel to pixel, over the step of the plane that the pixel sees. A larger step
+is a silhouette."""
 _LEAST_COSINE = 0.1
 """Least cosine between view and normal: 84 degrees."""
 
@@ -37,9 +38,9 @@ class SeenSurface:
     """Triangles of the object that the pixels of one view see."""
 
     places: NDArray[np.int32]
-    """[h, w] place in `triangles` of what a pixel sees, -1 where it is not used."""
+    """[h, w] place in `triangles` of the triangle that a pixel sees, -1 where the pixel is not used."""
     triangles: NDArray[np.int64]
-    """Rising numbers of the triangles that the pixels see."""
+    """Numbers of the triangles that the pixels see, in rising order."""
 
     @property
     def pixels(self) -> int:
@@ -56,7 +57,7 @@ def seen_surface(
     blur: tuple[float, float, float, float] | None = None,
     threads: int = 1,
 ) -> SeenSurface:
-    """Pixels and triangles of a view; `normals` [n, 3] are the mesh's.
+    """Return the pixels and triangles of a view; `normals` [n, 3] are those of the mesh.
 
     `blur` is focal length and focus distance in mm, f-number, and the largest circle of confusion in px; with
     None no pixel is left out because it is out of focus.
@@ -94,8 +95,8 @@ def seen_surface(
 def _circle(
     lens: Intrinsics, focal_mm: float, focus_mm: float, f_number: float, most_px: float
 ) -> tuple[float, float, float]:
-    """Diameter of the circle of confusion of what is infinitely far, the distance that is sharp, and the largest
-    diameter that is used, mm."""
+    """Return, in mm, the diameter of the circle of confusion of an infinitely distant point, the distance in
+    focus, and the largest diameter that is used."""
     pitch_mm = focal_mm * focus_mm / (focus_mm - focal_mm) / lens.fx
     return focal_mm**2 / (f_number * (focus_mm - focal_mm)), focus_mm, most_px * pitch_mm
 
@@ -114,7 +115,7 @@ def _turn_directions(directions, base_from_camera, ways):  # type: ignore[no-unt
 
 @numba.njit(cache=True, nogil=True)
 def _judge(hit, far, ways, normals, axis, fx, infinite_mm, focus_mm, most_mm, first, pixel_in_use):  # type: ignore[no-untyped-def]
-    """Mark the pixels of a band of rows that are not at a silhouette, not seen at a grazing angle, and sharp."""
+    """Mark the usable pixels of a band of rows: in focus, not at a silhouette, and not at a grazing angle."""
     for row in range(first, min(first + _ROWS, hit.shape[0] - 1)):
         for column in range(1, hit.shape[1] - 1):
             if hit[row, column] < 0:
@@ -137,7 +138,7 @@ def _judge(hit, far, ways, normals, axis, fx, infinite_mm, focus_mm, most_mm, fi
 
 
 def directions_of_rows(lens: Intrinsics, width: int, first: int, end: int) -> Floats:
-    """[end - first, width, 3] directions in the camera frame, z = 1, of the centres of rows of pixels."""
+    """[end - first, width, 3] directions in the camera frame, z = 1, of the centres of the pixels in some rows."""
     rows = np.unique(np.append(np.arange(first, end, _GRID_PX), end - 1))
     columns = np.unique(np.append(np.arange(0, width, _GRID_PX), width - 1))
     grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(float)

@@ -1,8 +1,8 @@
-"""One view's samples, batch by batch of LEDs in the order of the frames' file, block by block of triangles.
+"""One view's samples, in batches of LEDs in the order of the frames' file, and in blocks of triangles.
 
-f = S / (P E/Phi cos_i): mean signal S of a triangle's pixels (DN/s over the flat field, dark and response taken
-out) over the irradiance that the LED's power P (DN/s m^2 sr) throws on it (seed 003, Eqs. 1 to 3). The mean over a
-triangle stands for the paper's prefilter of 0.1 degree: neighbouring LEDs are degrees apart.
+f = S / (P E/Phi cos_i): the mean signal S of a triangle's pixels (DN/s over the flat field, dark and response
+removed), divided by the irradiance on the triangle from the LED's power P (DN/s m^2 sr) (seed 003, Eqs. 1 to 3).
+The mean over a triangle replaces the paper's prefilter of 0.1 degree, because neighbouring LEDs are degrees apart.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from coupole.reflectance.lanes import LANES
 from coupole.reflectance.parts_in_threads import first_alone
 
 BLOCK = 4096
-"""Triangles."""
+"""Number of triangles in a block."""
 _AHEAD = 4
-"""Blocks of triangles that wait for their samples to be taken, or are worked on, for each thread."""
+"""Number of blocks of triangles for each thread that are worked on, or wait until their samples are taken."""
 
 
 @dataclass(frozen=True)
@@ -42,20 +42,20 @@ class Samples:
     leds: slice
     """Places in the view's LEDs."""
     rows: slice
-    """Rows of the view's triangles."""
+    """Places of the triangles among the rows of the view's file."""
     codes: NDArray[np.uint8]
     """[triangles, leds]"""
     f: NDArray[np.float16]
-    """[triangles, leds, channels] 1/sr; NaN where there is none."""
+    """[triangles, leds, channels] 1/sr; NaN without a sample."""
     u_own: NDArray[np.float16]
-    """Relative standard uncertainty, of noise."""
+    """Relative standard uncertainty from noise."""
     glare: NDArray[np.float16]
-    """Veil that was taken off, over what is left; [0, 0, 0] without a record of the glare."""
+    """Subtracted veil over the remaining signal; [0, 0, 0] without a record of the glare."""
 
 
 @dataclass(frozen=True)
 class ViewPass:
-    """A view's frames and triangles, and what is known of both."""
+    """A view's frames and triangles, and the data that belong to both."""
 
     measured_run: MeasuredRun
     view: MeasuredView
@@ -68,11 +68,12 @@ class ViewPass:
 
     @property
     def together(self) -> int:
-        """LEDs whose frames are worked on together."""
+        """Number of LEDs whose frames are worked on together."""
         return min(len(self.leds), max(1, LANES // max(map(len, self.view.by_led.values()))))
 
     def samples(self, codes_of: Callable[[slice, Executor], NDArray[np.uint8]], threads: int) -> Iterator[Samples]:
-        """All samples; `codes_of` gives the codes of some LEDs [leds, triangles], with the threads of a pool."""
+        """Yield all samples; `codes_of` gives the codes of some LEDs [leds, triangles], with the threads of a
+        pool."""
         count = len(self.facets.centres_mm)
         blocks = [slice(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
         batches, block = self.batches(), first_alone(self._block)
@@ -85,11 +86,11 @@ class ViewPass:
 
     @property
     def parts(self) -> list[slice]:
-        """Places in the view's LEDs whose frames are worked on together, one part after the other."""
+        """Return the places in the view's LEDs whose frames are worked on together, one part after the other."""
         return [slice(n, min(n + self.together, len(self.leds))) for n in range(0, len(self.leds), self.together)]
 
     def batches(self) -> Generator[tuple[Shots, Lamps]]:
-        """Frames and LEDs of each of the `parts`; memory of a batch's frames is used again after it."""
+        """Yield frames and LEDs of each of the `parts`; the memory of a batch's frames is reused after it."""
         by_led = list(self.view.by_led.values())
         frames = [list(chain.from_iterable(by_led[part])) for part in self.parts]
         self.reader.prepare(self.view.frames)
@@ -101,7 +102,8 @@ class ViewPass:
                 ring.give_back(slots)
 
     def _shots(self, frames: list[LightFrame], pixels: NDArray[np.uint16], slots: list[int]) -> Shots:
-        """Frames of some LEDs in passes: a pass takes, of each LED, one frame of its exposure, if there is one."""
+        """Return frames of some LEDs in passes. A pass takes, for each LED, one frame with the pass's exposure, if
+        there is one."""
         lane_of: dict[int, int] = {}
         passes: dict[tuple[float, int], dict[int, int]] = {}
         for frame, slot in zip(frames, slots, strict=True):
@@ -118,7 +120,7 @@ class ViewPass:
         return Shots(pixels, slot_of, there, times_s, exposures, self._veils(frames, pixels, slots))
 
     def _veils(self, frames: list[LightFrame], pixels: NDArray[np.uint16], slots: list[int]) -> Veils:
-        """Glare of the LEDs of these frames, a lane each as they come."""
+        """Return the glare of the LEDs of these frames, one lane for each LED."""
         veils = self.reader.veils
         if veils is None:
             return NO_VEILS
@@ -140,7 +142,7 @@ class ViewPass:
         powers = np.where(powers > 0.0, powers, np.nan)
 
         def across(values: NDArray[np.float64]) -> NDArray[np.float32]:
-            """[..., 8]: one lane for each LED, the last for those that lack."""
+            """[..., 8]: one lane for each LED; the last LED fills the missing lanes."""
             return np.pad(values.T, ((0, 0), (0, LANES - len(leds))), mode="edge").astype(np.float32, order="C")
 
         return Lamps(across(centres_mm), across(normals), across(powers), self.measured_run.emission == "paper")
@@ -161,8 +163,8 @@ class ViewPass:
 
 
 def _in_order(work: Iterable[Future[Samples]], most: int) -> Iterator[Samples]:
-    """Yield the results of the work in its order; at most `most` pieces are begun, or wait to be taken, at a
-    time."""
+    """Yield the results of the work in its order. At most `most` pieces at a time are in work or wait until they
+    are taken."""
     futures: deque[Future[Samples]] = deque()
     for future in work:
         futures.append(future)

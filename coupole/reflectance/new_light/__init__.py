@@ -1,1 +1,1 @@
-"""Views of a measured object under lights that were not there."""
+"""Views of a measured object under lights that were not in the dome."""

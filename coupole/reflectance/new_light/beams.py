@@ -1,8 +1,8 @@
-"""Lights as beams: light from one direction or from one place. An area or an environment is many of them.
+"""Lights as beams: a beam is light from one direction or from one place. An area or an environment is many beams.
 
-A beam's irradiance on a surface that faces it is its strength, times cos^k / d^2 (d in m) if it comes from a
-place, where cos is that of the angle to the emitter's axis. Values of pictures are radiances in a unit of which a
-white diffuser that faces a light of irradiance pi has 1.
+A beam's irradiance on a surface that faces it is its strength. If the beam comes from a place, it is the strength
+times cos^k / d^2 (d in m), where cos is the cosine of the angle to the emitter's axis. Values of pictures are
+radiances. In their unit, a white diffuser that faces a light of irradiance pi has the value 1.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ class Beam:
 
     near: bool
     place: Floats
-    """[3] mm; of distant light the unit direction to it."""
+    """[3] mm; for distant light the unit direction to it."""
     axis: Floats
-    """[3] unit, which way the emitter looks."""
+    """[3] unit vector in the direction to which the emitter points."""
     exponent: int
-    """k: 0 for light that is alike in all directions, 1 for Lambert's law."""
+    """k: 0 for light that is equal in all directions, 1 for Lambert's law."""
     strength: Floats
     """[channels]"""
     density: float = 0.0
-    """Density of the beams that stand for an emitter: number per steradian as the surface sees them, if distant;
-    else per m^2 of the emitter. 0 for what has no size."""
+    """Density of the beams that represent an emitter: number per steradian for a distant emitter, else per m^2 of
+    the emitter. 0 for an emitter without size."""
 
 
 @dataclass(frozen=True)
 class Emitter:
-    """An area or an environment, as a mirror sees it."""
+    """An area or an environment, as a mirror reflects it."""
 
     near: bool
     axes: Floats
@@ -60,12 +60,12 @@ class Emitter:
     centre_mm: Floats
     """[3], of an area."""
     halves_mm: Floats
-    """[2] of its width and height."""
+    """[2] half of its width and half of its height."""
     radiance: NDArray[np.float32]
     """[h, w, channels]; [1, 1, channels] of an area."""
     density: float
-    """Density of its beams: number per m^2 of an area; of an environment, over the colours' mean radiance, per
-    steradian."""
+    """Density of its beams. For an area it is their number per m^2; for an environment it is their number per
+    steradian, divided by the colours' mean radiance."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +85,11 @@ def lighting_of(
     *,
     paper: bool,
 ) -> Lighting:
-    """Beams of lights whose places are in the support frame; `samples` of each area and environment. LEDs are as
-    the first of the views has them that was lit by them, `paper` if their emission is that of seed 003, Eq. 2.
+    """Return the beams of lights with places in the support frame; each area and environment has `samples` beams.
+    LEDs are taken from the first view that was lit by them; `paper` tells that their emission is by seed 003, Eq.
+    2.
 
-    Raises InputError: no view was lit by an LED, no environment in a file.
+    Raises InputError if no view was lit by an LED, or if a file has no environment.
     """
     beams: list[Beam] = []
     emitters: list[Emitter] = []
@@ -117,7 +118,8 @@ def lighting_of(
 
 
 def _led(light: LedLight, views: Sequence[ViewSamples], strength: Floats, paper: bool) -> Beam:
-    """E = full scale * cos / (pi d^2), as coupole.reflectance.extraction.lamp_sight has it."""
+    """Return the beam of an LED: E = full scale * cos / (pi d^2), as in
+    coupole.reflectance.extraction.lamp_sight."""
     for view in views:
         if len(rows := np.flatnonzero(view.leds == light.number)):
             row = int(rows[0])
@@ -130,7 +132,8 @@ def _led(light: LedLight, views: Sequence[ViewSamples], strength: Floats, paper:
 
 
 def _area(light: AreaLight, base_from_support: Floats, strength: Floats, samples: int) -> Emitter:
-    """Its width lies as `across` tells, or level: across the normal and z, along x if the normal is z."""
+    """Return an area's emitter. Its width has the direction `across`, or is level: perpendicular to the normal and
+    to z, or along x if the normal is z."""
     normal = np.array(light.normal) / np.linalg.norm(light.normal)
     across = np.cross([0.0, 0.0, 1.0], normal)
     if light.across is not None:
@@ -159,7 +162,7 @@ def _beams_of_area(area: Emitter, samples: int) -> list[Beam]:
 def _environment(
     light: EnvironmentLight, turn: Floats, channels: int, samples: int
 ) -> tuple[Emitter, list[Beam]] | None:
-    """None if nothing of it is light of these channels."""
+    """Return an environment's beams; None if it has no light of these channels."""
     environment = read_environment(light.file, OF_RUNS @ turn.T, light.rgb, light.turn_deg)
     if channels == 1:
         environment = replace(environment, radiance=environment.radiance[..., 1:2])

@@ -1,9 +1,9 @@
-"""Light from all directions, as a picture of latitude and longitude.
+"""Light from all directions, as a picture with latitude and longitude as axes.
 
-The top row is up. The middle column is the frame's middle direction, and what is left in the picture is to the
-left for one who looks there with up above. For results of runs up is z and the middle x, so that left is y; for
-results of pictures up is y and the middle z, towards the camera, so that left is x. Within a pixel radiance is
-constant.
+The top row is up. The middle column is the frame's middle direction. The left side of the picture is to the left
+of an observer who looks in the middle direction. For results of runs, up is z and the middle is x, so that left is
+y. For results of pictures, up is y and the middle is z, towards the camera, so that left is x. Within a pixel,
+radiance is constant.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ class Environment:
     """[3, 3] rows: middle, left, up."""
 
     def turned_about_up(self, angle_deg: float) -> Environment:
-        """Return the environment turned about up, from the middle to the left."""
+        """Return the environment turned about the up direction, from the middle to the left."""
         cosine, sine = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
         turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
         return replace(self, axes=turn @ self.axes)
 
     def solid_angles(self) -> Floats:
-        """[h] of a pixel in each row, sr."""
+        """[h] solid angle of a pixel in each row, sr."""
         height, width = self.radiance.shape[:2]
         heights = np.cos(np.linspace(0.0, math.pi, height + 1))
         angles: Floats = (heights[:-1] - heights[1:]) * 2.0 * math.pi / width
@@ -54,10 +54,10 @@ class Environment:
         return float(np.sum(mean * self.solid_angles()[:, None]))
 
     def sample(self, count: int) -> tuple[Floats, Floats, Floats]:
-        """Directions [count, 3] as dense as radiance is high, their radiances [count, channels], and how many of
-        them lie in a steradian there [count]. They are the same at each call.
+        """Return directions [count, 3] with a density in proportion to radiance, their radiances [count,
+        channels], and their number per steradian [count]. They are the same at each call.
 
-        Rows and columns are chosen by their cumulated light from a lattice of golden sections.
+        Rows and columns are chosen by their cumulative light, with a lattice of golden sections.
         """
         mean = self.radiance.mean(axis=2, dtype=np.float64)
         light = mean * self.solid_angles()[:, None]
@@ -80,8 +80,8 @@ class Environment:
 
 
 def _parts_at(cumulative_sum: Floats, shares: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """Return for each share of a cumulative sum the part into which it falls, and the position in this part, 0
-    to 1."""
+    """Return, for each share of a cumulative sum, the part that contains it, and the position in this part, 0 to
+    1."""
     at = shares * cumulative_sum[-1]
     part = np.clip(np.searchsorted(cumulative_sum, at, side="right") - 1, 0, len(cumulative_sum) - 2)
     within = (at - cumulative_sum[part]) / np.maximum(cumulative_sum[part + 1] - cumulative_sum[part], 1e-300)
@@ -89,8 +89,8 @@ def _parts_at(cumulative_sum: Floats, shares: Floats) -> tuple[NDArray[np.int64]
 
 
 def read_environment(path: Path, axes: Floats, strength: Floats, turn_deg: float = 0.0) -> Environment:
-    """A file in OpenEXR or Radiance format, times a strength [3]. Raises InputError if it cannot be read, is not
-    twice as wide as high, or holds what no light is."""
+    """Read a file in OpenEXR or Radiance format, and multiply it by a strength [3]. Raises InputError if the file
+    cannot be read, is not twice as wide as high, or has values that no light can have."""
     radiance = _read_radiance(path)
     if radiance.ndim != 3 or radiance.shape[2] < 3 or radiance.shape[1] != 2 * radiance.shape[0]:
         raise InputError(f"{path}: expected three colours, twice as wide as high; got {radiance.shape}")
@@ -101,7 +101,7 @@ def read_environment(path: Path, axes: Floats, strength: Floats, turn_deg: float
 
 
 def _read_radiance(path: Path) -> NDArray[np.float32]:
-    """[h, w, channels] red first."""
+    """[h, w, channels] radiance; red is first."""
     if path.suffix.lower() not in {".exr", ".hdr"}:
         raise InputError(f"{path}: expected an environment in a file .exr or .hdr")
     if path.suffix.lower() == ".hdr":

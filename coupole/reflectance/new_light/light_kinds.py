@@ -1,8 +1,8 @@
-"""Lights that a user names: on the command line, or in a file of several.
+"""Lights that a user names on the command line or in a file of lights.
 
-Places are in mm and directions without length, in the support frame for results of runs (z up), in that of the
-pictures for results of pictures. A strength is one number or three (r, g, b). The value 1 of a picture is a white
-diffuser in full light. Strength 1 then means:
+Places are in mm; the length of a direction does not matter. Both are in the support frame for results of runs (z
+up), and in the pictures' frame for results of pictures. A strength is one number or three (r, g, b). The value 1
+of a picture is a white diffuser in full light. Strength 1 then means:
 
 =============  ====================================================================================
 `direction`    a white diffuser that faces the light is 1
@@ -47,7 +47,8 @@ class Light(Model):
     """Properties that all lights have."""
 
     strength: Factor | tuple[Factor, Factor, Factor] = 1.0
-    """Strength, one for all channels or for red, green and blue; what 1 is stands at the head of this module."""
+    """Strength, one number for all channels or one each for red, green and blue. The head of this module tells
+    what strength 1 means."""
 
     @property
     def rgb(self) -> Floats:
@@ -56,7 +57,7 @@ class Light(Model):
 
 
 class DistantLight(Light):
-    """A light so far away that it comes from one direction."""
+    """A light at a great distance, whose light comes from one direction."""
 
     kind: Literal["direction"] = "direction"
     towards: Way
@@ -64,7 +65,7 @@ class DistantLight(Light):
 
 
 class LedLight(Light):
-    """An LED of the run, as it was measured."""
+    """An LED of the run with its measured power."""
 
     kind: Literal["led"] = "led"
     number: Annotated[int, Field(ge=0)]
@@ -72,7 +73,7 @@ class LedLight(Light):
 
 
 class PointLight(Light):
-    """A light at a point, which shines alike to all sides."""
+    """A light at a point that shines equally to all sides."""
 
     kind: Literal["point"] = "point"
     at_mm: Vector
@@ -80,17 +81,17 @@ class PointLight(Light):
 
 
 _LEVEL = (1.0, 0.0, 0.0)
-"""Direction of the width, where the normal is z."""
+"""Direction of the width if the normal is z."""
 
 
 class AreaLight(Light):
-    """A rectangle that radiates by Lambert's law to one side; its width lies level unless `across` is given."""
+    """A rectangle that radiates by Lambert's law to one side; its width is level unless `across` is given."""
 
     kind: Literal["area"] = "area"
     at_mm: Vector
     """Place of its centre, mm."""
     normal: Way
-    """Direction to the side to which it radiates."""
+    """Direction of the side that radiates."""
     across: Way | None = None
     """Direction of the width; only its part across the normal counts."""
     width_mm: Length
@@ -100,13 +101,14 @@ class AreaLight(Light):
 
 
 class EnvironmentLight(Light):
-    """A picture of all directions; coupole.reflectance.new_light.environment tells which is where."""
+    """A picture of all directions; coupole.reflectance.new_light.environment describes its layout."""
 
     kind: Literal["environment"] = "environment"
     file: FilePath
     """Picture of all directions."""
     turn_deg: float = 0.0
-    """Angle, degrees, by which it is turned about up, from the middle of the picture to its left."""
+    """Angle, degrees, by which the environment is turned about the up direction, from the middle of the picture to
+    its left."""
 
 
 AnyLight = Annotated[
@@ -115,7 +117,7 @@ AnyLight = Annotated[
 
 
 class LightsFile(Model):
-    """A file of lights that are summed."""
+    """A file of lights that shine together."""
 
     lights: Annotated[tuple[AnyLight, ...], Field(min_length=1, max_length=1000)]
     """The lights."""
@@ -134,7 +136,7 @@ def read_lights(path: Path) -> list[AnyLight]:
 
 
 def numbers_of(text: str, counts: Sequence[int], option: str, form: str) -> list[float]:
-    """Numbers with commas between. Raises InputError if they are not so many, or none."""
+    """Return numbers separated by commas. Raises InputError if their count is wrong, or if a text is no number."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
@@ -145,7 +147,7 @@ def numbers_of(text: str, counts: Sequence[int], option: str, form: str) -> list
 
 
 def way_of(text: str, option: str) -> Vector:
-    """A direction of any length. Raises InputError."""
+    """Return a direction vector of any length. Raises InputError."""
     form = "X,Y,Z, not all 0"
     x, y, z = numbers_of(text, (3,), option, form)
     length = math.hypot(x, y, z)
@@ -164,7 +166,7 @@ def place_of(text: str, option: str) -> Vector:
 
 
 def area_of(text: str) -> AreaLight:
-    """A rectangle from the words of the option `--area`. Raises InputError."""
+    """Return a rectangle from the value of the option `--area`. Raises InputError."""
     form = "X,Y,Z,NX,NY,NZ,WIDTH or X,Y,Z,NX,NY,NZ,WIDTH,HEIGHT in mm, the normal not all 0, sides above 0"
     numbers = numbers_of(text, (7, 8), "--area", form)
     at_mm = place_of(",".join(map(str, numbers[:3])), "--area")
@@ -176,8 +178,8 @@ def area_of(text: str) -> AreaLight:
 
 
 def turn_light(light: AnyLight, angle_deg: float) -> AnyLight:
-    """A light turned about the z axis, from x to y; an environment about its own up. Raises InputError for an LED,
-    because its place is fixed."""
+    """Return a light turned about the z axis, from x to y, or an environment turned about its own up direction.
+    Raises InputError for an LED, because its place is fixed."""
     cosine, sine = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
 
     def turn(vector: Vector) -> Vector:

@@ -1,4 +1,4 @@
-"""Emitters that have a size, as rays meet them that are drawn from the lobes of GGX materials."""
+"""Light of emitters with a size, found by rays that are drawn from the lobes of GGX materials."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from coupole.reflectance.new_light.shading import KD, KS, MIRROR_SHARE, Coats, P
 from coupole.reflectance.new_light.shadow_edges import DISTANT_MM
 
 _R2 = (0.7548776662466927, 0.5698402909980532)
-"""Steps of Roberts' sequence: powers of 1 over the plastic number."""
+"""Steps of Roberts' sequence: powers of 1 divided by the plastic number."""
 
 
 def add_mirrored(
@@ -27,7 +27,8 @@ def add_mirrored(
     emitter: Emitter,
     lobe_rays: int,
 ) -> None:
-    """Add what rays drawn from the materials' lobes meet of an emitter; `mesh` is what throws shadows."""
+    """Draw rays from the materials' lobes, and add the light of an emitter that these rays meet; `mesh` throws the
+    shadows."""
     of_emitter = (
         emitter.near, emitter.axes, emitter.centre_mm, emitter.halves_mm, emitter.radiance, emitter.density
     )  # fmt: skip
@@ -64,9 +65,9 @@ def _mirror(  # type: ignore[no-untyped-def]
     pixels, first_row, triangle_of_pixel, places_mm, camera_mm, faces, coats, near, axes, centre_mm,
     halves_mm, radiance, density, ray, lobe_rays, hit_pixels, gains, ways_mm
 ):  # fmt: skip
-    """Return how many of the rays of number `ray` from pixels [n, 2] point at a bright part of an emitter. Fill
-    `hit_pixels` with the pixels of these rays, `gains` with the radiance that each adds to its pixel if nothing is
-    in its way, and `ways_mm` with the vectors to the emitter."""
+    """Draw ray number `ray` from each of the pixels [n, 2], and return how many of these rays point at a bright
+    part of an emitter. Fill `hit_pixels` with the pixels of these rays, and `ways_mm` with the vectors to the
+    emitter. Fill `gains` with the radiance that each ray adds to its pixel if nothing blocks it."""
     way, channels, count = np.empty(3), gains.shape[1], 0
     for pixel in range(len(pixels)):
         row, column = pixels[pixel]
@@ -103,8 +104,9 @@ def _mirror(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _asking(triangle_of_pixel, places_mm, camera_mm, coats, near, axes, centre_mm, density, lobe_rays, asking):  # type: ignore[no-untyped-def]
-    """Mark the pixels for which rays are drawn. Not for an area that is at most as large as their lobe: the solid
-    angle that it could have at its distance, times how dense the lobe's rays can be, is at most 1."""
+    """Mark the pixels for which rays are drawn. None are drawn for an area that is at most as large as the lobe.
+    This is so if the largest solid angle of the area at its distance, times the largest density of the lobe's
+    rays, is at most 1."""
     for row in range(triangle_of_pixel.shape[0]):
         for column in range(triangle_of_pixel.shape[1]):
             coat, place = coats[max(triangle_of_pixel[row, column], 0)], places_mm[row, column]
@@ -123,8 +125,7 @@ def _asking(triangle_of_pixel, places_mm, camera_mm, coats, near, axes, centre_m
 
 @numba.njit(cache=True, nogil=True)
 def _two_numbers(row, column, ray):  # type: ignore[no-untyped-def]
-    """Return two numbers from 0 to 1: those of number `ray` in a sequence, shifted for each pixel (Wang's
-    hash)."""
+    """Return two numbers from 0 to 1: element `ray` of a sequence, shifted for each pixel (Wang's hash)."""
     seed = np.uint32(row * 65536 + column)
     seed = (seed ^ np.uint32(61)) ^ (seed >> np.uint32(16))
     seed = np.uint32(seed * np.uint32(9))
@@ -138,8 +139,8 @@ def _two_numbers(row, column, ray):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _on_area(place, way, axes, centre_mm, halves_mm, density):  # type: ignore[no-untyped-def]
-    """Distance to the area along a direction; beams per sr there, 0 if it is not met from its bright side; its
-    pixel."""
+    """Return the distance to the area along a direction, the beams per sr there, and the area's pixel. The beams
+    are 0 if the direction does not meet the area's bright side."""
     above, slope = 0.0, 0.0
     for k in range(3):
         above += (centre_mm[k] - place[k]) * axes[2, k]
@@ -158,7 +159,8 @@ def _on_area(place, way, axes, centre_mm, halves_mm, density):  # type: ignore[n
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _in_environment(way, axes, radiance, density):  # type: ignore[no-untyped-def]
-    """Return how far shadows of an environment reach, its beams per sr in a direction, and its pixel there."""
+    """Return the distance up to which objects cast shadows of an environment, its beams per sr in a direction, and
+    its pixel there."""
     height, width, channels = radiance.shape
     middle, leftward, up = 0.0, 0.0, 0.0
     for k in range(3):

@@ -1,8 +1,8 @@
-"""The object's surface as the pixels of a picture see it: from a measured view, or from a camera anywhere.
+"""The object's surface as the pixels of a picture see it, from a measured view or from a camera at any place.
 
-A result keeps, for each view, where the camera stood and which triangle each pixel sees, but not its lens. The
-directions of the pixels follow from that: triangles' centres are seen in known directions, and a polynomial of the
-pixel through some thousand of them has the lens and its distortion in it.
+For each view, a result keeps the camera's place and the triangle that each pixel sees, but not the lens. The
+directions of the pixels follow from these: triangles' centres are seen in known directions. A polynomial of the
+pixel, fitted to some thousand of them, includes the lens and its distortion.
 """
 
 from __future__ import annotations
@@ -29,26 +29,27 @@ from coupole.reflectance.run_result import RunResult, ViewSamples
 Floats = NDArray[np.float64]
 
 _DEGREE = 5
-"""Degree of the polynomial: for Brown's k2, and a homography up to 1e-6."""
+"""Degree of the polynomial: enough for Brown's k2, and for a homography up to 1e-6."""
 _LEAST_TRIANGLES = 4 * (_DEGREE + 1) * (_DEGREE + 2) // 2
 _OUTLIER = 4.0
-"""Largest departure of a triangle, over the median departure: beyond it are triangles that are seen in part."""
+"""Largest deviation of a triangle, over the median deviation. Triangles with a larger deviation are only partly
+visible."""
 _MARGIN = 1.05
-"""Factor for a margin about the object, in a picture whose field of view is not given."""
+"""Factor for a margin around the object, in a picture without a given field of view."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Surface that the pixels of a picture [h, w] see."""
+    """The surface that the pixels of a picture [h, w] see."""
 
     triangle_of_pixel: NDArray[np.int32]
-    """[h, w] place in `triangles`; -1 for none."""
+    """[h, w] place in `triangles`; -1 for no triangle."""
     places_mm: NDArray[np.float32]
     """[h, w, 3] base frame."""
     camera_mm: Floats
     """[3]"""
     triangles: NDArray[np.int64]
-    """Rising numbers in the mesh."""
+    """Numbers in the mesh, in rising order."""
     centres_mm: Floats
     """[triangles, 3]"""
     normals: Floats
@@ -56,12 +57,13 @@ class Surface:
 
     @cached_property
     def offsets_mm(self) -> Floats:
-        """[triangles] of their planes from the origin, along the normals."""
+        """[triangles] distances of their planes from the origin, along the normals."""
         offsets: Floats = np.einsum("tk,tk->t", self.centres_mm, self.normals)
         return offsets
 
     def by_texels(self, texel_of_pixel: NDArray[np.int32]) -> Surface:
-        """The same for shading by texels, whose numbers [h, w], -1 for none, stand in the place of triangles'."""
+        """Return the same surface for shading by texels: the numbers of texels [h, w], -1 for none, replace those
+        of triangles."""
         seen = texel_of_pixel >= 0
         triangle = np.zeros(int(texel_of_pixel.max(initial=-1)) + 1, np.int64)
         triangle[texel_of_pixel[seen]] = self.triangle_of_pixel[seen]
@@ -77,21 +79,22 @@ class Surface:
 
 @dataclass(frozen=True)
 class FreeCamera:
-    """A pinhole camera anywhere, in the support frame; z is up in the picture, y if it looks along z."""
+    """A pinhole camera at any place, in the support frame. In the picture z is up, or y if the camera looks along
+    z."""
 
     at_mm: Floats
     """[3] its projection centre."""
     look_at_mm: Floats | None = None
-    """The middle of the object without it."""
+    """Point at which the camera looks; the middle of the object by default."""
     size_px: tuple[int, int] = (1024, 768)
     """Width, height."""
     field_of_view_deg: float | None = None
-    """Across the width; as narrow as the object allows without it."""
+    """Field of view across the width; by default as narrow as the object allows."""
 
 
 def surface_of_view(result: RunResult, view: ViewSamples) -> Surface:
-    """Return the surface of a measured view; a mesh of fewer than some hundred seen triangles is seen at the
-    triangles' centres."""
+    """Return the surface of a measured view. If the view sees fewer than some hundred triangles, the triangles'
+    centres are used as places."""
     with h5py.File(view.path, "r") as file:
         triangle_of_pixel, centres_mm, normals = file["seen"][()], file["centres_mm"][()], file["normals"][()]
     places_mm = np.full((*triangle_of_pixel.shape, 3), np.nan, np.float32)
@@ -108,8 +111,8 @@ def surface_of_view(result: RunResult, view: ViewSamples) -> Surface:
 
 
 def surface_from(result: RunResult, mesh: PacketMesh, camera: FreeCamera) -> Surface:
-    """Return the surface of the triangles that any view has seen, from a camera anywhere. Triangles of `mesh` that
-    no view has seen also hide the surface behind them. Raises InputError if the camera sees none.
+    """Return the surface of the triangles that any view has seen, from a camera at any place. Triangles of `mesh`
+    that no view has seen also hide the surface behind them. Raises InputError if the camera sees no triangle.
     """
     triangles = result.triangles
     corners_mm = result.corners_mm[triangles].astype(np.float64)
@@ -144,7 +147,7 @@ def surface_from(result: RunResult, mesh: PacketMesh, camera: FreeCamera) -> Sur
 
 
 def in_strips(height: int, work: Callable[[slice], None]) -> None:
-    """Do something for all rows of a picture, in parallel."""
+    """Call a function for all rows of a picture, in parallel."""
     threads = len(os.sched_getaffinity(0))
     step = max(1, math.ceil(height / (8 * threads)))
     with ThreadPoolExecutor(threads) as pool:
@@ -184,20 +187,20 @@ def _aim_camera(result: RunResult, camera: FreeCamera) -> tuple[Floats, float]:
 
 @dataclass(frozen=True)
 class _Centres:
-    """Triangles' centres as a picture shows them."""
+    """Triangles' centres as they appear in a picture."""
 
     pixels: Floats
     """[n, 2] column and row: means of the pixels that see a triangle."""
     tangents: Floats
-    """[n, 2] of their directions, in `frame`."""
+    """[n, 2] tangents of their directions, in `frame`."""
     weights: Floats
     """[n] square roots of the numbers of pixels."""
     frame: Floats
-    """[3, 3] rows: axes of the directions' frame, the last forward."""
+    """[3, 3] rows: axes of the directions' frame, the last one forward."""
 
 
 def _seen_centres(triangle_of_pixel: NDArray[np.int32], centres_mm: Floats, camera_mm: Floats) -> _Centres | None:
-    """Return the centres that a picture shows; None for too few."""
+    """Return the centres that appear in a picture; None for too few."""
     row, column = np.nonzero(triangle_of_pixel >= 0)
     triangle = triangle_of_pixel[row, column]
     count = np.bincount(triangle, minlength=len(centres_mm)).astype(np.float64)
@@ -219,9 +222,9 @@ def _seen_centres(triangle_of_pixel: NDArray[np.int32], centres_mm: Floats, came
 def _directions(
     triangle_of_pixel: NDArray[np.int32], centres_mm: Floats, camera_mm: Floats
 ) -> tuple[Floats, Floats, Floats] | None:
-    """Return what turns a pixel into its direction: [3] middle column and row and the scale of both, [6, 6, 2]
-    coefficients of column^i row^j, [3, 3] rows: axes of the directions' frame, the last forward. None for too few
-    triangles."""
+    """Return the numbers that convert a pixel to its direction: [3] middle column, middle row and the scale of
+    both; [6, 6, 2] coefficients of column^i row^j; [3, 3] rows: axes of the directions' frame, the last one
+    forward. None for too few triangles."""
     centres = _seen_centres(triangle_of_pixel, centres_mm, camera_mm)
     if centres is None:
         return None
@@ -229,8 +232,8 @@ def _directions(
 
 
 def pixels_of_places(surface: Surface, places_mm: NDArray[np.floating]) -> Floats | None:
-    """[n, 2] column and row at which a measured view shows places [n, 3], whether or not something hides them; NaN
-    behind the camera. None if the view shows too few triangles."""
+    """[n, 2] column and row of places [n, 3] in a measured view, even if they are hidden; NaN behind the camera.
+    None if the view shows too few triangles."""
     centres = _seen_centres(surface.triangle_of_pixel, surface.centres_mm, surface.camera_mm)
     if centres is None:
         return None
@@ -244,8 +247,8 @@ def pixels_of_places(surface: Surface, places_mm: NDArray[np.floating]) -> Float
 
 
 def _polynomial(given: Floats, wanted: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Fit [n, 2] `wanted` by polynomials of [n, 2] `given`: middle of these and their scale [3], coefficients
-    [6, 6, 2] of x^i y^j. Triangles that are seen in part are left out."""
+    """Fit `wanted` [n, 2] by polynomials of `given` [n, 2]. Return the middle and scale of `given` [3], and the
+    coefficients [6, 6, 2] of x^i y^j. Triangles that are only partly visible are left out."""
     middle = 0.5 * (given.min(axis=0) + given.max(axis=0))
     scale = max(0.5 * float(np.ptp(given, axis=0).max()), 1e-9)
     x, y = ((given - middle) / scale).T
@@ -266,8 +269,8 @@ def _polynomial(given: Floats, wanted: Floats, weights: Floats) -> tuple[Floats,
 def _meet(  # type: ignore[no-untyped-def]
     first_row, triangle_of_pixel, pixel_scale, coefficients, frame, camera_mm, centres_mm, normals, places_mm
 ):
-    """Fill `places_mm` with the places where the rays of rows of pixels meet the planes of the triangles that they
-    see."""
+    """Fill `places_mm` with the places where the rays of some rows of pixels meet the planes of the triangles that
+    they see."""
     order = len(coefficients)
     along = np.empty((order, 2))
     way = np.empty(3)

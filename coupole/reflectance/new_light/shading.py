@@ -1,10 +1,10 @@
-"""Radiance of pixels under beams, by GGX materials or by values of triangles that a slice gives.
+"""Radiance of pixels under beams, by GGX materials or by the values of slices for triangles.
 
-Emitters that have a size are seen by GGX in two ways at once: by their beams, and by rays that are drawn from each
-pixel's lobe and meet the emitter or not (`mirrored`). Both are weighted by the balance heuristic (Veach, Robust
-Monte Carlo methods for light transport simulation, 1997, 9.2): a sharp lobe shows the emitter itself and not its
-beams, a rough one the beams and no noise. No rays are drawn for an area that is not larger than the lobe: its
-beams are as close to each other in the lobe as in the area.
+For GGX, the light of an emitter with a size is found in two ways at once: by its beams, and by rays that are drawn
+from each pixel's lobe and may meet the emitter (`mirrored`). Both are weighted by the balance heuristic (Veach,
+Robust Monte Carlo methods for light transport simulation, 1997, 9.2). So a sharp lobe shows the emitter itself and
+not its beams, and a rough lobe shows the beams without noise. No rays are drawn for an area that is not larger
+than the lobe, because its beams are as dense in the lobe as in the area.
 """
 
 from __future__ import annotations
@@ -41,17 +41,18 @@ from coupole.reflectance.triangle_fit import TriangleMaterials
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
-"""[h, w, channels]; what is added to it is radiance."""
+"""[h, w, channels] radiance, to which light is added."""
 
 Coats = NDArray[np.float32]
-"""[triangles, 12], in fours: normal and alpha (0 for no material), then `KD` and `KS`, 0 behind their channels."""
+"""[triangles, 12], in groups of four: normal and alpha (0 for no material), then `KD`, then `KS`; numbers after
+the last channel are 0."""
 KD, KS = 4, 8
 MIRROR_SHARE = 4
-"""Rays from a lobe are one for so many beams of an emitter."""
+"""Number of an emitter's beams for each ray that is drawn from a lobe."""
 
 
 def coats_of(materials: TriangleMaterials) -> Coats:
-    """Materials as they are read pixel by pixel."""
+    """Return materials in the form in which they are read for each pixel."""
     coats = np.zeros((len(materials.alpha), 12), np.float32)
     coats[:, :3], coats[:, 3] = materials.normals, np.nan_to_num(materials.alpha)
     for first, part in ((KD, materials.kd), (KS, materials.ks)):
@@ -60,7 +61,7 @@ def coats_of(materials: TriangleMaterials) -> Coats:
 
 
 def alike(beams: Iterable[Beam]) -> Iterator[list[Beam]]:
-    """Up to eight neighbouring beams of one kind, which are shaded together."""
+    """Yield groups of up to eight neighbouring beams of one kind, which are shaded together."""
     for _, same in groupby(beams, key=lambda beam: (beam.near, beam.exponent, beam.density > 0.0)):
         beams_alike = list(same)
         yield from (beams_alike[first : first + LANES] for first in range(0, len(beams_alike), LANES))
@@ -69,8 +70,8 @@ def alike(beams: Iterable[Beam]) -> Iterator[list[Beam]]:
 def add_beams(
     picture: Picture, surface: Surface, coats: Coats, codes: Codes, beams: Sequence[Beam], lobe_rays: int
 ) -> None:
-    """Add what GGX materials of the surface's triangles make of some of the `alike` beams where `codes` [8, h, w]
-    say that they reach; where `lobe_rays` are drawn for their emitter, only their part."""
+    """Add the light that GGX materials of the surface's triangles reflect from some of the `alike` beams, where
+    `codes` [8, h, w] say that they reach. If `lobe_rays` are drawn for their emitter, add only the beams' part."""
 
     def across(of: Callable[[Beam], Floats]) -> NDArray[np.float32]:
         """[..., 8]: one lane for each beam."""
@@ -95,8 +96,8 @@ def add_beams(
 
 
 def add_beam(picture: Picture, surface: Surface, coats: Coats, codes: Codes, beam: Beam) -> None:
-    """Add the same as `add_beams` for a single beam that is no part of an emitter, where `codes` [h, w] say that
-    it reaches; the picture lies in C order."""
+    """Add the light of a single beam that is not part of an emitter, as `add_beams` does, where `codes` [h, w] say
+    that the beam reaches. The picture must be in C order."""
     three = np.resize(beam.strength, 3)
     single = (values.astype(np.float32) for values in (surface.camera_mm, beam.place, beam.axis, three))
     camera_mm, place, axis, strength = single
@@ -124,7 +125,7 @@ def add_beam(picture: Picture, surface: Surface, coats: Coats, codes: Codes, bea
 
 
 def add_values(picture: Picture, surface: Surface, values: NDArray[np.float32], codes: Codes, beam: Beam) -> None:
-    """Add the same by values [triangles, channels] of f cos_i, 1/sr, under the beam."""
+    """Add the light of a beam by values [triangles, channels] of f cos_i, 1/sr."""
     of_beam = beam.near, beam.place, beam.axis, beam.exponent, beam.strength
     in_strips(
         len(picture),
@@ -136,8 +137,8 @@ def add_values(picture: Picture, surface: Surface, values: NDArray[np.float32], 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _towards(near, place, axis, exponent, x, y, z, way):  # type: ignore[no-untyped-def]
-    """Fill `way` [3] with the direction from a pixel's place to a beam's; return cos^k / d^2 in m^-2, 1 for
-    distant light."""
+    """Fill `way` [3] with the direction from a pixel's place to the beam's place. Return cos^k / d^2 in m^-2, or 1
+    for distant light."""
     if not near:
         way[0], way[1], way[2] = place[0], place[1], place[2]
         return 1.0
@@ -154,7 +155,7 @@ def _towards(near, place, axis, exponent, x, y, z, way):  # type: ignore[no-unty
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _reach(near, exponent, places, axes, x, y, z):  # type: ignore[no-untyped-def]
-    """Return the same as `_towards` for eight beams: three coordinates of their directions, and cos^k / d^2."""
+    """Do the same as `_towards` for eight beams: return three coordinates of their directions, and cos^k / d^2."""
     dx, dy, dz = load_row(places, 0), load_row(places, 1), load_row(places, 2)
     if not near:
         return dx, dy, dz, lanes(np.float32(1.0))
@@ -216,7 +217,8 @@ def _add_beams(  # type: ignore[no-untyped-def]
 def _add_beam(  # type: ignore[no-untyped-def]
     triangle_of_pixel, places_mm, codes, coats, camera_mm, near, place, axis, exponent, strength, picture
 ):
-    """Eight neighbouring pixels in the lanes: arrays [n, 8], [n, 8 coordinates], [n, 8 channels]."""
+    """Add a beam's light for eight neighbouring pixels in the lanes: arrays [n, 8], [n, 8 coordinates], [n, 8
+    channels]."""
     triangle, unity, none, half = np.zeros(LANES, np.int64), np.float32(1.0), np.float32(0.0), np.float32(0.5)
     for eight in range(len(triangle_of_pixel)):
         lit = if_less(absolute(load_row(codes, eight) - np.float32(LIT)), half, unity, none)
@@ -247,7 +249,7 @@ def _add_beam(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _reach_from(near, place, axis, exponent, x, y, z):  # type: ignore[no-untyped-def]
-    """Return the same as `_reach`, for one beam from eight places."""
+    """Do the same as `_reach` for one beam, from eight places."""
     if not near:
         return lanes(place[0]), lanes(place[1]), lanes(place[2]), lanes(np.float32(1.0))
     dx, dy, dz = place[0] - x, place[1] - y, place[2] - z
@@ -260,7 +262,7 @@ def _reach_from(near, place, axis, exponent, x, y, z):  # type: ignore[no-untype
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _lobe(n0, n1, n2, h0, h1, h2, nl, nv, alpha):  # type: ignore[no-untyped-def]
-    """D V of eight pixels, by `_facets`' sines; 0 where the normal looks away from the camera."""
+    """Return D V of eight pixels, by the sines of `_facets`; 0 where the normal points away from the camera."""
     unity, none = np.float32(1.0), np.float32(0.0)
     x, y, z = n1 * h2 - n2 * h1, n2 * h0 - n0 * h2, n0 * h1 - n1 * h0
     sin2 = (x * x + y * y + z * z) / (h0 * h0 + h1 * h1 + h2 * h2)
@@ -274,7 +276,7 @@ def _lobe(n0, n1, n2, h0, h1, h2, nl, nv, alpha):  # type: ignore[no-untyped-def
 
 @numba.njit(cache=True, nogil=True)
 def _across(places, axes, place):  # type: ignore[no-untyped-def]
-    """Squares of the distances, m^2, of a pixel's place from the planes of eight emitters."""
+    """Return the squared distances, m^2, of a pixel's place from the planes of eight emitters."""
     above = (load_row(places, 0) - place[0]) * load_row(axes, 0) + (load_row(places, 1) - place[1]) * load_row(
         axes, 1
     )
@@ -284,8 +286,8 @@ def _across(places, axes, place):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _facets(n0, n1, n2, h0, h1, h2, nv, alpha):  # type: ignore[no-untyped-def]
-    """GGX's distribution over 2 for eight half vectors of any length, and the view's part of the masking. From
-    sines, since single precision has no cosine of a small angle."""
+    """Return GGX's distribution divided by 2 for eight half vectors of any length, and the view's part of the
+    masking. Both are computed from sines, because the cosine of a small angle is inexact in single precision."""
     x, y, z = n1 * h2 - n2 * h1, n2 * h0 - n0 * h2, n0 * h1 - n1 * h0
     sin2 = (x * x + y * y + z * z) / (h0 * h0 + h1 * h1 + h2 * h2)
     alpha2 = alpha * alpha
@@ -310,7 +312,7 @@ def _add_values(triangle_of_pixel, places_mm, codes, values, near, place, axis, 
 
 @numba.njit(cache=True, nogil=True)
 def shines(coat):  # type: ignore[no-untyped-def]
-    """Tell whether a material has a lobe at all."""
+    """Tell whether a material has a lobe."""
     any_coat = False
     for number in range(KS, len(coat)):
         any_coat |= coat[number] > 0.0

@@ -1,8 +1,8 @@
 """Pixels of a surface that a beam reaches.
 
-Rays are traced from every fourth pixel in both directions, and from all between where these differ; then shadows'
-edges are followed from cell to cell until they end. A spot of light or shadow is missed if it lies between four
-rays and touches no edge that was found.
+Rays are traced from every fourth pixel in both directions. Where these rays differ, rays are traced from all
+pixels between them. Then the edges of shadows are followed from cell to cell until they end. A spot of light or
+shadow is missed if it lies between four rays and touches no edge that was found.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from coupole.reflectance.parts_in_threads import in_threads
 Codes = NDArray[np.uint8]
 
 NONE, AWAY, LIT, SHADED, ASKED = range(5)
-"""Codes of a pixel: no surface; it or the emitter looks away; what a ray found; a ray is needed."""
+"""Codes of a pixel: no surface; the surface or the emitter faces away; lit or shaded by a ray; a ray is needed."""
 CELL_PX = 4
 DISTANT_MM = 3000.0
-"""Distance beyond which nothing casts a shadow of distant light."""
+"""Distance beyond which objects cast no shadow of distant light."""
 _RAYS = 1 << 15
 _PACKET = 4
-"""Rays of the grid down and across that go together."""
+"""Number of grid rays, down and across, that are traced together."""
 
 
 def trace_beam(mesh: PacketMesh, surface: Surface, beam: Beam, codes: Codes) -> None:
-    """Fill `codes` [h, w] with whether the beam reaches each pixel; `mesh` is what throws shadows."""
+    """Fill `codes` [h, w], which say whether the beam reaches each pixel; `mesh` throws the shadows."""
     by = _facing(surface, beam), beam.place, beam.axis, beam.exponent
     in_strips(
         len(codes), lambda rows: _begin(surface.triangle_of_pixel[rows], surface.places_mm[rows], *by, codes[rows])
@@ -59,7 +59,7 @@ def _trace(mesh: PacketMesh, surface: Surface, beam: Beam, pixels: NDArray[np.in
 def _trace_rays(  # type: ignore[no-untyped-def]
     function, scene, arguments, pixels, triangle_of_pixel, places_mm, normals, near, place, codes
 ):
-    """Codes of some pixels, by a ray from each; neighbours in the list go together."""
+    """Find the codes of some pixels by a ray from each; neighbours in the list are traced together."""
     rays, words, valid = packet()
     for first in range(0, len(pixels), LANES):
         lanes = min(LANES, len(pixels) - first)
@@ -77,7 +77,7 @@ def _trace_rays(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _asked_on_grid(codes):  # type: ignore[no-untyped-def]
-    """Pixels, by squares whose rays go together."""
+    """Return the pixels of the grid that need a ray, in squares whose rays are traced together."""
     (height, width), side = codes.shape, _PACKET * CELL_PX
     pixels = np.empty(((height + CELL_PX - 1) // CELL_PX) * ((width + CELL_PX - 1) // CELL_PX), np.int64)
     count = 0
@@ -92,7 +92,7 @@ def _asked_on_grid(codes):  # type: ignore[no-untyped-def]
 
 
 def _facing(surface: Surface, beam: Beam) -> NDArray[np.bool_]:
-    """[triangles] whether they look towards a beam, which from all places of a plane is on the same side of it."""
+    """[triangles] True if they face a beam. The beam is on the same side for all places of a triangle's plane."""
     if not beam.near:
         return surface.normals @ beam.place > 0.0
     return surface.normals @ beam.place > surface.offsets_mm
@@ -100,7 +100,7 @@ def _facing(surface: Surface, beam: Beam) -> NDArray[np.bool_]:
 
 @numba.njit(cache=True, nogil=True)
 def _begin(triangle_of_pixel, places_mm, facing, place, axis, exponent, codes):  # type: ignore[no-untyped-def]
-    """Codes by the normals of triangles and emitter alone."""
+    """Fill the codes that follow from the normals of triangles and emitter alone."""
     for row in range(triangle_of_pixel.shape[0]):
         for column in range(triangle_of_pixel.shape[1]):
             triangle = triangle_of_pixel[row, column]
@@ -117,8 +117,8 @@ def _begin(triangle_of_pixel, places_mm, facing, place, axis, exponent, codes): 
 
 @numba.njit(cache=True, nogil=True)
 def _close_cells(codes, first, open_cells):  # type: ignore[no-untyped-def]
-    """Close cells of rows [n, cells across] from a `first` one on, which have others below and to the right.
-    Cells stay open if their rays at the corners are missing or differ, or if the surface ends there.
+    """Close cells in rows [n, cells across] from the `first` one on, if they have cells below and to the right. A
+    cell stays open if rays at its corners are missing or differ, or if the surface ends there.
     """
     down, across = open_cells.shape
     for i in range(down):
@@ -138,7 +138,7 @@ def _close_cells(codes, first, open_cells):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _asked_in(codes, cells):  # type: ignore[no-untyped-def]
-    """Pixels of cells [n, 2] that need a ray."""
+    """Return the pixels in cells [n, 2] that need a ray."""
     height, width = codes.shape
     pixels = np.empty(len(cells) * CELL_PX * CELL_PX, np.int64)
     count = 0
@@ -175,7 +175,7 @@ def _open_neighbours(codes, open_cells, fresh):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _differs(codes, row, column, down, across, expected_code):  # type: ignore[no-untyped-def]
-    """Tell whether one of a cell's pixels at its side was found to be other than `expected_code`."""
+    """Tell whether a pixel at the side of a cell is shaded although `expected_code` is lit, or the reverse."""
     height, width = codes.shape
     opposite = SHADED if expected_code == LIT else LIT
     for step in range(CELL_PX):
@@ -188,7 +188,8 @@ def _differs(codes, row, column, down, across, expected_code):  # type: ignore[n
 
 @numba.njit(cache=True, nogil=True)
 def _fill(codes, first, end):  # type: ignore[no-untyped-def]
-    """Fill in what is still asked in some rows: it lies in closed cells and is as their corners."""
+    """Fill the pixels of some rows that still need a code. They lie in closed cells and have the code of the
+    cell's corners."""
     for row in range(first, end):
         for column in range(codes.shape[1]):
             if codes[row, column] == ASKED:

@@ -14,7 +14,7 @@ PAGE = "ablation.html"
 
 
 def write(folder: Path, document: dict[str, Any]) -> Path:
-    """Write the page of what `ablate_result` found. Raises StorageError."""
+    """Write the page with the figures of `ablate_result`. Raises StorageError."""
     path = folder / PAGE
     write_page(path, _page(folder.resolve().name, document))
     return path

@@ -1,4 +1,5 @@
-"""`clusters.html` of a result of runs: which triangles share a material, and what is missed with it."""
+"""`clusters.html` of a result of runs: the triangles that share a material, and the errors with these
+materials."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from coupole.reflectance.run_result import RunResult
 
 PAGE = "clusters.html"
 _GROUND = np.array([0x10, 0x12, 0x14]) / 255
-"""Maps for the eye have this colour where no triangle is seen."""
+"""Colour of maps for the eye where no triangle is seen."""
 _TOLD = {
     "own": "triangles by their own material",
     "clustered": "the same triangles by their cluster's material",
@@ -26,7 +27,7 @@ _TOLD = {
 
 
 def write(folder: Path, document: dict[str, Any]) -> Path:
-    """Write the page of what `cluster_result` said. Raises InputError without clusters, StorageError."""
+    """Write the page with the figures of `cluster_result`. Raises InputError without clusters, StorageError."""
     path = folder / PAGE
     write_page(path, _page(folder, document))
     return path
@@ -88,7 +89,7 @@ def _notes(document: dict[str, Any]) -> list[str]:
 
 
 def _views(result: RunResult) -> Iterator[tuple[str, Sequence[Figure]]]:
-    """Each view's name, its clusters in any colours on the ground of maps, and their diffuse part."""
+    """Yield each view's name, its clusters in arbitrary colours on the ground of maps, and their diffuse part."""
     clusters = result.clusters
     colours = np.random.default_rng(5).uniform(0.2, 1.0, (len(clusters.alpha), 3))
     diffuse = clusters.kd if clusters.kd.shape[1] == 3 else np.repeat(clusters.kd, 3, axis=1)

@@ -1,4 +1,5 @@
-"""`report.html` of a refinement: how far apart views put the same spots, before and after, and what was moved."""
+"""`report.html` of a refinement: the distance between the places that views give to the same spots, before and
+after, and the steps."""
 
 from __future__ import annotations
 
@@ -19,9 +20,9 @@ from coupole.reflectance.alignment.refined_geometry import ABOUT, REFINED
 
 REPORT = "report.html"
 LONGER = 10.0
-"""Length of arrows over the disagreement that they show."""
+"""Length of arrows, as a multiple of the disagreement that they show."""
 SURPRISING = 3.0
-"""Standard deviations of a sum of squares beyond which stated uncertainties are called too small."""
+"""Number of standard deviations of a sum of squares above which stated uncertainties are called too small."""
 
 
 def write(folder: Path) -> Path:
@@ -36,7 +37,7 @@ def write(folder: Path) -> Path:
 
 
 def remarks(about: dict[str, Any]) -> Iterator[str]:
-    """Yield what the maker of the refinement must know, one sentence each."""
+    """Yield remarks for the user who made the refinement, one sentence each."""
     if about["simulated"]:
         yield "frames of a simulated cell"
     for when, words in (("before", "views disagree by"), ("after", "after refinement by")):
@@ -122,7 +123,7 @@ def _unknowns(about: dict[str, Any]) -> str:
 
 
 def _arrows(file: h5py.File, number: int, when: str, title: str) -> Drawing:
-    """A view's picture with an arrow for each match that it is the reference of."""
+    """Return a view's picture with an arrow for each match in which the view is the reference."""
     data = file[f"pictures/{number}"]
     small, blocks = data[()], data.attrs["blocks"]
     height, width = small.shape

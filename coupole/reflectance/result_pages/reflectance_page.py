@@ -1,4 +1,4 @@
-"""`report.html` of a result of pictures under known lights: pictures first, then what must be known about them."""
+"""`report.html` of a result of pictures under known lights: pictures first, then remarks about them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from coupole.reflectance.result_pages import lobes_told
 
 MOST_CHECKS = 6
 POOR_RESIDUAL = 0.05
-"""Residual of square roots of values, as a share of the diffuse part's, beyond which the material model itself is
+"""Residual of the square roots of values, as a share of the diffuse part, above which the material model itself is
 in doubt."""
 
 
@@ -33,7 +33,7 @@ def write(folder: Path) -> Path:
 
 
 def remarks(about: dict[str, Any]) -> Iterator[str]:
-    """Yield what the maker of the result must know, one sentence each."""
+    """Yield remarks for the user who made the result, one sentence each."""
     if run := about.get("uncalibrated_run"):
         yield (
             f"of the run {run} without calibrations: values are relative, and lights stand where rig and LED "
@@ -109,7 +109,7 @@ def _next_step(name: str, about: dict[str, Any]) -> Inline:
 
 
 def _on_the_picture(result: PictureResult, values: NDArray[Any]) -> NDArray[np.float32]:
-    """[h, w, ...] of values [pixels, ...], NaN outside the mask."""
+    """[h, w, ...] picture of values [pixels, ...], NaN outside the mask."""
     return result.picture(values.astype(np.float32), outside=np.nan)
 
 
@@ -152,7 +152,7 @@ def _figures(about: dict[str, Any]) -> Section:
 
 
 def _uncertainty(result: PictureResult) -> Section:
-    """A section of what is known of normals and relit pictures, and what is not."""
+    """Return a section about the known and the unknown uncertainty of normals and relit pictures."""
     cones_deg = np.load(result.folder / CONES)[result.mask]
     figures: list[Figure] = []
     words: list[Inline] = []

@@ -27,10 +27,9 @@ from coupole.storage.run import name_without_time
 
 SIMULATED = "frames of a simulated cell"
 POOR_RESIDUAL = 0.05
-"""Residual of square roots, as a share of the diffuse part's, beyond which the material model itself is in
-doubt."""
+"""Residual of square roots, as a share of the diffuse part, above which the material model is in doubt."""
 _VARIANCES = [0, 2, 5, 9, 14]
-"""Places in the lower half of a covariance."""
+"""Places of the variances in the lower half of a covariance."""
 PUBLISHED = (
     ("the paper, scanner of 30 um", (-10.66, 14.00), (-15.23, 22.42), "57 to 74 % without vertices"),
     ("the paper, scanner of 20 um", (-8.11, 9.51), None, ""),
@@ -45,7 +44,7 @@ def write(folder: Path) -> Path:
 
 
 def remarks(about: dict[str, Any]) -> Iterator[str]:
-    """Yield what the maker of the result must know, one sentence each."""
+    """Yield remarks for the user who made the result, one sentence each."""
     if growing := so_far.words(about):
         yield growing
     if about["simulated"]:
@@ -127,7 +126,7 @@ def _page(folder: Path) -> Page:
 
 
 def _objects(about: dict[str, Any]) -> str:
-    """The names that the runs were given, each once."""
+    """Return the names of the runs, each name once."""
     return ", ".join(dict.fromkeys(name_without_time(run) for run in about["runs"]))
 
 
@@ -147,7 +146,7 @@ def _best_fit(about: dict[str, Any]) -> str | None:
 
 
 def _first(checks: Sequence[Figure], about: dict[str, Any], views: Sequence[Section]) -> Sequence[Figure]:
-    """The check of the best fit; without one the first maps of the first view."""
+    """Return the check of the best fit; without a check, the first maps of the first view."""
     best = _best_fit(about)
     if checks and best is not None:
         place = 1 + 2 * list(FITS).index(best)
@@ -208,7 +207,7 @@ def _inter_reflection(about: dict[str, Any]) -> str:
 
 
 def _uncertain(about: dict[str, Any]) -> Section:
-    """A table of sources, beside the paper's."""
+    """Return a table by source of uncertainty, with the paper's figures."""
     section, heading = "uncertainty", "Uncertainty of samples"
     if not (percentages := about["uncertainty_percent"]) or percentages["monte_carlo"]["median"] is None:
         return Section(section, heading)
@@ -259,7 +258,7 @@ def _material_uncertainty(about: dict[str, Any]) -> Section:
 
 
 def _percent_in_words(percent: float) -> str:
-    """A relative uncertainty; of more than 100 % only that it is not told."""
+    """Return a relative uncertainty in words; above 100 % it only says that the quantity is not determined."""
     return f"{percent:.1f} %" if percent <= 100.0 else "not told"
 
 
@@ -305,7 +304,8 @@ def _check_section(view: str, figures: Sequence[Figure]) -> Section:
 
 
 def _reconstruction(result: RunResult, view: ViewSamples, about: dict[str, Any]) -> Iterator[Figure]:
-    """A frame that was kept for the check, and the prediction of each fit for it; the frame that shows most."""
+    """Yield a frame that was kept for the check, and the prediction of each fit for it. The frame with the most
+    values is taken."""
     frames = read_check_frames(result, view)
     if not len(frames.leds):
         return
@@ -336,7 +336,7 @@ def _fields(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _maps(path: Path, fits: dict[str, dict[str, NDArray[Any]]]) -> Section:
-    """Maps of a view: shape, diffuse part, lobe, what is left."""
+    """Return maps of a view: shape, diffuse part, lobe, residual."""
     with h5py.File(path, "r") as file:
         rows, triangles = file["seen"][()], file["triangles"][()]
     materials = fits[GGX_NORMAL.name]
@@ -367,7 +367,7 @@ def _maps(path: Path, fits: dict[str, dict[str, NDArray[Any]]]) -> Section:
 def _lobe(
     rows: NDArray[np.int32], ks: NDArray[Any], alpha: NDArray[Any], uncertain: NDArray[Any]
 ) -> tuple[list[Figure], str]:
-    """Maps of the specular lobe where it is told, and how much of the view that is."""
+    """Return maps of the specular lobe where it is determined, and a sentence about this share of the view."""
     is_told = lobes_told.is_told_by_uncertainty(ks, uncertain[:, 3])
     share = float(is_told.mean()) if len(is_told) else 0.0
     limit = f"{lobes_told.MOST_RELATIVE_U:.0%}"
@@ -393,7 +393,7 @@ def _rgb(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _picture(triangle_rows: NDArray[np.int32], values: NDArray[Any]) -> NDArray[np.float32]:
-    """[h, w, ...] of values [triangles, ...]; NaN where nothing is seen."""
+    """[h, w, ...] picture of values [triangles, ...]; NaN where no triangle is seen."""
     picture = np.full((*triangle_rows.shape, *values.shape[1:]), np.nan, np.float32)
     picture[triangle_rows >= 0] = values[triangle_rows[triangle_rows >= 0]]
     return picture

@@ -1,4 +1,4 @@
-"""The page of a suggested plan: how well the object will be known, where, and what it costs."""
+"""The page of a suggested plan: the expected uncertainty over the object, and the plan's cost."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def write(path: Path, name: str, suggestion: Suggestion) -> None:
 
 
 def sentences(suggestion: Suggestion) -> list[str]:
-    """Say what was chosen, what it promises, and what it costs."""
+    """Say what was chosen, the promised uncertainty, and the cost."""
     report = suggestion.report
     views = f"{len(suggestion.views)} view{'s' if len(suggestion.views) > 1 else ''}"
     exposures = ", ".join(f"{exposure_us / 1000:g}" for exposure_us in suggestion.exposures_us)
@@ -111,8 +111,8 @@ def _views(suggestion: Suggestion) -> Table:
 
 
 def _map_of_normals(suggestion: Suggestion, title: str, azimuth_deg: float, elevation_deg: float) -> Map:
-    """The object in a parallel projection, with the expected uncertainty of its normals for the material of which
-    they are known least."""
+    """Return the object in a parallel projection, with the expected uncertainty of its normals. The material with
+    the least certain normals is shown."""
     per_part = np.max([uncertainty[NORMAL_DEG] for uncertainty in suggestion.uncertainties.values()], axis=0)
     corners_mm, mesh = suggestion.job.shape.corners_mm, suggestion.job.motion.occlusions.mesh
     to_eye = direction(azimuth_deg, elevation_deg)

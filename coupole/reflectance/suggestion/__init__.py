@@ -1,1 +1,1 @@
-"""Plans that are written for an object, and the uncertainty that they promise."""
+"""Plans that are suggested for an object, with their expected uncertainty."""

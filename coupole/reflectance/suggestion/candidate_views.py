@@ -1,4 +1,4 @@
-"""Views from which a suggestion is chosen: directions round targets on the object that the arm can take."""
+"""Candidate views of a suggestion: directions around targets on the object that the arm can reach."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from coupole.reflectance.suggestion.supposed_signal import SeenParts, SupposedCe
 Floats = NDArray[np.float64]
 
 ELEVATIONS_DEG = {85: 1, 65: 6, 45: 8, 25: 8}
-"""Elevations of candidates, and how many azimuths each has."""
+"""Elevations of candidates, and the number of azimuths for each."""
 _FIRST_AZIMUTH_DEG = -90.0
 _FIELD_SHARE = 0.45
 """Distance from a target, as a share of the shorter side of the field, within which a view shows the surface."""
 _LEAST_FACING = 0.25
-"""Least cosine between a target's normal and the direction of a view, where there are several targets."""
+"""Least cosine between a target's normal and the direction of a view, if there are several targets."""
 _MOST_TARGETS = 40
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A view that may be taken, and what it would see."""
+    """A possible view, and the parts of the surface that it would see."""
 
     view: LookAt
     seen_parts: SeenParts
 
 
 def candidates_of(job: Job, cell: SupposedCell, say: Callable[[str, int, int], None]) -> list[Candidate]:
-    """All views that the arm can take without contact and that see something in focus; none if there is no such
-    view."""
+    """Return all views that the arm can reach without contact and that see something in focus; empty if there is
+    no such view."""
     wanted_views = list(_directions(cell.surface, cell.rig))
     candidates = []
     for number, view in enumerate(wanted_views, start=1):
@@ -54,7 +54,7 @@ def candidates_of(job: Job, cell: SupposedCell, say: Callable[[str, int, int], N
 
 
 def field_mm(rig: Rig) -> float:
-    """Shorter side of what the camera shows at its focus."""
+    """Return the shorter side of the field of view at the focus distance."""
     image_mm = 1.0 / (1.0 / rig.lens.focal_length_mm - 1.0 / rig.lens.focus_distance_mm)
     sensor_mm = min(rig.sensor.width_px, rig.sensor.height_px) * rig.sensor.pixel_pitch_um * 1e-3
     return sensor_mm * rig.lens.focus_distance_mm / image_mm
@@ -80,7 +80,8 @@ def _directions(surface: Surface, rig: Rig) -> Iterator[LookAt]:
 
 
 def _targets(surface: Surface, reach_mm: float) -> list[tuple[list[float], Floats | None]]:
-    """Points to look at, and the normal there; one in the middle, without a normal, if views of it show all."""
+    """Return points to look at, with the normals there. If views of the object's middle show all of it, return the
+    middle alone, without a normal."""
     points_mm = surface.points_mm
     middle_mm = (points_mm.min(axis=0) + points_mm.max(axis=0)) / 2.0
     if np.linalg.norm(points_mm - middle_mm, axis=1).max() <= reach_mm:

@@ -1,8 +1,8 @@
-"""Suggests a plan for an object: views, LEDs and exposures that tell most of it within a budget.
+"""Suggests a plan for an object: the most informative views, LEDs and exposures within a budget.
 
-For each exposure and number of LEDs that come into question, views are chosen until time or light are used up, or
-a further view tells little more (`view_choice`); preflight says what a view costs. The best of these plans is
-checked with paths; views to which there are none are replaced.
+For each possible exposure and number of LEDs, views are chosen until time or light is used up, or until a further
+view adds little information (`view_choice`). Preflight gives the cost of a view. The best of these plans is
+checked with paths; views without a path are replaced.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ from coupole.reflectance.suggestion.view_information import Information, ViewInf
 Said = Callable[[str, int, int], None]
 
 LED_NUMBERS = (60, 120, 240, 480)
-"""Numbers of LEDs that are tried beside all."""
+"""Numbers of LEDs that are tried besides all LEDs."""
 LONGER = 8
-"""Factor between the exposures that are tried: the shorter one saturates nothing."""
+"""Factor between the exposures that are tried; the shorter exposure saturates nothing."""
 _SATURATED_SHARE = 1e-3
-"""Share of samples that may be brighter than the shorter exposure can hold."""
+"""Share of samples that may be brighter than the range of the shorter exposure."""
 _FULL = 0.85
-"""Share of the camera's range that these reach."""
+"""Share of the camera's range that the brightest other samples reach."""
 _ROUNDS = 8
 _TRIAL_VIEWS = 3
 _ENDLESS = StorageFacts(free_bytes=1 << 60)
 _SAME = 0.02
-"""Plans whose values differ by less are equally good; the shortest is taken."""
+"""Plans with a smaller difference of value are equally good; the shortest one is taken."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """The most that a plan may cost."""
+    """The largest allowed cost of a plan."""
 
     seconds: float
     lux_h: float | None = None
@@ -65,9 +65,9 @@ class SuggestionRequest:
     """A request for a plan."""
 
     text: PlanText
-    """Names of the files, as the plan will have them."""
+    """Names of the files, as they will be written in the plan."""
     path: Path
-    """The file that the plan will be; its relative paths begin there."""
+    """The file of the plan to be written; relative paths in the plan begin there."""
     material: str
     """One of `supposed_materials.SUPPOSED`, or `unknown`."""
     budget: Budget
@@ -76,23 +76,23 @@ class SuggestionRequest:
 
 
 class Settings(NamedTuple):
-    """The rest of a plan, beside its views."""
+    """The parts of a plan besides its views."""
 
     exposures_us: tuple[int, ...]
     leds: int
-    """Place in the numbers of LEDs."""
+    """Index into the numbers of LEDs."""
 
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A plan, and what it promises."""
+    """A plan and its expected uncertainty."""
 
     text: str
     """The plan's YAML."""
     report: Report
-    """Preflight's, with paths."""
+    """Preflight's report, with paths."""
     views: tuple[LookAt, ...]
-    """The views, the one that tells most first."""
+    """The views, the most informative one first."""
     exposures_us: tuple[int, ...]
     leds: int
     surface: Surface
@@ -102,21 +102,21 @@ class Suggestion:
 
     @property
     def known_share(self) -> float:
-        """Share of the mesh's triangles that get a material, for the material that fewest get it of."""
+        """Share of the mesh's triangles that get a material, for the supposed material with the smallest share."""
         weights = self.surface.triangles
         shares = [weights[np.isfinite(u[NORMAL_DEG])].sum() / weights.sum() for u in self.uncertainties.values()]
         return float(min(shares))
 
     def medians(self) -> dict[str, dict[str, float | None]]:
         """Median standard uncertainties of the triangles that get a material, by supposed material; None without
-        any."""
+        such triangles."""
         return {
             name: {key: _median(values, self.surface.triangles) for key, values in uncertainty.items()}
             for name, uncertainty in self.uncertainties.items()
         }
 
     def figures(self) -> dict[str, Any]:
-        """JSON's values only."""
+        """Figures as JSON values."""
         return {
             "views": [view.name for view in self.views],
             "leds": self.leds,
@@ -132,8 +132,8 @@ class Suggestion:
 
 
 def suggest_plan(request: SuggestionRequest, say: Said = lambda step, count, total: None) -> Suggestion:
-    """Raises InputError if no view is possible, or a record is missing; PreflightRefused if the budget allows not
-    even one view, or the cell's records are not valid."""
+    """Suggest a plan. Raises InputError if no view is possible, or a record is missing. Raises PreflightRefused if
+    the budget does not allow a single view, or if the cell's records are not valid."""
     first = LookAt(
         kind="look_at", name="first", target_mm=(0, 0, 0), distance_mm=300, azimuth_deg=0, elevation_deg=80
     )
@@ -152,7 +152,7 @@ def suggest_plan(request: SuggestionRequest, say: Said = lambda step, count, tot
 
 
 def _job_of(request: SuggestionRequest, text: str) -> Job:
-    """Read a plan that is not written yet. Raises InputError with places of files that exist, and no others."""
+    """Read a plan that is not written yet. Raises InputError; its places name only files that exist."""
     try:
         return read_job(request.path, text=text)
     except InputError as error:
@@ -168,7 +168,7 @@ def _job_of(request: SuggestionRequest, text: str) -> Job:
 
 
 class _Trial:
-    """The plans that are compared."""
+    """Comparison of possible plans for a request."""
 
     def __init__(
         self, request: SuggestionRequest, job: Job, cell: SupposedCell, candidates: list[Candidate], say: Said
@@ -184,10 +184,10 @@ class _Trial:
         self._priors = [Information.before(self._surface, request.scan_noise_um) for _ in self._materials]
         self._exposures = self._exposures_to_try()
         self._cut_off = set[str]()
-        """Names of views to which no path was found."""
+        """Names of views that have no path."""
 
     def best(self) -> Suggestion:
-        """The best plan that has paths and is within the budget."""
+        """Return the best plan that has paths and is within the budget."""
         choices = self._choices()
         most_value = max((choice.value for choice, _ in choices.values()), default=0.0)
 
@@ -205,7 +205,8 @@ class _Trial:
         raise PreflightRefused([f"{refusal}, even with {self._numbers[0]} LEDs"])
 
     def _exposures_to_try(self) -> list[tuple[int, ...]]:
-        """Short, long, and both; for several materials the short one of the brightest, the long of the darkest."""
+        """Return the exposures to try: short, long, and both. For several materials, the short one suits the
+        brightest, the long one the darkest."""
         noise, limits = self._surface.noise, self._job.cell.rig.led_limits.on_us
         parts_of_views = [candidate.seen_parts for candidate in self._candidates]
         brightest = [
@@ -223,7 +224,8 @@ class _Trial:
         return [(short_us,)] if long_us <= short_us else [(short_us,), (long_us,), (short_us, long_us)]
 
     def _choices(self) -> dict[Settings, tuple[ViewChoice, float]]:
-        """Choice and time of a view, for all settings of which one view is within the budget."""
+        """Return the choice of views and the time of a view, for all settings for which one view is within the
+        budget."""
         choices = {}
         for count, exposures_us in enumerate(self._exposures, start=1):
             information = self._information(
@@ -261,7 +263,8 @@ class _Trial:
         return replace(choice, views=tuple(places[view] for view in choice.views))
 
     def _most_views(self, settings: Settings) -> tuple[int, float]:
-        """Number of views that the budget allows, and the time of one, by preflight without paths."""
+        """Return the number of views that the budget allows, and the time of one view, by preflight without
+        paths."""
         budget = self._request.budget
         some = [candidate.view for candidate in self._candidates[:_TRIAL_VIEWS]]
         _, report = self._check_views(some, settings, paths=False)
@@ -280,8 +283,8 @@ class _Trial:
         return self._request.text.with_views(views, settings.exposures_us, ids, remarks)
 
     def _with_paths(self, settings: Settings) -> Suggestion | None:
-        """The suggestion of these settings, with views to which there are paths; None if none fits the budget.
-        Raises PreflightRefused for what no other choice mends."""
+        """Return the suggestion with these settings and with views that have paths; None if no view fits the
+        budget. Raises PreflightRefused for a refusal that no other choice can avoid."""
         information = self._information(settings.exposures_us, "information of the views, chosen exposure")
         most = self._most_views(settings)[0]
         for number in range(1, _ROUNDS + 1):
@@ -303,7 +306,7 @@ class _Trial:
         return None
 
     def _over_budget(self, report: Report) -> float:
-        """Time or light of a plan over what is allowed, whichever is more."""
+        """Return the plan's time or light over the allowed amount, whichever ratio is larger."""
         budget = self._request.budget
         return max(report.duration_s / budget.seconds, report.dose_lux_h / (budget.lux_h or math.inf))
 
@@ -332,7 +335,7 @@ class _Trial:
 
 
 def _promises(medians: dict[str, dict[str, float | None]]) -> list[str]:
-    """A line for each supposed material."""
+    """Return one line for each supposed material."""
     lines = []
     for name, figures in medians.items():
         if (normal_deg := figures["normal_deg"]) is None:

@@ -14,7 +14,7 @@ _WIDTH = 110
 
 @dataclass(frozen=True)
 class PlanText:
-    """The part of a suggested plan that is there whatever its views are. Paths are relative to the plan."""
+    """The part of a suggested plan that does not depend on its views. Paths are relative to the plan."""
 
     name: str
     rig: str
@@ -22,7 +22,7 @@ class PlanText:
     mesh: str
     mesh_unit: str
     calibrations: tuple[str, ...] = ()
-    """Records; none: those of the rig."""
+    """Calibration records; if empty, the records of the rig."""
     translation_mm: tuple[float, float, float] | None = None
     """Place of the mesh's frame on the support."""
 
@@ -33,7 +33,7 @@ class PlanText:
         led_ids: Sequence[int] | None,
         remarks: Sequence[str] = (),
     ) -> str:
-        """The plan with these views and LEDs, all for None; `remarks` are comments at its head."""
+        """Return the plan with these views and LEDs (None for all LEDs); `remarks` are comments at its head."""
         lines = [f"# {line}" for remark in remarks for line in wrap(remark, _WIDTH)]
         lines += [
             "schema_version: 1",
@@ -75,5 +75,5 @@ def _lights(led_ids: Sequence[int] | None) -> list[str]:
 
 
 def _quote(text: str) -> str:
-    """Write any text as YAML has it: JSON's strings are YAML's."""
+    """Return any text as a YAML string; JSON strings are valid YAML."""
     return text if text.replace("-", "").replace("_", "").isalnum() and text[0].isalpha() else json.dumps(text)

@@ -1,8 +1,9 @@
-"""Draws the samples that a plan would give of a supposed material, and fits them as a result's are.
+"""Draws the samples that a plan would give for a supposed material, and fits them as in a result.
 
-What is drawn has the frames' noise, each LED's own power and place, and a highlight that grows towards grazing
-angles by Schlick's Fresnel term, which the fitted model lacks. The uncertainty is then that of the fit itself,
-misfit included. Light from surface to surface, shadows' edges, and errors of poses and mesh are not in it.
+The samples have the frames' noise, and errors of each LED's power and place. Their highlight grows towards grazing
+angles by Schlick's Fresnel term, which the fitted model lacks. So the uncertainty is that of the fit itself,
+including the misfit of the model. Inter-reflection, edges of shadows, and errors of poses and mesh are not
+included.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from coupole.reflectance.triangle_fit import TriangleSamples, fit_triangles
 Floats = NDArray[np.float64]
 
 _MOST_VALUES = 20_000_000
-"""Samples that are drawn, of all channels, at most; beyond it fewer parts stand for the surface."""
+"""Largest number of drawn samples, of all channels. If there are more, fewer parts represent the surface."""
 
 
 NORMAL_DEG = "normal_deg"
 ExpectedUncertainty = dict[str, Floats]
-"""Standard uncertainties [n] of parts by the names that the report of a result has: `normal_deg`, `kd_percent`,
-`ks_percent`, `alpha_percent`, kd and ks with what all LEDs share. NaN where too few samples are expected for a
-material, and of parts that were not drawn."""
+"""Standard uncertainties [n] of parts, by the names in the report of a result: `normal_deg`, `kd_percent`,
+`ks_percent`, `alpha_percent`. Those of kd and ks include the part that all LEDs share. NaN if too few samples are
+expected for a material, and for parts that were not drawn."""
 
 
 def rehearse(
@@ -41,7 +42,7 @@ def rehearse(
     *,
     seed: int = 1,
 ) -> ExpectedUncertainty:
-    """The uncertainty of the parts after these views under these LEDs, rows of the dome's table."""
+    """Return the uncertainty of the parts after these views under these LEDs (rows of the dome's table)."""
     count, channels = len(surface.points_mm), surface.signal_per_f.shape[2]
     step = -(-count * len(views) * len(led_rows) * channels // _MOST_VALUES)
     rows = np.arange(0, count, step)
@@ -68,7 +69,8 @@ def _drawn_samples(
     rows: NDArray[np.int64],
     random: np.random.Generator,
 ) -> TriangleSamples:
-    """Samples of some of the parts; LEDs stand elsewhere, and are as bright otherwise, than the records say."""
+    """Return samples of some of the parts. The places and the power of the LEDs have errors against the
+    records."""
     leds_mm, channels = surface.leds_mm[led_rows], surface.signal_per_f.shape[2]
     true_leds_mm = leds_mm + surface.u_led_mm * random.standard_normal(leds_mm.shape)
     own_power = 1.0 + surface.u_own[led_rows] * random.standard_normal(len(led_rows))

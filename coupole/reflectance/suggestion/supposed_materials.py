@@ -1,4 +1,4 @@
-"""Materials that an object may be of before anything of it is measured."""
+"""Materials that an object may have, supposed before anything is measured."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class SupposedMaterial:
     """Lambert plus GGX as in `coupole.reflectance.ggx`, the same in all channels."""
 
     kd: float
-    """1/sr"""
+    """Diffuse reflectance kd, 1/sr."""
     ks: float
     alpha: float
 
@@ -23,9 +23,9 @@ SUPPOSED = {
 }
 """Limestone or unglazed clay; varnished or lacquered; gilt or polished metal, a little worn."""
 UNKNOWN = "unknown"
-"""Any of them."""
+"""Name for any of these materials."""
 
 
 def supposed_materials(name: str) -> dict[str, SupposedMaterial]:
-    """The materials, by name, that a plan must serve."""
+    """Return the materials, by name, for which a plan must be suitable."""
     return SUPPOSED if name == UNKNOWN else {name: SUPPOSED[name]}

@@ -1,8 +1,8 @@
-"""The signal that a cell gives of parts of an object's surface, and its noise, by the records in force.
+"""The signal of parts of an object's surface in a cell, and its noise, by the records in force.
 
-Power of each LED from the record `led-power`, noise from the record `response`, shadows of the object, the arm and
-the tool by `coupole.motion.occlusion`. What is not in it: light from surface to surface, glare, and errors of the
-mesh and of the records beside the LEDs' own power.
+The power of each LED comes from the record `led-power`, and the noise from the record `response`. Shadows of the
+object, the arm and the tool come from `coupole.motion.occlusion`. Not included are inter-reflection, glare, errors
+of the mesh, and errors of the records other than the LEDs' own power.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from coupole.reflectance.triangle_fit import between, towards
 Floats = NDArray[np.float64]
 
 LEAST_COSINE = 0.1
-"""Least cosine between view and normal: what the extraction uses."""
+"""Least cosine between view and normal, as in the extraction."""
 
 
 @dataclass(frozen=True)
 class CameraNoise:
-    """Variance of a pixel at a signal of s DN above black, by channel: in_dark + gain s."""
+    """Variance of a pixel at a signal of s DN above black, for each channel: in_dark + gain s."""
 
     in_dark_dn2: Floats
     """[channels]"""
@@ -53,9 +53,9 @@ class CameraNoise:
     """[channels] share of the pixels that have this colour."""
 
     def relative_variances(self, signal_dn_per_s: Floats, pixels: Floats, exposures_us: Sequence[int]) -> Floats:
-        """[..., channels] relative variances by noise of triangles' mean signals, from all exposures in which
-        a signal is neither too dark nor saturated; infinite where it is so in all. `pixels` [...] are all that a
-        triangle has."""
+        """[..., channels] relative variances, from noise, of triangles' mean signals. They use all exposures in
+        which a signal is neither too dark nor saturated, and are infinite without such an exposure. `pixels` [...]
+        is the number of all pixels of a triangle."""
         precision = np.zeros(signal_dn_per_s.shape)
         for exposure_us in exposures_us:
             signal_dn = signal_dn_per_s * exposure_us * 1e-6
@@ -77,17 +77,17 @@ class Surface:
     normals: Floats
     """[n, 3] unit."""
     triangle_areas_mm2: Floats
-    """[n] of the triangle of each part."""
+    """[n] area of the triangle in each part."""
     triangles: Floats
-    """[n] number of triangles of each part."""
+    """[n] number of triangles that each part represents."""
     leds_mm: Floats
     """[leds, 3] support frame, in the order of the dome's table."""
     signal_per_f: Floats
-    """[n, leds, channels] DN/s above black of a reflectance of 1/sr; cosine of incidence included."""
+    """[n, leds, channels] DN/s above black for a reflectance of 1/sr, including the cosine of incidence."""
     u_own: Floats
     """[leds] relative standard uncertainty of an LED's own power."""
     u_shared: float
-    """Relative standard uncertainty of what all LEDs share."""
+    """Relative standard uncertainty that all LEDs share."""
     u_led_mm: float
     """Standard uncertainty of each coordinate of an LED's centre."""
     noise: CameraNoise
@@ -95,23 +95,24 @@ class Surface:
 
 @dataclass(frozen=True)
 class SeenParts:
-    """Parts of the surface as one view has them."""
+    """Parts of the surface as one view sees them."""
 
     camera_mm: Floats
     """[3] support frame."""
     pixels: Floats
-    """[n] pixels of a triangle, all channels; 0 where the view does not see the part."""
+    """[n] pixels of a triangle, in all channels; 0 if the view does not see the part."""
     is_lit: NDArray[np.bool_]
     """[n, leds]"""
 
     @property
     def parts(self) -> NDArray[np.int64]:
-        """Numbers of the parts that the view sees, rising."""
+        """Numbers of the parts that the view sees, in rising order."""
         return np.flatnonzero(self.pixels > 0.0)
 
 
 class SupposedCell:
-    """A job's cell, asked for what views would see. Raises InputError if a record that it takes is not named."""
+    """A job's cell, which computes what views would see. Raises InputError if a record that it needs is not
+    named."""
 
     def __init__(self, job: Job) -> None:
         self._job, self.rig = job, job.cell.rig
@@ -131,7 +132,7 @@ class SupposedCell:
 
     @cached_property
     def surface(self) -> Surface:
-        """The parts, and the light that reaches them where nothing shades them."""
+        """Return the parts, and the light that reaches them without shadows."""
         patches, leds = self.occlusions.patches, self._job.cell.leds
         support_from_base = inverse(self.rig.support.base_from_support.matrix())
         leds_mm = apply(support_from_base, leds.positions_mm)
@@ -159,14 +160,14 @@ class SupposedCell:
         )
 
     def seen_by(self, joints_deg: Floats, support_from_camera: Floats) -> SeenParts:
-        """The parts that a view sees with the arm in this posture."""
+        """Return the parts that a view sees with the arm in this posture."""
         occlusion: Occlusion = self.occlusions.at(joints_deg)
         sight = sight_of(self.rig, support_from_camera)
         pixels = np.where(occlusion.is_seen, self._pixels(sight), 0.0)
         return SeenParts(support_from_camera[:3, 3], pixels, occlusion.codes == REACHED)
 
     def _pixels(self, sight: Sight) -> Floats:
-        """[n] pixels that a triangle of each part covers; 0 where it is out of focus, or seen too obliquely."""
+        """[n] pixels that a triangle of each part covers; 0 if it is out of focus, or seen too obliquely."""
         ways = sight.support_from_camera[:3, 3] - self.surface.points_mm
         distance_mm = np.linalg.norm(ways, axis=1)
         depth_mm = -ways @ sight.support_from_camera[:3, 2]
@@ -179,8 +180,8 @@ class SupposedCell:
 
 
 def _triangles_of_parts(patches: Patches, corners_mm: Floats) -> tuple[Floats, Floats]:
-    """[n] number of triangles of each part, where one that lies in several counts in each by its share, and their
-    mean area, mm^2."""
+    """[n] number of triangles of each part, and their mean area, mm^2. A triangle that lies in several parts
+    counts in each by its share."""
     across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     areas_mm2 = 0.5 * np.linalg.norm(across, axis=1)
     share = 1.0 / np.bincount(patches.piece_triangle, minlength=len(corners_mm))[patches.piece_triangle]
@@ -191,7 +192,7 @@ def _triangles_of_parts(patches: Patches, corners_mm: Floats) -> tuple[Floats, F
 
 
 def _channels(sensor: Sensor) -> tuple[Sequence[str], Floats]:
-    """Names of the channels, as records have them, and the share of the pixels that each has."""
+    """Return the names of the channels, as in records, and each channel's share of the pixels."""
     channels = channels_of(sensor.bayer_pattern)
     shares = {"R": 0.25, "G": 0.5, "B": 0.25}
     return channels, np.array([shares[channel] for channel in channels] if len(channels) > 1 else [1.0])
@@ -213,9 +214,9 @@ def reflectances(
     surface: Surface, view: SeenParts, material: SupposedMaterial, leds_mm: Floats, parts: NDArray[np.int64]
 ) -> tuple[Floats, Floats]:
     """[parts, leds] reflectance, 1/sr, and cosine of incidence of some parts under LEDs at [leds, 3]; NaN where no
-    light reaches what the view sees.
+    light reaches the visible part.
 
-    The highlight grows towards grazing angles by Schlick's Fresnel term (1994), as a real one does.
+    Like a real highlight, it grows towards grazing angles, here by Schlick's Fresnel term (1994).
     """
     f, cosines = np.full((2, len(parts), len(leds_mm)), np.nan)
     _fill_reflectances(
@@ -228,7 +229,7 @@ def reflectances(
 def signal_quantile(
     surface: Surface, views: Sequence[SeenParts], material: SupposedMaterial, quantile: float
 ) -> float:
-    """Quantile of the samples' signals, DN/s in the most sensitive channel; NaN without any."""
+    """Return a quantile of the samples' signals, DN/s in the most sensitive channel; NaN without samples."""
     per_f = surface.signal_per_f.max(axis=2)
     signals = [np.zeros(0)]
     for view in views:

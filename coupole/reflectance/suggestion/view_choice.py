@@ -1,8 +1,9 @@
-"""Chooses views one after the other, each the one that takes most uncertainty away beside those before it.
+"""Chooses views one after the other. Each is the view that reduces the uncertainty most, given the views before
+it.
 
-The measure is the mean over the surface of half the logarithm of the covariance's determinant (D-optimality): what
-a further view tells of a part becomes less with each view that the part has, so that the choice by turns is near
-the best one (Nemhauser et al. 1978 for functions of this kind; here it is a rule, no proof).
+The measure is the mean over the surface of half the logarithm of the covariance's determinant (D-optimality). The
+information from a further view of a part becomes less with each view that the part has. So a choice of one view at
+a time is near the best choice (Nemhauser et al. 1978 for functions of this kind; here it is a rule, no proof).
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ from numpy.typing import NDArray
 from coupole.reflectance.suggestion.view_information import Information, ViewInformation
 
 ENOUGH = 0.1
-"""Gain of a further view, for the five unknowns together, below which none is added: 2 % of each."""
+"""Gain of a further view, for the five unknowns together, below which no view is added: 2 % of each."""
 
 
 @dataclass(frozen=True)
 class ViewChoice:
-    """Chosen views, in the order of their worth."""
+    """Chosen views, the most valuable one first."""
 
     views: tuple[int, ...]
     """Numbers of the candidates."""
     value: float
-    """Gain of all of them together, the mean over materials and parts."""
+    """Gain of all views together: the mean over materials and parts."""
 
 
 def choose_views(
@@ -37,8 +38,8 @@ def choose_views(
     weights: NDArray[np.float64],
     most: int,
 ) -> ViewChoice:
-    """Choose at most `most` of the candidates, each of which has its information for each supposed material, with
-    one `number` of their numbers of LEDs. `weights` [n] are those of the parts."""
+    """Choose at most `most` of the candidates by their information for each supposed material. `number` is the
+    index of the number of LEDs. `weights` [n] are the weights of the parts."""
     so_far, shares = deepcopy(list(priors)), weights / weights.sum()
     chosen_views, value = list[int](), 0.0
 

@@ -1,8 +1,9 @@
-"""Information of views about an object's materials, summed before anything is measured, to compare views.
+"""Expected information of views about an object's materials, to compare views before anything is measured.
 
 A fit's covariance is H^-1 M H^-1 (`coupole.reflectance.material_uncertainty`). Both are sums over samples, so each
-view adds its own to them. Here the derivatives are those of a supposed material, and M has what is known
-beforehand: the frames' noise, each LED's own power, and the priors. What a plan promises is `rehearsal`'s.
+view adds its own samples. Here the derivatives are those of a supposed material. M contains the errors that are
+known beforehand: the frames' noise, each LED's own power, and the priors. The uncertainty stated with a plan comes
+from `rehearsal`.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ class ViewInformation:
     """Sums over the samples of one view, for the parts that it sees and several numbers of LEDs."""
 
     parts: NDArray[np.int64]
-    """[k] numbers of the parts, rising."""
+    """[k] numbers of the parts, in rising order."""
     bread: Floats
-    """[numbers, k, 5, 5] the scores' derivatives."""
+    """[numbers, k, 5, 5] derivatives of the scores."""
     meat: Floats
-    """[numbers, k, 5, 5] the scores' variance."""
+    """[numbers, k, 5, 5] variance of the scores."""
 
 
 @dataclass
@@ -41,13 +42,13 @@ class Information:
     """Sums over the samples of all views so far, for the n parts of a surface."""
 
     bread: Floats
-    """[n, 5, 5] the scores' derivatives."""
+    """[n, 5, 5] derivatives of the scores."""
     meat: Floats
-    """[n, 5, 5] the scores' variance."""
+    """[n, 5, 5] variance of the scores."""
 
     @staticmethod
     def before(surface: Surface, noise_um: float) -> Information:
-        """Return what is known before any sample: the mesh's normals, and usual materials."""
+        """Return the information before any sample: the mesh's normals, and usual materials."""
         stiffness = prior_stiffness(surface.triangle_areas_mm2, noise_um)
         bread = np.zeros((len(stiffness), UNKNOWNS, UNKNOWNS))
         for place, precision in ((2, LEAST_KNOWN), (3, USUAL / SPREAD_KS**2), (4, USUAL)):
@@ -57,20 +58,20 @@ class Information:
         return Information(bread, bread.copy())
 
     def gains(self, view: ViewInformation, number: int) -> Floats:
-        """[k] half the logarithm by which a view, with one of its numbers of LEDs, makes the determinant of the
-        covariance of its parts smaller."""
+        """[k] half the decrease of the logarithm of the determinant of each part's covariance, by a view with one
+        of its numbers of LEDs."""
         bread, meat = self.bread[view.parts], self.meat[view.parts]
         before = _log_determinants(bread, meat)
         return 0.5 * (before - _log_determinants(bread + view.bread[number], meat + view.meat[number]))
 
     def add(self, view: ViewInformation, number: int) -> None:
-        """Add what a view tells, with one of its numbers of LEDs."""
+        """Add the information of a view with one of its numbers of LEDs."""
         self.bread[view.parts] += view.bread[number]
         self.meat[view.parts] += view.meat[number]
 
 
 def _log_determinants(bread: Floats, meat: Floats) -> Floats:
-    """[k] of the covariances."""
+    """[k] logarithms of the determinants of the covariances."""
     logarithms: Floats = np.linalg.slogdet(meat)[1] - 2.0 * np.linalg.slogdet(bread)[1]
     return logarithms
 
@@ -83,7 +84,8 @@ def information_of(
     led_rows: NDArray[np.int64],
     numbers: Sequence[int],
 ) -> ViewInformation:
-    """Return what a view tells, with the first n of `led_rows` for each n of `numbers`, which rise."""
+    """Return the information of a view, with the first n of `led_rows` for each n in `numbers`, which are in
+    rising order."""
     parts = view.parts
     bread, meat = np.zeros((2, len(numbers), len(parts), UNKNOWNS, UNKNOWNS))
     f = reflectances(surface, view, material, surface.leds_mm, parts)[0]
@@ -104,8 +106,8 @@ def information_of(
 def _fill(  # type: ignore[no-untyped-def]
     points_mm, normals, camera_mm, leds_mm, variances, material, led_rows, numbers, bread, meat
 ):
-    """Add to `bread` and `meat` [numbers, k, 5, 5] the samples of the LEDs that each number has more than the one
-    before it; `variances` [k, leds] are relative, of the channels' mean, infinite for no sample."""
+    """Add the samples of the additional LEDs of each number to `bread` and `meat` [numbers, k, 5, 5]. `variances`
+    [k, leds] are relative variances of the channels' mean, infinite for no sample."""
     kd, ks, alpha = material
     scale2 = CAUCHY * CAUCHY * kd
     light, view, half, row = np.empty(3), np.empty(3), np.empty(3), np.empty(UNKNOWNS)

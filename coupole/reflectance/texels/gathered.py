@@ -1,7 +1,7 @@
 """Materials of places on the object, gathered from the pixels of all views that show them.
 
-A place is looked up in each view by its direction. Between the four pixels around it, materials are interpolated
-(normals as vectors, the others as logarithms); views are weighted by how certain each is of what it shows.
+A place is looked up in each view by its direction. Materials are interpolated between the four pixels around it
+(normals as vectors, the other values as logarithms). Views are weighted by the certainty of their materials.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from coupole.reflectance.triangle_fit import TriangleMaterials
 Floats = NDArray[np.float64]
 
 _REACH = 3.0
-"""Largest distance of a place from what a pixel at its side sees, over the median distance of neighbouring pixels:
-farther away, the pixel sees something in front of it."""
+"""Largest distance of a place from the place that a neighbouring pixel sees, over the median distance of
+neighbouring pixels. Beyond it, the pixel sees something in front of the place."""
 _BLOCK, _PART = 1 << 20, 1 << 15
-"""Places that are looked up together, and by a thread in one go."""
+"""Number of places that are looked up together, and number in one part for a thread."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Gathered:
 
     materials: TriangleMaterials
     covariance: NDArray[np.float32]
-    """[n, 15] as files have it; views are taken as independent."""
+    """[n, 15] lower halves, as in files; views are taken as independent."""
 
 
 @dataclass(frozen=True)
@@ -50,23 +50,23 @@ class TexelView:
     texels: ViewTexels
     surface: Surface
     texel_of_pixel: NDArray[np.int32]
-    """[h, w] -1 for none."""
+    """[h, w] number of a pixel's texel, -1 for none."""
     step_mm: float
-    """Median distance of what neighbouring pixels see."""
+    """Median distance between the places that neighbouring pixels see."""
     texel_mm: float
     """Width of its texels on the surface."""
     u_common: float
-    """Relative standard uncertainty of kd and ks that covariances do not have: of responses, and of the LEDs'
+    """Relative standard uncertainty of kd and ks that is not in the covariances: of responses, and of the LEDs'
     power."""
 
 
 def open_views(result: RunResult) -> list[TexelView]:
-    """Open the views that have texels. Raises InputError if none has."""
+    """Open the views that have texels. Raises InputError if no view has texels."""
     return [_open_view(result, view) for view in views_with_texels(result)]
 
 
 def gather(views: Sequence[TexelView], places_mm: NDArray[np.floating]) -> Gathered:
-    """Gather materials of places [n, 3] of the base frame."""
+    """Gather the materials of places [n, 3] of the base frame."""
     count, channels = len(places_mm), views[0].texels.kd.shape[1]
     normals, logs = np.zeros((count, 3)), np.zeros((count, 2 * channels + 1))
     information = np.zeros((count, len(VARIANCES)))
@@ -97,14 +97,14 @@ def _open_view(result: RunResult, view: ViewSamples) -> TexelView:
 
 
 def _by_columns(of_unknowns: Floats, channels: int) -> Floats:
-    """[n, 2 channels + 1] of what is said of kd, ks and alpha [n, 3]."""
+    """[n, 2 channels + 1] columns for each channel, from values of kd, ks and alpha [n, 3]."""
     return np.repeat(of_unknowns, [channels, channels, 1], axis=1)
 
 
 def _add_view(
     view: TexelView, places_mm: NDArray[np.floating], normals: Floats, logs: Floats, information: Floats
 ) -> None:
-    """Add what a view shows of places [n, 3], times its weights, to sums."""
+    """Add the materials of places [n, 3] in a view, times its weights, to sums."""
     pixels = pixels_of_places(view.surface, places_mm)
     if pixels is None:
         return
@@ -156,7 +156,7 @@ def _look_up(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _corners(pixel, place_mm, texel_of_pixel, seen_mm, reach_mm, texels, weights):  # type: ignore[no-untyped-def]
-    """Fill the texels [4] around a pixel's place and their weights, which sum to 1; tell whether enough of them
+    """Fill the texels [4] around a pixel's place and their weights, which sum to 1. Return whether enough of them
     see the place."""
     height, width = texel_of_pixel.shape
     x, y, total = pixel[0], pixel[1], 0.0

@@ -1,9 +1,8 @@
-"""Materials of texels of several pixels: one fit for each, to the means of its channels, as triangles are fitted.
+"""Materials of texels of several pixels: one fit for each, to the means of its channels, as for triangles.
 
-Normal, lightness, ks and roughness are fitted to the mean of the channels, about the material of the triangle that
-most of a texel's pixels see, and neighbouring texels are taken into account as neighbouring pixels are. All
-channels of a texel
-are measured, and give its colour together with those of the texels beside it.
+Normal, lightness, ks and roughness are fitted to the mean of the channels. The prior is the material of the
+triangle that most of a texel's pixels see. Neighbouring texels are taken into account as neighbouring pixels are.
+All channels of a texel are measured; together with those of the texels beside it they give its colour.
 """
 
 from __future__ import annotations
@@ -31,12 +30,12 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 _TOGETHER = 1 << 16
-"""Texels that are fitted together."""
+"""Number of texels that are fitted together."""
 _PART = 1 << 12
 _MOST_WIDER = 4.0
-"""Largest factor of kd's variance."""
+"""Largest factor by which kd's variance is enlarged."""
 _SPREAD_PX, _LEAST_SPREAD = 2.5, 1.0
-"""Standard deviation of the weights with which texels around count for a colour, px, and its least, texels."""
+"""Standard deviation of the weights of surrounding texels in a colour, px, and its least value, in texels."""
 
 
 def texels_of_grid(
@@ -48,8 +47,8 @@ def texels_of_grid(
     threads: int,
     say: Say,
 ) -> ViewTexels:
-    """Fit all texels of a view, under its LEDs but those `left_out`; frames are read once for each band of texels
-    whose values fit into the memory. Raises StorageError for a damaged frame."""
+    """Fit all texels of a view, under its LEDs except those `left_out`. Frames are read once for each band of
+    texels with values that fit into the memory. Raises StorageError for a damaged frame."""
     grid, channels = reader.grid, result.channels
     centres = centres_of(result, view, grid.triangle, reader.mesh_normals)
     lights = lights_of(result, view, left_out)
@@ -91,7 +90,7 @@ def texels_of_grid(
 
 
 def _wider(colours: Singles) -> Singles:
-    """[n] factors of kd's variance for colours [n, channels]: means over the channels. If the lobe has another
+    """[n] factors of kd's variance for colours [n, channels], as means over the channels. If the lobe has another
     form, the error of kd is as large in a dark channel as in a light one."""
     factors: Singles = np.clip(np.exp(-2.0 * colours).mean(axis=1), 1.0, _MOST_WIDER)
     return factors
@@ -100,13 +99,13 @@ def _wider(colours: Singles) -> Singles:
 def colours_around(
     colours: Singles, u_colours: Singles, of_triangles: Singles, is_fitted: NDArray[np.bool_], side_px: int
 ) -> tuple[Singles, Singles]:
-    """Colours of texels [h, w, channels], logarithms of kd over the channels' mean, with those around, and their
-    standard uncertainty [h, w].
+    """Return colours of texels [h, w, channels], averaged with the texels around them, and their standard
+    uncertainty [h, w]. A colour is the logarithm of kd over the channels' mean.
 
-    A texel's red and blue pixels are not in the same places, and paint that changes between them looks like a
+    A texel's red and blue pixels are at different places, so a change of the paint between them looks like a
     colour. So the difference of a texel's colour from its triangle's is averaged with those of the texels around,
-    within some pixels. The spread that this removes says how uncertain the mean is. The mean of the logarithms
-    over the channels is 0, so kd's mean over the channels stays as it was fitted.
+    within some pixels. The spread that the mean removes gives its uncertainty. The mean of the logarithms over the
+    channels is 0, so kd's mean over the channels stays as it was fitted.
     """
     width = max(_SPREAD_PX / side_px, _LEAST_SPREAD)
     weight = is_fitted.astype(np.float32)
@@ -131,8 +130,8 @@ def colours_around(
 def _pixels_of(
     texel_of_pixel: NDArray[np.int32], texels: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """The first pixel of each of the `texels` [n], row by row in the picture, and [h, w] which of them a pixel
-    belongs to; -1 for none."""
+    """Return the first pixel of each of the `texels` [n], row by row in the picture; and the number of each
+    pixel's texel [h, w], -1 for none."""
     number = np.full(int(texel_of_pixel.max(initial=0)) + 2, -1, np.int32)
     number[texels] = np.arange(len(texels))
     number_of_pixel = number[texel_of_pixel]  # -1, for no texel, takes the last
@@ -144,9 +143,9 @@ def _pixels_of(
 def colours_of(
     values: Singles, places_mm: Singles, lights: Lights, fit: PixelMaterials, shine: Floats, threads: int | None
 ) -> tuple[Floats, Floats]:
-    """[n, channels] logarithms of kd over the mean of the channels, of texels with fits, and their standard
-    uncertainty [n], mean of channels. `values` [n, channels, leds of the view]; `shine` [n, channels] is ks over
-    the channels' mean. NaN without a fit."""
+    """[n, channels] logarithms of kd over the mean of the channels, for texels with fits, and their standard
+    uncertainty [n], mean of channels. `values` are [n, channels, leds of the view]; `shine` [n, channels] is ks
+    over the channels' mean. NaN without a fit."""
     count, channels = values.shape[:2]
     kd, u_kd = np.full((count, channels), np.nan), np.full((count, channels), np.nan)
     grey = np.exp(fit.logs)
@@ -167,8 +166,9 @@ def colours_of(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _colours(values, places_mm, led_mm, camera_mm, normals, grey, shine, kd, u_kd):  # type: ignore[no-untyped-def]
-    """Each channel's kd by least squares, and its uncertainty by the residuals. What is fitted is how a channel's
-    values differ from their mean over the channels: there the error of a lobe of another form is gone."""
+    """Fill `kd` with each channel's kd by least squares, and `u_kd` with its uncertainty from the residuals. The
+    fit uses the difference of a channel's values from their mean over the channels, because the error of a lobe
+    with another form cancels in it."""
     channels, leds = values.shape[1:]
     cosines, lobes, weights = np.empty(leds), np.empty(leds), np.empty(leds)
     for texel in range(len(values)):
@@ -194,8 +194,8 @@ def _colours(values, places_mm, led_mm, camera_mm, normals, grey, shine, kd, u_k
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _weigh(sample, place_mm, led_mm, camera_mm, normal, grey, cosines, lobes, weights):  # type: ignore[no-untyped-def]
-    """Fill for each LED the cosine of incidence, what the lobe of the mean gives, and the weight of its values
-    [channels, leds], 0 where one of them is missing or the LED is behind the surface."""
+    """Fill, for each LED, the cosine of incidence, the value of the mean's lobe, and the weight of its values
+    [channels, leds]. The weight is 0 if one of them is missing or the LED is behind the surface."""
     light, half, view = np.empty(3), np.empty(3), np.empty(3)
     towards(place_mm, camera_mm, view)
     nv = max(normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2], 1e-3)

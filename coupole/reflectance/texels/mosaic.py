@@ -1,8 +1,9 @@
-"""Colours between the pixels of a Bayer pattern, from what single pixels show of their own channel.
+"""Colours between the pixels of a Bayer pattern, from the own channel of single pixels.
 
-Detail of surfaces is above all light and dark, alike in all channels, and each pixel has it; colours change less
-from pixel to pixel. So a channel that a pixel does not have is its own deviation from its triangle, plus the mean
-difference of the channels around it. Its own channel stays as it was fitted.
+Detail of surfaces is mostly lightness, which is alike in all channels and is present in each pixel. Colours change
+less from pixel to pixel. So the deviation of a missing channel is the deviation of the pixel's own channel from
+its triangle, plus the mean difference of the channels around the pixel. The pixel's own channel stays as it was
+fitted.
 """
 
 from __future__ import annotations
@@ -14,17 +15,17 @@ from scipy.ndimage import gaussian_filter
 Singles = NDArray[np.float32]
 
 _SPREAD_PX = 2.5
-"""Standard deviation of the weights of neighbours: stripes of five pixels are nearly gone from a mean, so that the
-channels' places in them are not taken for colours."""
+"""Standard deviation of the weights of neighbours, px. Stripes of five pixels nearly disappear in a mean, so that
+they do not look like colours."""
 _LEAST_SHARE = 1e-2
-"""Least share of a channel in the certainty around a pixel."""
+"""Least share that a channel must have in the certainty around a pixel."""
 _MOST_CHANGE = 1.0
-"""Largest difference of channels' logarithms that is believed; fits that failed are farther apart."""
+"""Largest accepted difference of channels' logarithms; failed fits differ more."""
 
 
 def all_channels(deviation: Singles, certainty: Singles, channel: NDArray[np.int8], channels: int) -> Singles:
-    """[h, w, channels] of deviations [h, w] that pixels of a `channel` [h, w] show, weighted by their `certainty`
-    [h, w]; 0 where that is 0, as nothing is fitted."""
+    """[h, w, channels] deviations of all channels, from deviations [h, w] of pixels in their own `channel` [h, w],
+    weighted by their `certainty` [h, w]. They are 0 where the certainty is 0, because nothing is fitted there."""
     is_fitted = certainty > 0.0
     if channels == 1:
         return np.where(is_fitted, deviation, np.float32(0.0))[..., None]

@@ -1,11 +1,11 @@
-"""The word of neighbours on a pixel: its material lies about that of its triangle, and that one about those beside
-it, as far as all around it do.
+"""Shrinkage of materials, as far as neighbours agree: a pixel's material moves towards that of its triangle, and a
+triangle's material towards those of the triangles around it.
 
-In a window the spread of materials is that of the surface and that of the fits; what the fits' covariances do
-not explain is the surface's (empirical Bayes: Morris, Parametric empirical Bayes inference, 1983). Where the
-surface is plain little is left, and pixels become as their triangles are; where it has detail they stay as they
-were fitted. The same holds for ks and roughness of triangles, which few samples near a highlight say badly; kd and
-normal follow by their covariance with them.
+In a window the spread of materials comes from the surface and from the fits. The part that the fits' covariances
+do not explain is the surface's (empirical Bayes: Morris, Parametric empirical Bayes inference, 1983). Where the
+surface is plain, this part is small, and pixels take the material of their triangle. Where the surface has detail,
+pixels stay as they were fitted. The same is done for ks and roughness of triangles, which are uncertain with few
+samples near a highlight; kd and normal follow by their covariance with these.
 """
 
 from __future__ import annotations
@@ -23,33 +23,36 @@ from coupole.reflectance.run_result import LOWER, VARIANCES
 Singles = NDArray[np.float32]
 
 WINDOW_PX = 17
-"""Side of the window: some hundred pixels of each channel say how the surface varies."""
+"""Side of the window: it has some hundred pixels of each channel, from which the variation of the surface is
+found."""
 _ALIKE_PX = 5
-"""Side of the window in which covariances are averaged: eight groups of LEDs alone say little of one."""
+"""Side of the window in which covariances are averaged, because eight groups of LEDs determine a single covariance
+poorly."""
 _LEAST = 1e-6
-"""Least variance of the surface, so that no triangle is taken for exact."""
+"""Least variance of the surface, so that no triangle is treated as exact."""
 _FREE = 100.0
-"""Variance of what is not drawn anywhere."""
+"""Variance of unknowns that are not shrunk."""
 TRIANGLES_AROUND = 64
-"""Triangles of a window that say how ks and roughness vary from one to the other."""
+"""Number of triangles of a window, from which the variation of ks and roughness between triangles is found."""
 _MOST_STEP = 1.0
-"""Largest step of a triangle: a fit that failed has no straight way to where it should have ended."""
+"""Largest step of a triangle, because a failed fit cannot be corrected by a linear step."""
 _OUTLIER = 9.0
-"""Square of the largest deviation, over the window's mean square, that counts in full."""
+"""Largest squared deviation that is used, as a multiple of the window's mean square; larger ones are reduced to
+it."""
 
 
 def lower_half(covariance: NDArray[np.float64]) -> Singles:
-    """[..., 15] of [..., 5, 5], row by row."""
+    """[..., 15] lower halves of [..., 5, 5], row by row."""
     return covariance[..., *LOWER].astype(np.float32)
 
 
 def settle(
     deviation: Singles, covariance: Singles, is_fitted: NDArray[np.bool_], centre_covariance: Singles
 ) -> None:
-    """Draw the deviations [h, w, 5] of a view's pixels from their triangles (tilts, logarithms) towards 0 as far
-    as their neighbours agree, and set their covariances [h, w, 15, lower half row by row] to what is left; in
-    place. Only pixels that are `is_fitted` [h, w] are used and changed. `centre_covariance` [h, w, 15] is that of
-    what they are drawn to.
+    """Shrink, in place, the deviations [h, w, 5] of a view's pixels from their triangles (tilts, logarithms)
+    towards 0, as far as their neighbours agree. Replace their covariances [h, w, 15, lower half row by row] by
+    those after the shrinkage. Only pixels with `is_fitted` [h, w] are used and changed. `centre_covariance` [h, w,
+    15] is the covariance of the triangles' materials.
     """
     covariance[...] = mean_around(covariance, is_fitted, _ALIKE_PX)
     square = deviation**2
@@ -59,9 +62,9 @@ def settle(
 
 
 def settle_triangles(logs: Singles, covariance: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:
-    """Return the steps [h, w, 5] by which materials of triangles change, seen pixel by pixel, when ks and
-    roughness (`logs` [h, w, 2]) are drawn to their means in a window as far as the neighbours agree; set the
-    covariances [h, w, 15] to what is left, in place.
+    """Shrink ks and roughness of triangles (`logs` [h, w, 2], seen pixel by pixel) towards their means in a
+    window, as far as the neighbours agree. Return the steps [h, w, 5] by which the materials change. Replace the
+    covariances [h, w, 15], in place, by those after the shrinkage.
     """
     weight = (1.0 / np.maximum(covariance[..., VARIANCES[3:]], _LEAST)).astype(np.float32)
     middle = mean_around(weight * logs, is_fitted, side_px) / np.maximum(
@@ -83,9 +86,9 @@ def settle_triangles(logs: Singles, covariance: Singles, is_fitted: NDArray[np.b
 
 
 def settle_colours(colours: Singles, variance: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:
-    """Return colours of triangles [h, w, channels] (logarithms, any sum), seen pixel by pixel and drawn to their
-    means in a window as far as those around say. `variance` [h, w] is that of kd's logarithm, which colours have
-    too."""
+    """Return colours of triangles [h, w, channels] (logarithms, any sum), seen pixel by pixel and shrunk towards
+    their means in a window, as far as the neighbours agree. `variance` [h, w] is the variance of kd's logarithm,
+    which is used for colours too."""
     own_variance = np.maximum(variance, _LEAST)[..., None]
     weight = (1.0 / own_variance).astype(np.float32)
     total = np.maximum(mean_around(weight, is_fitted, side_px), _LEAST)
@@ -98,7 +101,7 @@ def settle_colours(colours: Singles, variance: Singles, is_fitted: NDArray[np.bo
 
 
 def _surface(square: Singles, own_covariance: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:
-    """[h, w, k] variances of the surface: mean squares in a window, without those of the fits."""
+    """[h, w, k] variances of the surface: mean squares in a window, minus the variances of the fits."""
     return np.maximum(mean_around(square - own_covariance, is_fitted, side_px), _LEAST).astype(np.float32)
 
 
@@ -112,8 +115,7 @@ def _draw_rows(
 
 
 def mean_around(values: Singles, is_used: NDArray[np.bool_], side_px: int, *, default: float = 0.0) -> Singles:
-    """[h, w, k] mean over the pixels of a window that are used [h, w], whatever the others are; `default` where
-    there are none."""
+    """[h, w, k] mean over the pixels of a window that are used [h, w]; `default` where there are none."""
     weight = _window_sum(is_used.astype(np.float32), side_px)
     means = np.empty_like(values)
     for k in range(values.shape[-1]):
@@ -130,8 +132,8 @@ def _window_sum(plane: Singles, side_px: int) -> Singles:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _draw(deviation, covariance, surface, is_fitted, centre):  # type: ignore[no-untyped-def]
-    """A pixel's deviation and covariance, given the `surface`'s variances about 0: Kalman's; and what 0 may itself
-    be off, as far as the pixel was drawn to it."""
+    """Update each pixel's deviation and covariance by Kalman's equations, with the `surface`'s variances about 0.
+    The covariance includes the uncertainty of the centre, as far as the pixel was shrunk towards it."""
     own_covariance, whole = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
     rest, of_centre = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
     before = np.empty(UNKNOWNS)
@@ -165,7 +167,7 @@ def _draw(deviation, covariance, surface, is_fitted, centre):  # type: ignore[no
 
 @numba.njit(cache=True, nogil=True)
 def tilts_from(normals, prior, tilts):  # type: ignore[no-untyped-def]
-    """Fill `tilts` [n, 2] with those of normals [n, 3] from others, along the tangents of the first."""
+    """Fill `tilts` [n, 2] with the tilts of `normals` [n, 3] against `prior`, along the tangents of `normals`."""
     for n in range(len(normals)):
         t1, t2 = tangents(normals[n, 0], normals[n, 1], normals[n, 2])
         first, second = 0.0, 0.0

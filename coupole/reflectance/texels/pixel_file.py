@@ -35,7 +35,7 @@ _TOLD_OF_SEVERAL = _TOLD | {
     "of kd, ks (the channels' mean) and alpha; without u_pixel and u_shared",
 }
 _ASKED, _SIDE, _PIXEL = "texel_mm", "side_px", "pixel_mm"
-"""Attributes of files of texels of a size that was asked for."""
+"""Attributes of files of texels with a requested size."""
 _OF_PIXEL = "texel_of_pixel"
 
 
@@ -44,8 +44,8 @@ class ViewTexels:
     """Materials of n texels of a view: of single pixels, or of squares of them."""
 
     pixels: NDArray[np.int32]
-    """[n] places in the picture, row by row, rising; of squares the first pixel of each, in the order of the
-    squares."""
+    """[n] places in the picture, row by row, in rising order. For squares they are the first pixel of each, in the
+    order of the squares."""
     normals: Singles
     """[n, 3] unit, base frame."""
     kd: Singles
@@ -53,14 +53,14 @@ class ViewTexels:
     ks: Singles
     alpha: Singles
     covariance: Singles
-    """[n, 15] as `fits/*.h5` have it."""
+    """[n, 15] lower halves, as in `fits/*.h5`."""
     texel_of_pixel: NDArray[np.int32] | None = None
-    """[h, w] which of them a pixel belongs to, -1 for none; None for single pixels."""
+    """[h, w] number of a pixel's texel, -1 for none; None for single pixels."""
     side_px: int = 1
-    """Pixels across a texel."""
+    """Number of pixels across a texel."""
 
     def in_picture(self, shape: tuple[int, ...]) -> NDArray[np.int32]:
-        """[h, w] which of the texels a pixel belongs to; -1 for none."""
+        """[h, w] number of a pixel's texel; -1 for none."""
         if self.texel_of_pixel is not None:
             return self.texel_of_pixel
         number = np.full(shape, -1, np.int32)
@@ -70,7 +70,7 @@ class ViewTexels:
 
 @dataclass(frozen=True)
 class TexelFileHead:
-    """Head of a file of texels: all that it says beside them."""
+    """Head of a file of texels: its contents besides the texels."""
 
     view: str
     size_px: tuple[int, int]
@@ -79,9 +79,9 @@ class TexelFileHead:
     pixel_mm: float
     """Width of a pixel on the surface."""
     u_pixel: NDArray[np.float64]
-    """[channels] relative standard uncertainty of kd and ks, of the responses of a texel's pixels."""
+    """[channels] relative standard uncertainty of kd and ks, from the responses of a texel's pixels."""
     u_shared: float
-    """The same, of the power of all LEDs."""
+    """The same uncertainty from the power of all LEDs."""
     is_simulated: bool
 
 
@@ -121,7 +121,7 @@ def has_texels(result: RunResult) -> bool:
 
 
 def views_with_texels(result: RunResult) -> list[ViewSamples]:
-    """Return the views that have texels. Raises InputError if none has."""
+    """Return the views that have texels. Raises InputError if no view has texels."""
     views = [view for view in result.views if texels_path(result, view).exists()]
     if not views:
         raise _none_of(result)
@@ -134,7 +134,7 @@ def _none_of(result: RunResult, of: str = "") -> InputError:
 
 
 def read_view_texels(result: RunResult, view: ViewSamples) -> ViewTexels:
-    """Raises InputError if the view has none."""
+    """Read the texels of a view. Raises InputError if the view has none."""
     path = texels_path(result, view)
     if not path.exists():
         raise _none_of(result, f" of the view {view.view}")
@@ -145,7 +145,7 @@ def read_view_texels(result: RunResult, view: ViewSamples) -> ViewTexels:
 
 
 def size_of_texels(folder: Path) -> TexelSize | None:
-    """Return the size that the texels of a result folder were asked for with; None without texels."""
+    """Return the requested size of the texels of a result folder; None without texels."""
     path = next(iter(sorted((folder / FOLDER).glob("*.h5"))), None)
     if path is None:
         return None
@@ -154,7 +154,7 @@ def size_of_texels(folder: Path) -> TexelSize | None:
 
 
 def refuse_other_size(folder: Path, size: TexelSize) -> None:
-    """Raise InputError if a result folder has texels that were asked for with another size."""
+    """Raise InputError if a result folder has texels with another requested size."""
     there = size_of_texels(folder)
     if there is not None and there != size:
         raise InputError(
@@ -165,7 +165,7 @@ def refuse_other_size(folder: Path, size: TexelSize) -> None:
 
 
 def read_texel_errors(folder: Path) -> dict[str, float | None]:
-    """Mean absolute errors that the check found, by fit; empty without texels."""
+    """Read the mean absolute errors from the check, by fit; empty without texels."""
     path = folder / FOLDER / ABOUT
     if not path.exists():
         return {}
@@ -174,13 +174,15 @@ def read_texel_errors(folder: Path) -> dict[str, float | None]:
 
 
 def read_texel_widening(folder: Path) -> dict[str, Any] | None:
-    """Widths of texels' intervals that the check found, as `result.json` has them of fits; None without."""
+    """Read the widths of texels' intervals from the check, in the form of `result.json` for fits; None without
+    them."""
     path = folder / FOLDER / ABOUT
     widening: dict[str, Any] | None = read_json(path, allow_nan=True).get("widening") if path.exists() else None
     return widening
 
 
 def texel_uncertainty(result: RunResult, view: ViewSamples) -> tuple[float, float]:
-    """Relative standard uncertainties of kd and ks, means of channels: of a pixel's own response, and of all."""
+    """Return relative standard uncertainties of kd and ks, as means of channels: from a pixel's own response, and
+    the part that all pixels share."""
     with h5py.File(texels_path(result, view), "r") as file:
         return float(np.mean(file["u_pixel"][()])), float(file["u_shared"][()])

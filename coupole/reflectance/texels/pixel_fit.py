@@ -1,8 +1,8 @@
 """Materials of single pixels: normal, kd, ks and alpha of each, with the material of its triangle as prior.
 
-The fit is that of triangles (`coupole.reflectance.ggx_fit`), of one view and one channel, and begins at the
-triangle's material. The prior is weak here: how much neighbours say of a pixel is found afterwards, from all of
-them (`coupole.reflectance.texels.neighbours`).
+The fit is that of triangles (`coupole.reflectance.ggx_fit`), with one view and one channel, and begins at the
+triangle's material. The prior is weak here. The influence of neighbours on a pixel is found afterwards, from all
+of them (`coupole.reflectance.texels.neighbours`).
 """
 
 from __future__ import annotations
@@ -25,34 +25,35 @@ from coupole.reflectance.triangle_fit import between, towards
 Floats = NDArray[np.float64]
 
 TILT, LOG_KS, LOG_ALPHA = math.radians(20.0), 1.5, 0.7
-"""Standard deviations of a pixel's normal (each of two tilts) and of the logarithms of ks and alpha about those of
-its triangle: wider than any that was seen, so that they decide where the samples say nothing."""
+"""Standard deviations of a pixel's normal (each of two tilts) and of the logarithms of ks and alpha from those of
+its triangle. They are wider than any that was seen, so that they decide only where the samples say nothing."""
 FEWEST_OF_PIXEL = 8
-"""Samples that a pixel needs: its triangle's material says the rest, and its uncertainty how much that is."""
+"""Least number of samples of a pixel. Its triangle's material adds the missing information, and its uncertainty
+shows how much."""
 LEAST_KS = 1e-3
 """Least ks of a prior, as a share of kd."""
 LEAST_COSINE = 0.05
-"""Least cosine between view and prior normal: beyond it the triangle's normal was fitted from elsewhere."""
+"""Least cosine between view and prior normal; with less, the triangle's normal was fitted from other views."""
 _SETTLED = 1e-4
 _PART = 512
 
 
 @dataclass(frozen=True)
 class Lights:
-    """LEDs that a view's pixels are fitted to, in the order of their groups."""
+    """LEDs to which a view's pixels are fitted, in the order of their groups."""
 
     columns: NDArray[np.int64]
     """[leds] places in the pixels' values."""
     places_mm: Floats
     """[leds, 3]"""
     group: NDArray[np.int64]
-    """[leds] numbers of groups of neighbours, rising: errors are alike in them."""
+    """[leds] numbers of groups of neighbours, in rising order; errors in a group are alike."""
     camera_mm: Floats
 
 
 @dataclass(frozen=True)
 class Prior:
-    """Materials about which those of n pixels lie: those of their triangles, in the pixels' channels."""
+    """Prior materials of n pixels: the materials of their triangles, in the pixels' channels."""
 
     normals: Floats
     """[n, 3]"""
@@ -63,14 +64,14 @@ class Prior:
 
 @dataclass(frozen=True)
 class PixelMaterials:
-    """Materials of n pixels in their own channels; NaN where there were too few samples, or a fit ran off."""
+    """Materials of n pixels in their own channels; NaN with too few samples, or after a failed fit."""
 
     normals: Floats
     """[n, 3]"""
     logs: Floats
     """[n, 3] logarithms of kd, ks and alpha."""
     covariance: Floats
-    """[n, 5, 5] of tilts and logarithms, as those of triangles."""
+    """[n, 5, 5] covariance of tilts and logarithms, as for triangles."""
 
 
 def fit_pixels(
@@ -148,7 +149,7 @@ def _fit_part(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _begin(unknowns, roots, good, lights, half, view, prior):  # type: ignore[no-untyped-def]
-    """Set the start: the prior's material (kd, ks, alpha), as bright as the samples say."""
+    """Set the start to the prior's material (kd, ks, alpha), with the brightness of the samples."""
     kd, ks, alpha = prior[0], prior[1], prior[2]
     products, squares = 0.0, 0.0
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]

@@ -1,7 +1,7 @@
 """Values of a view's single pixels under all its LEDs, block by block of triangles.
 
-A block's values are all in memory: each pixel's fit sees every LED. Frames are read once for each block, so that a
-larger memory means fewer readings, not another result.
+All values of a block are in memory, because each pixel's fit uses every LED. Frames are read once for each block.
+A larger memory needs fewer readings and gives the same result.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.run_result import INTER_REFLECTION, ViewSamples
 
 _TRIANGLES = 512
-"""Triangles whose pixels a thread fills in one go."""
+"""Number of triangles whose pixels a thread fills at a time."""
 
 
 @dataclass(frozen=True)
@@ -37,18 +37,18 @@ class PixelBlock:
     pixels: NDArray[np.int32]
     """[n] places in a frame, row by row."""
     triangle: NDArray[np.int64]
-    """[n] row of the view's file of samples."""
+    """[n] rows of their triangles in the view's file of samples."""
     channel: NDArray[np.int64]
     """[n]"""
     places_mm: NDArray[np.float32]
-    """[n, 3] what they see, base frame."""
+    """[n, 3] places that they see, base frame."""
     values: NDArray[np.float16]
-    """[n, leds] f times the cosine of incidence, 1/sr, as their square roots shall be used (`fill_pixels`); NaN
-    where there is none: clipped, in shadow."""
+    """[n, leds] f times the cosine of incidence, 1/sr, corrected for the use of their square roots
+    (`fill_pixels`); NaN for pixels that are clipped or in shadow."""
 
 
 class PixelReader:
-    """A view's pixels, ready for its frames; `samples` is its file in a result whose fits are there."""
+    """A view's pixels, ready for its frames; `samples` is its file in a result that has its fits."""
 
     def __init__(
         self,
@@ -68,7 +68,8 @@ class PixelReader:
         self._reader = SignalReader(radiometry, SeenSurface(surface.triangle_of_pixel, samples.triangles))
         self._pass = ViewPass(measured_run, view, geometry.of(samples.triangles), self._reader)
         self._response = self._reader.response._replace(least_dn=np.float32(-np.inf))
-        """Dark pixels count as others: to leave out those that noise has made darker would make all brighter."""
+        """Response without a lower limit: if pixels that noise has darkened were left out, the mean would be too
+        bright."""
 
     @property
     def count(self) -> int:
@@ -76,7 +77,7 @@ class PixelReader:
         return len(self._reader.lists.places)
 
     def blocks(self, memory_bytes: int) -> list[slice]:
-        """Rows of the view's file whose pixels' values fit into a memory."""
+        """Return slices of rows of the view's file, with pixels' values that fit into a memory."""
         starts = self._reader.lists.starts[:: self._reader.pixels.shape[1]]
         pixel_bytes = 2 * len(self._samples.leds)
         most = max(int(memory_bytes // pixel_bytes), int(np.diff(starts).max(initial=1)))
@@ -120,8 +121,8 @@ def fill_rows(
     root_share: np.float32,
 ) -> None:
     """Fill `values` [pixels, leds] of the pixels of some rows, which see `places_mm` [pixels, 3], from the frames
-    of some LEDs, whose `light` has reached the rows (`light_of`). `root_share` is the share of what noise takes
-    from square roots that is given back: 1 if each pixel is fitted by itself."""
+    of some LEDs. `light` tells how the LEDs' light has reached the rows (`light_of`). Noise lowers the mean of
+    square roots; `root_share` of this loss is added, which is 1 if each pixel is fitted alone."""
     lists, (codes, direct) = reader.lists, light
     channels = reader.pixels.shape[1]
     first = int(lists.starts[rows.start * channels])
@@ -144,7 +145,7 @@ def fill_rows(
 def light_of(
     file: h5py.File, rows: slice, part: slice, channels: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Codes [b, 8] of some triangles and LEDs, and the share [b, leds, channels] of light that came straight."""
+    """Return the codes [b, 8] of some triangles and LEDs, and the share [b, leds, channels] of direct light."""
     codes = np.full((rows.stop - rows.start, LANES), AWAY, np.uint8)
     codes[:, : part.stop - part.start] = file["codes"][rows, part]
     if INTER_REFLECTION not in file:

@@ -1,7 +1,7 @@
-"""Errors of texels, and of triangles beside them, in pictures of LEDs that were kept for the check.
+"""Errors of texels, compared with those of triangles, in pictures of LEDs that were kept for the check.
 
-Pictures are made as `coupole reflectance relight --led` makes them, and compared with the frames pixel by pixel,
-where both have a value: light from surface to surface is taken off the frames, as off the samples.
+Pictures are made as by `coupole reflectance relight --led`. They are compared with the frames pixel by pixel,
+where both have a value. Inter-reflection is subtracted from the frames, as from the samples.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from coupole.storage.durable import write_synced
 
 SCHEMA = "coupole-texels/1"
 WIDENED_BY_EVERY = 2
-"""LEDs in whose pictures the widths of intervals are found: one in so many of those that were left out."""
+"""Step between the left-out LEDs whose pictures are used to find the widths of intervals."""
 _MOST_SAMPLES = 200_000
-"""Pixels and channels of a picture that are used for them."""
+"""Number of pixels and channels of a picture from which the widths are found."""
 _BLOCK_BYTES = 500_000_000
-"""Memory for shares of light that are read together."""
+"""Memory for shares of direct light that are read together, bytes."""
 Singles = NDArray[np.float32]
 
 
 def check_texels(result: RunResult, say: Said = silent) -> dict[str, Any]:
-    """Compare pictures by texels, and by the best fit of triangles, with those of the LEDs that were left out;
-    write and return `texels/texels.json`."""
+    """Compare pictures by texels, and by the best fit of triangles, with the frames of left-out LEDs. Write
+    `texels/texels.json`, and return its content."""
     triangle_fit = best_fit(result, FITS)
     misses: dict[str, list[NDArray[np.float64]]] = {TEXELS: [], triangle_fit: []}
     measured_parts: list[Singles] = []
@@ -83,8 +83,8 @@ def _psnr_db(parts: list[NDArray[np.float64]], peak: float) -> float | None:
 
 
 def texel_widening(result: RunResult, say: Said = silent) -> dict[str, Any] | None:
-    """Quantiles of the errors of pictures over their stated uncertainty, as `result.json` has them of fits, from
-    every second LED that was left out; None from too few pixels."""
+    """Return quantiles of the errors of pictures over their stated uncertainty, in the form of `result.json` for
+    fits. They come from every second left-out LED; None from too few pixels."""
     samples = WideningSamples()
     for number, view in enumerate(result.views, start=1):
         _add_errors(samples, result, view)
@@ -93,7 +93,7 @@ def texel_widening(result: RunResult, say: Said = silent) -> dict[str, Any] | No
 
 
 def _add_errors(samples: WideningSamples, result: RunResult, view: ViewSamples) -> None:
-    """Add the errors of a view's pictures."""
+    """Add the errors of a view's pictures to the samples."""
     scene = scene_of_view(result, view.view, TEXELS)
     residuals = np.nan_to_num(residuals_of(scene))[..., None].repeat(result.channels, axis=2).astype(np.float32)
     makers: dict[str, Callable[[int], Singles]] = {
@@ -119,9 +119,9 @@ def _add_errors(samples: WideningSamples, result: RunResult, view: ViewSamples) 
 def held_out_pictures(
     result: RunResult, view: ViewSamples, makers: Mapping[str, Callable[[int], Singles]], *, every: int = 1
 ) -> Iterator[tuple[Singles, dict[str, Singles]]]:
-    """Pictures of each LED that was kept for the check, or of one in so many: the measured one [h / 2, w / 2,
-    channels] in shares of the camera's range, and those that `makers` make [h, w, channels] of an LED, by their
-    names."""
+    """Yield pictures of each LED that was kept for the check, or of one in so many: the measured picture [h / 2, w
+    / 2, channels] in shares of the camera's range, and the pictures of the `makers`, by their names. A maker
+    returns [h, w, channels] for an LED."""
     frames = read_check_frames(result, view)
     with h5py.File(result.folder / FRAMES / view.path.name, "r") as file:
         offsets = file["offsets"][()]
@@ -144,6 +144,6 @@ def picture_maker(result: RunResult, view: ViewSamples, fit: str) -> Callable[[i
 
 
 def _of_blocks(picture: Singles, offsets: NDArray[np.int64], shape: tuple[int, ...]) -> Singles:
-    """[h / 2, w / 2, channels] of the pixels that count in blocks of 2 x 2."""
+    """[h / 2, w / 2, channels] values of the pixels that are used in blocks of 2 x 2."""
     parts = [picture[row::2, column::2, channel] for channel, (row, column) in enumerate(offsets)]
     return np.stack([part[: shape[0], : shape[1]] for part in parts], axis=-1)

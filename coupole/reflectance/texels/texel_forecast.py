@@ -1,9 +1,8 @@
-"""Forecast of texels of a size, before the work begins: how many, how wide, how much memory and disk they
-take, and how long they take on this machine.
+"""Forecast of texels of a size, before the work begins: their number and width, the memory and disk that they
+need, and the time on this machine.
 
-Rays through some pixels of each view tell how many pixels see the object, and how wide these are on it. Time
-follows from small
-trials with the run's own frames and LEDs: reading, fitting, and asking the neighbours.
+Rays through some pixels of each view give the number of pixels that see the object, and their width on it. The
+time follows from small trials with the run's own frames and LEDs: reading, fitting, and the steps with neighbours.
 """
 
 from __future__ import annotations
@@ -42,15 +41,15 @@ from coupole.reflectance.texels.texel_values import texel_bytes
 _TRACED = 200_000
 """Approximate number of pixels of a view through which rays are traced."""
 _FITTED, _SIDE_PX = 2048, 192
-"""Number of texels for the trial of fits, and width of the trial of neighbours."""
+"""Number of texels for the trial of fits, and width in pixels of the trial of the steps with neighbours."""
 _ALL_OVER_SETTLE, _CHECK_OVER_FIT = 3.0, 17.0
-"""Times that were seen: all that is done with neighbours over the part that is tried; a pixel under an LED of
-the check, with the uncertainties of every second, over a fit's sample."""
+"""Ratios of measured times. First: all steps with neighbours over the step in the trial. Second: a pixel under an
+LED of the check, with uncertainties for every second LED, over a sample of a fit."""
 _PLACE_BYTES, _PIXEL_BYTES, _SHOWN_BYTES, _BEFORE_BYTES = 650, 60, 900, 400_000_000
-"""Memory of a texel's place in a view, of a pixel of the picture, of a pixel that sees the object while pictures
-are compared, and of the program before it begins (measured)."""
+"""Measured memory, in bytes, of a texel's place in a view; of a pixel of the picture; of a pixel that sees the
+object while pictures are compared; and of the program before the work."""
 _HEAD_BYTES, _NUMBER_BYTES = 40_000, 0.1
-"""Disk that a file takes without texels, and that the number of a pixel's texel takes."""
+"""Disk space, in bytes, of a file without texels, and of the number of a pixel's texel."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +59,13 @@ class ViewForecast:
     view: str
     leds: int
     picture_px: int
-    """Pixels of its pictures."""
+    """Number of pixels of its pictures."""
     pixels: int
     """Number of pixels that see the object."""
     pixel_mm: float
-    """Width of one on the surface, median."""
+    """Median width of such a pixel on the surface."""
     side_px: int
-    """Pixels across a texel."""
+    """Number of pixels across a texel."""
 
     @property
     def texels(self) -> int:
@@ -84,7 +83,7 @@ class TexelForecast:
     size: TexelSize
     views: tuple[ViewForecast, ...]
     edge_mm: float
-    """Edge of the triangles that are seen, median."""
+    """Median edge of the triangles that are seen."""
     memory_bytes: int
     disk_bytes: int
     time_s: float
@@ -94,17 +93,17 @@ class TexelForecast:
         return sum(view.texels for view in self.views)
 
     def document(self) -> dict[str, Any]:
-        """Document of `--json`."""
+        """Return the document for `--json`."""
         views = [{**asdict(view), "texels": view.texels, "texel_mm": view.texel_mm} for view in self.views]
         figures = ("edge_mm", "memory_bytes", "disk_bytes", "time_s")
         return {"texels": self.texels, **{name: getattr(self, name) for name in figures}, "views": views}
 
 
 def foresee_texels(request: RunRequest, out: Path, size: TexelSize) -> TexelForecast | None:
-    """Foresee the texels that a result folder, which may not be there yet, lacks; None if it lacks none.
+    """Forecast the texels that a result folder lacks; None if it lacks none. The folder need not exist yet.
 
-    Raises InputError: texels that are narrower than what pixels of the finest view see, a folder with texels of
-    another size; and as `reflectance_of` for runs that cannot be evaluated.
+    Raises InputError for texels that are narrower than the pixels of the finest view, and for a folder with texels
+    of another size. For runs that cannot be evaluated, raises as `reflectance_of`.
     """
     refuse_other_size(out, size)
     token = uuid4().hex
@@ -151,7 +150,7 @@ def _refuse_narrower(size: TexelSize, views: list[ViewForecast]) -> None:
 def _foresee_view(
     measured_run: MeasuredRun, geometry: Geometry, view: MeasuredView, name: str, size: TexelSize
 ) -> tuple[ViewForecast, NDArray[np.int64]]:
-    """A view's texels, and the triangles that it sees, traced at every few pixels."""
+    """Return a view's texels, and the triangles that it sees, from rays at every few pixels."""
     width, height = measured_run.frames.size_px
     step, lens = max(1, math.isqrt(width * height // _TRACED)), measured_run.lens
     coarse = replace(
@@ -181,7 +180,8 @@ def _edges_mm(corners_mm: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _memory_bytes(view: ViewForecast, channels: int, budget_bytes: int) -> int:
-    """Peak of a view: while its pixels are read and fitted, or while its pictures are compared."""
+    """Return the peak memory of a view: while its pixels are read and fitted, or while its pictures are
+    compared."""
     places, values = view.picture_px / view.side_px**2, 2 * view.leds * view.pixels
     if view.side_px > 1:
         values = texel_bytes(channels, view.leds, view.side_px) * view.texels
@@ -202,14 +202,14 @@ class _Rates:
 
     channels: int
     pixel_s: float
-    """Time in which a pixel that sees the object, under one LED, is read and made a value."""
+    """Time to read a pixel that sees the object, under one LED, and to convert it to a value."""
     sample_s: float
     """Time of a value in a fit."""
     place_s: float
-    """Time of a place of a view's texels, seen or not, in all that is done with neighbours."""
+    """Time for a place of a view's texels, seen or not, in all steps with neighbours."""
 
     def time_s(self, view: ViewForecast, left_out: list[int], budget_bytes: int) -> float:
-        """Time of a view's texels."""
+        """Return the time of a view's texels."""
         of_texel, texels = 2 * view.leds, view.pixels
         if view.side_px > 1:
             of_texel, texels = texel_bytes(self.channels, view.leds, view.side_px), view.texels
@@ -220,7 +220,7 @@ class _Rates:
         return reading + fitting + self.place_s * view.picture_px / view.side_px**2
 
     def check_s(self, view: ViewForecast, leds: int) -> float:
-        """Time of a view's pictures for the check."""
+        """Return the time of a view's pictures for the check."""
         return _CHECK_OVER_FIT * self.sample_s * view.pixels * leds
 
     @staticmethod
@@ -238,8 +238,8 @@ class _Rates:
 def _batch_s(
     measured_run: MeasuredRun, geometry: Geometry, radiometry: Radiometry, view: MeasuredView, threads: int
 ) -> tuple[float, int]:
-    """Time in which the frames of some LEDs are read and turned into values of a view's pixels, and how many LEDs
-    these are; the second time, as the first one compiles."""
+    """Measure the time to read the frames of some LEDs and convert them to values of a view's pixels; return it
+    with the number of these LEDs. The second call is timed, because the first one compiles."""
     work, surface = view_pass(measured_run, geometry, radiometry, view, threads)
     rows, channels = slice(0, len(surface.triangles)), radiometry.channels
     places_mm = work.facets.centres_mm[surface.places.reshape(-1)[work.reader.lists.places]].astype(np.float32)
@@ -261,7 +261,7 @@ def _batch_s(
 def _fit_s(
     led_mm: NDArray[np.float64], camera_mm: NDArray[np.float64], middle_mm: NDArray[np.float64], threads: int
 ) -> float:
-    """Time of a value in fits of texels that face the camera, with a hundredth of noise."""
+    """Measure the time of a value in fits of texels that face the camera, with noise of one hundredth."""
     group = groups_of_leds(led_mm, middle_mm)
     order = np.argsort(group, kind="stable")
     lights = Lights(order, led_mm[order], group[order], camera_mm)
@@ -280,7 +280,7 @@ def _fit_s(
 
 
 def _place_s() -> float:
-    """Time of a place of a view's texels in all that neighbours are asked for."""
+    """Measure the time of a place of a view's texels in the step with neighbours."""
     shape = (_SIDE_PX, _SIDE_PX)
     for _ in range(2):  # the first time compiles
         deviation, covariance = np.zeros((*shape, 5), np.float32), np.full((*shape, 15), 1e-3, np.float32)

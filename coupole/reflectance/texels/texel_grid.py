@@ -1,7 +1,7 @@
-"""Texels of a size that was asked for: squares of a view's pixels that share one material.
+"""Texels of a requested size: squares of a view's pixels that share one material.
 
-How many pixels a texel is wide follows from what a pixel of the view sees on the surface. Pixels of a square that
-see another surface than most of it, nearer or farther away, belong to no texel.
+The number of pixels across a texel follows from the width of the view's pixels on the surface. Pixels of a square
+that see another surface than most of its pixels, nearer or farther away, belong to no texel.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from numpy.typing import NDArray
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 
 _SAMPLED = 1_000_000
-"""Approximate number of pixels by which their size on the surface is found."""
+"""Approximate number of pixels from which their size on the surface is found."""
 
 
 @dataclass(frozen=True)
 class TexelGrid:
-    """Texels of a view, each a square of pixels: what they are on, and which pixels are theirs."""
+    """Texels of a view, each a square of pixels: their triangles, and their pixels."""
 
     side_px: int
     triangle: NDArray[np.int32]
     """[rows, columns] row, in the view's file, of the triangle that most of a texel's pixels see; -1 for none."""
     texel_of_pixel: NDArray[np.int32]
-    """[h, w] place in the grid, row by row; -1 for none."""
+    """[h, w] place of a pixel's texel in the grid, row by row; -1 for none."""
     places_mm: NDArray[np.float32]
-    """[rows, columns, 3] mean of what a texel's pixels see, base frame."""
+    """[rows, columns, 3] mean of the places that a texel's pixels see, base frame."""
 
 
 def pixel_mm(surface: Surface) -> float:
-    """Return the width of a view's pixels on the surface, mm: the root of the area that a pixel sees, median over
-    the
-    pixels. It is the mean if the mesh is so coarse that pixels see the centres of its triangles."""
+    """Return the width of a view's pixels on the surface, mm: the root of the area that a pixel sees, as the
+    median over the pixels. If the mesh is so coarse that pixels see the centres of its triangles, it is the
+    mean."""
     step = max(1, math.isqrt(surface.triangle_of_pixel.size // _SAMPLED))
     places_mm = surface.places_mm
     here = places_mm[:-1:step, :-1:step]
@@ -72,8 +72,8 @@ def _cut_rows(  # type: ignore[no-untyped-def]
     first, end, side_px, most_mm, triangle_of_pixel, seen_mm, centres_mm, normals, triangle, places_mm,
     texel_of_pixel
 ):  # fmt: skip
-    """Fill rows of texels. A pixel is left out if it sees a place farther than `most_mm` before or behind the
-    plane of what most pixels of its square see."""
+    """Fill rows of texels. A pixel is left out if its place is farther than `most_mm` in front of or behind the
+    plane of the triangle that most pixels of its square see."""
     for row in range(first, end):
         down = slice(row * side_px, (row + 1) * side_px)
         for column in range(triangle.shape[1]):
@@ -93,7 +93,8 @@ def _cut_rows(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _gather(triangle, seen_mm, centre_mm, normal, most_mm, texel, place_mm, texel_of_pixel):  # type: ignore[no-untyped-def]
-    """Give a square's pixels to its texel, and find the mean place of what they see. Returns how many they are."""
+    """Give a square's pixels to its texel, and find the mean of the places that they see. Return the number of
+    these pixels."""
     members = 0
     for y in range(triangle.shape[0]):
         for x in range(triangle.shape[1]):
@@ -112,7 +113,7 @@ def _gather(triangle, seen_mm, centre_mm, normal, most_mm, texel, place_mm, texe
 
 @numba.njit(cache=True, nogil=True)
 def _most_frequent(numbers):  # type: ignore[no-untyped-def]
-    """Return the number that is there most often; of several the lowest. `numbers` [n] are sorted in place."""
+    """Return the most frequent number; the lowest of several. `numbers` [n] are sorted in place."""
     numbers.sort()
     best, best_count, count = numbers[0], 0, 0
     for place in range(len(numbers)):

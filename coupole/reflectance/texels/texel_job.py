@@ -1,8 +1,8 @@
 """Job that adds materials of texels (single pixels, or squares of them) to a result of runs, view by view, and
 compares them with pictures of LEDs that were kept for the check.
 
-Each view's texels are a file of their own, whole or not there; a job that was killed goes on with the first that
-is missing.
+Each view's texels are a separate file, complete or missing. A job that was killed continues with the first missing
+file.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from coupole.storage.run_json import RUN_JSON
 
 @dataclass(frozen=True)
 class _View:
-    """A block of the job: one view's texels, a file."""
+    """A block of the job: the texels of one view, which become one file."""
 
     run: Path
     view: str
@@ -71,11 +71,12 @@ def add_texels(
     scheduler: str | None = None,
     say: Said = silent,
 ) -> dict[str, Any]:
-    """Make the texels of a `size` (without one: single pixels) that a whole result lacks, in the workers of a
-    `scheduler` if one is named; returns what `texels/texels.json` says.
+    """Make the missing texels of a complete result, in the workers of a `scheduler` if one is named. They have a
+    `size`, or are single pixels without one. Return the content of `texels/texels.json`.
 
-    Raises InputError: a result that is not whole or is that of another request, or has texels of another size, a
-    scheduler that does not answer; StorageError if a frame is damaged or the disk takes nothing.
+    Raises InputError for a result that is incomplete, belongs to another request, or has texels of another size,
+    and for a scheduler that does not answer. Raises StorageError if a frame is damaged or the disk cannot be
+    written.
     """
     token, size = uuid4().hex, size or TexelSize()
     refuse_other_size(out, size)

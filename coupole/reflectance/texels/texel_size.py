@@ -1,4 +1,4 @@
-"""The width of texels that is asked for; without a heavy import, so that a wrong one is refused at once."""
+"""The requested width of texels. The module has no heavy import, so that a wrong width is refused at once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _MOST_MM = 100.0
 
 @dataclass(frozen=True)
 class TexelSize:
-    """Width of texels that was asked for. Raises InputError for one that cannot be."""
+    """Requested width of texels. Raises InputError for an impossible width."""
 
     mm: float | None = None
     """Width on the surface; None for single pixels of each view, `auto`."""
@@ -22,21 +22,21 @@ class TexelSize:
 
     @property
     def text(self) -> str:
-        """Text of the command line."""
+        """Width as it is written on the command line."""
         return "auto" if self.mm is None else f"{self.mm:g}"
 
     @property
     def in_words(self) -> str:
-        """Name for people."""
+        """Name of the size for readers."""
         return "single pixels (auto)" if self.mm is None else f"{self.mm:g} mm"
 
     def side_px(self, of_pixel_mm: float) -> int:
-        """Width of a texel, px, in a view whose pixels are that wide on the surface."""
+        """Return the width of a texel, px, in a view with pixels of the given width on the surface."""
         return 1 if self.mm is None else max(1, round(self.mm / of_pixel_mm))
 
 
 def size_refused(text: str) -> InputError:
-    """Return the error for what is no size of texels."""
+    """Return the error for a text that is no size of texels."""
     return InputError(
         f"--texels: expected auto, each view's own pixels, or a width on the surface in mm up to {_MOST_MM:g}, "
         f"such as 0.2; got {text!r}"

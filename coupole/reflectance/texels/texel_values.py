@@ -1,7 +1,8 @@
-"""Values of a view's texels under all its LEDs: means of their pixels, channel by channel, band by band.
+"""Values of a view's texels under all its LEDs: means of their pixels for each channel, computed in bands of rows.
 
-Means are taken of a few LEDs' frames at a time, so that only those of the texels stay in memory, not the pixels'
-own. The lists of a band's pixels are filled for eight LEDs at once, as for single pixels (`pixel_values`).
+Means are taken from the frames of a few LEDs at a time, so that only the means of the texels stay in memory, not
+the values of the pixels. The lists of a band's pixels are filled for eight LEDs at once, as for single pixels
+(`pixel_values`).
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ from coupole.reflectance.texels.pixel_values import fill_rows, light_of
 from coupole.reflectance.texels.texel_grid import TexelGrid
 
 _TEXELS = 1 << 13
-"""Texels whose means a thread takes in one go."""
+"""Number of texels whose means a thread computes at a time."""
 PIXEL_BYTES = 64
-"""Memory of a pixel of a band beside the values of its texel: lists, darks, and values of eight LEDs."""
+"""Memory of a pixel of a band, in bytes, besides the values of its texel: lists, darks, and values of eight
+LEDs."""
 
 
 @dataclass(frozen=True)
@@ -40,16 +42,16 @@ class TexelBlock:
     """Texels of some rows of a view's grid."""
 
     texels: NDArray[np.int64]
-    """[n] places in the grid, row by row; rising."""
+    """[n] places in the grid, row by row, in rising order."""
     places_mm: NDArray[np.float32]
     """[n, 3] base frame."""
     values: NDArray[np.float16]
-    """[n, channels, leds] mean over a texel's pixels of f times the cosine of incidence, 1/sr; NaN where there is
-    none: a pixel is clipped, or more than half of a channel's pixels lie in shadow."""
+    """[n, channels, leds] mean over a texel's pixels of f times the cosine of incidence, 1/sr. NaN if a pixel is
+    clipped, or if more than half of a channel's pixels lie in shadow."""
 
 
 class TexelReader:
-    """A view's texels, ready for its frames; `samples` is its file in a result whose fits are there."""
+    """A view's texels, ready for its frames; `samples` is its file in a result that has its fits."""
 
     def __init__(
         self,
@@ -69,7 +71,7 @@ class TexelReader:
         """[triangles, 3]"""
         self.grid = grid
         self.pixels_of_channels = grid.side_px**2 * channel_shares(radiometry)
-        """[channels] pixels of a whole texel."""
+        """[channels] number of pixels of a full texel."""
 
     @property
     def count(self) -> int:
@@ -77,7 +79,7 @@ class TexelReader:
         return int(np.count_nonzero(self.grid.triangle >= 0))
 
     def bands(self, memory_bytes: int) -> list[slice]:
-        """Rows of the grid whose texels' values fit into a memory."""
+        """Return slices of rows of the grid, with texels' values that fit into a memory."""
         counts = np.count_nonzero(self.grid.triangle >= 0, axis=1)
         row_bytes = counts * texel_bytes(self._radiometry.channels, len(self._samples.leds), self.grid.side_px)
         rows, first = [], 0
@@ -121,25 +123,25 @@ class TexelReader:
 
 
 def channel_shares(radiometry: Radiometry) -> NDArray[np.float64]:
-    """[channels] share of the camera's pixels that a channel has."""
+    """[channels] each channel's share of the camera's pixels."""
     counts = np.bincount(radiometry.channel.ravel(), minlength=radiometry.channels)
     shares: NDArray[np.float64] = counts / radiometry.channel.size
     return shares
 
 
 def texel_bytes(channels: int, leds: int, side_px: int) -> int:
-    """Memory that a texel takes while its band is read."""
+    """Return the memory that a texel needs while its band is read."""
     return 2 * channels * leds + PIXEL_BYTES * side_px**2
 
 
 @dataclass(frozen=True)
 class _Band:
-    """Rows of a grid."""
+    """Some rows of a view's grid."""
 
     triangle_of_pixel: NDArray[np.int32]
-    """[h, w] -1 outside of the band, too."""
+    """[h, w] also -1 outside of the band."""
     texels: NDArray[np.int64]
-    """[n] places in the grid; rising."""
+    """[n] places in the grid, in rising order."""
 
     @classmethod
     def of(cls, grid: TexelGrid, rows: slice, triangle_of_pixel: NDArray[np.int32]) -> _Band:
@@ -152,18 +154,18 @@ class _Band:
 
 @dataclass(frozen=True)
 class _Entries:
-    """Pixels of a band in the order of its texels."""
+    """Pixels of a band, ordered by texel."""
 
     rows: slice
     """Rows of the view's file that the band's pixels see."""
     order: NDArray[np.int64]
     """[pixels] places in the lists of the reader."""
     starts: NDArray[np.int64]
-    """[texels + 1] of a texel's pixels in `order`."""
+    """[texels + 1] first place of each texel's pixels in `order`."""
     channel: NDArray[np.int64]
-    """[pixels] by the lists."""
+    """[pixels] channels, in the order of the lists."""
     triangle: NDArray[np.int64]
-    """[pixels] by the lists, from the first of `rows`."""
+    """[pixels] triangles in the order of the lists, counted from the first of `rows`."""
 
     @classmethod
     def of(cls, reader: SignalReader, texel_of_pixel: NDArray[np.int32], texels: NDArray[np.int64]) -> _Entries:
@@ -183,7 +185,8 @@ class _Entries:
     def means(
         self, texels: slice, of_pixels: NDArray[np.uint16], is_reached: NDArray[np.bool_], channels: int
     ) -> NDArray[np.float32]:
-        """[n, channels, leds] means of some texels, of bits of float16 [pixels, leds] by the lists."""
+        """[n, channels, leds] means of some texels, from bits of float16 [pixels, leds] in the order of the
+        lists."""
         starts = self.starts[texels.start : texels.stop + 1]
         some = self.order[starts[0] : starts[-1]]
         means = np.full((len(starts) - 1, channels, of_pixels.shape[1]), np.nan, np.float32)
@@ -194,8 +197,8 @@ class _Entries:
 
 @numba.njit(cache=True, nogil=True)
 def _mean(starts, channel, is_reached, values, means):  # type: ignore[no-untyped-def]
-    """Fill `means` [texels, channels, leds] from values [pixels, leds]: over pixels that light has reached, if
-    these are at least half of all; NaN if one of them has no value."""
+    """Fill `means` [texels, channels, leds] from values [pixels, leds]. A mean is over the pixels that light has
+    reached, if these are at least half of all; it is NaN if one of them has no value."""
     channels, leds = means.shape[1:]
     sums, counts = np.empty((channels, leds)), np.empty((channels, leds), np.int64)
     members = np.empty(channels, np.int64)

@@ -1,4 +1,5 @@
-"""Materials about which those of a view's texels lie: those of its triangles; and the lights of their fits."""
+"""Centres of the materials of a view's texels, which are the materials of its triangles; and the lights of their
+fits."""
 
 from __future__ import annotations
 
@@ -38,29 +39,30 @@ Singles = NDArray[np.float32]
 KD, KS, ALPHA = 2, 3, 4
 """Places of the logarithms among the unknowns."""
 MOST_KD = 1.0
-"""1/sr: three times that of white, for strong light from other surfaces. A fit with more ran off."""
+"""Largest kd, 1/sr: three times that of white, to allow for strong light from other surfaces. A fit with more has
+failed."""
 MOST_VARIANCE = np.square([TILT, TILT, 1.0, LOG_KS, LOG_ALPHA]) * 4.0
-"""Largest variances of a fit that says anything: beyond the prior's."""
+"""Largest variances of a useful fit; they are larger than those of the prior."""
 _ROWS = 1 << 12
-"""Triangles whose inter-reflection is read together."""
+"""Number of triangles whose inter-reflection is read together."""
 
 
 @dataclass(frozen=True)
 class Centres:
-    """Materials about which those of a view's pixels lie: those of triangles, drawn to each other; of triangles
-    without any, those around them."""
+    """Centres of the materials of a view's pixels: the materials of triangles, shrunk towards each other.
+    Triangles without material take the materials around them."""
 
     normals: Singles
     """[h, w, 3]"""
     logs: Singles
     """[h, w, 2 channels + 1] logarithms of kd, ks and alpha; NaN where nothing is known."""
     colours: Singles
-    """[h, w, channels] logarithms of kd without their mean, drawn to those around."""
+    """[h, w, channels] logarithms of kd without their mean, shrunk towards those around them."""
     covariance: Singles
     """[h, w, 15]"""
 
     def prior(self, block: PixelBlock) -> Prior:
-        """Materials of a block's pixels in their own channels; NaN without any."""
+        """Return the centres of a block's pixels in their own channels; NaN without material."""
         at = np.unravel_index(block.pixels, self.logs.shape[:2])
         logs, channels = self.logs[at].astype(np.float64), self.logs.shape[2] // 2
         rows = np.arange(len(logs))
@@ -72,8 +74,8 @@ class Centres:
         )
 
     def grey_prior(self, places: NDArray[np.integer]) -> tuple[Prior, Floats]:
-        """Materials at places [n], row by row, means of the channels; and ks of each channel [n, channels] over
-        that mean. NaN without any."""
+        """Return the materials at places [n], row by row, as means of the channels; and ks of each channel [n,
+        channels] over this mean. NaN without material."""
         at = np.unravel_index(places, self.logs.shape[:2])
         values, channels = np.exp(self.logs[at].astype(np.float64)), self.logs.shape[2] // 2
         ks = values[:, channels:-1].mean(axis=1)
@@ -84,7 +86,7 @@ class Centres:
 def centres_of(
     result: RunResult, view: ViewSamples, triangle_of_pixel: NDArray[np.int32], mesh_normals: Floats
 ) -> Centres:
-    """Return the centres of a view; `mesh_normals` [triangles, 3] are those of triangles without a fit."""
+    """Return the centres of a view; `mesh_normals` [triangles, 3] are used for triangles without a fit."""
     places = np.searchsorted(result.triangles, view.triangles)
     materials = result.materials(GGX_NORMAL.name, places)
     of_triangles = result.material_covariances(GGX_NORMAL.name, places)
@@ -117,15 +119,15 @@ def centres_of(
 
 
 def _window_px(triangle_of_pixel: NDArray[np.int32]) -> int:
-    """Side of a window that holds enough triangles to say how they spread."""
+    """Return the side of a window with enough triangles to determine their spread."""
     counts = np.bincount(triangle_of_pixel)
     side_px = math.sqrt(TRIANGLES_AROUND * float(np.median(counts[counts > 0]))) if len(counts) else 0.0
     return max(WINDOW_PX, 2 * round(side_px / 2) + 1)
 
 
 def u_of_inter_reflection(view: ViewSamples) -> Floats:
-    """[triangles] relative standard uncertainty of kd, of the inter-reflection that was taken off its samples,
-    which is off alike under all LEDs."""
+    """[triangles] relative standard uncertainty of kd from the inter-reflection that was subtracted from its
+    samples. The error is taken as equal under all LEDs."""
     with h5py.File(view.path, "r") as file:
         if INTER_REFLECTION not in file:
             return np.zeros(len(view.triangles))

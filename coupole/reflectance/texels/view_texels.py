@@ -1,5 +1,5 @@
-"""Materials of all pixels of a view: those of its triangles first, then fits of single pixels about them, what
-neighbours say, and colours between the pixels of the pattern."""
+"""Materials of all pixels of a view, in four steps: materials of its triangles, fits of single pixels around them,
+shrinkage by neighbours, and colours between the pixels of the pattern."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Say = Callable[[int, int], None]
 MOST_OFF = 5.0
-"""Largest deviation from a triangle, of logarithms: farther away are fits that ran off."""
+"""Largest deviation of logarithms from a triangle; fits that are farther away have failed."""
 _ALIKE = 1e-3
-"""Variance of logarithms below which pixels are equally certain of colours."""
+"""Variance of logarithms below which pixels have equal weight for colours."""
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """Fits of a view's texels [h, w], as they come block by block."""
+    """Fits of a view's texels [h, w], collected block by block."""
 
     normals: Singles
     """[h, w, 3]"""
     deviation: Singles
-    """[h, w, 5] from the centres: tilts, logarithms."""
+    """[h, w, 5] deviations from the centres: tilts, logarithms."""
     covariance: Singles
     """[h, w, 15]"""
     is_fitted: NDArray[np.bool_]
@@ -59,7 +59,7 @@ class Fitted:
         return cls(normals, deviation, np.empty((*shape, 15), np.float32), np.zeros(shape, np.bool_))
 
     def add(self, places: NDArray[np.integer], prior: Prior, fit: PixelMaterials) -> None:
-        """Take the fits at places [n], row by row, which began at `prior`; those that ran off do not count."""
+        """Take the fits at places [n], row by row, which began at `prior`; failed fits are not used."""
         off = np.empty((len(places), UNKNOWNS))
         tilts_from(fit.normals, prior.normals, off[:, :2])
         off[:, 2:] = fit.logs - np.log(np.stack([prior.kd, prior.ks, prior.alpha], axis=1))
@@ -73,8 +73,8 @@ class Fitted:
         )
 
     def settle(self, view: ViewSamples, centres: Centres, triangle: NDArray[np.int32]) -> Singles:
-        """Take the neighbours into account, and add what inter-reflection makes uncertain by the `triangle`
-        [h, w] of each; return the normals [fitted, 3] of those that are fitted."""
+        """Take the neighbours into account, and add the uncertainty from inter-reflection. It comes from the
+        `triangle` [h, w] of each texel. Return the normals [fitted, 3] of the fitted texels."""
         is_fitted = self.is_fitted
         before = self.deviation[is_fitted][:, :2]
         settle(self.deviation, self.covariance, is_fitted, centres.covariance)
@@ -94,8 +94,8 @@ def texels_of_view(
     threads: int,
     say: Say,
 ) -> ViewTexels:
-    """Fit all pixels of a view, under its LEDs but those `left_out`; frames are read once for each part of the
-    pixels whose values fit into the memory. Raises StorageError for a damaged frame."""
+    """Fit all pixels of a view, under its LEDs except those `left_out`. Frames are read once for each part of the
+    pixels with values that fit into the memory. Raises StorageError for a damaged frame."""
     centres = centres_of(result, view, reader.triangle_of_pixel, reader.mesh_normals)
     lights = lights_of(result, view, left_out)
     shape = reader.triangle_of_pixel.shape
@@ -123,7 +123,7 @@ def texels_of_view(
 
 def view_texels(places: NDArray[np.integer], normals: Singles, logs: Floats, covariance: Singles) -> ViewTexels:
     """Return texels at places [n] of a picture, from the logarithms [n, 2 channels + 1] of kd, ks and alpha, which
-    are kept within what is possible."""
+    are limited to possible values."""
     channels = logs.shape[1] // 2
     return ViewTexels(
         places.astype(np.int32),
@@ -136,8 +136,8 @@ def view_texels(places: NDArray[np.integer], normals: Singles, logs: Floats, cov
 
 
 def _with_colours(logs: Floats, colours: Singles, channel: NDArray[np.int8]) -> Floats:
-    """Logarithms of kd [n, channels] whose own `channel` [n] stays, and whose others differ from it as `colours`
-    do."""
+    """Return logarithms of kd [n, channels]. The pixel's own `channel` [n] stays; the other channels differ from
+    it as in `colours`."""
     column = channel[:, None].astype(np.int64)
     own_logs, own_colour = np.take_along_axis(logs, column, 1), np.take_along_axis(colours, column, 1)
     return np.asarray(own_logs + colours - own_colour)

@@ -65,7 +65,7 @@ Material = Annotated[Plain | Coating | MeasuredMaterial | Weathered | Glass, Fie
 
 
 def bsdf(material: Material, folder: Path) -> Description:
-    """The material for Mitsuba, arrays [81] for spectra; paths of spectra are relative to `folder`."""
+    """Return the material for Mitsuba, with arrays [81] for spectra; paths of spectra are relative to `folder`."""
     if isinstance(material, Glass):
         return {"type": "dielectric", "int_ior": material.index, "ext_ior": 1.0}
     return {"type": "twosided", "material": _one_side(material, folder)}

@@ -39,7 +39,7 @@ _BLACK = Constant(kind="constant", value=0.0)
 
 
 class Coefficients(Model):
-    """Coefficients of four fluxes, per mm: K and S of diffuse light; k, s_i (forwards), s_j (backwards) of
+    """Coefficients of four fluxes, per mm: K and S for diffuse light; k, s_i (forwards), s_j (backwards) for
     directed light."""
 
     kind: Literal["values"]
@@ -51,19 +51,20 @@ class Coefficients(Model):
 
 
 FourFluxes = Annotated[Coefficients | MeasuredPaint, Field(discriminator="kind")]
-"""A paint file has them if `coupole layer` was given spectra under directional light."""
+"""Coefficients of four fluxes. A paint file has them if `coupole layer` was given spectra under directional
+light."""
 
 
 class FourFlux(Model):
-    """A glaze: part of the light passes it as it came, and returns from a glossy ground as its mirror image."""
+    """A glaze: part of the light passes it unscattered, and returns from a glossy ground as its mirror image."""
 
     kind: Literal["four_flux"]
     coefficients: FourFluxes
     thickness_mm: Positive
     ground: Reflectance = _BLACK
-    """Inside the binder; measured under a face of the same index."""
+    """Reflectance of the ground inside the binder; a measured one was measured under a face of the same index."""
     ground_mirror: Share = 0.0
-    """Reflectance of a glossy ground for directed light: in addition to `ground`."""
+    """Reflectance of a glossy ground for directed light, in addition to `ground`."""
     ground_roughness: Roughness = 0.1
     index: Annotated[float, Field(ge=1.01, le=3)] = indices.BINDER
     roughness: Roughness = 0.05
@@ -74,7 +75,7 @@ class PaintLayer(Model):
     pigment: Colouring
     thickness_mm: Positive
     scattering_per_mm: Positive = 30.0
-    """Scattering of a pigment whose reflectance is given; a paint file has its own."""
+    """Scattering of a pigment that is given by its reflectance; a paint file has its own."""
 
 
 class GlazeLayer(Model):
@@ -107,15 +108,15 @@ Layer = Annotated[PaintLayer | GlazeLayer | ClearLayer | Leaf, Field(discriminat
 
 
 class Layers(Model):
-    """Layers from the top to the bottom, in one binder; a leaf on top lies bare in the air."""
+    """Layers from the top to the bottom, in one binder; a leaf on top lies in air."""
 
     kind: Literal["layers"]
     layers: Annotated[tuple[Layer, ...], Field(min_length=1, max_length=20)]
     ground: Reflectance = _BLACK
-    """Inside the binder; measured under a face of the same index."""
+    """Reflectance of the ground inside the binder; a measured one was measured under a face of the same index."""
     index: Refraction = indices.BINDER
     roughness: Roughness = 0.05
-    """Roughness of the face; a leaf on top has its own."""
+    """Roughness of the face; a leaf on top has its own roughness."""
 
     @model_validator(mode="after")
     def _check_top_leaf(self) -> Layers:
@@ -129,12 +130,12 @@ Coating = FourFlux | Layers
 
 
 def coating_bsdf(material: Coating, folder: Path) -> Description:
-    """One side of it. Raises InputError."""
+    """Return one side of the coating for Mitsuba. Raises InputError."""
     return {"type": "measured", "table": bake(partial(stack_brdf, stack=stack_of(material, folder)))}
 
 
 def stack_of(material: Coating, folder: Path) -> Stack:
-    """Ready for `stack_brdf`; paths are relative to `folder`. Raises InputError."""
+    """Return the layers as a stack, ready for `stack_brdf`; paths are relative to `folder`. Raises InputError."""
     if isinstance(material, FourFlux):
         binder = Binder(material.index)
         below = binder.matt(internal(material.ground, folder, material.index).values)

@@ -1,7 +1,7 @@
-"""Materials that are measured, or were exported, as files: MERL's, RGL's and ALTA's formats, and our own results.
+"""Measured or exported materials from files: MERL's, RGL's and ALTA's formats, and our own results.
 
-Mitsuba reads them as tables of RGL's format: files of that format as they are, all others resampled. Spectra are
-kept; red, green and blue become smooth spectra by a published method, which are not measured.
+Mitsuba reads them as tables of RGL's format. Files of this format are used unchanged, all others are resampled.
+Spectra are kept. Red, green and blue become smooth spectra by a published method; these spectra are not measured.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ _TURNS = 16
 
 
 class MeasuredMaterial(Model):
-    """A file `.binary` (MERL), `.bsdf` (RGL) or of ALTA's text, or the folder of a result of `coupole
+    """A file `.binary` (MERL), `.bsdf` (RGL) or ALTA's text, or the folder of a result of `coupole
     reflectance`."""
 
     kind: Literal["measured"]
     path: Path
     fit: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")] = "ggx"
-    """Fit that is taken of a result: one with a material for each triangle."""
+    """Fit that is used from a result: one with a material for each triangle."""
     cluster: Annotated[int, Field(ge=0)] | None = None
     """Cluster of a result; if not given, the mean of its triangles."""
     triangles: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] | None = None
-    """Triangles of a result's mesh, whose mean is taken."""
+    """Triangles of a result's mesh; their mean is used."""
 
     @model_validator(mode="after")
     def _one_region(self) -> MeasuredMaterial:
@@ -50,7 +50,7 @@ class MeasuredMaterial(Model):
 
 
 def measured_bsdf(material: MeasuredMaterial, folder: Path) -> Description:
-    """One side of it. Raises InputError."""
+    """Return one side of the material for Mitsuba. Raises InputError."""
     return {"type": "measured", "table": measured_table(material, folder)}
 
 
@@ -72,7 +72,8 @@ def measured_table(material: MeasuredMaterial, folder: Path) -> BakedTable:
 
 
 def measured_brdf(material: MeasuredMaterial, folder: Path) -> Brdf:
-    """Return the BRDF by the file's own channels [..., channels], as its reader has it. Raises InputError."""
+    """Return the BRDF in the file's own channels [..., channels], as the file's reader returns it. Raises
+    InputError."""
     path = folder / material.path
     if path.is_dir():
         return read_result(path, material.fit, cluster=material.cluster, triangles=material.triangles)
@@ -88,17 +89,18 @@ def measured_brdf(material: MeasuredMaterial, folder: Path) -> Brdf:
 
 
 def spectra_of_rgb() -> Array:
-    """[3, 81] spectra of reflectance that red, green and blue of linear sRGB stand for; they sum to 1.
+    """[3, 81] reflectance spectra for red, green and blue of linear sRGB; they sum to 1.
 
     Mallett and Yuksel, Spectral primary decomposition for rendering with sRGB reflectance, EGSR 2019: smooth
-    ones with the primaries' colours under D65, 2 degrees, none below 0.
+    spectra with the primaries' colours under D65, 2 degrees, nowhere below 0.
     """
     functions = import_extra("colour", "materials").recovery.MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
     return np.asarray(functions.values, dtype=float).T
 
 
 def _turned_to_all_sides(table: RglTable) -> Brdf:
-    """The mean over turns of the surface about its normal: meshes have no direction of their own."""
+    """Return the mean over turns of the surface about its normal, because meshes have no direction of their
+    own."""
     angles = 2.0 * np.pi * (np.arange(_TURNS) + 0.5) / _TURNS
     turns = [np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in angles]
 

@@ -1,9 +1,9 @@
 """Materials by Mitsuba's own plugins, with spectra of `appearance.matter`.
 
-Kept: complex indices of metals, interference in films by reflectance at every angle, Kubelka and Munk's layers,
-Fresnel surfaces with all internal reflections (Saunderson), GGX facets, polarisation by surfaces. Simplified:
-bodies under films are Lambertian, absorption over metals under lacquer is that along the normal, facets reflect
-once (docs/decisions/0013).
+These are modelled: complex indices of metals, interference in films by reflectance at every angle, Kubelka and
+Munk's layers, Fresnel surfaces with all internal reflections (Saunderson), GGX facets, polarisation by surfaces.
+These are simplified: bodies under films are Lambertian, metals under lacquer have the absorption along the normal,
+facets reflect once (docs/decisions/0013).
 """
 
 from __future__ import annotations
@@ -41,15 +41,16 @@ from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Comple
 
 THINNEST_NM = 1e-3
 Facets = Literal["ggx", "beckmann", "cook_torrance"]
-"""`beckmann`: its slopes under Smith's shadowing; `cook_torrance`: the same in V-shaped grooves (seed 001)."""
+"""Kind of facets. `beckmann`: Beckmann's slopes with Smith's shadowing; `cook_torrance`: the same slopes in
+V-shaped grooves (seed 001)."""
 _LEAST_SHARE = 0.1
-"""Least share of the paths for each part of a sum."""
+"""Least share of the paths for each part of a blended material."""
 _LEAST_THROUGH = 1e-5
-"""Share of the light that comes back through a leaf, below which it hides its bole."""
+"""Share of the light that returns through a leaf. Below this share, the leaf hides its bole."""
 
 
 class Diffuse(Model):
-    """Lambert."""
+    """A Lambertian surface."""
 
     kind: Literal["diffuse"]
     reflectance: Reflectance
@@ -60,14 +61,14 @@ class Paint(Model):
 
     kind: Literal["paint"]
     pigment: Colouring
-    """Reflectance of an opaque layer: measured as it is seen under its face, otherwise inside the binder. Or K and
-    S."""
+    """Reflectance of an opaque layer, or K and S. A measured reflectance is that under the face; others are inside
+    the binder."""
     thickness_mm: Positive | None = None
     ground: Reflectance = Constant(kind="constant", value=0.0)
-    """Reflectance of the ground, as `pigment`: measured under a face of the same index, otherwise inside the
+    """Reflectance of the ground. A measured one is that under a face of the same index; others are inside the
     binder."""
     scattering_per_mm: Positive = 30.0
-    """Scattering of a pigment whose reflectance is given; a paint file has its own."""
+    """Scattering of a pigment that is given by its reflectance; a paint file has its own."""
     index: Refraction = indices.BINDER
     roughness: Roughness = 0.25
 
@@ -77,26 +78,28 @@ class Lacquer(Model):
 
     kind: Literal["lacquer"]
     body: Reflectance = Constant(kind="constant", value=0.006)
-    """Inside the lacquer; measured through it, unless the sample was bare."""
+    """Reflectance inside the lacquer. A measured one was measured through the lacquer, unless the sample was
+    bare."""
     index: Refraction = indices.URUSHI
     roughness: Roughness = 0.04
 
 
 class Metal(Model):
-    """A bare metal, or one at a depth in clear urushi."""
+    """A bare metal, or a metal at a depth in clear urushi."""
 
     kind: Literal["metal"]
     gold: Share = 1.0
     """Share of gold by atoms; the rest is silver."""
     index: IndexFile | None = None
-    """Index of another metal, in place of gold and silver."""
+    """Index of another metal, instead of gold and silver."""
     roughness: Roughness = 0.1
-    """Alpha, of GGX's or of Beckmann's slopes."""
+    """Alpha of GGX's or of Beckmann's slopes."""
     distribution: Facets = "ggx"
     depth_mm: Annotated[float, Field(ge=0)] | None = None
-    """Depth under the lacquer's face. None: in air."""
+    """Depth under the lacquer's face; None for a metal in air."""
     face: bool = True
-    """True if light that the face reflects is lost here; False where the scene has the face as a body of glass."""
+    """True if light that the face reflects is subtracted here; False if the scene has the face as a body of
+    glass."""
 
 
 class Gilt(Model):
@@ -108,18 +111,18 @@ class Gilt(Model):
     index: IndexFile | None = None
     """Index of another metal's leaf."""
     holes: Annotated[float, Field(ge=0, le=0.3)] = 0.0
-    """Nanoscopic, by volume (Maxwell Garnett)."""
+    """Share of nanoscopic holes, by volume (Maxwell Garnett)."""
     uncovered: Share = 0.0
     """Share of the surface left bare by cracks and large holes."""
     bole: Reflectance = Bole(kind="bole")
-    """Inside its binder of egg white; a measured one is seen in air."""
+    """Reflectance inside its binder of egg white; a measured one was measured in air."""
     roughness: Roughness = 0.12
     bole_roughness: Roughness = 0.35
 
 
 class OneFilm(Model):
     index: Refraction
-    """A file may have k as well."""
+    """Index of refraction; a file may have k as well."""
     thickness_nm: Positive
 
 
@@ -129,13 +132,13 @@ class Films(Model):
     kind: Literal["films"]
     films: Annotated[tuple[OneFilm, ...], Field(min_length=1, max_length=20)]
     gold: Share | None = 1.0
-    """The metal underneath; None: something dark of `index`."""
+    """The metal underneath; None for something dark with the `index`."""
     index: Refraction = indices.BINDER
     roughness: Roughness = 0.05
 
 
 class Glass(Model):
-    """Transparent and smooth: a closed body of it refracts, and absorbs along light's way through it."""
+    """A transparent and smooth material. A closed body of it refracts light, and absorbs it along its path."""
 
     kind: Literal["glass"]
     index: Index = indices.BINDER
@@ -152,7 +155,8 @@ def diffuse(spectral: Array) -> Description:
 def metal(
     index: Complex, roughness: float, factor: Array | float = 1.0, distribution: Facets = "ggx"
 ) -> Description:
-    """A rough conductor of complex index [81] (relative to its surroundings) times `factor`."""
+    """Return a rough conductor of complex index [81] (relative to its surroundings), with its reflectance times
+    `factor`."""
     share = np.broadcast_to(np.asarray(factor, dtype=float), BANDS).copy()
     if distribution == "cook_torrance":
         grooves = partial(
@@ -170,11 +174,12 @@ def metal(
 
 
 def coated_body(body: InternalReflectance, index: Array, roughness: float) -> Description:
-    """A body [81] inside a medium with a glossy face; the face itself reflects as its index [81] does at 587.6 nm.
+    """Return a body [81] inside a medium with a glossy face; the face itself reflects by its index [81] at 587.6
+    nm.
 
-    Mitsuba's polarised plastic (Baek et al. 2020) transmits light in and out once. With all internal reflections
-    the factor is body/(n^2 (1 - k2 body)), with k2 the face's reflectance for diffuse light from within: for light
-    along the normal this agrees with Saunderson.
+    Mitsuba's polarised plastic (Baek et al. 2020) transmits light in once and out once. With all internal
+    reflections the factor is body/(n^2 (1 - k2 body)), with k2 the face's reflectance for diffuse light from
+    within: for light along the normal this agrees with Saunderson.
     """
     return {
         "type": "pplastic",
@@ -187,12 +192,12 @@ def coated_body(body: InternalReflectance, index: Array, roughness: float) -> De
 
 
 def under_face(body: InternalReflectance, index: Array) -> Array:
-    """[81], what a face of index [81] makes of a body by reflections between them and refraction."""
+    """[81] reflectance of a body under a face of index [81], with reflections between them and refraction."""
     return np.asarray(body.values / (index**2 * (1.0 - fresnel.diffuse_internal(index) * body.values)))
 
 
 def paint_inside(paint: Paint, folder: Path) -> InternalReflectance:
-    """[81]."""
+    """[81] reflectance of a paint inside its binder."""
     index = real_index(paint.index, folder)
     if isinstance(paint.pigment, MeasuredPaint):
         pigment = coefficients(paint.pigment, folder, needs_mm=paint.thickness_mm is not None)
@@ -206,12 +211,12 @@ def paint_inside(paint: Paint, folder: Path) -> InternalReflectance:
 
 
 def lacquer_body(material: Lacquer, folder: Path) -> InternalReflectance:
-    """[81]."""
+    """[81] reflectance of the body inside the lacquer."""
     return internal(material.body, folder, real_index(material.index, folder))
 
 
 def gilt_of(material: Gilt, folder: Path) -> tuple[gilding.Gilt, Complex]:
-    """The gilt and its leaf's index [81]."""
+    """Return the gilt and its leaf's index [81]."""
     index = metal_of(material, folder)
     if material.holes > 0.0:
         index = gilding.leaf_index(index, material.holes)
@@ -220,27 +225,27 @@ def gilt_of(material: Gilt, folder: Path) -> tuple[gilding.Gilt, Complex]:
 
 
 def metal_of(material: Metal | Gilt, folder: Path) -> Complex:
-    """[81], of the user's own file if there is one."""
+    """[81] index of the metal, from the user's file if there is one."""
     if material.index is not None:
         return complex_index(material.index, folder)
     return metal_index(material.gold)
 
 
 def films_of(material: Films, folder: Path) -> tuple[list[Film], Complex]:
-    """The films, and the index [81] of what they lie on."""
+    """Return the films, and the index [81] of the material under them."""
     films = [Film(complex_index(film.index, folder), film.thickness_nm) for film in material.films]
     base = complex_index(material.index, folder) if material.gold is None else metal_index(material.gold)
     return films, base
 
 
 def metal_index(gold: float) -> Complex:
-    """Johnson and Christy's gold or silver, Rioux's alloys between."""
+    """Return the index of Johnson and Christy's gold or silver, or of Rioux's alloys between them."""
     pure = {1.0: indices.gold, 0.0: indices.silver}
     return pure[gold]() if gold in pure else indices.gold_silver(gold)
 
 
 def plain_bsdf(material: Plain, folder: Path) -> Description:
-    """One side of it, arrays [81] for spectra; paths are relative to `folder`."""
+    """Return one side of the material, with arrays [81] for spectra; paths are relative to `folder`."""
     if isinstance(material, Diffuse):
         return diffuse(matt(material.reflectance, folder).values)
     if isinstance(material, Paint):
@@ -265,7 +270,8 @@ def _metal(material: Metal, folder: Path) -> Description:
 
 
 def seen_of_gilt(material: Gilt, folder: Path) -> tuple[bool, bool, bool]:
-    """Tell whether its leaf is seen, its bole is seen (bare, or through the leaf), and its bole is seen bare."""
+    """Tell whether the gilt's leaf is visible, whether its bole is visible (bare or through the leaf), and whether
+    its bole is visible bare."""
     if not _has_leaf(material):
         return False, True, True
     is_bare = material.uncovered > 0.0
@@ -301,10 +307,10 @@ def _gilt(material: Gilt, folder: Path) -> Description:
 
 
 def _sum(mirror: Description, mirror_share: Array, through: Array) -> Description:
-    """A metal and a Lambertian part together.
+    """Return the sum of a metal and a Lambertian part.
 
-    Mitsuba blends, w of one and 1 - w of the other; each is divided by its weight first. The weight is the same
-    for all bands, so that they share their paths.
+    Mitsuba blends with the weight w for one part and 1 - w for the other, so each part is divided by its weight
+    first. The weight is the same for all bands, so that they share their paths.
     """
     weight = float(np.clip(through.mean() / (through + mirror_share).mean(), _LEAST_SHARE, 1.0 - _LEAST_SHARE))
     stronger = {**mirror, "specular_reflectance": mirror["specular_reflectance"] / (1.0 - weight)}

@@ -1,4 +1,4 @@
-"""Values that a material is computed from: those that have no effect in the case at hand are left out."""
+"""Values from which a material is computed. Values without effect in the given case are left out."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _OF_LEAF = {"gold", "index", "holes", "roughness"}
 
 
 def used_values(material: BaseModel, folder: Path) -> dict[str, Any]:
-    """Return a material in JSON's types, without keys that change nothing of it, such as the `ground` of an opaque
-    paint; paths of its files are relative to `folder`. Raises InputError for files that cannot be read."""
+    """Return a material in JSON's types, without keys that have no effect, such as the `ground` of an opaque
+    paint. Paths of its files are relative to `folder`. Raises InputError for files that cannot be read."""
     unused_names = _unused_names(material, folder)
     return {
         name: _plain(value, folder) for name, value in material if value is not None and name not in unused_names
@@ -57,7 +57,7 @@ def _unused_names(material: BaseModel, folder: Path) -> set[str]:
 
 
 def _unused_of_paint(paint: Paint | PaintLayer) -> set[str]:
-    """An opaque paint hides its ground, and its colour is that of K over S alone."""
+    """Return the unused keys of an opaque paint: it hides its ground, and its colour depends on K over S alone."""
     if paint.thickness_mm is None:
         return {"ground", "scattering_per_mm"}
     return {"scattering_per_mm"} if isinstance(paint.pigment, MeasuredPaint) else set()
@@ -74,5 +74,5 @@ def _unused_of_gilt(gilt: Gilt, folder: Path) -> set[str]:
 
 
 def _unused_of_alloy(metal: Metal | Gilt | Leaf) -> set[str]:
-    """A metal whose index is a file is no alloy of gold and silver."""
+    """Return the unused keys of a metal with an index from a file, which is no alloy of gold and silver."""
     return set() if metal.index is None else {"gold"}

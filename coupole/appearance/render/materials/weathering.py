@@ -1,4 +1,4 @@
-"""Layers that are worn off or cracked, and dust on them: two materials by shares of the surface."""
+"""Layers that are worn off or cracked, and dust on them: two materials, each with a share of the surface."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from coupole.appearance.render.spectra import Constant, Reflectance
 from coupole.appearance.spectra.grid import Array
 
 WORN, DUSTY = "worn", "dust"
-"""Numbers of each vertex in a mesh: share of the ground that shows, share that dust covers."""
+"""Names of numbers at each vertex of a mesh: share of the ground that is visible, share that dust covers."""
 
 
 class Uniform(Model):
-    """Finer than can be seen."""
+    """A pattern that is too fine to be seen."""
 
     kind: Literal["uniform"]
 
@@ -30,18 +30,18 @@ class Cracks(Model):
 
     kind: Literal["cracks"]
     cell_mm: Positive
-    """Size of a cell, in the mean of all."""
+    """Mean size of a cell."""
     width_mm: Positive | None = None
-    """Width of a crack; if not given, the `share` says it."""
+    """Width of a crack; by default it follows from the `share`."""
     seed: int = 1
 
 
 class Edges(Model):
-    """Rubbed off where the surface is convex."""
+    """Wear where the surface is convex."""
 
     kind: Literal["edges"]
     reach_mm: Positive
-    """Distance within which the surface about a point decides whether it is on an edge."""
+    """Distance within which the surface around a point decides whether the point is on an edge."""
     seed: int = 1
 
 
@@ -49,13 +49,13 @@ Solid = Annotated[Plain | Coating | MeasuredMaterial, Field(discriminator="kind"
 
 
 class Worn(Model):
-    """A layer that is off a share of the surface, where another material shows."""
+    """A layer that is missing on a share of the surface, where another material is visible."""
 
     kind: Literal["worn"]
     over: Solid
     under: Solid
     share: Share | None = None
-    """Share of the area where `under` shows."""
+    """Share of the area where `under` is visible."""
     pattern: Annotated[Uniform | Cracks | Edges, Field(discriminator="kind")] = Uniform(kind="uniform")
 
     @model_validator(mode="after")
@@ -74,7 +74,7 @@ class Dusty(Model):
     grams_per_m2: Annotated[float, Field(ge=0)]
     """Mass of dust per area on surfaces that face up."""
     settles: Literal["up", "everywhere"] = "up"
-    """`up`: per area of ground plan, z up; nothing on what faces down."""
+    """`up`: the mass is per area of ground plan, with z up, and surfaces that face down have no dust."""
     grain_um: Positive = 20.0
     """Diameter of a grain."""
     density_g_cm3: Positive = 2.0
@@ -82,9 +82,10 @@ class Dusty(Model):
     """Reflectance of thick dust."""
 
     def covered_share(self, upward: Array) -> Array:
-        """Share of the surface under grains, by the normals' upward parts [n].
+        """Return the share of the surface under grains, by the normals' upward components [n].
 
-        Spheres in random places hide 1 - exp(-N a), with N a = 3 m/(2 density diameter) of the mass m per area.
+        Spheres in random places hide the share 1 - exp(-N a), where N a = 3 m/(2 density diameter) for the mass m
+        per area.
         """
         lying = np.maximum(upward, 0.0) if self.settles == "up" else np.ones_like(upward)
         return -np.expm1(-1.5 * self.grams_per_m2 * lying / (self.density_g_cm3 * self.grain_um))
@@ -101,7 +102,7 @@ def needs_mesh(material: Weathered) -> bool:
 
 
 def blended_bsdf(material: Weathered, over: Description, under: Description) -> Description:
-    """`under` by its share, one number or the mesh's."""
+    """Return the material blended with `under`, by its share: one number, or numbers of the mesh."""
     weight: Description | float
     if isinstance(material, Worn):
         by_mesh, name, share = needs_mesh(material), WORN, material.share

@@ -42,7 +42,7 @@ def certificate(
     ),
     as_json: JsonOption = False,
 ) -> None:
-    """Write a certificate of a cell: results with U, conditions, and the chain to certificates (ISO/IEC 17025, 7.8).
+    """Write a certificate of a cell: results with U, conditions, and chain to certificates (ISO/IEC 17025, 7.8).
 
     The exit code is 3 if a record is not accepted, has expired by date or by drift, or is not traceable.
     """

@@ -65,7 +65,7 @@ def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None
     signals = sensitivities * _spectrum(leds, 1)
     white = signals.sum(axis=1)
     if not (white > 0.0).all():
-        raise InputError(f"{sensor}: a channel sees nothing of the light of {leds}; see to both tables")
+        raise InputError(f"{sensor}: one channel sees no light of {leds}; check both tables")
     try:
         functions, daylight = observer("2 deg"), illuminant("D65")
     except ImportError as error:

@@ -135,9 +135,9 @@ def _refuse_miss(picture: PlainPicture, miss: float, *, is_given: bool) -> None:
         else "leave the picture or are saturated"
     )
     raise InputError(
-        f"{picture.name}: the patches {where} {how}, whichever way round; expected the chart of the "
-        f"description, and linear values. {'See to the corners' if is_given else 'Give --corners'}: the middles "
-        "of the four corner patches"
+        f"{picture.name}: the patches {where} {how}, in every orientation of the chart; expected the chart of "
+        f"the description, and linear values. {'See to the corners' if is_given else 'Give --corners'}: the "
+        "middles of the four corner patches"
     )
 
 

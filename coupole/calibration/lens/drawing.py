@@ -58,7 +58,7 @@ def _draw_field(ax: Axes, lens_report: Shown) -> None:
     ax.text(0.04 * width, 0.94 * height, f"{key_px:g} px", color=DARK)
     ax.set(
         xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="x (px)", ylabel="y (px)",
-        title=f"Residuals, {enlargement:g} times enlarged; beyond 3 sigma in red",
+        title=f"Residuals, enlarged {enlargement:g} times; red: beyond 3 sigma",
     )  # fmt: skip
 
 

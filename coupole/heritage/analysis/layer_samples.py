@@ -82,7 +82,7 @@ def read_samples(layer_file: LayerGiven, folder: Path) -> Samples:
     has_thickness = [film.thickness_um is not None for film in films if film.over is not None]
     if any(has_thickness) != all(has_thickness):
         raise InputError(
-            "thickness: expected one for each film over a ground, or for none; some have one, some not"
+            "thickness: expected one for every film over a ground, or for none of them; only some have one"
         )
     binder_face = face(layer_file.binder_index, layer_file.geometry)
     paths = {film.spectrum for film in films} | {film.over for film in films if film.over is not None}

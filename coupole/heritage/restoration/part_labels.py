@@ -79,8 +79,8 @@ def parts_of(mesh: PaintedMesh, document: Document, parts_file: PartsFile) -> Pa
         if count == 0 and not problems:
             at = ("rules", places[name]) if name in places else ("rest",)
             message = (
-                f"the part {name!r} has no triangle: no rule gives it one, or later rules took it; "
-                f"{_remark_text(remarks)}"
+                f"the part {name!r} has no triangle: no rule gives it a triangle, or later rules took all of "
+                f"them; {_remark_text(remarks)}"
             )
             problems.append(document.problem(at, message))
     if problems:

@@ -109,7 +109,7 @@ class ArmPaths:
         planner = PathPlanner(self.arm, self.motion.bodies, [self._cell.rig.motion.home_joints_deg])
         leg = planner.leg(start_deg, goal_deg)
         if leg.contact is not None:
-            raise InputError(f"{name}: no path to it was found from where the arm stands: {leg.contact}")
+            raise InputError(f"{name}: no path to it was found from the arm's present place: {leg.contact}")
         return Visit(goal_deg, leg)
 
     def job_of(self, plan: Path) -> Job:

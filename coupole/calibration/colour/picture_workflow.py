@@ -195,7 +195,9 @@ def _refuse_tints(views: Sequence[_ChartView], known_chart: KnownChart, remarks:
     worst = int(np.argmax(apart))
     words = f"{views[worst].picture.name}: its light differs in colour from that of {views[0].picture.name}"
     if apart[worst] > _TINT_REFUSED:
-        raise InputError(f"{words} by {apart[worst]:.0%}; a profile holds for one light: calibrate each by itself")
+        raise InputError(
+            f"{words} by {apart[worst]:.0%}; a profile is valid for one light: calibrate for each light separately"
+        )
     if apart[worst] > _TINT_TOLD:
         remarks.append(f"{words} by {apart[worst]:.1%}")
 

@@ -174,7 +174,7 @@ def _film(film: FilmGiven, spectra: dict[Path, Array], binder_face: Face, layer_
     if ground.min() < -_BEYOND * layer_file.noise or ground.max() > 1.0 + _BEYOND * np.max(u_ground):
         raise InputError(
             f"{film.over}: as a ground under a glossy face it would reflect {ground.min():.3g} to "
-            f"{ground.max():.3g} inside; expected 0 to 1: see `grounds` (bare), and whether gloss is included"
+            f"{ground.max():.3g} inside; expected 0 to 1: check `grounds` (bare), and whether gloss is included"
         )
     h, u_h = 1.0, 0.0
     if film.thickness_um is not None:
@@ -193,7 +193,8 @@ def _check_level(reflectance: Array, path: Path, nm: Array, binder_face: Face, n
         raise InputError(
             f"{path}: is {reflectance[at]:.3g} at {nm[at]:g} nm; a paint under this face is seen as "
             f"{low[at]:.3g} to "
-            f"{high[at]:.3g}: see whether gloss is included, the binder's index, and percent or fractions"
+            f"{high[at]:.3g}: check whether gloss is included, the binder's index, and whether values are "
+            "percent or fractions"
         )
 
 

@@ -158,7 +158,7 @@ def _expect_one_frame(mesh: PaintedMesh, picked_parts: Picked, path: Path) -> No
         raise InputError(
             f"{path}: was painted on a mesh that lies elsewhere: {100 * far:.0f} % of it is more than "
             f"{_NEAR_SHARE * size_mm:.3g} mm from {mesh.path}. Both must be in one frame and one unit: register "
-            "the scans with --control, see to --unit, or paint this mesh"
+            "the scans with --control, check --unit, or paint this mesh"
         )
 
 

@@ -86,8 +86,8 @@ class Call:
             )
         return DeviceTimeout(
             self.of,
-            expected=f"an end of the call `{self.operation}`",
-            happened=f"it has not returned for {lasts_s:.0f} s; nobody waits for it any more",
+            expected=f"the call `{self.operation}` to return",
+            happened=f"it has not returned for {lasts_s:.0f} s; the program no longer waits for it",
             remedy="Switch the device off and on, then resume the run; if this happens again, report it with the "
             "versions of the device's library and firmware.",
         )

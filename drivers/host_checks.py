@@ -106,7 +106,7 @@ def receive_buffer() -> HostNeed:
     return HostNeed(
         "receive buffer of the network",
         limit_bytes >= LEAST_RECEIVE_BUFFER_BYTES,
-        f"at most {limit_bytes / 2**20:.1f} MB (net.core.rmem_max), {least} are wanted",
+        f"at most {limit_bytes / 2**20:.1f} MB (net.core.rmem_max), {least} are needed",
         remedy,
         is_vital=False,
     )

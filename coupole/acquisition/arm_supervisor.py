@@ -244,8 +244,8 @@ class ArmSupervisor:
         raise DeviceFault(
             "robot",
             expected=f"all of the arm within {PATH_TOLERANCE_MM:g} mm of the path that was checked",
-            happened=f"{when} it deviated and was stopped; it comes to rest up to {off_mm:.1f} mm off the path"
-            + (f"; {cause}" if cause else ""),
+            happened=f"{when} the arm deviated and was stopped; it comes to rest up to {off_mm:.1f} mm off the "
+            "path" + (f"; {cause}" if cause else ""),
             remedy="Check the cell; perhaps the controller does not move on straight lines in joint space.",
         )
 

@@ -135,8 +135,8 @@ class BurstRunner:
         if burst.timing.period_us < needed_us:
             raise DeviceError(
                 "camera",
-                expected=f"to be triggered every {needed_us} us at the most",
-                happened=f"by the rig's `sensor:` it would be triggered every {burst.timing.period_us} us",
+                expected=f"to be triggered at intervals of at least {needed_us} us",
+                happened=f"with the rig's `sensor:` the intervals would be {burst.timing.period_us} us",
                 remedy="Lower `max_frames_per_s`, or raise `exposure_gap_us`, in the rig.",
             )
         period_s = burst.timing.period_us * 1e-6

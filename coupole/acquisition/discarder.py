@@ -73,7 +73,7 @@ class Discarder:
         raise DiskFull(
             f"{self._run.folder}: the view {view} needs {bytes_text(needed_bytes)}, {bytes_text(free_bytes)} are "
             f"free, and no more frames are discarded: {reason}{kept_text}. Free space on the disk, then resume "
-            "the run: it goes on with what is left, and with the samples"
+            "the run: it continues with the remaining frames and with the samples"
         )
 
     def _waiting_views(self) -> set[str]:

@@ -111,7 +111,7 @@ class LightOnObject:
         limit = self._history.warn_above_lux_h
         if limit is None or self.total_lux_h <= limit:
             return ""
-        return f"object {self._id}: {self.total_lux_h:.3f} lux.h in all; its ledger warns above {limit:g}"
+        return f"object {self._id}: {self.total_lux_h:.3f} lux.h in total; its ledger warns above {limit:g}"
 
     @property
     def _history(self) -> History:

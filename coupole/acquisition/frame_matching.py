@@ -124,7 +124,7 @@ def match(
     id_steps = np.diff(frame_ids) % (id_modulus[1] - id_modulus[0] + 1)
     obstacle = _obstacle(edge_steps, id_steps, (id_modulus[1] - id_modulus[0]) // 2, timestamps_ns)
     if not obstacle and n_frames <= model.max_surplus + in_flight:
-        obstacle = "too few frames: all of them may be surplus, or of steps that are not in the log yet"
+        obstacle = "too few frames: all of them may be surplus, or may belong to steps that are not in the log yet"
     if obstacle:
         return _match_without_labels(n_frames, n_steps, reason=obstacle)
 
@@ -141,10 +141,10 @@ def match(
         alignment.agrees,
     )
     if candidates == 0:
-        reason = f"no alignment of box and camera leaves {model.max_surplus} frames or fewer unexplained"
+        reason = f"every alignment of box and camera leaves more than {model.max_surplus} frames unexplained"
         return _match_without_labels(n_frames, n_steps, reason=reason)
     if candidates < 0:
-        reason = "a gap is so long that the clocks' drift hides which step comes next"
+        reason = "after a long gap, the clocks' drift makes it uncertain which step comes next"
         return _match_without_labels(n_frames, n_steps, reason=reason)
     return _verdict(log, timestamps_ns, id_steps, alignment)
 

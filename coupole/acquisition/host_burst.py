@@ -229,4 +229,7 @@ def too_bright(frame: Frame, frame_format: FrameFormat) -> str:
     bright_dn = float(np.quantile(frame.pixels, DARK_QUANTILE))
     if bright_dn < limit_dn:
         return ""
-    return f"a dark mark shows light ({bright_dn:.0f} DN, {limit_dn:.0f} at most): a lamp is on that should be off"
+    return (
+        f"a dark mark shows light ({bright_dn:.0f} DN, {limit_dn:.0f} at most): a lamp is on although it "
+        "should be off"
+    )

@@ -37,7 +37,7 @@ def ask_to_begin(cell: Cell, *, confirm: bool) -> None:
     """Ask the operator before a real cell moves the arm or switches lights."""
     real = not in_world(cell.rig, dry_run=False)
     if real and confirm and not ask("Move the arm and light the object?"):
-        raise Interrupted("not started: answer the question, or say `--yes`")
+        raise Interrupted("the run was not started: answer the question, or give `--yes`")
 
 
 def longest_exposure_us(rig: Rig) -> int:

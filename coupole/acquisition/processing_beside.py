@@ -90,9 +90,10 @@ class ProcessingBeside:
     def __exit__(self, *_: object) -> None:
         """End the process, if it has not ended; its results are kept."""
         if self._end() and self._run is not None:
-            self._why = "ended with the run, which is not complete"
+            self._why = "the processing ended with the run, which is not complete"
             self._console.print(
-                f"reflectance: ended with the run; the samples of {self._views_text} are kept until it is resumed",
+                f"reflectance: the processing ended with the run; the samples of {self._views_text} are kept "
+                "until the run is resumed",
                 markup=False,
             )
         assert self._process.stdin is not None

@@ -37,7 +37,7 @@ State = dict[str, Any]
 """`run`, `rig`, `pid`, `light_after_lux_h`, `state` (running, pausing, paused, stopping); from the first burst on
 `Progress` too."""
 _SAFE_WITHIN_S = 4.0
-_UNHEARD = "it did not run for a while and is being made safe; when it is safe, ask again"
+_UNHEARD = "the process did not run for a while, and is making the cell safe; when the cell is safe, ask again"
 _LOOK_PATIENCE_S = 0.5
 
 

@@ -322,7 +322,7 @@ class Sequencer:
         if self._recorder.has_room(view):
             return
         self._observer.note(
-            f"waits for room on the disk before {view}: frames of earlier views are to be discarded"
+            f"the run waits for space on the disk before {view}: frames of earlier views will be discarded"
         )
         while not self._recorder.has_room(view):
             self._wait_while_paused()

@@ -332,7 +332,7 @@ def _say_outcome(console: Console, run: Run, outcome: Outcome, ending: str) -> N
         f"{outcome.duration_s:.1f} s (at best {outcome.ideal_s:.1f} s), {outcome.dose_lux_h:.3f} lux.h"
     )
     if run.is_lost:
-        console.print(f"  frames  lost with {run.folder}, unless that is found")
+        console.print(f"  frames lost with {run.folder}, unless this folder is found")
         return
     console.print(f"  frames  {run.folder / 'views'}")
     if ending != "done":

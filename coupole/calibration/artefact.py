@@ -276,7 +276,9 @@ def read_described(path: Path, model: type[D]) -> D:
         message = f"expected the certificate's file: {reason(error)}"
         raise InputError([document.problem(place, message)]) from error
     if artefact.certificate.sha256 not in (None, digest):
-        message = f"has the checksum {digest}, another than its `sha256`: it is not that certificate"
+        message = (
+            f"has the checksum {digest}, which differs from its `sha256`: it is not the certificate that is named"
+        )
         raise InputError([document.problem(place, message)])
     hashed_file = {"file": Path(artefact.certificate.file.name), "sha256": digest}
     certificate = artefact.certificate.model_copy(update=hashed_file)

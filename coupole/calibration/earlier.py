@@ -83,8 +83,8 @@ def refuse_same_images(path: Path, record: Record, inputs: Sequence[tuple[str, s
     image_hashes = {line.sha256 for line in record.inputs if "/" in line.name}
     if common := [name for name, sha256 in inputs if "/" in name and sha256 in image_hashes]:
         raise InputError(
-            f"{path}: was made from the same images ({common[0]}), so these would count twice. Leave it out: the "
-            "lens is estimated from these images anyway"
+            f"{path}: was made from the same images ({common[0]}), so these would count twice. Leave this record "
+            "out: the lens is estimated from these images anyway"
         )
 
 

@@ -96,8 +96,8 @@ class Picture:
     def _refuse_grey(self, channel: Channel) -> None:
         if channel != "green":
             raise InputError(
-                f"{self.name}: a grey image; there is no {channel} in it. Give colour pictures, or runs of a "
-                "colour camera"
+                f"{self.name}: the image is grey, and has no {channel} channel. Give colour pictures, or runs of "
+                "a colour camera"
             )
 
 

@@ -79,7 +79,8 @@ def match_points(found_mm: Floats, known_mm: Floats, tolerance_mm: float) -> Mat
     if not best:
         raise InputError(
             f"targets: no motion brings {least} of the {len(found_mm)} targets found onto those of the table "
-            f"({len(known_mm)}) within {tolerance_mm:g} mm. Another object, another unit, or targets that moved?"
+            f"({len(known_mm)}) within {tolerance_mm:g} mm. Is it another object, is the unit wrong, or did "
+            "targets move?"
         )
     best.sort(key=lambda entry: (-entry[0], entry[1]))
     count, rms_mm, motion = best[0]

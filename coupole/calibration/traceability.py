@@ -9,9 +9,9 @@ from coupole.calibration.record import Kind, Record
 from coupole.pages.page_parts import Section
 
 WITHOUT_ARTEFACT: dict[Kind, str] = {
-    "dark": "no artefact is needed: figures of the camera in its own unit, DN",
-    "response": "no artefact is needed: ratios of the camera's own signals",
-    "flat-field": "no artefact is needed: ratios of the camera's own signals",
+    "dark": "no artefact is needed: the figures are in the camera's own unit, DN",
+    "response": "no artefact is needed: the figures are ratios of the camera's own signals",
+    "flat-field": "no artefact is needed: the figures are ratios of the camera's own signals",
     "leds": "traceable through the records that it was made from",
     "mesh": "traceable through the records that it was made from, and through the scanner",
 }

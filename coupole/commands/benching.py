@@ -39,8 +39,8 @@ def bench(
     """Hold a cell's devices while no run is acquired, so that a console can read, move and photograph.
 
     The arm moves to a view, or by hand. Clients of the same user send requests to a Unix socket, whose path
-    `--json` prints at the beginning. Ends by
-    Ctrl-C, or when a client asks for it; the cell is then safe.
+    `--json` prints at the beginning. The command ends by Ctrl-C or when a client asks for it, and makes the cell
+    safe.
     """
     from coupole.acquisition.cell_bench.bench_service import serve_bench
     from coupole.console.command_line.client import borrowed_cell
@@ -119,7 +119,7 @@ def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> di
     steps = len(path["waypoints_deg"]) - 1
     print(f"{path['to']}: {path['duration_s']:.1f} s, {steps} straight motion(s)", file=sys.stderr)
     if not yes and not ask("Drive the arm along this path?"):
-        raise Interrupted("not driven: answer the question, or say `--yes`")
+        raise Interrupted("the arm was not driven: answer the question, or give `--yes`")
     control.await_word()  # the answer may have been given while nobody ran
     control.go_on()
     try:

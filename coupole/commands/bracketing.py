@@ -38,8 +38,8 @@ def bracket(
 ) -> None:
     """Merge photographs of different exposure times, taken from a tripod with one aperture and ISO number.
 
-    The command finds the camera's response from them, and draws it. Raw files have a linear response, which is
-    only tested.
+    The command finds the camera's response from them, and draws it. For raw files the response is known to be
+    linear, and the command only tests this.
     """
     from coupole.viewing.terminal import make_console
 
@@ -113,9 +113,7 @@ def sphere_brdf(
     if as_json:
         print(json.dumps(document | {"left_out": left_out}))
         return
-    text = (
-        f"{out}: {len(samples.f)} samples, half of them with an error up to {off[0]:.1%}, 95 % up to {off[1]:.1%}"
-    )
+    text = f"{out}: {len(samples.f)} samples; error at most {off[0]:.1%} for half of them, {off[1]:.1%} for 95 %"
     console.print(text, markup=False)
     for line in _prediction_lines(finish, paths) if len(paths) > 1 else []:
         console.print(line, markup=False)
@@ -124,7 +122,7 @@ def sphere_brdf(
 def _prediction_lines(finish: Finish, paths: list[str]) -> list[str]:
     """One line for each photograph that the others predict."""
     return [
-        "each photograph as the others predict it: incidence, error at the peak, median error, nearest sample",
+        "prediction of each photograph by the others: incidence, error at the peak, median error, nearest sample",
         *(
             f"  {paths[miss.photograph]}: {miss.incidence_deg:.0f} degrees, {miss.peak_miss:+.1%}, "
             f"{miss.median_miss:.1%}; {miss.nearest_to_peak_deg:.1f} degrees from the peak"
@@ -174,13 +172,17 @@ def _document(
 def _lines(document: dict[str, Any]) -> list[str]:
     lines = [f"{document['picture']}: {len(document['photographs'])} photographs merged"]
     if document["median_uncertainty"] is not None:
-        lines[0] += f"; half of the pixels are known within {document['median_uncertainty']:.2%} (standard)"
-    lines.append(f"{document['response_picture']}: the response that they show")
+        lines[0] += (
+            f"; for half of the pixels the standard uncertainty is at most {document['median_uncertainty']:.2%}"
+        )
+    lines.append(f"{document['response_picture']}: the response found from the photographs")
     off = document["departure_from_straight"]
     if document["used_response"] == "linear":
-        lines.append(f"taken as linear; the response found is straight within {off:.1%} from 10 to 90 % of values")
+        lines.append(f"taken as linear; from 10 to 90 % of values the response found is straight within {off:.1%}")
         if off > 0.1:
-            lines.append("that is much: processed pictures are not linear; leave out --linear, or give raw files")
+            lines.append(
+                "this departure is large: processed pictures are not linear; leave out --linear, or give raw files"
+            )
     for state, meaning in (("saturated", "at least as bright as written"), ("dark", "hardly more than noise")):
         if document[state] > 0.0:
             lines.append(f"{document[state]:.2%} of the pixels are {state} in all photographs: {meaning}")

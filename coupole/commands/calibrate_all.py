@@ -34,12 +34,12 @@ def calibrate_all(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before each step of a real cell.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Dark frames, response, flat field, lens and hand-eye, LEDs and their power, an object's place: acquire and
-    calibrate each.
+    """Acquire and calibrate each of: dark frames, response, flat field, lens and hand-eye, LEDs and their power,
+    an object's place.
 
     A step with a record in the folder is skipped, and an interrupted run is resumed, so call it again to finish.
-    For a real cell it prints what must be on the support, and waits; a simulated one has its own object and
-    scanner.
+    For a real cell the command prints what must be on the support, and waits; a simulated cell has its own object
+    and scanner.
     """
     from coupole.console.command_line.client import borrowed_cell
     from coupole.plan.cell import read_cell
@@ -73,7 +73,8 @@ def calibrate_all(
     for kind, record in campaign.record_paths().items():
         console.print(f"[green]{kind}[/]: {record}")
     console.print(
-        f"To put them in force for all plans of {rig}, write there:\n{_for_a_rig(rig, campaign.record_paths())}"
+        f"To put these records in force for all plans of {rig}, write in that "
+        f"file:\n{_for_a_rig(rig, campaign.record_paths())}"
     )
 
 

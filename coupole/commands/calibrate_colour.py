@@ -36,8 +36,8 @@ ChartOption = Annotated[
     Path,
     typer.Option(
         "--chart",
-        help="The chart's description (YAML); for pictures also its values alone (CxF, CGATS, CSV) with patches "
-        "A1, A2, ..., B1, ..., a letter for each row.",
+        help="The chart's description (YAML). For pictures the chart's values are enough (CxF, CGATS, CSV), with "
+        "patches A1, A2, ..., B1, ..., a letter for each row.",
         show_default=False,
     ),
 ]
@@ -46,9 +46,9 @@ CornersOption = Annotated[
     typer.Option(
         "--corners",
         metavar='"X,Y X,Y X,Y X,Y"',
-        help="Centres of the chart's top left, top right, bottom right and bottom left patch, px. Of runs in the "
-        "first view's frames; by default the chart lies as its description says. Of pictures from any corner "
-        "around; by default the chart is searched for.",
+        help="Centres of the chart's top left, top right, bottom right and bottom left patch, px. For runs: in "
+        "the first view's frames; by default the chart lies as its description says. For pictures: begin at any "
+        "corner and go round; by default the chart is searched for.",
         show_default=False,
     ),
 ]
@@ -56,18 +56,20 @@ WhiteOption = Annotated[
     Path | None,
     typer.Option(
         "--white",
-        help="A run of the same plan with a white sheet in the chart's place: it replaces the LEDs' known light; "
-        "or a picture of a white card in the chart's place: it replaces the light that is found from the patches.",
+        help="For runs: a run of the same plan with a white sheet in the chart's place, in place of the LEDs' "
+        "known light. For pictures: a picture of a white card in the chart's place, in place of the light found "
+        "from the patches.",
         show_default=False,
     ),
 ]
 WithoutOption = Annotated[
-    str | None, typer.Option("--without", help="Names of patches to leave out, as A1,B2.", show_default=False)
+    str | None, typer.Option("--without", help="Names of patches to leave out, such as A1,B2.", show_default=False)
 ]
 SrgbOption = Annotated[
     bool,
     typer.Option(
-        "--srgb", help="Pictures have the transfer curve of sRGB and no other; by default they are linear."
+        "--srgb",
+        help="The pictures have the transfer curve of sRGB and no other curve; by default they are linear.",
     ),
 ]
 

@@ -22,11 +22,16 @@ if TYPE_CHECKING:
     from coupole.plan.cell import Cell
 
 Runs = Annotated[list[Path], typer.Argument(help="Runs.", show_default=False, metavar="RUN...")]
-HandEyeOption = Annotated[Path, typer.Option("--hand-eye", help="The hand-eye record, which has the lens too.")]
+HandEyeOption = Annotated[
+    Path, typer.Option("--hand-eye", help="The hand-eye record, which also contains the lens.")
+]
 CameraOption = Annotated[
     Path | None, typer.Option("--camera", help="The camera's record, as a check that it is the same lens.")
 ]
-_OF_THE_ROBOT = "Noise of the robot from pose to pose, as stated; its absolute error where that is not calibrated."
+_OF_THE_ROBOT = (
+    "Noise of the robot from pose to pose, as stated. If the robot's absolute error is not "
+    "calibrated, give the absolute error instead."
+)
 RepeatabilityMm = Annotated[float, typer.Option("--repeatability-mm", min=1e-4, help=_OF_THE_ROBOT)]
 RepeatabilityDeg = Annotated[float, typer.Option("--repeatability-deg", min=1e-5, help=_OF_THE_ROBOT)]
 
@@ -61,12 +66,12 @@ def leds(
     hand_eye: HandEyeOption,
     camera: CameraOption = None,
     rig: Annotated[
-        Path | None, typer.Option("--rig", help="The rig with the dome; the run's own if not given.")
+        Path | None, typer.Option("--rig", help="The rig with the dome; by default the run's own.")
     ] = None,
     *,
     robot: RobotRepeatability,
     tolerance_mm: Annotated[
-        float, typer.Option(min=1e-4, help="Tolerance of LEDs on their boards that the maker states.")
+        float, typer.Option(min=1e-4, help="The maker's tolerance for the places of LEDs on their boards.")
     ] = 0.05,
     accept_faults: Annotated[
         bool,
@@ -75,7 +80,7 @@ def leds(
         ),
     ] = False,
 ) -> Work:
-    """Find positions and normals of all LEDs, from views of the lit LEDs, each seen six times or more.
+    """Find positions and normals of all LEDs, from views of the lit LEDs. Each LED must be seen six times or more.
 
     With a dead LED or swapped wires the record is not accepted and no table is written, unless --accept-faults.
     """

@@ -60,7 +60,7 @@ class Warmth:
             "--board-c",
             min=-50.0,
             max=100.0,
-            help="Temperature of a board with a certificate, C; that of the run's coolest LED board if not given.",
+            help="Temperature of a board with a certificate, C; by default that of the run's coolest LED board.",
             show_default=False,
         ),
     ] = None
@@ -123,16 +123,17 @@ class StatedRobot:
     """Errors of the robot, as stated."""
 
     repeatability_mm: Annotated[
-        float, typer.Option(min=1e-4, help="Repeatability of position that the robot's maker states.")
+        float, typer.Option(min=1e-4, help="Repeatability of position, as stated by the robot's maker.")
     ] = 0.03
     repeatability_deg: Annotated[
-        float, typer.Option(min=1e-5, help="Repeatability of orientation that the robot's maker states.")
+        float, typer.Option(min=1e-5, help="Repeatability of orientation, as stated by the robot's maker.")
     ] = 0.003
     absolute_mm: Annotated[
-        float, typer.Option(min=0.0, help="Absolute error of the robot's position that its maker states.")
+        float, typer.Option(min=0.0, help="Absolute error of the robot's position, as stated by its maker.")
     ] = 0.3
     absolute_deg: Annotated[
-        float, typer.Option(min=1e-5, help="Absolute error of its orientation, or of the zero of each axis.")
+        float,
+        typer.Option(min=1e-5, help="Absolute error of the robot's orientation, or of the zero of each axis."),
     ] = 0.02
 
 
@@ -149,7 +150,9 @@ def hand_eye(
     ] = None,
     rig: Annotated[
         Path | None,
-        typer.Option("--rig", help="The rig of the arm: zero errors of its axes are estimated too (for runs)."),
+        typer.Option(
+            "--rig", help="The arm's rig. With it, the zero errors of the arm's axes are estimated too (for runs)."
+        ),
     ] = None,
     *,
     robot: StatedRobot,

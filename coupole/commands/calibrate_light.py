@@ -30,7 +30,7 @@ DarkOption = Annotated[
 ResponseOption = Annotated[Path | None, typer.Option("--response", help="A record of `calibrate response`.")]
 FlatOption = Annotated[Path | None, typer.Option("--flat", help="A record of `calibrate flat-field`.")]
 GlareOption = Annotated[
-    Path | None, typer.Option("--glare", help="A record of `calibrate glare`: the veil is taken off.")
+    Path | None, typer.Option("--glare", help="A record of `calibrate glare`: the veiling glare is subtracted.")
 ]
 CameraOption = Annotated[
     Path | None, typer.Option("--camera", help="A camera's record; the rig's lens if not given.")
@@ -123,14 +123,14 @@ def glare(
     runs: Runs,
     target: Annotated[
         Path | None,
-        typer.Option("--target", help="Description of the target (YAML): its name, light of its traps."),
+        typer.Option("--target", help="Description of the target (YAML): its name, and the light of its traps."),
     ] = None,
     dark_record: DarkOption = None,
     response_record: ResponseOption = None,
 ) -> Work:
     """Veiling glare of lens and camera, per channel, from views of black traps in a white card.
 
-    With the record extraction takes the glare off, and its uncertainty is in that of each sample.
+    With this record, extraction subtracts the glare; each sample's uncertainty then includes that of the glare.
     """
     from coupole.calibration.light.frames import open_light_frames
     from coupole.calibration.light.glare_records import glare_outcome

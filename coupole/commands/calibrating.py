@@ -71,7 +71,7 @@ def rig_of(run: Path) -> Path:
     path, rig_entry = folder.rig_path, folder.about["rig"]
     is_unchanged = path.is_file() and ("stored" in rig_entry or sha256(path) == rig_entry["sha256"])
     if not is_unchanged:
-        raise InputError(f"{run}: its rig {path} is gone or was changed since; name one with --rig")
+        raise InputError(f"{run}: its rig {path} is missing or has changed since the run; name a rig with --rig")
     return path
 
 
@@ -86,8 +86,8 @@ def arm_of(cell: Cell, hand_eye: Path) -> CalibratedArm | None:
     arm = planning_arm(cell.rig)
     if arm is None:
         raise InputError(
-            f"{hand_eye}: was made with the arm's model, but the rig's robot has none; name the rig that it was "
-            "made with by --rig"
+            f"{hand_eye}: this record was made with a model of the arm, but the rig's robot has none; give --rig "
+            "with the rig of the record"
         )
     return read_arm(hand_eye, arm)
 
@@ -100,7 +100,7 @@ def calibration(
     Its options may be in dataclasses (`option_groups`). All commands have `--out`, `--name`, `--valid-days` and
     `--json` besides; `--limit` where the calibration has `limits`, and `--lens` where records are of one lens.
     """
-    words = f"Set an acceptance limit; again for more. Usual are {words_of(limits)}."
+    words = f"Set an acceptance limit; repeat for more. The usual limits are {words_of(limits)}."
     common: list[tuple[str, Any, Any]] = [
         ("out", OutOption, Path("calibrations")),
         ("name", NameOption, None),

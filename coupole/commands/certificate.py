@@ -42,7 +42,7 @@ def certificate(
     ),
     as_json: JsonOption = False,
 ) -> None:
-    """Write a certificate of a cell: results with U, conditions, chain to certificates (ISO/IEC 17025, 7.8).
+    """Write a certificate of a cell: results with U, conditions, and chain to certificates (ISO/IEC 17025, 7.8).
 
     The exit code is 3 if a record is not accepted, has expired by date or by drift, or is not traceable.
     """
@@ -89,7 +89,7 @@ def _refuse_doubtful(out: Path, all_doubts: tuple[str, ...], console: Console) -
 def _refuse_out(out: Path) -> None:
     """Raise InputError for another name than that of a page, or one that is taken."""
     if out.suffix != ".html":
-        raise InputError(f"--out {out}: expected the name of a page, as certificate.html")
+        raise InputError(f"--out {out}: expected the name of a page, such as certificate.html")
     for path in (out, out.with_suffix(".json")):
         if path.exists():
             raise InputError(f"{path}: exists already; choose another --out")

@@ -72,7 +72,7 @@ class IndependentArtefact:
     mpe: Annotated[
         str | None,
         typer.Option(
-            "--mpe-um", help="Largest permissible error of a length: A+L/K, A in um, L in mm; as 50+L/20."
+            "--mpe-um", help="Largest permissible error of a length: A+L/K, A in um, L in mm; such as 50+L/20."
         ),
     ] = None
 
@@ -112,7 +112,7 @@ def _refuse_wrong(paths: Sequence[Path], independent: IndependentArtefact, emiss
     if (independent.board is None) != bool(tiles):
         raise InputError("check-artefact: give one of --board and --tile, the artefact's description")
     if tiles and (independent.mpe is not None or independent.poses is not None):
-        raise InputError(f"--{'mpe-um' if independent.mpe is not None else 'poses'}: is for --board")
+        raise InputError(f"--{'mpe-um' if independent.mpe is not None else 'poses'}: is for --board only")
     if independent.mpe is not None:
         parse_permissible(independent.mpe)
     emission_of(emission)
@@ -240,7 +240,7 @@ def _check_tile(
     artefacts = [refuse_dependent(read_tile(tile).artefact, tile, records) for tile in tiles]
     if len({artefact.serial for artefact in artefacts}) > 1:
         raise InputError(
-            f"--tile: expected one tile in all places, found {', '.join(a.serial for a in artefacts)}"
+            f"--tile: expected the same tile in all places, found {', '.join(a.serial for a in artefacts)}"
         )
     refuse_read_otherwise(record_of_kind["led-power"].path, record, list(record_of_kind))
     places, inputs = [], []

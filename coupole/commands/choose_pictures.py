@@ -18,7 +18,7 @@ from coupole.errors import CoupoleError, InputError
 
 @flatten_options
 def choose(
-    count: Annotated[int, typer.Option("--count", min=6, help="Lights that are chosen, at most.")],
+    count: Annotated[int, typer.Option("--count", min=6, help="Largest number of lights to choose.")],
     *,
     picture_options: KnownPictures,
     until: Annotated[
@@ -36,9 +36,9 @@ def choose(
     to: Annotated[Path | None, typer.Option("--to", help="Write the choice into this file (JSON).")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Choose, among pictures under known distant lights, the few that add most information; only those are read.
+    """Choose the few pictures under known distant lights that add most information; only these are read.
 
-    Lights are counted from 0. `left_out` of the JSON is what `coupole reflectance --leave-out` takes.
+    Lights are counted from 0. Give the JSON's `left_out` to `coupole reflectance --leave-out`.
     """
     from coupole.viewing.terminal import make_console, step_bars
 
@@ -48,7 +48,7 @@ def choose(
         from coupole.storage.durable import write_synced
 
         if to is not None and not to.parent.is_dir():
-            raise InputError(f"--to: expected a folder that exists, {to.parent} does not")
+            raise InputError(f"--to: expected a file in an existing folder; {to.parent} does not exist")
         pictures = picture_options.read()
         with step_bars(console) as say:
             choice = choose_pictures(

@@ -44,8 +44,8 @@ def commission(
 ) -> None:
     """Measure a cell's safety figures at reduced speed, step by step; a person confirms before each step.
 
-    The record is in the cell's state folder. Without a record that passed and fits, a real cell runs no plan.
-    Steps that passed are not repeated. Exit code 3: a step did not pass.
+    The record is in the cell's state folder. A real cell runs plans only with a record that passed and fits the
+    cell. Steps that passed are not repeated. Exit code 3: a step did not pass.
     """
     from coupole.acquisition.commissioning.persons import PersonAtTerminal, SimulatedPerson
     from coupole.acquisition.commissioning.session import commission as commission_cell
@@ -64,7 +64,7 @@ def commission(
         read_board(board)
     console, cell = make_console(quiet=as_json), read_cell(rig)
     if yes and not in_world(cell.rig, dry_run=False):
-        raise InputError(f"--yes: {rig} is a real cell, where a person must see and answer; leave it out")
+        raise InputError(f"--yes: {rig} is a real cell, where a person must see and answer; leave --yes out")
 
     try:
         with borrowed_cell(cell, f"commission, {name}"):

@@ -141,7 +141,7 @@ def queue(
     give_control: Annotated[bool, typer.Option("--give-control", help="Give up control last.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Enter plans in the queue of a cell whose console is served on this machine; without plans show it.
+    """Enter plans in the queue of a cell whose console is served on this machine; without plans, show the queue.
 
     Each plan is checked by preflight when it is entered, together with the plans that run and wait before it.
     """

@@ -30,7 +30,7 @@ class Demo:
 
 
 def demo(
-    folder: Annotated[Path, typer.Argument(help="Folder that is made; or one of an interrupted demo.")] = Path(
+    folder: Annotated[Path, typer.Argument(help="Folder to make, or the folder of an interrupted demo.")] = Path(
         "coupole-demo"
     ),
     short: Annotated[

@@ -123,5 +123,6 @@ def advice_of(jitters: list[Any], rig: Path) -> str:
     if last.holds:
         return why + f"set `cycle_ms: {last.cycle_ms}` among the robot's settings, with #IPO in the RSI program"
     return (
-        why + "end other work on it; until then use EthernetKRL (`drivers.kuka.eki:KukaEki`), which is not timed"
+        why + "end this machine's other work; until then use EthernetKRL (`drivers.kuka.eki:KukaEki`), "
+        "which is not timed"
     )

@@ -35,16 +35,16 @@ def dose(
         typer.Option(
             "--budget",
             min=0,
-            help="Total light that the object may receive in its life, in lux hours; needs --name.",
+            help="Largest total light that the object may receive in its life, in lux hours; needs --name.",
         ),
     ] = None,
-    name: Annotated[str, typer.Option("--name", help="Name of the person who decides it.")] = "",
+    name: Annotated[str, typer.Option("--name", help="Name of the person who decides the budget.")] = "",
     reason: Annotated[str, typer.Option("--reason", help="Reason for this budget.")] = "",
     as_json: JsonOption = False,
 ) -> None:
     """All light that an object has received, run by run, and its budget; light given elsewhere is entered by hand.
 
-    The budget holds under every rig and plan from the next burst on. The budget of a plan can only be stricter.
+    The budget holds under every rig and plan from the next burst on. A plan's own budget can only be stricter.
     """
     from coupole.plan.cell import read_cell, users_ledger_folder
     from coupole.storage.ledger import Ledger, ledger_of, similar_ids

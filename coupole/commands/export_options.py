@@ -22,10 +22,10 @@ ToOption = Annotated[
     str,
     typer.Option(
         "--to",
-        help=f"Of runs: {', '.join(formats_of(Source.RUN))}. "
-        f"Of results of runs: {', '.join(formats_of(Source.RESULT))}; "
-        f"of results of pictures: {', '.join(formats_of(Source.PICTURES))}; "
-        f"of restorations: {', '.join(formats_of(Source.RESTORATION))}.",
+        help=f"For runs: {', '.join(formats_of(Source.RUN))}. "
+        f"For results of runs: {', '.join(formats_of(Source.RESULT))}; "
+        f"for results of pictures: {', '.join(formats_of(Source.PICTURES))}; "
+        f"for restorations: {', '.join(formats_of(Source.RESTORATION))}.",
         show_default=False,
         autocompletion=formats,
     ),
@@ -56,7 +56,7 @@ TriangleOption = Annotated[
     list[int] | None,
     typer.Option(
         "--triangle",
-        help=f"For results, for {', '.join(_OF_MATERIALS)}: number of a triangle; repeat for more.",
+        help=f"For results, with {', '.join(_OF_MATERIALS)}: number of a triangle; repeat for more.",
         min=0,
         rich_help_panel=_PARTS,
     ),
@@ -66,9 +66,9 @@ AdaptiveOption = Annotated[
     typer.Option(
         "--adaptive",
         metavar="ERROR",
-        help="For bsdf: the smallest table whose error against the fit is at most this share (such "
-        "as 0.003) in 95 % of directions, of all and of those in the lobe; by default a table "
-        "of 17 MB.",
+        help="For bsdf: largest error of the table against the fit, as a share such as 0.003. It holds for 95 % "
+        "of all directions, and for 95 % of those in the lobe. The smallest such table is written; by default a "
+        "table of 17 MB.",
         min=1e-5,
         max=0.5,
         show_default=False,
@@ -80,8 +80,8 @@ TexelOption = Annotated[
     typer.Option(
         "--texel-mm",
         metavar="MM",
-        help=f"For {', '.join(_WITH_MAPS)}: width of the maps' texels on the object; by default that of the "
-        "finest view's pixels, or more if the maps would be too large.",
+        help=f"For {', '.join(_WITH_MAPS)}: width of the maps' texels on the object; by default the width of the "
+        "finest view's pixels, or larger if the maps would be too large.",
         min=1e-4,
         show_default=False,
         rich_help_panel=_PARTS,
@@ -92,7 +92,8 @@ MapOption = Annotated[
     typer.Option(
         "--map-px",
         metavar="PX",
-        help="For the same: greatest width and height of the maps, 256 to 16384 (default).",
+        help="For the formats of --texel-mm: greatest width and height of the maps, from 256 to 16384, which is "
+        "the default.",
         min=256,
         max=16384,
         show_default=False,
@@ -104,8 +105,8 @@ UvOption = Annotated[
     typer.Option(
         "--uv",
         metavar="MESH",
-        help="For the same: the mesh with texture coordinates of its own (.obj, .ply, .glb), in which the "
-        "maps are laid out; by default on new charts.",
+        help="For the formats of --texel-mm: the mesh with texture coordinates (.obj, .ply, .glb), in which the "
+        "maps are laid out; by default new charts are made.",
         rich_help_panel=_PARTS,
     ),
 ]

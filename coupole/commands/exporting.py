@@ -105,7 +105,7 @@ def export(
         raise
     console.print(f"{summary.files} files, {bytes_text(summary.bytes)}, in {folder}")
     for view, miss_dn in summary.misses_dn.items():
-        console.print(f"{view}: the error against its own pictures is {miss_dn:.1f} of 255, rms")
+        console.print(f"{view}: rms error against the view's own pictures: {miss_dn:.1f} of 255")
     if as_json:
         document = {"out": str(folder.resolve()), "files": summary.files, "bytes": summary.bytes}
         print(json.dumps({**document, **({"misses_dn": summary.misses_dn} if summary.misses_dn else {})}))
@@ -251,7 +251,9 @@ def _colour_of(request: Asked) -> ColourWanted | None:
 
     eye, sensor = "for-the-eye" in request.options, request.path("sensor-spectra")
     if eye and request.to != "tiff":
-        raise InputError(f"--for-the-eye: is for --to tiff; a {request.to} with --sensor-spectra has its colours")
+        raise InputError(
+            f"--for-the-eye: is for --to tiff; a {request.to} contains colours if --sensor-spectra is given"
+        )
     if not eye:
         request.refuse(("linear",), "for --for-the-eye")
         if request.to == "tiff":

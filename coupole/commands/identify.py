@@ -167,8 +167,9 @@ def _show(console: Console, findings: list[PigmentFinding]) -> None:
         console.print(f"{finding.name}: {'; '.join([finding.reason, *finding.remarks])}", markup=False)
     rates = findings[-1].rates
     console.print(
-        f"the library's own spectra, each left out (95 %): first class right {rates.right}, match with a "
-        f"wrong class {rates.false_matches}; with the class left out unknown {rates.unknown}"
+        f"the library's own spectra, each left out in turn (95 % intervals): first class right {rates.right}, "
+        f"match with a wrong class {rates.false_matches}; with its whole class left out, the answer is unknown: "
+        f"{rates.unknown}"
     )
 
 

@@ -61,7 +61,10 @@ def identify_spot(spot: Spot, references: References) -> dict[str, Any]:
         references,
     )
     apart = answer.not_told_apart
-    many = f"{len(apart)} of {len(answer.candidates)} classes of the library have its colour at some concentration"
+    many = (
+        f"{len(apart)} of {len(answer.candidates)} classes of the library have the spot's colour at some "
+        "concentration"
+    )
     return {
         "name": f"{spot.result.resolve().name} at {spot.at}",
         "verdict": "ambiguous" if apart else "unknown",

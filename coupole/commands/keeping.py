@@ -64,12 +64,12 @@ def report(
 def verify(
     run: RunPath,
     with_manifest: Annotated[
-        bool, typer.Option("--manifest", help="Enter files in manifest.sha256 that it does not list yet.")
+        bool, typer.Option("--manifest", help="Add the files that manifest.sha256 does not list yet to it.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Read a run back: every frame, its completeness and checksums, whether its light, exposure and pose agree
-    with the run's plan, and every file that the manifest lists.
+    """Read a run back: every frame, and every file that the manifest lists. Check that the run is complete, that
+    all checksums are right, and that light, exposure and pose of each frame agree with the run's plan.
     """
     from rich.progress import Progress
 
@@ -106,9 +106,8 @@ def verify(
     if check.bad:
         subject = "1 thing is" if len(check.bad) == 1 else f"{len(check.bad)} things are"
         raise ChecksumMismatch(
-            f"{subject} not right (above); read back were {check.frames} frames, and {check.listed_count} files "
-            f"that "
-            "the manifest lists"
+            f"{subject} not right (above); {check.frames} frames and {check.listed_count} files of the manifest "
+            "were read back"
         )
     if check.missing:
         goes_on = f"go on with `{folder.go_on_command}`"
@@ -136,10 +135,10 @@ def _show_verified(console: Console, run: Run, verification: Verification) -> No
     if verification.not_compared:
         console.print(f"[yellow]not compared with the plan:[/] {escape(verification.not_compared)}")
     if verification.listed_count and not verification.bad:
-        console.print(f"{verification.listed_count} files are as manifest.sha256 lists them")
+        console.print(f"{verification.listed_count} files have the checksums of manifest.sha256")
     if verification.unlisted:
         console.print(
-            f"not listed there: {', '.join(verification.unlisted[:5])}"
+            f"not listed in manifest.sha256: {', '.join(verification.unlisted[:5])}"
             f"{' ...' if verification.unlisted[5:] else ''}"
         )
 
@@ -148,12 +147,14 @@ def _show_discarded(console: Console, verification: Verification) -> None:
     counts = ", ".join(f"{count} of {view}" for view, count in verification.discarded_counts.items())
     total = sum(verification.discarded_counts.values())
     console.print(
-        f"{total} more frames were discarded, as the plan says (discard: after_fit): {counts}. They cannot be "
-        "looked at again. The journal has their shots and checksums; their samples stand for them:",
+        f"{total} more frames were discarded, as the plan says (discard: after_fit): {counts}. Nobody can look at "
+        "them again. The journal has their shots and checksums; the samples that were taken from them replace "
+        "them:",
         markup=False,
     )
     samples = (
-        ": its samples are as they were read back before anything was discarded, or replaced after that"
+        ": its samples are unchanged since they were read back before frames were discarded, or since they were "
+        "replaced later"
         if not verification.bad
         else " (what is wrong is said above)"
     )

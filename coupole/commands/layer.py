@@ -304,8 +304,8 @@ def _grains(paint: Any, other_path: Path) -> dict[str, Any]:
     other_paint = read_paint(other_path)
     if other_paint.unit != "per mm" or paint.unit != "per mm":
         raise InputError(
-            f"{other_path}: sizes of grains need K and S per mm of both grindings; found {other_paint.unit} and "
-            f"{paint.unit}: give --thickness-um"
+            f"{other_path}: to compare grain sizes, K and S of both grindings must be per mm; found "
+            f"{other_paint.unit} and {paint.unit}: give --thickness-um"
         )
     nm = other_paint.wavelengths_nm
     inside = (nm >= paint.wavelengths_nm[0]) & (nm <= paint.wavelengths_nm[-1])
@@ -354,7 +354,9 @@ def _say(document: dict[str, Any], console: Console) -> None:
             "under diffuse light"
         )
     if (misfit := document["misfit"]) is not None:
-        console.print(f"the films differ from a single K and S by {misfit:.1f} times what noise explains")
+        console.print(
+            f"the films' differences from a single K and S are {misfit:.1f} times as large as noise explains"
+        )
     _say_films(document, console)
     if grains := document.get("grains"):
         console.print(
@@ -372,7 +374,9 @@ def _say_films(document: dict[str, Any], console: Console) -> None:
         name = f"at {film['thickness_um']:g} um over {film['over']}"
         bands = [number for number, value in enumerate(film["reflectance"]) if value is not None]
         if not bands:
-            console.print(f"{name}: not known; the measured films hide their grounds", markup=False)
+            console.print(
+                f"{name}: cannot be predicted, because the measured films hide their grounds", markup=False
+            )
             continue
         at = bands[len(bands) // 2]
         console.print(

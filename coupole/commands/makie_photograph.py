@@ -78,7 +78,7 @@ def makie(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Separate a photograph of makie: alpha is the share of metal, colours are the part of the lacquers.
+    """Separate a photograph of makie: alpha is the share of metal, and the colours are those of the lacquers.
 
     Photograph in diffuse light, so that all of the metal is equally bright. X counts columns from the left, Y rows
     from the top, both from 0.
@@ -140,8 +140,8 @@ def _say(console: Any, out: Path, result: _Result) -> None:
         console.print(f"{result.unknown_share:.2%} of the pixels are saturated or dark; they have no metal here")
     if parts.clamped_share > _TOLD_FROM:
         console.print(
-            f"of {parts.clamped_share:.1%} of the pixels the share of metal was beyond 0 or 1 and was cut off: "
-            "noise, shadow, or a colour that --metal or --lacquer do not name",
+            f"in {parts.clamped_share:.1%} of the pixels the share of metal was beyond 0 or 1 and was cut off: "
+            "noise, shadow, or a colour that neither --metal nor --lacquer names",
             markup=False,
         )
 

@@ -81,7 +81,7 @@ def view(
     show: Annotated[bool, typer.Option("--show", help="Open the page in a browser.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw a plan, refused or not: a picture (PNG) and an interactive page (HTML)."""
+    """Draw a plan, even one that is refused: a picture (PNG) and an interactive page (HTML)."""
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
     from coupole.viewing.view import look_at_plan
@@ -100,7 +100,7 @@ def view(
 def simulate(
     plan: PlanPath,
     rig: RigOption = None,
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Number of shots, of all views together.")] = 12,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Number of shots of all views together.")] = 12,
     out: Annotated[Path, typer.Option("--out", help="Folder for the pictures.")] = Path("simulated"),
     width: Annotated[
         int | None, typer.Option("--width", min=16, help="Width of the frames, if smaller than the rig's.")
@@ -224,7 +224,7 @@ def _on_the_support(template: str, rig: Path, name: str) -> Path | None:
         return None
     paths = place_for(template, step.things, rig, name)
     make_console(quiet=False).print(
-        f"this cell is simulated: {paths[0]} has on its support {step.stands}"
+        f"this cell is simulated: on the support of {paths[0]} is {step.stands}"
         + "".join(f"; {description} describes it" for description in paths[1:]),
         markup=False,
     )

@@ -64,8 +64,8 @@ def recipe(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find paints of a palette whose opaque mixture has a colour: shares, match under several lights, error with
-    one paint less.
+    """Find a mixture of a palette's paints that matches a colour as an opaque layer: shares, match under several
+    lights, error with one paint less.
     """
     from coupole.appearance.matter.glossy_face import face
     from coupole.exchange.target_folder import refuse_standing
@@ -205,7 +205,9 @@ def _say(search: Found, matches: Sequence[Sequence[Match]], console: Console) ->
     console.print(f"{search.verdict()}.", markup=False)
     for rival in search.rivals[:_FEWER]:
         shares = ", ".join(f"{100 * share:.0f} % {name}" for name, share in rival.items())
-        console.print(f"not distinguishable from it at a noise of {search.noise:g}: {shares}", markup=False)
+        console.print(
+            f"not distinguishable from this recipe at a noise of {search.noise:g}: {shares}", markup=False
+        )
     for number in range(search.chosen_index - 1, max(-1, search.chosen_index - _FEWER), -1):
         fewer = search.recipes[number]
         words = ", ".join(f"{100 * share:.0f} % {name}" for name, share in fewer.shares.items())

@@ -50,16 +50,18 @@ def refine(
     calibrations: RecordsOption = None,
     search_mm: Annotated[
         float,
-        typer.Option("--search-mm", min=0.1, max=20.0, help="Largest disagreement of views that is searched."),
+        typer.Option(
+            "--search-mm", min=0.1, max=20.0, help="Largest disagreement between views that the search covers."
+        ),
     ] = 3.0,
     *,
     stated: StatedUncertainties,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure how far apart views put the same spots of the surface, and refine poses, lens and mesh together
-    until they agree, within the uncertainties of records and scan.
+    """Measure how far apart views put the same spots of the surface. Then refine poses, lens and mesh together,
+    within the uncertainties of records and scan, until the views agree.
 
-    `coupole reflectance RUN... --refined OUT` uses what was found.
+    `coupole reflectance RUN... --refined OUT` uses the refined poses, lens and mesh.
 
     The last options are standard uncertainties that no record states.
     """

@@ -129,7 +129,9 @@ def _refuse_mixed(runs: list[Path], samples: SamplesOfRuns, without: PicturesWit
         raise InputError("expected runs, or --pictures with --lights; see coupole reflectance from --help")
     is_uncalibrated = without.is_uncalibrated
     if (is_uncalibrated and (samples.calibrations or len(runs) != 1)) or (without.view and not is_uncalibrated):
-        raise InputError("--uncalibrated: expected one run and no --calibrations; --view goes with it alone")
+        raise InputError(
+            "--uncalibrated: expected one run and no --calibrations; --view is for --uncalibrated only"
+        )
     if (samples.refined_folder or samples.poses) and (is_uncalibrated or without.pictures is not None):
         raise InputError("--refined, --poses: are for calibrated runs")
     if without.pictures is None and any((without.lights, without.srgb, without.intensities, without.mask)):
@@ -192,7 +194,7 @@ def _numbers(text: str) -> list[int]:
     try:
         return [int(word) for word in words]
     except ValueError as error:
-        raise InputError(f"--leave-out: expected numbers with commas between, got {text!r}") from error
+        raise InputError(f"--leave-out: expected numbers separated by commas, got {text!r}") from error
 
 
 @reflectance_app.command()

@@ -54,7 +54,9 @@ DirectionOption = Annotated[
 LedOption = Annotated[
     list[int] | None, _option("--led", "An LED of the run; values are shares of the camera's range.", min=0)
 ]
-LightAtOption = Annotated[Several, _option("--light-at", "X,Y,Z of a point light, mm; white is 1 at 1 m.")]
+LightAtOption = Annotated[
+    Several, _option("--light-at", "X,Y,Z of a point light, mm; a white diffuser at 1 m from it has the value 1.")
+]
 AreaOption = Annotated[
     Several,
     _option(

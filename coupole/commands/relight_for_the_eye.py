@@ -72,8 +72,8 @@ class EyeColours:
         if self.sensor_spectra is None or self.led_spectrum is None:
             missing = ", ".join(name for name, path in tables.items() if path is None)
             raise InputError(
-                f"--for-the-eye: expected {missing} too, a table of what its maker has measured; or --colour, a "
-                "record of `calibrate colour`"
+                f"--for-the-eye: expected {missing} too, a table measured by the maker; or --colour, a record of "
+                "`calibrate colour`"
             )
         return camera_colour(self.sensor_spectra, self.led_spectrum)
 
@@ -97,7 +97,8 @@ def write_relit_for_the_eye(
         raise InputError("--for-the-eye: the camera has one channel; it has no colours")
     if any(isinstance(light, LedLight) for light in lights):
         raise InputError(
-            "--for-the-eye: an LED's picture is in the camera's range; expected lights of other kinds"
+            "--for-the-eye: the values of an LED's picture are shares of the camera's range; expected lights of "
+            "other kinds"
         )
     linear = linear_colours(relit.picture(lights, lambda count, of: bars("light", count, of)), colour)
     white = white or float(np.quantile(bright(linear), PEAK_QUANTILE)) or 1.0

@@ -45,7 +45,10 @@ def go_on(run: RunningRun = None, as_json: JsonOption = False) -> None:
     state = _state_after(run, "go-on")
     if why := state.get("unheard"):
         raise DeviceError(
-            "run", expected="it to go on", happened=why, remedy="Give `coupole go-on` again when it is paused."
+            "run",
+            expected="it to go on",
+            happened=why,
+            remedy="Give `coupole go-on` again when the run is paused.",
         )
     _say(state, as_json=as_json)
 
@@ -71,7 +74,7 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
             raise DeviceError(
                 "cell",
                 expected=f"the process {reply['pid']} to end within {_ENDS_WITHIN_S:g} s of its stop",
-                happened="it still acquires into the run",
+                happened="the process still acquires frames into the run",
                 remedy="Look at the cell, then end the process (`kill -9`); the run can be resumed.",
             )
         time.sleep(_LOOK_EVERY_S)

@@ -36,7 +36,8 @@ ReflectanceOption = Annotated[
     typer.Option(
         "--reflectance",
         help="Take samples of each view as soon as it is complete, beside the acquisition, and end with the "
-        "result that `coupole reflectance RUN` makes. A resumed run continues it by itself.",
+        "result that `coupole reflectance RUN` makes. When the run is resumed, the processing continues by "
+        "itself.",
     ),
 ]
 ResultOption = Annotated[
@@ -68,10 +69,10 @@ def acquire(
 ) -> None:
     """Run a plan: check it, move, trigger, prove the frames, store them.
 
-    Ctrl-C stops safely (lights off, arm still) and the run can be resumed: `acquire --resume RUN`, with the run's
-    own copies of plan and rig, or with the plan again, whose comments alone may have changed. On a terminal the
-    key p pauses between bursts and continues, q stops. From elsewhere use `coupole pause`, `go-on` and `stop`. If
-    a console owns the cell (`coupole serve`), the command acquires in the console's name, if nothing runs or waits
+    Ctrl-C stops safely (lights off, arm still). Resume the run with `acquire --resume RUN`, which uses the run's
+    own copies of plan and rig. Or name the plan again; only its comments may have changed. On a terminal the key p
+    pauses between bursts and continues, q stops. From elsewhere use `coupole pause`, `go-on` and `stop`. If a
+    console owns the cell (`coupole serve`), the command acquires in the console's name, if nothing runs or waits
     there.
     """
     from coupole.acquisition.session import acquire_plan, rehearse
@@ -190,7 +191,9 @@ def meter(
     snr: Annotated[float, typer.Option("--snr", min=1, help="Signal-to-noise ratio to reach.")] = 30.0,
     share: Annotated[
         float,
-        typer.Option("--share", min=0.01, max=1, help="Share of the object's pixels that must reach this ratio."),
+        typer.Option(
+            "--share", min=0.01, max=1, help="Share of the object's pixels that must reach the ratio of --snr."
+        ),
     ] = 0.9,
     write: Annotated[
         Path | None, typer.Option("--write", help="Write the plan with this exposure, in the plan's folder.")
@@ -241,8 +244,8 @@ def live(
 ) -> None:
     """Live view of the camera, or of a run in progress: figures here, pictures on a page for this machine.
 
-    For a run only its folder is read, so the run is not slowed. For a rig or a plan the camera is opened, and the
-    arm is not moved. A plan names an object: the light on it is entered in its ledger.
+    For a run, only its folder is read, so the run is not slowed. For a rig or a plan, the camera is opened, and
+    the arm is not moved. A plan names an object: the light on it is entered in its ledger.
     """
     from coupole.acquisition.looking import watch_cell, watch_run
     from coupole.console.command_line.client import borrowed_cell
@@ -278,7 +281,7 @@ def confirm(
     note: Annotated[str, typer.Option("--note", help="Cause of the fault.")] = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Confirm, by name, that after a fault of the arm its cause is found, the cell is clear and the arm may move
+    """After a fault of the arm, confirm by name that the cause is found, the cell is clear, and the arm may move
     again.
     """
     from coupole.plan.cell import read_cell
@@ -304,9 +307,9 @@ def sim(
     plan: Annotated[Path | None, typer.Option("--plan", help="Put this plan's object on the support.")] = None,
     speed: Annotated[float | None, typer.Option("--speed", min=0.01, help="Pace of the world.")] = None,
 ) -> None:
-    """Serve the simulated devices of a rig for other clients; prints one JSON line with their endpoints, and on
-    standard error what the robot's controller refuses, and why. Ctrl-C ends it; exit code 4 if they end by
-    themselves."""
+    """Serve the simulated devices of a rig for other clients. The command prints one JSON line with their
+    endpoints. On standard error it prints what the robot's controller refuses, and why. Ctrl-C ends it; the exit
+    code is 4 if the devices end by themselves."""
     from coupole.plan.cell import read_cell
     from coupole.plan.registry import WORLD, load_class
     from coupole.preflight.job import read_job

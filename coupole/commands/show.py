@@ -76,8 +76,8 @@ BesideOption = Annotated[
     typer.Option(
         "--beside",
         metavar="RESULT",
-        help="For a result of runs: another result of the same object (another state of it), to compare with by a "
-        "slider. It is brought onto the first by what did not change.",
+        help="For a result of runs: a result of another state of the same object, to compare with by a slider. "
+        "It is aligned to the first by the surfaces that did not change.",
         show_default=False,
     ),
 ]
@@ -133,8 +133,10 @@ def show(source: SourceArgument, out: OutOption, options: ShowOptions, as_json: 
         if residual := look.about.get("residual"):
             names = {name for view in residual["views"] for name in view["blocks"]}
             beside = sum(file.stem in names for file in files[1:])
-            where = f"; {beside} of {len(names)} files of it lie beside the page" if beside else ""
-            share_text = f"{residual['planes']} planes have {100 * residual['kept']:.4g} % of its energy"
+            where = f"; {beside} of {len(names)} files of the residual lie beside the page" if beside else ""
+            share_text = (
+                f"{residual['planes']} planes contain {100 * residual['kept']:.4g} % of the residual's energy"
+            )
             console.print(f"residual: {share_text}{where}")
 
 
@@ -201,15 +203,17 @@ def _other_state(first: Path, other_folder: Path, *, is_aligned: bool) -> OtherS
             f"--beside {other_folder}: expected a result of runs (`coupole reflectance RUN --out FOLDER`)"
         )
     if is_aligned:
-        return OtherState(other_folder, np.eye(4), "Both were said to be in one frame; nothing was aligned.")
+        return OtherState(
+            other_folder, np.eye(4), "By --aligned both states are in one frame; nothing was aligned."
+        )
     try:
         alignment = align(read_result_state(first), read_result_state(other_folder))
     except InputError as error:
         raise InputError(f"--beside {other_folder}: {error}") from error
     u_mm = math.sqrt(float(np.trace(alignment.covariance[:3, :3])))
     remark = (
-        f"Brought together by what did not change, standard uncertainty {u_mm:.2g} mm; surfaces that did not "
-        f"change lie {alignment.noise_mm:.2g} mm apart (rms)."
+        f"The two states were aligned by their unchanged surfaces, with a standard uncertainty of {u_mm:.2g} mm; "
+        f"these surfaces lie {alignment.noise_mm:.2g} mm apart (rms)."
     )
     return OtherState(other_folder, alignment.before_from_after, remark)
 

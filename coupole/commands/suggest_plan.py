@@ -160,4 +160,4 @@ def plan_suggest(
         return
     for line in suggestion_page.sentences(suggestion):
         console.print(line, markup=False)
-    console.print(f"[bold]{request.path}[/], and {page_path} shows where it is known how well")
+    console.print(f"[bold]{request.path}[/]; {page_path} shows how well each part of the object will be known")

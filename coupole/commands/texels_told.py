@@ -33,11 +33,14 @@ def lines_of(forecast: TexelForecast) -> Iterator[str]:
     yield f"texels: some {number:,} in {in_views}, {pixels}, {widths} mm on the surface"
     memory, disk = bytes_text(forecast.memory_bytes), bytes_text(forecast.disk_bytes)
     duration = duration_text(forecast.time_s)
-    yield f"they take some {memory} of memory, {disk} of disk, and {duration} here after the fits of triangles"
+    yield (
+        f"they need some {memory} of memory and {disk} of disk; after the fits of triangles they take "
+        f"{duration} on this machine"
+    )
     if size_mm is not None and size_mm > forecast.edge_mm:
         yield (
             f"texels of {size_mm:g} mm are larger than the mesh's triangles, whose edge is {forecast.edge_mm:.2g} "
-            "mm (median): without --texels each of these has a material, too"
+            "mm (median): each triangle also has a material without --texels"
         )
 
 

@@ -86,7 +86,8 @@ def budget(
     out: Annotated[Path | None, typer.Option("--out", help="Write this PNG, and HTML and JSON beside it.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute the uncertainty of a reflectance, its dominant sources, and our accuracies beside the paper's.
+    """Compute the uncertainty of a reflectance and its dominant sources, and compare the accuracies with those of
+    the paper.
 
     The intervals are by Monte Carlo (JCGM 101); the linear formula checks them.
     """
@@ -274,7 +275,10 @@ def _show(console: Console, budget: Budget) -> None:
             console.print(
                 f"{interval.coverage:.0%}: [{low:+.2%}, {high:+.2%}], shortest [{short[0]:+.2%}, {short[1]:+.2%}]"
             )
-    console.print("alone: half the 68 % interval of this source alone; variance: its share by the linear formula;")
+    console.print(
+        "alone: half the 68 % interval from this source alone; variance: share of the variance by the linear "
+        "formula;"
+    )
     console.print("without: how much narrower the interval is without this source")
     console.print(
         f"linear formula: u {budget.linear.result.u / budget.nominal:.2%}; {budget.numeric.trials} trials"

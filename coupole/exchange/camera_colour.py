@@ -65,7 +65,7 @@ def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None
     signals = sensitivities * _spectrum(leds, 1)
     white = signals.sum(axis=1)
     if not (white > 0.0).all():
-        raise InputError(f"{sensor}: a channel sees nothing of the light of {leds}; see to both tables")
+        raise InputError(f"{sensor}: one channel sees no light of {leds}; check both tables")
     try:
         functions, daylight = observer("2 deg"), illuminant("D65")
     except ImportError as error:
@@ -79,7 +79,7 @@ def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None
     if np.linalg.cond(white_balance @ covariance @ white_balance.T) > _LARGEST_CONDITION:
         raise InputError(
             f"{sensor}: its channels are too similar under the light of {leds} to tell colours apart; expected "
-            "sensitivities of red, green and blue that differ in shape"
+            "sensitivities of red, green and blue that have different shapes"
         )
     matrix = _least_missing(white_balance, towards, covariance)
     neutral = white / white.max()

@@ -172,7 +172,7 @@ class Plan(Model):
             return ""
         return (
             "expected a run with `--reflectance`: frames are discarded only when their samples are safe, and "
-            "without it none are taken. Without `discard` all frames are kept"
+            "without `--reflectance` no samples are taken. Without `discard` all frames are kept"
         )
 
     @property

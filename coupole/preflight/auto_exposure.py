@@ -289,7 +289,7 @@ def _conclusion(leds: int, clipped_count: int, noisy_count: int) -> str:
         return f"all {leds} LEDs are exposed as asked for"
     parts = [f"{clipped_count} of {leds} LEDs clip more than allowed"] if clipped_count else []
     parts += [f"{noisy_count} of {leds} LEDs are noisier than asked for"] if noisy_count else []
-    return f"{' and '.join(parts)}; the plan allows no more"
+    return f"{' and '.join(parts)}; the plan allows no more exposures"
 
 
 def _figures(evidence: Evidence) -> dict[str, Any]:

@@ -128,7 +128,7 @@ def without_hidden(job: Job, known_leds: Mapping[str, Sequence[int]] | None = No
     schedule = job.schedule.without(hidden_leds)
     for view, bursts in zip(schedule.views, schedule.choosable, strict=False):
         if not any(burst.is_light().any() for burst in bursts):
-            raise InputError(f"view {view.name}: arm and object hide all LEDs from which is chosen")
+            raise InputError(f"view {view.name}: arm and object hide all LEDs of the choice")
     return replace(job, schedule=schedule, hidden_leds=hidden_leds)
 
 

@@ -46,9 +46,7 @@ def refuse_without_frames(run: Run, out: Path) -> None:
                 f"`{go_on_command(run.folder, result)}`. A result with other settings needs a run of its own"
             )
         if problem := problem_of(result, view, event.digest):
-            raise ChecksumMismatch(
-                f"{problem}. It stands for {len(event.frames)} discarded frames of {run.folder}"
-            )
+            raise ChecksumMismatch(f"{problem}. It replaces {len(event.frames)} discarded frames of {run.folder}")
 
 
 def refuse_texels(run: Run, out: Path) -> None:

@@ -160,7 +160,7 @@ def _binary_triangles(path: Path, file, element: _Element, order: str, vertices:
         corners = part["corners"]
         if (wrong := np.flatnonzero(corners != 3)).size:
             count = int(corners[wrong[0]])
-            raise InputError(f"{path}: face {first + wrong[0]}: expected 3 corners, found {count}: no triangle")
+            raise InputError(f"{path}: face {first + wrong[0]}: expected 3 corners, found {count}")
         expect_records(path, "face", element.count, first + len(part), first + record_count)
         triangles[first : first + len(part)] = part["indices"]
         expect_corners(path, triangles[first : first + len(part)], vertices, first)

@@ -181,4 +181,4 @@ def _parse_line(text: bytes) -> Line:
     try:
         return _LINE.validate_json(text)
     except ValidationError:
-        return ArmFault(t="an unknown time", message="a line of the record of its faults cannot be read")
+        return ArmFault(t="an unknown time", message="a line of the record of the arm's faults cannot be read")

@@ -53,7 +53,7 @@ class LineFile:
         if start < self._end_bytes:
             raise StorageError(
                 f"{self._path}: was cut to {start} bytes while lines were appended; it had {self._end_bytes}. "
-                "Find out which program did that, and restore what was there, if there is a copy."
+                "Find out which program did that, and restore the lost lines, if there is a copy."
             )
         try:
             view = memoryview(data)

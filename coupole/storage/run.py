@@ -289,8 +289,8 @@ class Run:
             if altered_files := manifest.problems(self.folder, only=own_files):
                 raise InputError(
                     f"{self.folder}: cannot be resumed, because the run's own files were changed after it began: "
-                    f"{'; '.join(altered_files.values())}. Only these files say what the plan and the rig were: "
-                    "put the old files back (from a copy of the run), or start a new run."
+                    f"{'; '.join(altered_files.values())}. Only these files contain the run's plan and rig: put "
+                    "the old files back (from a copy of the run), or start a new run."
                 )
             raise InputError(
                 f"{self.folder}: cannot be resumed, because this changed since the run began: "

@@ -51,7 +51,7 @@ def prove(result: Path, view: str, digest: str) -> None:
     path = samples_path(result, view)
     if digest_on_disk(path) != digest:
         raise ChecksumMismatch(
-            f"{path}: differs from what was written, when it is read back. Its frames are kept; check disk and "
+            f"{path}: read back, it differs from what was written. Its frames are kept; check disk and "
             "memory of this machine, then take the samples again"
         )
     note(result, view, digest, is_first=True)

@@ -108,7 +108,7 @@ def _check_discarded(run: Run, result: Verification, proven: Mapping[ShotId, Fra
         result.results += [str(folder)] if str(folder) not in result.results else []
         if problem := problem_of(folder, view, event.digest):
             result.bad.append(
-                f"{view}: {len(event.frames)} frames were discarded, and the samples that stand for them are not "
+                f"{view}: {len(event.frames)} frames were discarded, and the samples that replace them are not "
                 f"right: {problem}"
             )
     return frames

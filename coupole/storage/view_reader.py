@@ -53,9 +53,9 @@ class View:
         if self.is_discarded(slot):
             raise FrameDiscarded(
                 f"{self.path}: {self.records[slot]['shot'].decode(errors='replace')} was discarded when its "
-                "samples of reflectance were safe, as its plan said (`discard: after_fit`). `coupole verify` says "
-                "which result has them, and `coupole reflectance relight` makes pictures from that; frames of "
-                "LEDs that are kept for the check, and dark frames, are still there"
+                "samples of reflectance were safe, as its plan said (`discard: after_fit`). `coupole verify` "
+                "says which result has these samples, and `coupole reflectance relight` makes pictures from this "
+                "result; frames of LEDs that are kept for the check, and dark frames, are still there"
             )
 
     def is_discarded(self, slot: int) -> bool:

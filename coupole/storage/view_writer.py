@@ -110,7 +110,7 @@ class ViewWriter:
                 slot = self._free.popleft()
         except IndexError:
             raise StorageError(
-                f"{self.path}: no slot is free: more frames came than the view's bursts can have made. "
+                f"{self.path}: no slot is free: more frames arrived than the view's bursts can produce. "
                 "Check whether the trigger line bounces."
             ) from None
         record = np.zeros((), FRAME_DTYPE)

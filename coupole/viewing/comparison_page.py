@@ -110,13 +110,13 @@ def remarks(comparison: Comparison) -> Iterator[str]:
         )
     if (~is_finite).any():
         yield (
-            f"{int((~is_finite).sum()):,} points have no surface of the other state near them that faces as they "
-            "do, as in hollows that were not seen: not compared"
+            f"{int((~is_finite).sum()):,} points were not compared, because no surface of the other state near "
+            "them faces the same way, for example in hollows that were not seen"
         )
     if comparison.noise_factor > 1.5 or comparison.colour_factor > 1.5:
         yield (
-            f"differences scatter {max(comparison.noise_factor, comparison.colour_factor):.1f} times more than "
-            "points about their own surface: uncertainties were multiplied by this factor"
+            f"differences scatter {max(comparison.noise_factor, comparison.colour_factor):.1f} times as much as "
+            "points scatter about their own surface: uncertainties were multiplied by this factor"
         )
     if comparison.before.outward is None:
         yield "without triangles it is not known which side is outside: signs of distances have no meaning"

@@ -25,7 +25,9 @@ def show_dose(console: Console, ledger: Ledger, history: History, similar_ids: l
         part = history.of_run(run)
         notes = [entry.note for entry in part.entries if entry.note]
         if part.unsettled_lux_h:
-            notes.append(f"of which {part.unsettled_lux_h:.3f} at most: how it ended is not known")
+            notes.append(
+                f"of which at most {part.unsettled_lux_h:.3f} are planned light: how that burst ended is not known"
+            )
         table.add_row(
             escape(run), part.entries[0].t, f"{part.total_lux_h:.3f}", _damage(part), escape("; ".join(notes))
         )

@@ -60,7 +60,9 @@ def light(events: Sequence[Event], views: Iterable[SampledView], run_status: Sta
         "light",
         "Light on the object",
         tables=[Table("Light on the point that received the most light", ("view", "lux h"), rows)],
-        notes=["A burst in which a session was killed counts as it was planned."] if was_killed else [],
+        notes=["If a session was killed during a burst, the burst counts with its planned light."]
+        if was_killed
+        else [],
     )
 
 

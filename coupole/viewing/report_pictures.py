@@ -132,12 +132,13 @@ def coverages(coverage: Coverage) -> Section:
         figure_size="medium",
         legend=_legend(),
         facts={
-            "surface": f"{at_least}; of what can be seen from above the disk ({coverage.reachable:.0%} of all)",
+            "surface": f"{at_least}; of the surface that can be seen from above the disk "
+            f"({coverage.reachable:.0%} of all)",
             "object": f"{size} mm",
             "sharp": f"{near:.0f} mm to {f'{far:.0f} mm' if math.isfinite(far) else 'infinity'} from the lens "
             f"(blurred over at most {SHARP_PX:g} pixels)",
         },
-        tables=[Table("What each view has of the object", _FRAMED, list(_framings(coverage)))],
+        tables=[Table("How much of the object each view shows", _FRAMED, list(_framings(coverage)))],
         notes=[
             "By the mesh, the measured poses and the rig's lens. It does not consider whether the arm hides a "
             "point, nor which lights reach it."

@@ -124,7 +124,7 @@ class Scene:
         )
         return [
             f"an LED reaches {share:.0%} of the visible surface",
-            f"{dark_leds} of {self.is_used.sum()} LEDs reach nothing of it",
+            f"{dark_leds} of {self.is_used.sum()} LEDs reach none of it",
         ]
 
     def arm(self, joints_deg: Joints, around: int = 24) -> list[Solid]:

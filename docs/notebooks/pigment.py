@@ -67,7 +67,7 @@ plt.show()
 # %% [markdown]
 # ## Spots to identify
 #
-# Two spots: another batch of the red, and a violet that the library lacks.
+# There are two spots: another batch of the red paint, and a violet paint that the library lacks.
 
 # %%
 violet = np.interp(NM, [380, 430, 540, 640, 780], [0.35, 0.40, 0.08, 0.30, 0.60])

@@ -20,7 +20,7 @@ class CallEnded(DeviceError):
             device,
             expected=f"time for {doing}",
             happened="meanwhile the lights were switched off, which ends all other calls",
-            remedy="See why they were switched off.",
+            remedy="Find out why they were switched off.",
         )
 
 

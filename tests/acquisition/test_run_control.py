@@ -123,7 +123,7 @@ def test_a_word_to_go_on_is_not_heard_while_it_is_not_known_why_the_process_stoo
     served.control.can_stand = True
     served.control.hold("the program did not run for 6.0 s")
     answer = ask(served.run, "go-on")
-    assert "when it is safe, ask again" in answer["unheard"]
+    assert "when the cell is safe, ask again" in answer["unheard"]
     assert served.control.pause.is_set()
 
 

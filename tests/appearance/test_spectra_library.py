@@ -77,7 +77,7 @@ def test_a_folder_of_exports(tmp_path: Path) -> None:
         ("Red,0.1,0.4,0.2\n", "t.csv:1:1: expected .* wavelengths in nm that all rise"),
         ("name,400,500,600\nRed,0.1,0.2,1.8\n", "t.csv:2:1: Red: 1.8 may be percent or a fraction"),
         ("name,400,500,600\nRed,0.1,0.2,-0.3\n", "t.csv:2:1: Red: .* found -0.3 at 600 nm"),
-        ("name,400,500,600\nRed,0,0,1\nBlue,1,0,0\nRed,0,0,0.9\n", "t.csv:4:1: the name 'Red' is that of .*:2"),
+        ("name,400,500,600\nRed,0,0,1\nBlue,1,0,0\nRed,0,0,0.9\n", "t.csv:4:1: the name 'Red' is used in .*:2"),
     ],
 )
 def test_what_cannot_be_read_without_guessing_is_refused(tmp_path: Path, text: str, message: str) -> None:

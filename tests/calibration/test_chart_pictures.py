@@ -291,7 +291,9 @@ def test_pictures_for_displays_are_refused_unless_their_curve_is_stated(even: Pa
     chart = ("--chart", even / "chart.yaml")
     encoded = write_picture(tmp_path / "p.png", srgb_of(EVEN.picture()), bits=8)
     why = refusal(encoded, *chart)
-    assert "p.png: its values are not linear: on the greys they go as light to the power of 0." in why
+    assert (
+        "p.png: its values are not linear: on the greys they are proportional to light to the power of 0." in why
+    )
     assert "--srgb" in why
     matrix, u = matrix_of(made(tmp_path, encoded, *chart, "--srgb"))
     assert np.abs((matrix - EVEN.true_matrix()) / u).max() < 3.5

@@ -131,7 +131,7 @@ def test_a_lens_of_another_focus_is_named_though_its_record_says_nothing() -> No
     assert isinstance(lens, Intrinsics)
     record = found(replace(made, prior=replace(made.prior, lens=lens))).record
     assert not record.is_accepted
-    assert any("it was made at another focus" in remark for remark in record.remarks)
+    assert any("the record was made at another focus" in remark for remark in record.remarks)
 
 
 def test_without_any_led_near_the_table_nothing_is_claimed(sound: Dome) -> None:

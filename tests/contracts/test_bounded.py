@@ -54,7 +54,7 @@ def test_a_call_that_never_returns_is_given_up_with_its_name(never: threading.Ev
         with under_way("camera", "arm"):
             never.wait()
 
-    with pytest.raises(DeviceTimeout, match="camera: expected an end of the call `arm`") as raised:
+    with pytest.raises(DeviceTimeout, match="camera: expected the call `arm` to return") as raised:
         bounded.run_bounded(hang)
     assert raised.value.device == "camera"
     assert left_behind()

@@ -118,7 +118,7 @@ def test_white_of_a_record_goes_before_that_of_the_spectra(tables: tuple[Path, P
 @pytest.mark.parametrize(
     ("rows", "why"),
     [
-        ("400;1;1;0\n500;1;1;0\n600;1;1;0\n", "a channel sees nothing"),
+        ("400;1;1;0\n500;1;1;0\n600;1;1;0\n", "one channel sees no light"),
         ("400;1;1;1\n500;2;2;2\n600;1;1;1\n", "channels are too similar"),
         ("400;1;1;1.000002\n500;2;2.000001;2\n600;1;1;1\n", "channels are too similar"),
         ("400;1\n500;1\n600;1\n", "expected column 1 to 1, found 2"),

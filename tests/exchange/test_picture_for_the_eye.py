@@ -79,7 +79,7 @@ def test_without_a_white_the_brightest_thousandth_is_white(tmp_path: Path, spect
     [
         (("--to", "eye.npy"), "ends in .png, .tif, .tiff"),
         (("--to", "eye.png", "--turn", "8"), "not to a video"),
-        (("--to", "eye.png", "--led", "7"), "an LED's picture is in the camera's range"),
+        (("--to", "eye.png", "--led", "7"), "an LED's picture are shares of the camera's range"),
     ],
 )
 def test_what_cannot_be_for_the_eye_is_refused(

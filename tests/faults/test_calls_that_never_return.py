@@ -116,9 +116,9 @@ def test_a_session_ends_by_itself_when_a_call_of_a_device_never_returns(
         ended = session.ended()
         cells.wait_until(lambda: dark_and_still(world), "a dark cell and an arm at rest")
     assert ended.code == 4, ended
-    assert f"{device}: expected an end of the call `{call}`" in ended.err
+    assert f"{device}: expected the call `{call}` to return" in ended.err
     if name not in ("led box.board_temperature_c", "robot.stopping_deg"):  # before there is a run
-        told(cell, ended, f"{device}: expected an end of the call `{call}`")
+        told(cell, ended, f"{device}: expected the call `{call}` to return")
         can_be_resumed(cell)
 
 
@@ -164,7 +164,7 @@ def test_a_device_that_hangs_while_it_is_opened_is_told_and_the_process_ends(cel
         assert dark_and_still(world)
     assert ended.code == (130 if how else 4), ended
     if not how:
-        assert "camera: expected an end of the call `open`" in ended.err
+        assert "camera: expected the call `open` to return" in ended.err
 
 
 def test_a_camera_that_hangs_when_it_is_closed_is_told_after_a_whole_run(cell: CellFolder) -> None:
@@ -256,7 +256,7 @@ def test_whatever_else_opens_a_cell_ends_too(
         ended = session.ended()
         cells.wait_until(lambda: dark_and_still(world), "a dark cell and an arm at rest")
     assert ended.code == 4, ended
-    assert f"an end of the call `{name.partition('.')[2]}`" in ended.err
+    assert f"the call `{name.partition('.')[2]}` to return" in ended.err
 
 
 @pytest.mark.parametrize(("name", "code"), [("robot.measured", 4), ("motion.file", 6)])

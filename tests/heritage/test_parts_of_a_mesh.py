@@ -92,7 +92,7 @@ PLANE = "schema_version: 1\nrules:\n  - {kind: plane, part: left, point_mm: [0, 
         (PLANE + "rest: left\n" + "extra: 1\n", "parts.yaml:5:1: extra: "),
         (PARTS.replace("#0000ff", "#00ff00"), "16 of 32 triangles have no part"),
         (PARTS.replace("#0000ff", "#00ff00") + "rest: other\n", "the part 'right' has no triangle: no rule gives "
-         "it one, or later rules took it; rule 1 (vertex_colours): 32 of 64 places differ from "
+         "it a triangle, or later rules took all of them; rule 1 (vertex_colours): 32 of 64 places differ from "
          "every part's colour by more than 8, most often #0000ff (32)"),
         (PARTS.replace("vertex_colours", "texture"), "parts.yaml:3:5: rules[0]: "),
         (PLANE.replace("normal: [-1, 0, 0]", "normal: [0, 0, 0]"), "the normal has no direction"),

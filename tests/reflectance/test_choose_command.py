@@ -60,7 +60,7 @@ def test_it_stops_at_an_expected_error(case: Case) -> None:
         (["--count", "400"], "--count: expected at most"),
         (["--count", "8", "--first", "9"], "--first: expected"),
         (["--count", "8", "--lights", "nowhere.lp"], "nowhere.lp"),
-        (["--count", "8", "--to", "nowhere/chosen.json"], "--to: expected a folder that exists"),
+        (["--count", "8", "--to", "nowhere/chosen.json"], "--to: expected a file in an existing folder"),
     ],
 )
 def test_what_cannot_be_chosen_is_refused(case: Case, options: list[str], message: str) -> None:

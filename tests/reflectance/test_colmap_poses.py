@@ -175,7 +175,7 @@ def test_with_one_or_two_views_nothing_fixes_another_frame(tmp_path: Path) -> No
     measured = measured_run(2)
     model = model_of(measured)
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array([3.0, 0.0, 0.0])))
-    with pytest.raises(InputError, match=r"camera of \w+ is 3 mm .* as with one or two views .* 30.0 times"):
+    with pytest.raises(InputError, match=r"camera of \w+ is 3 mm .* with one or two views .* 30.0 times"):
         read_poses(written(model, tmp_path / "moved"), measured)
 
 

@@ -176,7 +176,7 @@ def test_a_byte_that_changed_on_disk_fails_verify_with_six_and_names_the_shot(ce
     assert verified.document["ok"] is False
     assert len(verified.document["bad"]) == 1
     assert "top/led0700/e0" in verified.document["bad"][0]
-    assert "1 thing is not right (above); read back were " in verified.err
+    assert "1 thing is not right (above); " in verified.err
 
 
 # -- what the operator sees -----------------------------------------------------------------------------------

@@ -177,6 +177,8 @@ def test_texels_larger_than_triangles_are_told() -> None:
     view = ViewForecast("top", 45, 200_000, 30_000, 0.4, 4)
     lines = list(lines_of(TexelForecast(TexelSize(1.6), (view,), 1.2, 500_000_000, 2_000_000, 75.0)))
     assert lines[0] == "texels: some 1,900 in 1 view, 4 x 4 pixels each, 1.6 mm on the surface"
-    assert lines[1].startswith("they take some 500.0 MB of memory, 2.0 MB of disk, and 1 min 15 s here")
+    assert lines[1].startswith(
+        "they need some 500.0 MB of memory and 2.0 MB of disk; after the fits of triangles they take 1 min 15 s"
+    )
     assert "larger than the mesh's triangles, whose edge is 1.2 mm" in lines[2]
     assert len(list(lines_of(TexelForecast(TexelSize(), (view,), 1.2, 1, 1, 1.0)))) == 2

@@ -109,7 +109,7 @@ class ArmPaths:
         planner = PathPlanner(self.arm, self.motion.bodies, [self._cell.rig.motion.home_joints_deg])
         leg = planner.leg(start_deg, goal_deg)
         if leg.contact is not None:
-            raise InputError(f"{name}: no path to it was found from where the arm stands: {leg.contact}")
+            raise InputError(f"{name}: no path to it was found from the arm's present place: {leg.contact}")
         return Visit(goal_deg, leg)
 
     def job_of(self, plan: Path) -> Job:
@@ -125,7 +125,8 @@ class ArmPaths:
         job = self._jobs[key]
         if self._job is not None and not np.array_equal(job.shape.corners_mm, self._job.shape.corners_mm):
             raise InputError(
-                f"{plan}: its object, or the place of its object, differs from that with which the bench was begun"
+                f"{plan}: its object, or the object's place, differs from the object with which the bench was "
+                "begun"
             )
         return job
 

@@ -78,7 +78,7 @@ class BenchArm:
         """A path from where the arm stands. Raises InputError if it moves, or there is none."""
         state = self._opened.robot.measured()
         if state.moving:
-            raise InputError("the arm moves: a path is planned from where it stands")
+            raise InputError("the arm is moving; a path is planned only from an arm at rest")
         with self._planning:
             path = self._paths.plan(str(next(self._numbers)), request.to, np.array(state.joints_deg))
             self._shown[path.id] = path

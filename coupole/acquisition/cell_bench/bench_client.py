@@ -49,7 +49,7 @@ def ask_bench(
 
 def _why_no_bench(cell: Cell) -> str:
     if is_in_use(cell):
-        return f"{OPEN_ELSEWHERE}, and it is no bench that could be asked; end it first"
+        return f"{OPEN_ELSEWHERE}, and that process is not a bench, so it cannot be asked; end it first"
     return "no bench of this user holds this cell on this machine (`coupole bench`)"
 
 

@@ -52,7 +52,7 @@ class BenchFrames:
         it was asked. Raises InputError, DoseBudgetReached, DeviceError."""
         self._refuse_what_there_is_not(request)
         if request.stops not in (None, stops):
-            raise InputError("frame: the bench was stopped meanwhile; look at its state, then ask again")
+            raise InputError("frame: the bench was stopped while it waited; look at its state, then ask again")
         with self._devices.in_use:
             before_lux_h = self._shots.given_lux_h
             shot = self._expose_lights(request, stops)
@@ -131,7 +131,7 @@ class BenchFrames:
         try:
             for led, panel in lights or [(NO_LED, 0)]:
                 if self._works.stops != stops or self._opened.made_safe:
-                    raise InputError("frame: it was stopped before its last light")
+                    raise InputError("frame: the bench was stopped before the frame's last light")
                 shots.append(self._shots.take(led, request.exposure_us, request.gain_db, panel))
                 self._shots.rest()
         except DeviceError:

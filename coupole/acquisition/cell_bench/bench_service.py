@@ -187,7 +187,7 @@ class BenchService:
         if self._devices.in_use.acquire(timeout=_STOPPED_WITHIN_S):
             self._devices.in_use.release()
         else:
-            trouble.append("not sure: box and camera are still at work")
+            trouble.append("the cell may not be safe: box and camera are still at work")
         return trouble
 
     def _state(self) -> dict[str, Any]:
@@ -277,7 +277,7 @@ def serve_bench(
                     remedy="The cell was made safe; begin the bench again.",
                 )
             if service.idle_s > leave_after_s:
-                console.print(f"nobody has asked for {leave_after_s:g} s: closed")
+                console.print(f"no request for {leave_after_s:g} s: the bench has closed")
                 break
         service.closing.set()
     if service.trouble:

@@ -44,7 +44,8 @@ class EnablingSwitch:
             return
         if not self._box.presence():
             raise InputError(
-                "the enabling switch at the cell is not held: a person there holds it while the arm moves"
+                "the enabling switch at the cell is not held: a person at the cell must hold it while the arm "
+                "moves"
             )
 
     @contextmanager

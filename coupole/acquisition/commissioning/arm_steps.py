@@ -68,8 +68,8 @@ def axes(bench: Bench) -> None:
     """
     findings = bench.findings
     bench.ask_before(
-        "Step axes: A1 to A6 are turned one after the other by 3 to 10 degrees and back. After each you are asked "
-        "whether the camera moved as described."
+        "Step axes: A1 to A6 are turned one after the other by 3 to 10 degrees and back. After each turn you are "
+        "asked whether the camera moved as described."
     )
     home_deg = bench.joints_deg()
     for axis in range(6):
@@ -133,9 +133,9 @@ def stopping(bench: Bench) -> None:
             return
         bench.go_to(home_deg)
     findings.remarks.append(
-        f"at the greatest speeds of this session the arm turned on for as long as {1e3 * max(delays_s):.0f} ms of "
-        "its "
-        "full speed; stops from the speeds of plans are not measured, because these exceed 250 mm/s"
+        "at the greatest speeds of this session, the angle to a stop was at most that of "
+        f"{1e3 * max(delays_s):.0f} ms at full speed; stops from the speeds of plans are not measured, because "
+        "these exceed 250 mm/s"
     )
 
 

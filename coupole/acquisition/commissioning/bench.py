@@ -113,7 +113,7 @@ class Bench:
         """Raises Interrupted unless the person agrees."""
         self.control.go_on()
         if not self.person.is_ready(announcement):
-            raise Interrupted("not continued; the steps that were done are kept")
+            raise Interrupted("the commissioning was not continued; the steps that were done are kept")
         self.control.go_on()
 
     def ask_whether(self, question: str) -> bool:

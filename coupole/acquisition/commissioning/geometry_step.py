@@ -68,7 +68,7 @@ def geometry(bench: Bench) -> None:
 _BOARD = (
     ("board_x_mm", "x of the board's middle in the support's frame (0: the disk's centre)"),
     ("board_y_mm", "y of the board's middle in the support's frame"),
-    ("board_top_mm", "height of the board's printed side over the disk's surface"),
+    ("board_top_mm", "height of the board's printed side above the disk's surface"),
 )
 
 
@@ -112,8 +112,8 @@ def _ask_for_volumes(bench: Bench) -> None:
     volumes = bench.cell.rig.keep_out
     for volume in volumes:
         bench.ask_whether(
-            f"{_volume_text(volume)}. Measure with your ruler: does it enclose the thing that it is there for "
-            "completely, wherever the arm reaches?"
+            f"{_volume_text(volume)}. Measure with your ruler: does the volume completely enclose its obstacle, "
+            "wherever the arm reaches?"
         )
     names = ", ".join(volume.name for volume in volumes) or "none"
     bench.ask_whether(

@@ -201,7 +201,8 @@ class BurstJudge:
             int(np.argmax(is_over)),
             None,
             lambda figure: (
-                f"a place of the picture has changed by {figure:+.1%} and stays so: a smudge on the lens"
+                f"a place in the picture has changed by {figure:+.1%} and remains changed: perhaps a smudge on "
+                "the lens"
             ),
         )
 
@@ -216,7 +217,7 @@ class BurstJudge:
         if since is None or len(shifts_mm) - since < SENTINELS:
             return None
         figure, limit = float(np.median(shifts_mm[since:])), float(np.median(limits_mm[since:]))
-        words = f"the picture is displaced by {figure:.2f} mm on the object: it was moved, or the camera"
+        words = f"the picture is displaced by {figure:.2f} mm on the object: the object or the camera was moved"
         return series.finding("moved", since, None, figure, limit, "mm", words)
 
     def _of_light(self, series: _Series) -> Found | None:
@@ -241,12 +242,15 @@ class BurstJudge:
             finding = series.finding("LED", largest, None, abs(figure), limit, OF_THE_LIGHT, words)
             return replace(finding, labels=labels)
         if since == 0 and series.is_since_earlier:
-            words = f"all light differs by {share} from that of the session before: LEDs, camera or its settings"
+            words = (
+                f"all light differs by {share} from that of the session before: check LEDs, camera and its "
+                "settings"
+            )
             return series.finding("drift", since, None, abs(figure), limit, OF_THE_LIGHT, words)
         if _is_step(np.array(series.places, float), gains):
-            words = f"all light changed by {share} in one step: gain or exposure of the camera"
+            words = f"all light changed by {share} in one step: check gain and exposure of the camera"
             return series.finding("exposure step", since, None, abs(figure), limit, OF_THE_LIGHT, words)
-        words = f"all light has drifted by {share}: LEDs, reference or camera warm up"
+        words = f"all light has drifted by {share}: perhaps LEDs, reference or camera are warming up"
         return series.finding("drift", since, None, abs(figure), limit, OF_THE_LIGHT, words)
 
 

@@ -203,7 +203,7 @@ class WatchedRecorder:
         spoilt &= {shot.label for shot in self._held}
         self._prove_held(spoilt)
         if self._watch.pause and any(finding.kind in FOR_A_PERSON for finding in findings):
-            self._observer.note("paused by what was found: mend it, then go on")
+            self._observer.note("paused because of this finding: remove the cause, then go on")
             self._control.pause.set()
         return "; ".join(finding.words for finding in findings if finding.kind in TAKEN_AGAIN) if spoilt else ""
 
@@ -283,7 +283,7 @@ class WatchedRecorder:
         try:
             return self.keep_picture(name, finding_picture(finding))
         except StorageError as error:
-            self._observer.note(f"{burst.view}: the picture of what was found was not kept: {error}")
+            self._observer.note(f"{burst.view}: the picture of the finding was not kept: {error}")
             return ""
 
     def _tell(self, finding: FindingNoted) -> None:

@@ -83,8 +83,8 @@ def _three_lacquers(t: Array, m: Array, c: Array, region: str) -> Array:
     if region == "inside":
         if abs(1.0 - m_in.sum()) < _SUM_IS_ONE:
             raise InputError(
-                "makie: expected a metal that is no average of the lacquers; its weights sum to 1, and the sum "
-                "rule says nothing; decompose with region 'anywhere'"
+                "makie: expected a metal that is not an average of the lacquers; its weights sum to 1, so that "
+                "the sum rule has no effect; decompose with region 'anywhere'"
             )
         return np.asarray((1.0 - t_in.sum(axis=-1)) / (1.0 - m_in.sum()))
     positive = m_in > _SINGULAR

@@ -31,8 +31,8 @@ def turned_body(profile_mm: Sequence[tuple[float, float]], *, around: int = 256,
     chords = np.linalg.norm(np.diff(outline, axis=0), axis=1)
     if np.any(outline[[0, -1], 0] != 0.0) or np.any(outline[1:-1, 0] <= 0.0) or np.any(chords == 0.0):
         raise InputError(
-            "profile: expected points from the axis (radius 0) to the axis, all others off it and none twice; "
-            f"found radii {outline[:, 0].tolist()}"
+            "profile: expected points from the axis (radius 0) to the axis, all other points off the axis, and "
+            "no point twice; found radii {outline[:, 0].tolist()}"
         )
     way = np.concatenate([[0.0], np.cumsum(chords)])
     steps = max(2 * len(outline), int(way[-1] / step_mm))

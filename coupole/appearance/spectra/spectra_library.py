@@ -69,8 +69,8 @@ def read_library(path: Path, *, unit: Unit = "auto") -> tuple[LibrarySpectrum, .
             raise _wrong(
                 spectrum.file,
                 spectrum.line,
-                f"the name {spectrum.name!r} is that of {before.file}:{before.line} too; "
-                "give each spectrum a name of its own",
+                f"the name {spectrum.name!r} is used in {before.file}:{before.line} too; "
+                "give each spectrum a different name",
             )
         by_name[spectrum.name] = spectrum
     return tuple(spectra)

@@ -62,7 +62,7 @@ def _quality(budget: Budget) -> str:
 
 def _next_step(budget: Budget, doubts: Sequence[str]) -> Inline:
     if doubts:
-        return ["Read the ", Link("#doubts", "reasons for doubt"), " before these figures are used."]
+        return ["Read the ", Link("#doubts", "reasons for doubt"), " before you use these figures."]
     if not budget.numeric.stable:
         return ["Ask for more trials: ", Code("--trials"), "."]
     largest = max(budget.shares, key=lambda share: share.width_decrease, default=None)
@@ -75,7 +75,7 @@ def _next_step(budget: Budget, doubts: Sequence[str]) -> Inline:
 def verdict(validation: Validation) -> str:
     """Say in words whether the linear formula is sufficient."""
     if not validation.sure:
-        return "may be good enough or not: more trials would show it"
+        return "may or may not be good enough: more trials would show this"
     return "will do" if validation.is_within_tolerance else "will not do"
 
 

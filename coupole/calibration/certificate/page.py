@@ -34,7 +34,7 @@ _METHODS = {
     "drift": "drift of LED power by readings of a white tile",
     "colour": "colour profile by a chart",
     "glare": "veiling glare by black traps in a white field",
-    "artefact-check": "comparison with an artefact that took part in no fit, E_n by ISO 13528",
+    "artefact-check": "comparison with an artefact that was not used in any fit, E_n by ISO 13528",
 }
 
 
@@ -194,7 +194,10 @@ def _results(record: Record) -> Table:
         (name, " ".join(f"{v:.4f}" for v in (*pose.translation_mm, *pose.abc_deg)), "x y z mm, A B C deg", "")
         for name, pose in record.transforms.items()
     ]
-    title = f"{record.kind} {record.name}, {record.created:%Y-%m-%d}; units are in the names, relative without one"
+    title = (
+        f"{record.kind} {record.name}, {record.created:%Y-%m-%d}; the names contain the units, and a name "
+        "without a unit is a relative figure"
+    )
     return Table(title, ("quantity", "value", "U", "k"), [*poses, *rows])
 
 

@@ -95,7 +95,8 @@ def refuse_used_images(items: Sequence[InForce], inputs: Sequence[tuple[str, str
         image_hashes = {line.sha256 for line in item.record.inputs if "/" in line.name}
         if common := [name for name, sha256 in inputs if "/" in name and sha256 in image_hashes]:
             raise InputError(
-                f"{item.path}: was made from the same images ({common[0]}), which check nothing. Acquire others"
+                f"{item.path}: was made from the same images ({common[0]}), so the comparison would check "
+                "nothing. Acquire others"
             )
 
 

@@ -93,9 +93,9 @@ def place_chart(picture: PlainPicture, known_chart: KnownChart, corners_px: Floa
         places = search_corners(picture.values, chart.rows, chart.columns)
         if not places:
             raise InputError(
-                f"{picture.name}: the chart was not found: expected {chart.rows} rows of {chart.columns} even "
-                "patches, in whole in the picture, sharp, each 10 pixels wide or more of 900; or give the middles "
-                "of its corner patches with --corners"
+                f"{picture.name}: the chart was not found: expected a sharp picture of the whole chart, "
+                f"{chart.rows} rows of {chart.columns} even patches, each at least 10 pixels wide if the picture "
+                "has 900; or give the middles of the corner patches with --corners"
             )
     else:
         places = [corners_px]
@@ -135,9 +135,9 @@ def _refuse_miss(picture: PlainPicture, miss: float, *, is_given: bool) -> None:
         else "leave the picture or are saturated"
     )
     raise InputError(
-        f"{picture.name}: the patches {where} {how}, whichever way round; expected the chart of the "
-        f"description, and linear values. {'See to the corners' if is_given else 'Give --corners'}: the middles "
-        "of the four corner patches"
+        f"{picture.name}: the patches {where} {how}, in every orientation of the chart; expected the chart of "
+        f"the description, and linear values. {'Check the corners' if is_given else 'Give --corners'}: the "
+        "middles of the four corner patches"
     )
 
 
@@ -227,7 +227,7 @@ def read_plain_patches(picture: PlainPicture, polygons_px: Floats, names: Sequen
         patch_list = ", ".join(names[n] for n in np.flatnonzero(uneven)[:8])
         raise InputError(
             f"{picture.name}: {int(uneven.sum())} patches are not even where they are expected ({patch_list}); "
-            "see to --corners, and to `patch_mm`, `pitch_mm` and `used` of the chart; or the picture is not sharp"
+            "check --corners, and `patch_mm`, `pitch_mm` and `used` of the chart; perhaps the picture is not sharp"
         )
     return PlainReading(Reading(mean, u, sd, full), uneven)
 

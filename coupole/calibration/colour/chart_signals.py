@@ -154,7 +154,7 @@ def combined_signals(
     _refuse(bright, names, "saturated under most lights", "expose less")
     dark = ~(np.nanmedian(np.where(good[:, :, None], mean, np.nan), axis=0) > 0.0).all(axis=1)
     unlit = [int(n) for n in np.flatnonzero(dark)]
-    _refuse(unlit, names, "without light", "see to the lights and the chart's place")
+    _refuse(unlit, names, "without light", "check the lights and the chart's place")
     remarks = []
     full = [f"{lit[k]} on {_list([names[int(n)] for n in np.flatnonzero(~good[k])])}" for k in _with(~good)]
     if full and not are_pictures:

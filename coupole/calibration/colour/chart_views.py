@@ -80,9 +80,8 @@ class ChartReader:
         frames = [frame for frame in self._frames.lit if self._suits(frame)]
         if not frames:
             raise InputError(
-                "colour: no light can be used: all graze the chart, or are reflected into the camera; expected "
-                "LEDs at "
-                "about 45 degrees to the chart, seen from above"
+                "colour: no light can be used: each one grazes the chart, or is reflected into the camera; "
+                "expected LEDs at about 45 degrees to the chart, seen from above"
             )
         return frames
 

@@ -292,7 +292,7 @@ def _patch_table(known_chart: KnownChart, patch_signals: Balanced, profile_choic
     """CSV: each patch's balanced channels, its L*a*b* on the chart and by the profile, CIEDE2000 with and without
     it."""
     text = io.StringIO()
-    text.write("# channels of which the perfect white has 1; L*, a*, b* under D50, 1931 observer\n")
+    text.write("# channels: the perfect white has 1; L*, a*, b* under D50, 1931 observer\n")
     text.write("patch,r,g,b,u_r,u_g,u_b,L,a,b_star,L_found,a_found,b_found,de00,de00_left_out\n")
     white = profile_choice.chosen_profile.white_signal
     table = np.column_stack(

@@ -88,9 +88,9 @@ def sentence_of(figure: Figure) -> str:
 def colour_figures(de: Floats) -> list[Figure]:
     """Return figures of the CIEDE2000 of patches that were left out."""
     return [
-        Figure("colour_mean", float(de.mean()), "dE00", "colour of patches left out, mean"),
-        Figure("colour_90", float(np.quantile(de, 0.9)), "dE00", "colour of patches left out, 90 %"),
-        Figure("colour_max", float(de.max()), "dE00", "colour of patches left out, largest"),
+        Figure("colour_mean", float(de.mean()), "dE00", "colour error of patches left out, mean"),
+        Figure("colour_90", float(np.quantile(de, 0.9)), "dE00", "colour error of patches left out, 90 %"),
+        Figure("colour_max", float(de.max()), "dE00", "colour error of patches left out, largest"),
     ]
 
 

@@ -176,9 +176,10 @@ def _refuse_curved(view: _ChartView, known_chart: KnownChart) -> None:
     slope = float(np.polyfit(np.log(luminance), np.log(view.reading.mean[grey, 1]), 1)[0])
     if not _GAMMA[0] < slope < _GAMMA[1]:
         raise InputError(
-            f"{view.picture.name}: its values are not linear: on the greys they go as light to the power of "
-            f"{slope:.2f}, expected 1. Give RAW, a linear TIFF or OpenEXR, or merge several exposures with "
-            "`coupole bracket`; --srgb is for pictures with the curve of sRGB and no other, and for no linear ones"
+            f"{view.picture.name}: its values are not linear: on the greys they are proportional to light to the "
+            f"power of {slope:.2f}, expected 1. Give RAW, a linear TIFF or OpenEXR, or merge several exposures "
+            "with `coupole bracket`; --srgb is only for pictures with the curve of sRGB and no other curve, not "
+            "for linear ones"
         )
 
 
@@ -194,7 +195,9 @@ def _refuse_tints(views: Sequence[_ChartView], known_chart: KnownChart, remarks:
     worst = int(np.argmax(apart))
     words = f"{views[worst].picture.name}: its light differs in colour from that of {views[0].picture.name}"
     if apart[worst] > _TINT_REFUSED:
-        raise InputError(f"{words} by {apart[worst]:.0%}; a profile holds for one light: calibrate each by itself")
+        raise InputError(
+            f"{words} by {apart[worst]:.0%}; a profile is valid for one light: calibrate for each light separately"
+        )
     if apart[worst] > _TINT_TOLD:
         remarks.append(f"{words} by {apart[worst]:.1%}")
 
@@ -239,8 +242,8 @@ def _refuse_rough(white: PlainPicture, card: Reading, chart: Chart) -> None:
     worst = float(np.abs(light - basis @ smooth).max())
     if worst > _ROUGH:
         raise InputError(
-            f"--white {white.name}: no smooth light: it departs by {worst:.0%} from patch to patch where the "
-            "chart is; expected a white card that covers the chart's place, without shadows"
+            f"--white {white.name}: the light is not smooth: it departs by {worst:.0%} from patch to patch where "
+            "the chart is; expected a white card that covers the chart's place, without shadows"
         )
 
 
@@ -259,8 +262,9 @@ def _by_found_light(
     signals, lights = signals_and_lights(None)
     widest = max((light.span for light in lights), key=lambda span: span[0])
     remarks.append(
-        f"light over the chart, with the lens's fall-off, found from the patches: they differ by {widest[0]:.1%} "
-        f"(u {widest[1]:.1%}), taken off as a smooth factor; a picture of a white card (--white) is surer"
+        f"light over the chart, with the lens's fall-off, found from the patches: it differs by {widest[0]:.1%} "
+        f"(u {widest[1]:.1%}), and is corrected by a smooth factor; a picture of a white card (--white) is more "
+        "reliable"
     )
     mean_covariance = np.mean([light.covariance for light in lights], axis=0)
     light_u = replace(lights[0], covariance=mean_covariance).effects()
@@ -293,7 +297,7 @@ def _offsets(signals: Signals, known_chart: KnownChart) -> list[str]:
     words = ", ".join(f"{value:+.1%}" for value in share)
     return [
         f"the greys show an offset of {words} of white in red, green and blue: a black level that was not taken "
-        "off, or stray light. Dark colours are wrong by it, and the uncertainty does not contain it"
+        "off, or stray light. Dark colours are wrong by it, and the uncertainty does not include this error"
     ]
 
 

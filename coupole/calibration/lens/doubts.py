@@ -69,8 +69,8 @@ class Doubts:
                     f"(log-likelihood ratio {suspect.evidence:.0f}); values and uncertainties account for it"
                 )
         yield (
-            f"views left out in turn are predicted to {self.predicted_px:.2g} px, {self.predictions.ratio:.2f} of "
-            "the stated uncertainty"
+            f"views left out in turn are predicted with an error of {self.predicted_px:.2g} px, "
+            f"{self.predictions.ratio:.2f} times the stated uncertainty"
         )
 
 

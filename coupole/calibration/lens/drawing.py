@@ -58,7 +58,7 @@ def _draw_field(ax: Axes, lens_report: Shown) -> None:
     ax.text(0.04 * width, 0.94 * height, f"{key_px:g} px", color=DARK)
     ax.set(
         xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="x (px)", ylabel="y (px)",
-        title=f"Residuals, {enlargement:g} times enlarged; beyond 3 sigma in red",
+        title=f"Residuals, enlarged {enlargement:g} times; red: beyond 3 sigma",
     )  # fmt: skip
 
 
@@ -107,7 +107,7 @@ def _draw_distribution(ax: Axes, lens_report: Shown) -> None:
     ax.plot(grid, np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi), color=BLUE, lw=2)
     inside = np.mean(np.abs(normal) < 1.96)
     ax.set(
-        title=f"Residuals over their noise; {inside:.1%} within 1.96 (normal: 95 %)",
+        title=f"Residuals divided by their noise; {inside:.1%} within 1.96 (normal: 95 %)",
         xlabel="residual / sigma", yticks=[], xlim=(-4.5, 4.5),
     )  # fmt: skip
     ax.spines["left"].set_visible(False)

@@ -18,7 +18,7 @@ DRIFT = (
     Allowed("left_out", "share of readings left out", 0.2),
 )
 GLARE = (
-    Allowed("veil", "uncertainty of the veil in the middle of white, shares of it", 0.001),
-    Allowed("left_out", "veil of traps left out, off by shares of white", 0.0005),
-    Allowed("form", "veil of traps left out, relative, worst view", 0.1),
+    Allowed("veil", "uncertainty of the veil in the middle of a white picture, as a share of white", 0.001),
+    Allowed("left_out", "error of the predicted veil of traps left out, as a share of white", 0.0005),
+    Allowed("form", "relative error of the predicted veil of traps left out, worst view", 0.1),
 )

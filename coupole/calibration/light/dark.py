@@ -216,7 +216,8 @@ def _refuse_saturated(frame: DarkFrame, pixels: NDArray[np.uint16], white_dn: in
         )
     if float(np.mean(pixels == 0)) > 0.01:
         raise InputError(
-            f"{frame.name}: more than 1 % of a dark frame is 0, noise is clipped; raise the camera's black level"
+            f"{frame.name}: more than 1 % of a dark frame's pixels are 0, so the noise is clipped; raise the "
+            "camera's black level"
         )
 
 

@@ -41,7 +41,7 @@ def draw_glare(fits: Mapping[str, GlareFit], record: Record, figure: Figure) -> 
     most = 105 * max(float(fit.found_veil.max()) for fit in fits.values())
     axes[0, 1].plot([0, most], [0, most], color=DARK, lw=1)
     axes[0, 1].set(
-        title="Traps of each view, predicted from the other views (% of the white beside)",
+        title="Traps of each view, predicted from the other views (% of the neighbouring white)",
         xlabel="predicted",
         ylabel="found",
     )
@@ -52,7 +52,7 @@ def draw_glare(fits: Mapping[str, GlareFit], record: Record, figure: Figure) -> 
         *green.pixels.T, c=off, cmap="RdBu", vmin=-most_off, vmax=most_off, s=40, ec=DARK, lw=0.3
     )
     axes[1, 0].set(
-        title="Found less predicted by place, green (% of white)", xlabel="x (px)", ylabel="y (px)",
+        title="Measured minus predicted, by place, green (% of white)", xlabel="x (px)", ylabel="y (px)",
         xlim=(0, width), ylim=(height, 0), aspect="equal",
     )  # fmt: skip
     figure.colorbar(dots, ax=axes[1, 0], shrink=0.8)

@@ -69,7 +69,7 @@ def photon_transfer(pairs: Sequence[Pair]) -> PhotonTransfer:
     if fit.slope <= 0.0 or fit.slope < 3.0 * np.sqrt(fit.covariance[1, 1]):
         raise InputError(
             "response: the variance of pixels does not grow with their signal; does the camera process its "
-            "frames, or is the light the same in all frames?"
+            "frames, or is the light equal in all frames?"
         )
     read_var = fit.intercept - ROUNDING_VARIANCE
     u_read_var = float(np.sqrt(fit.covariance[0, 0]))

@@ -121,19 +121,20 @@ def _connect(cell: Cell, connection: _Local, end_s: float, given_up: Callable[[]
             owner = owner_of(cell)
             if owner is None:
                 raise NotServed(
-                    f"{rig}: no console of this cell is served on this machine by this user; "
-                    f"`coupole serve {rig}` does"
+                    f"{rig}: this user serves no console of this cell on this machine; `coupole serve {rig}` "
+                    "starts one"
                 ) from error
             if time.monotonic() > end_s:
                 raise InputError(
-                    f"process {owner} has this cell, but does not listen by the name of {rig}: name the rig that "
-                    "it serves, if that is another one"
+                    f"process {owner} has this cell, but does not listen under the name of {rig}: if it serves "
+                    "another rig, name that rig"
                 ) from error
             if not has_spoken and time.monotonic() - begun_s > _SAID_AFTER_S:
                 has_spoken = True
                 alarm(
-                    f"{rig}: a console has this cell and does not listen by this rig's name: {_state_of(owner)}. "
-                    "It may be starting, or be that of another rig with the same storage folder; waiting for it"
+                    f"{rig}: a console has this cell, but does not listen under this rig's name: "
+                    f"{_state_of(owner)}. It may be starting, or it may serve another rig with the same storage "
+                    "folder; waiting for it"
                 )
         else:
             return
@@ -189,8 +190,8 @@ def _told_if_given_up(rig: Path, counts_anyway: bool) -> Iterator[None]:
     except BaseException:
         if not counts_anyway:
             alarm(
-                f"{rig}: given up without an answer: what was asked will not be carried out, unless the console "
-                f"had begun it before it fell silent; `coupole queue {rig}` shows what is in its queue"
+                f"{rig}: given up without an answer: the request will not be carried out, unless the console had "
+                f"begun it before it stopped answering; `coupole queue {rig}` shows what is in its queue"
             )
         raise
 

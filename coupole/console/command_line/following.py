@@ -104,7 +104,7 @@ class _Followed:
         A run is asked itself, which obeys whatever its console does, and answers when lights are off and the arm
         was stopped."""
         if not self._entry:
-            return ["nothing has begun, as far as this terminal knows"]
+            return ["as far as this terminal knows, nothing has begun"]
         for _ in range(_TRIALS):
             if (trouble := self._stop_run(self._run)) is not None:
                 return trouble
@@ -184,15 +184,15 @@ class _Followed:
                 if self._state() is None:
                     raise DeviceLost(
                         "console",
-                        expected="it to tell how the run ends",
+                        expected="the console to tell how the run ends",
                         happened=reason(error),
-                        remedy=f"`coupole status {run}` says what became of it, `coupole stop {run}` stops it.",
+                        remedy=f"`coupole status {run}` shows the run's state; `coupole stop {run}` stops it.",
                     ) from error
                 if not is_announced:
                     is_announced = True
                     alarm(
-                        "the console is gone; the run GOES ON, with its arm and lamps. Ctrl-C and q stop it "
-                        f"still, as does `coupole stop {run}`"
+                        "the console is gone; the run GOES ON, with its arm and lamps. Ctrl-C, q and `coupole "
+                        f"stop {run}` still stop it"
                     )
                 self._show_progress()
             except InputError:

@@ -61,7 +61,7 @@ class Entering:
             raise InputError("expected either `plan` or `hold`, or `resume`")
         if request.hold:
             if request.now:
-                raise InputError("`now`: a hold does not begin")
+                raise InputError("`now`: a hold cannot be begun")
             return self._queue.add(by, before=request.before, hold=request.hold)
         for_command_line = request.output or request.with_mesh or request.result
         if not by_command_line and (for_command_line or (request.plan and request.resume)):

@@ -229,7 +229,7 @@ class PlanQueue:
         decided, is not why it is now."""
         with self._lock:
             if seen_reason is not None and self.halt_reason not in (seen_reason, ""):
-                raise InputError(f"queue: it now waits for something else: {self.halt_reason}")
+                raise InputError(f"queue: it now waits for another reason: {self.halt_reason}")
             self._keep(self.entries, "")
 
     def _keep(self, entries: tuple[Entry, ...], halt_reason: str) -> None:

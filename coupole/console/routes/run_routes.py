@@ -54,7 +54,7 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
         """Normals and diffuse colour of the view that was processed last, as PNG, while the run goes on."""
         result = service.runs.run(run).asked_result
         if result is None:
-            raise InputError(f"{run}: is not processed beside its acquisition")
+            raise InputError(f"{run}: is not processed during its acquisition")
         return _file(result / PICTURE, "image/png", _STILL)
 
     @app.get("/api/v1/runs/{run}/so-far", response_class=FileResponse)
@@ -62,7 +62,7 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
         """Report of the result of the views so far, while the run goes on: normals, materials, uncertainty."""
         result = service.runs.run(run).asked_result
         if result is None:
-            raise InputError(f"{run}: is not processed beside its acquisition")
+            raise InputError(f"{run}: is not processed during its acquisition")
         return _file(result / LINK / REPORT, "text/html", _STILL)
 
     @app.get("/api/v1/runs/{run}/report", response_class=FileResponse)

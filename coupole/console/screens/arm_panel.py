@@ -21,7 +21,7 @@ _SHARES = {"0.1": "10 % of 250 mm/s", "0.4": "40 % of 250 mm/s", "1": "250 mm/s 
 _ENABLING = {
     None: "",
     True: "The arm moves only while a person at the cell holds the enabling switch there.",
-    False: "This cell has no enabling switch that the console could see: nothing tells whether anybody is there.",
+    False: "The console sees no enabling switch at this cell, and cannot know whether anybody is there.",
 }
 _HOLD = Path(__file__).parent / "hold.js"
 

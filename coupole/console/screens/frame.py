@@ -118,7 +118,7 @@ def _buttons(visit: Visit) -> None:
             )
             if answer is not None:
                 trouble = answer.get("trouble") or []
-                words = "; ".join(trouble) or "stopped: lights off, arm told to stop, camera disarmed"
+                words = "; ".join(trouble) or "stopped: lights off, arm commanded to stop, camera disarmed"
                 visit.say(words, bad=bool(trouble))
         elif entry is not None:
             await visit.act(f"stop {entry.id}", lambda: visit.service.acquisitions.stop(entry), acts=False)
@@ -164,7 +164,7 @@ async def stop_bench(visit: Visit) -> None:
     """Stop what the open devices do."""
     troubles = await visit.act("stop the devices", visit.service.bench.stop, acts=False)
     if troubles is not None:
-        visit.say("; ".join(troubles) or "stopped: lights off, arm told to stop", bad=bool(troubles))
+        visit.say("; ".join(troubles) or "stopped: lights off, arm commanded to stop", bad=bool(troubles))
 
 
 def _person(visit: Visit) -> None:

@@ -76,7 +76,7 @@ def numbers(text: str, label: str) -> list[int]:
     """Whole numbers with commas or blanks between them. Raises InputError."""
     words = [word for word in re.split(r"[,;\s]+", text) if word]
     if strange := [word for word in words if not re.fullmatch(r"\d{1,9}", word)]:
-        raise InputError(f"{label}: expected whole numbers, as in 3, 17; found {strange[0]!r}")
+        raise InputError(f"{label}: expected whole numbers, such as 3, 17; found {strange[0]!r}")
     return list(dict.fromkeys(map(int, words)))
 
 

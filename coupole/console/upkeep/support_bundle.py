@@ -54,8 +54,8 @@ state/          faults of the arm, and other facts of the cell
 runs/           of the {runs} newest runs: description, journal, plan and rig; no frames
 console/        who asked for what; the queue; what commands and acquisitions printed
 
-There are names of people in it (who asked for what) and of objects. Values of keys that look like passwords or
-tokens are replaced by {left_out}; accounts and notifications are not in it at all.
+It contains names of people (who asked for what) and of objects. Values of keys that look like passwords or
+tokens are replaced by {left_out}; accounts and notifications are not included.
 """
 
 

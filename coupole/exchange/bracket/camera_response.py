@@ -112,8 +112,9 @@ def left_open(exposure_s: Array) -> str:
     if factor < _WIDE:
         return ""
     return (
-        f"no two photographs are nearer than {factor:.1f} times in exposure: only its smoothness excludes waves "
-        "of the response, and u is larger for them; steps of 2, or raw files, determine it better"
+        f"the exposures of all photographs differ by at least {factor:.1f} times: only the assumed smoothness "
+        "excludes waves of the response, and u is larger for this reason; steps of 2, or raw files, determine "
+        "the response better"
     )
 
 

@@ -48,7 +48,9 @@ def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None =
         if len(settings) > 1:
             raise InputError(f"bracket: expected photographs that differ in time alone; found {label} {settings}")
     if untold := [str(path) for path, tags in zip(paths, exif_tags, strict=True) if not tags.get(_TIME)]:
-        raise InputError(f"{untold[0]}: has no exposure time in its EXIF; give all of them with --exposure-s")
+        raise InputError(
+            f"{untold[0]}: has no exposure time in its EXIF; give the times of all photographs with --exposure-s"
+        )
     shapes = {
         (values.shape, levels, path.suffix.lower() in PLAIN)
         for path, (values, levels) in zip(paths, pictures, strict=True)
@@ -60,7 +62,8 @@ def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None =
     times = times[order]
     if np.any(times <= 0.0) or times[-1] / times[0] < _LEAST_RATIO:
         raise InputError(
-            f"bracket: expected exposure times in steps of 2 to 4, found {times.tolist()} s; take others"
+            f"bracket: expected exposure times in steps of 2 to 4, found {times.tolist()} s; take other "
+            "photographs"
         )
     return Photographs(
         tuple(paths[k] for k in order),

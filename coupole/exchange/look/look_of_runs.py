@@ -178,8 +178,8 @@ def _residuals(result: RunResult, fit: str, planes: int, about: dict[str, Any], 
     about["residual"], blocks = residual_blocks(result, planes, say)
     about["told"]["Residual"] = (
         f"what {fit} leaves of each view's samples, as {planes} planes, which have "
-        f"{100 * about['residual']['kept']:.4g} % of its energy. It belongs to one view, "
-        "and fades out beside this view."
+        f"{100 * about['residual']['kept']:.4g} % of its energy. The residual belongs to one view, and fades out "
+        "beside this view."
     )
     return blocks
 

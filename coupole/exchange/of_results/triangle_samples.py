@@ -44,8 +44,8 @@ def samples_of(surface: MeasuredSurface, triangle: int, quantile: float) -> Samp
     whole = SamplesOfTriangle(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
     if np.isnan(np.where(np.isfinite(whole.f), whole.low + whole.high, 0.0)).any():
         raise InputError(
-            f"{surface.result.folder}: has no bounds, because no record of the response stated its frames' "
-            "noise; make it again with one (`coupole calibrate response`)"
+            f"{surface.result.folder}: has no bounds, because it was made without a record of the response, "
+            "which states the frames' noise; make it again with such a record (`coupole calibrate response`)"
         )
     return whole
 

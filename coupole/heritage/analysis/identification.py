@@ -157,7 +157,7 @@ def _judge(
         )
     if not model.is_known(probabilities)[0]:
         return "unknown", (
-            f"that the library has its class is probable by {1.0 - probabilities[0, -1]:.0%} only, "
+            f"the probability that the library has its class is {1.0 - probabilities[0, -1]:.0%}, and at least "
             f"{model.threshold:.0%} is needed; {best.class_name} comes nearest{flat}"
         )
     missing = lacking(best.class_name, model.class_names)

@@ -84,7 +84,7 @@ def read_samples(layer_file: LayerGiven, folder: Path) -> Samples:
     has_thickness = [film.thickness_um is not None for film in films if film.over is not None]
     if any(has_thickness) != all(has_thickness):
         raise InputError(
-            "thickness: expected one for each film over a ground, or for none; some have one, some not"
+            "thickness: expected one for every film over a ground, or for none of them; only some have one"
         )
     binder_face = face(layer_file.binder_index, layer_file.geometry)
     paths = {film.spectrum for film in films} | {film.over for film in films if film.over is not None}
@@ -176,7 +176,7 @@ def _film(film: FilmGiven, spectra: dict[Path, Array], binder_face: Face, layer_
     if ground.min() < -_BEYOND * layer_file.noise or ground.max() > 1.0 + _BEYOND * np.max(u_ground):
         raise InputError(
             f"{film.over}: as a ground under a glossy face it would reflect {ground.min():.3g} to "
-            f"{ground.max():.3g} inside; expected 0 to 1: see `grounds` (bare), and whether gloss is included"
+            f"{ground.max():.3g} inside; expected 0 to 1: check `grounds` (bare), and whether gloss is included"
         )
     h, u_h = 1.0, 0.0
     if film.thickness_um is not None:
@@ -195,7 +195,8 @@ def _check_level(reflectance: Array, path: Path, nm: Array, binder_face: Face, n
         raise InputError(
             f"{path}: is {reflectance[at]:.3g} at {nm[at]:g} nm; a paint under this face is seen as "
             f"{low[at]:.3g} to "
-            f"{high[at]:.3g}: see whether gloss is included, the binder's index, and percent or fractions"
+            f"{high[at]:.3g}: check whether gloss is included, the binder's index, and whether values are "
+            "percent or fractions"
         )
 
 

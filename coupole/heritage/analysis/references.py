@@ -180,7 +180,11 @@ class References:
         last = violet[wrong[-1]]
         reliable = reflectance.copy()
         reliable[: last + 1] = np.nan
-        return reliable, f"below {BANDS_NM[last + 1]:g} nm it rises as no reference does (stray light?): left out"
+        return (
+            reliable,
+            f"below {BANDS_NM[last + 1]:g} nm it rises in a way that no reference does (stray light?), so these "
+            "bands are left out",
+        )
 
     def without_class(self, class_name: str) -> References:
         """Return the library without one of its classes."""

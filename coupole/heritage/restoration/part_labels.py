@@ -80,8 +80,8 @@ def parts_of(mesh: PaintedMesh, document: Document, parts_file: PartsFile) -> Pa
         if count == 0 and not problems:
             at = ("rules", places[name]) if name in places else ("rest",)
             message = (
-                f"the part {name!r} has no triangle: no rule gives it one, or later rules took it; "
-                f"{_remark_text(remarks)}"
+                f"the part {name!r} has no triangle: no rule gives it a triangle, or later rules took all of "
+                f"them; {_remark_text(remarks)}"
             )
             problems.append(document.problem(at, message))
     if problems:
@@ -160,7 +160,7 @@ def _expect_one_frame(mesh: PaintedMesh, picked_parts: Picked, path: Path) -> No
         raise InputError(
             f"{path}: was painted on a mesh that lies elsewhere: {100 * far:.0f} % of it is more than "
             f"{_NEAR_SHARE * size_mm:.3g} mm from {mesh.path}. Both must be in one frame and one unit: register "
-            "the scans with --control, see to --unit, or paint this mesh"
+            "the scans with --control, check --unit, or paint this mesh"
         )
 
 

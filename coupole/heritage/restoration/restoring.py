@@ -276,6 +276,6 @@ def common_white(restoration: Restoration, made_pictures: Sequence[Made]) -> flo
     white = float(np.quantile(np.concatenate(some), 1.0 - display.clipped))
     if white <= 0.0:
         raise InputError(
-            f"{restoration.document.path}: expected some light in the pictures, found none; see to its lights"
+            f"{restoration.document.path}: expected some light in the pictures, found none; check its lights"
         )
     return white

@@ -64,10 +64,12 @@ def _next_step(findings: Sequence[PigmentFinding]) -> Inline:
     if all(finding.verdict in ("match", "mixture") for finding in findings):
         return [
             "Weigh it by ",
-            Link("#library", "what the verdicts are worth"),
-            "; ask another method before it is published.",
+            Link("#library", "how reliable the verdicts are"),
+            "; confirm the result by another method before you publish it.",
         ]
-    return "Where it is ambiguous or unknown, add references of the classes in question, or ask another method."
+    return (
+        "If a verdict is ambiguous or unknown, add references of the classes in question, or use another method."
+    )
 
 
 def _overview(findings: Sequence[PigmentFinding]) -> Table:

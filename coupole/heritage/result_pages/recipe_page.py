@@ -28,12 +28,13 @@ def recipe_page(name: str, search: Found, matches: Sequence[Sequence[Match]]) ->
         Page(
             title=f"{name}: recipe of {len(best.shares)} paints",
             pictures=[_patches(m) for m in under],
-            summary=f"The colour is mixed of {amounts}, by the paint's amount.",
+            summary=f"The colour is mixed from {amounts}, by amount of paint.",
             quality=f"{verdict[0].upper()}{verdict[1:]}.",
             next_step=[
                 "Mix a little by the ",
                 Link("#shares", "shares"),
-                ", let it dry, and compare it with the target under the lights of its later place.",
+                ", let it dry, and compare it with the target under the lights of the place where it will be "
+                "shown.",
             ],
             sections=[
                 Section("shares", "Shares", tables=[_shares(best)]),

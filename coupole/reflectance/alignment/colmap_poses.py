@@ -182,7 +182,7 @@ def _refuse_far(poses: ColmapPoses, measured_run: MeasuredRun) -> None:
     conditions = (
         f"after a similarity to the {len(poses.steps_from_records)} cameras of the records"
         if len(poses.steps_from_records) >= LEAST_FITTED
-        else "in the support's frame, in mm, as with one or two views the model must be"
+        else "in the support's frame, in mm; with one or two views the model must be in this frame"
     )
     raise InputError(
         f"{poses.path}: the camera of {measured_run.views[view].name} is {how_far} from its place in the records, "

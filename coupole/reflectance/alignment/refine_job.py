@@ -117,8 +117,8 @@ def _refuse_other_cameras(measured_runs: Sequence[MeasuredRun]) -> None:
     for other_run in measured_runs[1:]:
         if sha256(first.records["hand-eye"]) != sha256(other_run.records["hand-eye"]):
             raise InputError(
-                f"{other_run.run.folder} and {first.run.folder} name different hand-eye records; only one "
-                "camera can be refined: name its record with --calibrations"
+                f"{other_run.run.folder} and {first.run.folder} name different hand-eye records; only one camera "
+                "can be refined: name the record of this camera with --calibrations"
             )
 
 

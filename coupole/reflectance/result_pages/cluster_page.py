@@ -58,7 +58,7 @@ def _page(folder: Path, document: dict[str, Any]) -> Page:
 def _quality(document: dict[str, Any]) -> str:
     own_mae, cluster_mae = (document["mae"][name] for name in ("own", "clustered"))
     if own_mae is None or cluster_mae is None:
-        return "It is not known: no LEDs were kept for the check."
+        return "The error is not known, because no LEDs were kept for the check."
     return (
         f"With its cluster's material a triangle is off by {100 * cluster_mae:.3f} % of range, with its own by "
         f"{100 * own_mae:.3f} %."

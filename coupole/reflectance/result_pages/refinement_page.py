@@ -112,13 +112,11 @@ def _next_step(name: str, about: dict[str, Any]) -> Inline:
 
 def _unknowns(about: dict[str, Any]) -> str:
     return (
-        f"{about['unknowns']} unknowns, of which the pictures determine {about['determined']:.0f}; square sum "
-        "of the "
-        f"steps over what was stated {about['chi2_of_steps']:.0f}. Matches scatter {about['noise_factor']:.1f} "
-        "times "
-        "as much as noise and texture alone would make them, and are weighted by that; "
-        f"{about['rejected']} were rejected. Motions that pictures cannot determine, such as that of mesh and "
-        "cameras together, keep their stated uncertainty."
+        f"{about['unknowns']} unknowns, of which the pictures determine {about['determined']:.0f}; square sum of "
+        f"the steps divided by the stated uncertainties: {about['chi2_of_steps']:.0f}. Matches scatter "
+        f"{about['noise_factor']:.1f} times as much as noise and texture alone explain, and are weighted "
+        f"accordingly; {about['rejected']} were rejected. Motions that pictures cannot determine, such as that "
+        "of mesh and cameras together, keep their stated uncertainty."
     )
 
 

@@ -48,7 +48,7 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
     if about["residual"] > POOR_RESIDUAL:
         yield (
             "the materials explain the pictures poorly: is the object translucent or fluorescent, are the "
-            "pictures linear, are the lights in the order of the pictures?"
+            "pictures linear, are the lights in the same order as the pictures?"
         )
     if about["suspect_pictures"]:
         names = ", ".join(f"{name} ({gain:.2f})" for name, gain in about["suspect_pictures"].items())

@@ -171,8 +171,8 @@ def _next_step(name: str, about: dict[str, Any]) -> Inline:
 
 def _glare(about: dict[str, Any]) -> str:
     if all("glare" in records for records in about["records"]):
-        return "Veiling glare was taken off; the uncertainty of that is in the bounds."
-    return "Veiling glare is not subtracted, and is not in the bounds."
+        return "Veiling glare was subtracted; the bounds include the uncertainty of this correction."
+    return "Veiling glare is not subtracted, and the bounds do not include it."
 
 
 def _shares(about: dict[str, Any]) -> Section:
@@ -196,7 +196,7 @@ def _shares(about: dict[str, Any]) -> Section:
 
 def _inter_reflection(about: dict[str, Any]) -> str:
     if not about["subtracted"]:
-        return "Inter-reflection is left in the samples."
+        return "Inter-reflection was not subtracted from the samples."
     shares_of_views = (view["inter_reflection"] for view in about["views"])
     shares = [f"{100 * half:.1f} % ({100 * far:.1f} %)" for half, far in shares_of_views]
     return (

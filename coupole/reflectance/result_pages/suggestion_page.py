@@ -64,7 +64,7 @@ def _page(name: str, suggestion: Suggestion) -> Page:
                 tables=[_expectation_table(suggestion)],
                 notes=_LIMITS,
             ),
-            Section("views", "Views, the one that tells most first", tables=[_views(suggestion)]),
+            Section("views", "Views, the most informative one first", tables=[_views(suggestion)]),
             Section("warnings", "Preflight's warnings", items=suggestion.report.warnings),
         ],
     )
@@ -74,7 +74,8 @@ _LIMITS = (
     "The figures are those of the fits themselves, made of drawn samples: the frames' noise, each LED's own power "
     "and place, and a highlight with Fresnel's term.",
     "Not in them: light from surface to surface, edges of shadows, translucency, errors of the mesh and of poses, "
-    "and materials that are no sum of a matt part and a highlight. Where these matter, less will be known.",
+    "and materials that are no sum of a matt part and a highlight. Where these matter, the uncertainties will be "
+    "larger.",
 )
 
 

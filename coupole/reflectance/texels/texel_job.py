@@ -84,7 +84,7 @@ def add_texels(
     settings = read_settings(out)
     try:
         if settings != json.loads(json.dumps(settings_of(request, token, measured_runs))):
-            raise InputError(f"{out}: is the result of other runs, records or settings than these")
+            raise InputError(f"{out}: is a result of other runs, records or settings")
         result = RunResult(out.resolve())
         result.refuse_unfinished(settings, fits=True)
         tasks = [

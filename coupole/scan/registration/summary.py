@@ -173,8 +173,8 @@ def remarks(registration: Registration) -> Iterator[str]:
     blind = [scan.name for scan in registration.scans if scan.viewpoint.stand == "none"]
     if blind:
         yield (
-            "scanner's place not known, so the empty space before these scans proves nothing (see --seen-from): "
-            + ", ".join(blind)
+            "the scanner's place is not known for these scans, so the empty space in front of them was not used "
+            "as a test (see --seen-from): " + ", ".join(blind)
         )
     for sighting in registration.fit.sightings:
         if sighting.left_mm > _CONSPICUOUS * np.sqrt(3) * sighting.u_mm:

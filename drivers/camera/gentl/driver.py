@@ -195,7 +195,9 @@ class GenTLCamera:
     def trigger(self) -> None:
         if self._settings.free_running or self._exposure is None or self._exposure.hardware_trigger:
             raise misuse_error(
-                self._name, "hardware_trigger=False", "a software trigger while something else triggers"
+                self._name,
+                "hardware_trigger=False",
+                "a software trigger, but the camera is set to another trigger",
             )
         with self._lock:
             self._features.write("TriggerSoftware", True)

@@ -83,7 +83,8 @@ class Order:
                 self._device,
                 expected=f"the files after number {last}, in their order",
                 happened=f"{path.name} came after it",
-                remedy="A picture came too late or twice: increase `patience_s` in the rig, then resume the run.",
+                remedy="A picture came too late, or came twice: increase `patience_s` in the rig, then resume "
+                "the run.",
             )
         return steps
 

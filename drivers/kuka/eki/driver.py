@@ -344,7 +344,7 @@ class KukaEki:
             return
         raise fault.kind(
             "robot",
-            expected="an arm that moves as its program says",
+            expected="an arm that follows its program",
             happened=fault.text,
             remedy="Check the cell, acknowledge at the controller, restart its program, reopen the robot",
         )

@@ -234,7 +234,7 @@ class KukaRsi:
             if self._process.poll() is None:
                 if self._silence.after(self._block.ran_ns()) < ASKS_FROM_S:
                     return self._block.read_state()
-                self._hung = f"it stood still for {ASKS_FROM_S:g} s, and was ended"
+                self._hung = f"the process stood still for {ASKS_FROM_S:g} s, and was ended"
                 self._end()
         except TimeoutError:
             self._end()
@@ -320,7 +320,7 @@ def _refuse_normal_priority(settings: Settings) -> None:
         "robot",
         expected="the right to real-time priority (SCHED_FIFO) for the process that answers the controller "
         f"in every {settings.cycle_ms} ms",
-        happened="this user does not have it: beside other work 16 % of the answers were late",
+        happened="this user does not have this right; without it, 16 % of the answers were late beside other work",
         remedy=f"{how_to_give_the_right()}. Or a person writes `without_realtime_by: NAME` among the robot's "
         "`settings:` in the rig's file; `coupole doctor` measures what this machine can",
     )
@@ -330,13 +330,15 @@ def _no_session_reason(state: shared_state.State) -> str:
     if state.foreign:
         other_sender, own_sender = state.other_sender.decode(), state.sender.decode()
         own_packets = (
-            f"the driver listens to {own_sender}, of which {state.packets} came"
+            f"the driver listens to {own_sender}; {state.packets} packets came from there"
             if own_sender
             else "no others came"
         )
         return f"{state.foreign} packets of other senders were ignored, the last of {other_sender}; {own_packets}"
     if state.astray:
-        return f"{state.astray} packets came that do not continue the session, and {state.packets} that do"
+        return (
+            f"{state.astray} packets came that do not continue the session, and {state.packets} that continue it"
+        )
     if state.refused:
         return f"{state.refused} packets belong to a running RSI session that another program may have begun"
     if state.malformed:

@@ -82,5 +82,8 @@ def _singular(settings: Settings, paths_deg: NDArray[np.float64]) -> str:
         ("the shoulder's (wrist above axis 1)", out_mm / reach_mm),
     ):
         if np.abs(sines).min() < np.sin(np.radians(margin_deg)) or np.ptp(np.sign(sines)) > 0:
-            return f"the motion comes within {margin_deg:g} deg of {name} singularity, where a pose is not enough"
+            return (
+                f"the motion comes within {margin_deg:g} deg of {name} singularity, where a pose does not "
+                "determine the axes"
+            )
     return ""

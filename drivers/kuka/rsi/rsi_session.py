@@ -348,7 +348,7 @@ class RsiSession:
         elif advance > 0:
             self.fail(shared_state.LINK_LOST, f"{advance // step - self._astray_run} packets are missing")
         else:
-            self.fail(shared_state.RESTARTED, "RSI was restarted: its packets begin to count anew")
+            self.fail(shared_state.RESTARTED, "RSI was restarted: its packets have begun to count anew")
 
     def _watch(self, packet: Packet, *, strays: bool) -> None:
         """Compare the measured axes with those commanded in the last answer."""

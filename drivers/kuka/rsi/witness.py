@@ -74,7 +74,7 @@ class ArmWitness:
         if advance <= 0:
             return f"its IPOC went back from {int(last.ipoc)} to {int(packet.ipoc)}: RSI was started anew"
         if advance % (self._step or step) and self._answered > _SURE:
-            return f"its IPOC went on by {advance} instead of a multiple of {self._step}: its cycle has changed"
+            return f"its IPOC advanced by {advance} instead of a multiple of {self._step}: its cycle has changed"
         missing_cycles = advance // step - 1
         if last.delay is None or packet.delay is None:
             return f"{missing_cycles} cycles are missing, and no counter tells whether RSI was started anew" * (

@@ -139,8 +139,7 @@ class Plan(Model):
     reshoot_limit: Annotated[int, Field(ge=0, le=20)] = 3
     """Greatest number of times that unproven frames are taken again."""
     discard: Literal["after_fit"] | None = None
-    """With `after_fit`, frames are discarded when their samples are safe, except the frames that the check
-    needs."""
+    """`after_fit`: frames are discarded when their samples are safe, except the frames that the check needs."""
     watch: bool | Watch = DARKS_ONLY
     """Watching of the run: `true`, `false`, or its settings. Without it, only dark frames are watched."""
     licence: Words | None = None

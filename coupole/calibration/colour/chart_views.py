@@ -1,4 +1,5 @@
-"""The chart in frames of runs: linear signals, its place by its described pose or its corners in the picture."""
+"""The chart in frames of runs: linear signals, and its place from its described pose or from its corners in the
+picture."""
 
 from __future__ import annotations
 
@@ -20,11 +21,11 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 _LEAST_COSINE = 0.3
-"""Least cosine of incidence on the chart: light nearer to its plane than 17 degrees shows its surface, not its
-colour."""
+"""Least cosine of incidence on the chart. Light that is nearer to its plane than 17 degrees shows its surface, not
+its colour."""
 _GLOSS_DEG = 25.0
-"""Angle about the mirrored direction to the camera: light from within it is not used (45/0 geometry keeps away
-from it)."""
+"""Angle about the mirrored direction to the camera. Light from within this angle is not used (45/0 geometry also
+avoids it)."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Acquisition controller of La Coupole: plans in, proven frames out.
 
-`import coupole` is cheap: each public name is imported when it is first used (PEP 562). Its types are in
-`__init__.pyi`; docs/how-to/from-python.md shows them at work.
+`import coupole` is fast, because each public name is imported when it is first used (PEP 562). The types are in
+`__init__.pyi`; docs/how-to/from-python.md shows how to use them.
 """
 
 import importlib
@@ -23,9 +23,10 @@ def _is_writable(folder: Path) -> bool:
 
 
 def _keep_kernels_somewhere() -> None:
-    """Numba needs a folder for its compiled code: beside the package or in the user's cache. Where neither can be
-    written (another user's installation, no home), it gets this user's folder among the temporary files; one that
-    somebody else has made there is not used, since code is loaded from it. Set before numba is imported.
+    """Give numba a folder for its compiled code, which is usually beside the package or in the user's cache. If
+    neither can be written (another user's installation, no home), it is a folder of this user among the temporary
+    files. A folder that somebody else has made there is not used, because code is loaded from it. Call this before
+    numba is imported.
     """
     places = (Path(__file__).parent, Path("~/.cache").expanduser())
     if "NUMBA_CACHE_DIR" in os.environ or any(map(_is_writable, places)):
@@ -70,14 +71,14 @@ _NAMES = {
     "compare": "scripting.analyses",
     "Comparison": "heritage.comparison.state_comparison",
 }
-"""Module of this package by public name."""
+"""Modules of this package by the public names that they define."""
 _MODULES = {
     "errors": "errors",
     "events": "storage.journal_events",
     "lights": "reflectance.new_light.light_kinds",
     "testing": "testing",
 }
-"""Modules by their public names."""
+"""Public modules by their names."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,9 +1,10 @@
 """Every wait ends: a call that never returns is reported and given up.
 
-A library may hang in a call, a network disk may be dead: no thread that waits in there can be ended, by a signal
-as little as by another thread. So whoever may hang is a thread that nobody needs (`run_bounded`), and each call of
-a device or a disk notes that it is under way (`under_way`), which costs a microsecond and hands nothing over. The
-waiting side looks at these notes and gives up a call that is under way for longer than its work asks plus
+A library may hang in a call, or a network disk may be dead. A thread that waits there cannot be ended, neither by
+a signal nor by another thread. So work that may hang runs in a thread that nobody needs (`run_bounded`). Each call
+of a device or a disk notes that it is under way (`under_way`); this takes a microsecond and passes nothing to
+another thread. The waiting side looks at these notes. It gives up a call that is under way for longer than its
+work needs plus
 
 ==================  =========================================
 `DEVICE_S`          a call of a device
@@ -11,8 +12,9 @@ waiting side looks at these notes and gives up a call that is under way for long
 `STOPPED_S`         either, once the session is to end
 ==================  =========================================
 
-on the machine's clock: longer than what drivers and kernels grant themselves, whose words are better. Whatever is
-left behind (`left_behind`) cannot be ended: its process leaves by `os._exit` (`leave`), once all has been said.
+on the machine's clock. This is longer than the time-outs of drivers and kernels, whose messages are better. Calls
+that are left behind (`left_behind`) cannot be ended. Their process ends by `os._exit` (`leave`), after all
+messages are written.
 """
 
 from __future__ import annotations
@@ -35,10 +37,10 @@ from coupole.errors import CoupoleError, DeviceTimeout, StorageError
 
 DEVICE_S, DISK_S, STOPPED_S = 30.0, 60.0, 15.0
 _MOST_S = 120.0
-"""A session that is to end, and whose calls all return, is left behind after this time all the same."""
+"""A session that is to end is left behind after this time, even if all its calls return."""
 _LOOK_S, _STOOD_S = 0.1, 1.0
 _BACK_S = 1.0
-"""Time for a call to come back once the cell was made safe, or once whoever waited for it was interrupted."""
+"""Time for a call to return after the cell was made safe, or after the waiting thread was interrupted."""
 _FLUSH_S = 2.0
 DISK = "disk"
 
@@ -50,12 +52,12 @@ T = TypeVar("T")
 
 @dataclass(eq=False, slots=True)
 class Call:
-    """A call of a device (by its name in errors) or of the `DISK`; noted while its context lasts."""
+    """A call of a device (by its name in errors) or of the `DISK`. It is noted while its context lasts."""
 
     of: str
     operation: str
     work_s: float = 0.0
-    """Time that the work itself may take, if all is well."""
+    """Time that the work itself may take if nothing fails."""
     since_s: float = 0.0
 
     def __enter__(self) -> Call:
@@ -68,11 +70,11 @@ class Call:
         _UNDER_WAY.pop(self, None)
 
     def goes_on(self) -> None:
-        """Part of it is done, as slowly as it may be: its time begins anew."""
+        """Note that a part of the slow work is done: the time of the call begins again."""
         self.since_s = time.monotonic()
 
     def end_s(self, stopped_s: float) -> float:
-        """Time when it is given up, monotonic; the session is to end since `stopped_s`."""
+        """Return the monotonic time when the call is given up. The session is to end since `stopped_s`."""
         disk = self.of == DISK
         end_s = self.since_s + self.work_s + (DISK_S if disk else DEVICE_S)
         return min(end_s, max(self.since_s, stopped_s) + STOPPED_S + (min(self.work_s, DISK_S) if disk else 0.0))
@@ -100,12 +102,12 @@ _LEFT: list[threading.Thread | Call] = []
 
 
 under_way = Call
-"""`with under_way("camera", "arm"):` notes a call while the context lasts."""
+"""`with under_way("camera", "arm"):` notes a call while its context lasts."""
 
 
 @contextmanager
 def waited_for() -> Iterator[None]:
-    """Calls of this thread are not noted: somebody waits for it with a limit of its own."""
+    """Do not note calls of this thread, because another thread waits for it with a limit of its own."""
     _BY_OTHERS.add(threading.get_ident())
     try:
         yield
@@ -114,7 +116,8 @@ def waited_for() -> Iterator[None]:
 
 
 def overdue(since_s: float, stopped_s: float = math.inf) -> Call | None:
-    """A call that began since then and is to be given up. While this process stood, no time has passed."""
+    """Return a call that began since then and is to be given up. Time in which this process stood still does not
+    count."""
     now_s = time.monotonic()
     looked_s = _looked_s[-1]
     _looked_s.append(now_s)
@@ -126,14 +129,16 @@ def overdue(since_s: float, stopped_s: float = math.inf) -> Call | None:
 
 
 def refuse_overdue(since_s: float) -> None:
-    """Raise DeviceTimeout or StorageError for a call that is given up; for who waits for something else."""
+    """Raise DeviceTimeout or StorageError for a call that is given up. This is for threads that wait for something
+    else."""
     if call := overdue(since_s):
         leave_behind(call)
         raise call.error()
 
 
 def hangs(of: str) -> str:
-    """The call of this device, or of the `DISK`, that was left behind and is still under way; empty if none is."""
+    """Return the call of this device, or of the `DISK`, that was left behind and is still under way; empty if
+    there is none."""
     return next((call.operation for call in list(_UNDER_WAY) if call.of == of), "") if left_behind() else ""
 
 
@@ -145,7 +150,7 @@ class _GivenUp(BaseException):
 
 
 class _Runner(Generic[T]):
-    """Does something in a thread of its own."""
+    """Does work in a thread of its own."""
 
     def __init__(self, do: Callable[[], T], discard: Callable[[T], object]) -> None:
         self._do, self._unwanted = do, discard
@@ -174,7 +179,7 @@ class _Runner(Generic[T]):
         return self._done.done()
 
     def leave(self) -> bool:
-        """Stop waiting for the call: it is left behind. Returns False if it has just ended."""
+        """Stop waiting for the call, which is then left behind. Returns False if it has just ended."""
         with self._lock:
             self.is_left = not self._done.done()
         if self.is_left:
@@ -182,7 +187,7 @@ class _Runner(Generic[T]):
         return self.is_left
 
     def interrupt(self) -> None:
-        """End it as a signal would end the thread that waits for it, at its next step of Python."""
+        """End the thread at its next step of Python, as a signal would end the thread that waits for it."""
         ident = self.thread.ident
         if ident is not None and not self._done.done():
             ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(ident), ctypes.py_object(_GivenUp))
@@ -199,12 +204,12 @@ def run_bounded(
     discard: Callable[[T], object] | None = None,
     since_s: float | None = None,
 ) -> T:
-    """Do it in a thread of its own, and wait until it has ended or a call is to be given up; what it raises is
-    raised here. `stop` tells that it is to end, `rescue` is called before a call is given up, which may bring that
-    back; what comes after all is passed to `discard`. Without `discard` the thread ends as soon as its call
-    returns. Calls are looked at that begin from now on, or `since_s`.
+    """Run `do` in a thread of its own, and wait until it has ended or a call is given up. Errors of `do` are
+    raised here. `stop` says that `do` is to end. `rescue` is called before a call is given up, and may make the
+    call return. A late result is passed to `discard`; without `discard` the thread ends as soon as its call
+    returns. Only calls that begin from now on, or from `since_s` on, are watched.
 
-    Raises DeviceTimeout or StorageError for a call that is given up, and what a signal raises.
+    Raises DeviceTimeout or StorageError for a call that is given up, and the error of a signal.
     """
     since_s = time.monotonic() if since_s is None else since_s
     stopped_s = math.inf
@@ -233,12 +238,12 @@ def run_bounded(
 
 
 NOW = threading.Event()
-"""Event for `stop` of what is done at the end of a session."""
+"""Event that is always set, for `stop` of work at the end of a session."""
 NOW.set()
 
 
 def on_disk(label: str, do: Callable[[], T], work_s: float = 0.0, *, stop: threading.Event | None = None) -> T:
-    """`run_bounded`, for work with files."""
+    """`run_bounded` for work with files."""
 
     def work() -> T:
         with under_way(DISK, label, work_s):
@@ -248,7 +253,7 @@ def on_disk(label: str, do: Callable[[], T], work_s: float = 0.0, *, stop: threa
 
 
 class Workers:
-    """Threads that take work in turn. They keep no process alive, as those of concurrent.futures do."""
+    """Threads that take work in turn. They do not keep a process alive, unlike those of concurrent.futures."""
 
     def __init__(self, count: int, name: str) -> None:
         self._queue: queue.SimpleQueue[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]] | None]
@@ -274,14 +279,15 @@ class Workers:
             del task, future, do, arguments  # they may hold a frame's memory
 
     def end(self) -> None:
-        """Wait until all is done, and end the threads: within a `run_bounded` call, if their work may hang."""
+        """Wait until all work is done, and end the threads. Call this within `run_bounded` if the work may
+        hang."""
         threads = self._threads
         self.end_soon()
         for thread in threads:
             thread.join()
 
     def end_soon(self) -> None:
-        """End the threads once all is done; does not wait for it."""
+        """End the threads once all work is done, without waiting for this."""
         for _ in self._threads:
             self._queue.put(None)
         self._threads = []
@@ -291,17 +297,18 @@ class Workers:
 
 
 def leave_behind(waited_for: threading.Thread | Call) -> None:
-    """This, too, was waited for in vain."""
+    """Note that this thread or call was given up."""
     _LEFT.append(waited_for)
 
 
 def left_behind() -> bool:
-    """Tell whether something that was given up still hangs."""
+    """Tell whether a thread or call that was given up still hangs."""
     return any(leftover in _UNDER_WAY if isinstance(leftover, Call) else leftover.is_alive() for leftover in _LEFT)
 
 
 def leave(code: int) -> NoReturn:
-    """End the process: in order if nothing was left behind; else at once, when all was said that is read."""
+    """End the process: normally if nothing was left behind, otherwise at once, after all messages that can be read
+    are written."""
     if left_behind():
         saying = threading.Thread(target=_flush, daemon=True)
         saying.start()

@@ -8,20 +8,21 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """The rig's clock. On a simulated rig it is the world's, which may run faster or wait."""
+    """The rig's clock. On a simulated rig it is the world's clock, which may run faster or wait."""
 
     def now_ns(self) -> int: ...
 
     def sleep(self, seconds: float, at_most_s: float = math.inf) -> None:
-        """Wait `seconds` on this clock, but no longer than `at_most_s` on the machine's; returns early only if the
-        clock's source is gone."""
+        """Wait `seconds` on this clock, but no longer than `at_most_s` on the machine's clock. Returns early only
+        if the clock's source is gone."""
 
     def hurry(self, until_ns: int) -> None:
-        """Run fast until then, as the caller only waits: a simulated clock may; a real clock ignores this."""
+        """Say that the caller only waits until then. A simulated clock may run fast meanwhile; a real clock
+        ignores this."""
 
 
 class SystemClock:
-    """The clock of a rig of real devices: the machine's monotonic one."""
+    """The clock of a rig of real devices, which is the machine's monotonic clock."""
 
     def now_ns(self) -> int:
         return time.monotonic_ns()
@@ -30,7 +31,7 @@ class SystemClock:
         time.sleep(min(seconds, at_most_s))
 
     def hurry(self, until_ns: int) -> None:
-        """No effect on a real clock."""
+        """Do nothing: this is a real clock."""
 
 
 class Deadline:

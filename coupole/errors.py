@@ -37,7 +37,7 @@ class CoupoleError(Exception):
 
     exit_code = 1
     heading = ""
-    """Line that an operator reads above the message, where that does not say by itself what is the matter."""
+    """Line above the message, for messages that do not say by themselves what has happened."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ class Problem:
     column: int
     """Column, from 1."""
     key: str
-    """Key of the file that it concerns, with those above it; empty for the file as a whole."""
+    """Key of the file that it concerns, with the keys above it; empty for the file as a whole."""
     message: str
-    """Sentence of what was expected, and what was found."""
+    """Sentence that says what was expected, and what was found."""
 
     def __str__(self) -> str:
         place = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
@@ -74,11 +74,11 @@ class InputError(CoupoleError):
 
 
 class FrameDiscarded(InputError):
-    """A frame is asked for whose pixels were discarded when its samples were safe, as its plan said."""
+    """A frame is requested, but its pixels were discarded when its samples were safe, as its plan said."""
 
 
 class ExtraMissing(CoupoleError):
-    """A library that not everybody needs is not installed; the message names the extra that adds it."""
+    """An optional library is not installed; the message names the extra that adds it."""
 
     exit_code = 2
 
@@ -95,7 +95,7 @@ class PreflightRefused(CoupoleError):
 
 
 class DoseBudgetReached(CoupoleError):
-    """The next light would take the object beyond its dose budget; it was not given."""
+    """The next light would exceed the object's dose budget; it was not given."""
 
     exit_code = 3
 
@@ -112,7 +112,7 @@ class CalibrationRefused(CoupoleError):
 
 
 class CommissioningFailed(CoupoleError):
-    """A step of a cell's commissioning did not pass; `reasons` holds what was wrong and what to do."""
+    """A step of a cell's commissioning did not pass; `reasons` says what was wrong and what to do."""
 
     exit_code = 3
 
@@ -147,9 +147,10 @@ class DeviceRefused(DeviceError):
 
 
 class ArmUnattended(DeviceError):
-    """The arm braked on its path because nobody watched its motion; no fault is latched, and it may move again.
+    """The arm braked on its path because nobody watched its motion. No fault is latched, and the arm may move
+    again.
 
-    `silent_s` is for how long nobody looked, on the machine's clock.
+    `silent_s` is the time for which nobody looked, on the machine's clock.
     """
 
     def __init__(self, silent_s: float) -> None:
@@ -168,7 +169,7 @@ class DeviceFault(DeviceError):
 
 
 class UnprovenError(CoupoleError):
-    """Shots are missing or unproven though re-shot up to the plan's limit."""
+    """Shots are missing or unproven, although they were taken again up to the plan's limit."""
 
     exit_code = 5
 
@@ -190,7 +191,7 @@ class ChecksumMismatch(StorageError):
 class Interrupted(CoupoleError):
     """The operator asked to stop, or a signal did; the run can be resumed.
 
-    Exit code 128 + the signal's number, as shells have it: 130 Ctrl-C, 143 SIGTERM, 129 SIGHUP.
+    The exit code is 128 + the signal's number, as in shells: 130 Ctrl-C, 143 SIGTERM, 129 SIGHUP.
     """
 
     exit_code = 128 + signal.SIGINT
@@ -211,12 +212,12 @@ def unsafe_end(what_happened: str, remedy: str = "Look at the cell.") -> DeviceE
 
 
 def reason(error: BaseException) -> str:
-    """Say why something failed: of the system's errors without their numbers."""
+    """Return why something failed, in words; errors of the system are given without their numbers."""
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 def error_as_told(figures: Mapping[str, Any]) -> CoupoleError:
-    """The error that the figures of another process's `--json` tell: `kind`, `error` and `exit_code`."""
+    """Return the error in the figures of another process's `--json`: `kind`, `error` and `exit_code`."""
     kind = globals().get(figures["kind"], CoupoleError)
     error: CoupoleError = kind.__new__(kind)
     Exception.__init__(error, figures["error"])

@@ -1,8 +1,8 @@
-"""Rigid transforms: 4x4 float64, millimetres and degrees; and points that are spread.
+"""Rigid transforms (4x4 float64, millimetres and degrees), and a selection of points that are far apart.
 
-A transform is named after the frames it joins: `base_from_camera` maps camera coordinates to base
-coordinates. KUKA's A, B, C are Euler angles about z, y', x'': R = Rz(A) Ry(B) Rx(C).
-The camera frame has x to the right of the image, y down, z forward (the OpenCV convention).
+A transform is named after its two frames: `base_from_camera` maps camera coordinates to base coordinates. KUKA's
+A, B, C are Euler angles about z, y', x'': R = Rz(A) Ry(B) Rx(C). The camera frame has x to the right of the image,
+y down, z forward (the OpenCV convention).
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Transform = NDArray[np.float64]
-"""4x4, last row 0 0 0 1, translation in mm."""
+"""4x4 matrix with the last row 0 0 0 1; the translation is in mm."""
 
 _GIMBAL_LOCK = 1e-9
 
 
 def rotation_from_abc(a_deg: float, b_deg: float, c_deg: float) -> NDArray[np.float64]:
-    """3x3 rotation of KUKA's A, B, C in degrees: Rz(A) Ry(B) Rx(C)."""
+    """Return the 3x3 rotation for KUKA's A, B, C in degrees: Rz(A) Ry(B) Rx(C)."""
     a, b, c = np.radians([a_deg, b_deg, c_deg])
     ca, sa, cb, sb, cc, sc = np.cos(a), np.sin(a), np.cos(b), np.sin(b), np.cos(c), np.sin(c)
     return np.array(
@@ -32,7 +32,7 @@ def rotation_from_abc(a_deg: float, b_deg: float, c_deg: float) -> NDArray[np.fl
 
 
 def abc_from_rotation(rotation: ArrayLike) -> tuple[float, float, float]:
-    """KUKA's A, B, C in degrees of a 3x3 rotation; at gimbal lock (B = +-90) C is 0."""
+    """Return KUKA's A, B, C in degrees for a 3x3 rotation. At gimbal lock (B = +-90), C is 0."""
     r = np.asarray(rotation, dtype=np.float64)
     cos_b = float(np.hypot(r[0, 0], r[1, 0]))
     b = np.arctan2(-r[2, 0], cos_b)
@@ -44,7 +44,7 @@ def abc_from_rotation(rotation: ArrayLike) -> tuple[float, float, float]:
 
 
 def transform(translation_mm: ArrayLike = (0.0, 0.0, 0.0), abc_deg: ArrayLike = (0.0, 0.0, 0.0)) -> Transform:
-    """4x4 from a translation in mm and KUKA's A, B, C in degrees."""
+    """Return the 4x4 transform for a translation in mm and KUKA's A, B, C in degrees."""
     t = np.eye(4)
     a, b, c = (float(v) for v in np.asarray(abc_deg, dtype=np.float64))
     t[:3, :3] = rotation_from_abc(a, b, c)
@@ -53,7 +53,7 @@ def transform(translation_mm: ArrayLike = (0.0, 0.0, 0.0), abc_deg: ArrayLike = 
 
 
 def inverse(a_from_b: Transform) -> Transform:
-    """`b_from_a`, by transposition: exact for rigid transforms."""
+    """Return `b_from_a`, by transposition, which is exact for rigid transforms."""
     b_from_a = np.eye(4)
     b_from_a[:3, :3] = a_from_b[:3, :3].T
     b_from_a[:3, 3] = -a_from_b[:3, :3].T @ a_from_b[:3, 3]
@@ -61,13 +61,14 @@ def inverse(a_from_b: Transform) -> Transform:
 
 
 def apply(a_from_b: Transform, points_b: ArrayLike) -> NDArray[np.float64]:
-    """Points [..., 3] in mm, from frame b to frame a."""
+    """Map points [..., 3], mm, from frame b to frame a."""
     result: NDArray[np.float64] = np.asarray(points_b, dtype=np.float64) @ a_from_b[:3, :3].T + a_from_b[:3, 3]
     return result
 
 
 def direction(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
-    """Unit vector [3]: azimuth about z from x towards y, elevation above the xy plane, degrees."""
+    """Return the unit vector [3] of a direction, degrees. The azimuth is about z from x towards y, the elevation
+    is above the xy plane."""
     az, el = np.radians(azimuth_deg), np.radians(elevation_deg)
     return np.array([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)])
 
@@ -75,11 +76,11 @@ def direction(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
 def look_at(
     target_mm: ArrayLike, distance_mm: float, azimuth_deg: float, elevation_deg: float, roll_deg: float = 0.0
 ) -> Transform:
-    """`support_from_camera` of a camera whose projection centre is `distance_mm` from the target.
+    """Return `support_from_camera` for a camera whose projection centre is `distance_mm` from the target.
 
     The camera is in direction (azimuth, elevation) from the target and looks at it. The image is upright: the
-    support's z axis points up in it (straight from above, the direction away from the camera's azimuth does).
-    `roll_deg` turns the camera about its optical axis, clockwise as seen from behind it.
+    support's z axis points up in it. For a camera straight above, the direction away from its azimuth points up
+    instead. `roll_deg` turns the camera about its optical axis, clockwise as seen from behind it.
     """
     towards_camera = direction(azimuth_deg, elevation_deg)
     forward = -towards_camera
@@ -96,8 +97,9 @@ def look_at(
 
 
 def farthest_first(points: ArrayLike, first: int) -> Iterator[tuple[int, float]]:
-    """Give the index of each of points [n, d], after `first` always the one that is farthest from all before it,
-    with that distance (infinite for the first). Among equals the lowest index comes first.
+    """Yield the indices of points [n, d] with a distance. The first index is `first`, with an infinite distance.
+    Each further point is the one that is farthest from all points before it, and its distance is that from them.
+    Among equal points the lowest index comes first.
     """
     points_array = np.asarray(points, dtype=np.float64)
     index, distance = first, np.inf
@@ -110,7 +112,7 @@ def farthest_first(points: ArrayLike, first: int) -> Iterator[tuple[int, float]]
 
 
 def rotation_angle_deg(a_from_b: Transform, a_from_c: Transform) -> float:
-    """Angle in degrees between the orientations of frames b and c (accurate also near 0)."""
+    """Return the angle in degrees between the orientations of frames b and c. It is accurate also near 0."""
     r = a_from_b[:3, :3].T @ a_from_c[:3, :3]
     sine = 0.5 * np.linalg.norm([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
     return float(np.degrees(np.arctan2(sine, (np.trace(r) - 1.0) / 2.0)))

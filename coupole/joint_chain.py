@@ -1,9 +1,9 @@
 """A chain of six revolute joints: frames of its links, and inverse kinematics in closed form.
 
-A chain is data: for each joint its origin in the frame of the previous link and the coordinate axis of rotation. A
-link's frame has its origin in the joint and, with all angles 0, is parallel to the base frame. Two structures are
-solved, which nearly all arms with six joints have; `structure_of` identifies a chain's structure and verifies it
-with the forward kinematics.
+A chain is data: for each joint, its origin in the frame of the previous link, and the coordinate axis of rotation.
+A link's frame has its origin in the joint and, with all angles 0, is parallel to the base frame. Two structures
+are solved; nearly all arms with six joints have one of them. `structure_of` identifies a chain's structure and
+verifies it with the forward kinematics.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Vector: TypeAlias = tuple[float, float, float]
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 FLANGE = 7
-"""Number of the flange's frame; 0 is the base's, 1 to 6 are the links'."""
+"""Number of the flange's frame. Frame 0 is the base's, 1 to 6 are the links'."""
 _WRIST_NUDGE_RAD = 1e-3
 _MEETS_MM, _ROUNDING = 1e-6, 1e-9
 _PROOF_DEG = ((20.0, -50.0, 65.0, 25.0, 40.0, -70.0), (-110.0, -130.0, -75.0, -35.0, -55.0, 100.0))
@@ -37,7 +37,7 @@ class JointChain:
     axes: tuple[Axis, ...]
     """Axis of rotation of each joint, right-handed, in its link's frame."""
     link_6_from_flange: tuple[tuple[float, ...], ...]
-    """4x4, row by row, mm."""
+    """4x4 matrix, row by row, mm."""
 
     @cached_property
     def axis_numbers(self) -> tuple[int, ...]:
@@ -46,7 +46,7 @@ class JointChain:
 
     @cached_property
     def senses(self) -> tuple[float, ...]:
-        """1 for each joint whose axis is a positive coordinate axis of its frame, -1 for a negative one."""
+        """Senses of the axes: 1 for a positive coordinate axis of the joint's frame, -1 for a negative one."""
         return tuple(-1.0 if axis[0] == "-" else 1.0 for axis in self.axes)
 
 
@@ -54,9 +54,9 @@ class JointChain:
 class SphericalWrist:
     """Ortho-parallel basis and spherical wrist (OPW): axes 2 and 3 are parallel, axes 4, 5 and 6 meet in a point.
 
-    Lengths as in Brandstoetter, Angerer, Hofbaur: "An Analytical Solution of the Inverse Kinematics Problem of
-    Industrial Serial Manipulators with an Ortho-parallel Basis and a Spherical Wrist" (2014), fig. 2, whose angles
-    are those of the joints, negative where `flip_axes`, minus `offsets_deg`.
+    The lengths are those of Brandstoetter, Angerer, Hofbaur: "An Analytical Solution of the Inverse Kinematics
+    Problem of Industrial Serial Manipulators with an Ortho-parallel Basis and a Spherical Wrist" (2014), fig. 2.
+    The angles there are the joints' angles, negated where `flip_axes` is True, minus `offsets_deg`.
     """
 
     a1_mm: float
@@ -68,12 +68,12 @@ class SphericalWrist:
     c4_mm: float
     offsets_deg: tuple[float, ...]
     flip_axes: tuple[bool, ...]
-    """True where the axis turns opposite to OPW's sense."""
+    """True for an axis that turns opposite to OPW's sense."""
     opw_from_flange: tuple[tuple[float, ...], ...]
-    """4x4: from the flange of the paper, its z axis along axis 6, to the chain's."""
+    """4x4 transform from the paper's flange, whose z axis is along axis 6, to the chain's flange."""
 
     def theta(self, joints_deg: ArrayLike) -> Floats:
-        """The paper's angles [..., 6] in radians."""
+        """Return the paper's angles [..., 6] in radians."""
         joints = np.asarray(joints_deg, dtype=np.float64)
         theta: Floats = np.radians(np.where(self.flip_axes, -joints, joints) - np.asarray(self.offsets_deg))
         return theta
@@ -81,13 +81,13 @@ class SphericalWrist:
 
 @dataclass(frozen=True)
 class ParallelAxes:
-    """Axes 2, 3 and 4 are parallel, 1 meets 2, 4 meets 5 and 5 meets 6, at right angles each: Universal Robots'
-    arms.
+    """Axes 2, 3 and 4 are parallel. Axis 1 meets 2, 4 meets 5 and 5 meets 6, each at right angles. These are
+    Universal Robots' arms.
 
     Lengths and angles are Denavit and Hartenberg's in their standard form, with alpha 90, 0, 0, 90, -90 and 0
-    degrees, with the base at the intersection of axes 1 and 2 and the last frame at that of axes 5 and 6, so that
-    d1 and d6 are 0 (Hawkins, "Analytic Inverse Kinematics for the Universal Robots UR-5/UR-10 Arms", 2013, has the
-    same chain).
+    degrees. The base is at the intersection of axes 1 and 2, and the last frame at the intersection of axes 5 and
+    6, so that d1 and d6 are 0 (Hawkins, "Analytic Inverse Kinematics for the Universal Robots UR-5/UR-10 Arms",
+    2013, has the same chain).
     """
 
     a2_mm: float
@@ -96,12 +96,12 @@ class ParallelAxes:
     d5_mm: float
     senses: tuple[float, ...]
     zeros_rad: tuple[float, ...]
-    """theta = sense * joint angle + zero."""
+    """Zeros of the angles: theta = sense * joint angle + zero."""
     base_from_first: tuple[tuple[float, ...], ...]
     last_from_flange: tuple[tuple[float, ...], ...]
 
     def theta(self, joints_deg: ArrayLike) -> Floats:
-        """Denavit and Hartenberg's angles [..., 6] in radians."""
+        """Return Denavit and Hartenberg's angles [..., 6] in radians."""
         joints = np.radians(np.asarray(joints_deg, dtype=np.float64))
         theta: Floats = np.array(self.senses) * joints + np.array(self.zeros_rad)
         return theta
@@ -111,7 +111,7 @@ Structure: TypeAlias = SphericalWrist | ParallelAxes
 
 
 def link_frames(chain: JointChain, joints_deg: ArrayLike) -> Floats:
-    """`base_from_link` [..., 8, 4, 4] of joint angles [..., 6]: base, the six links, the flange."""
+    """Return `base_from_link` [..., 8, 4, 4] for joint angles [..., 6]: base, the six links, the flange."""
     joints = np.radians(np.array(chain.senses) * np.asarray(joints_deg, dtype=np.float64))
     frames = np.zeros((*joints.shape[:-1], 8, 4, 4))
     frames[..., 0, :, :] = np.eye(4)
@@ -129,7 +129,7 @@ def link_frames(chain: JointChain, joints_deg: ArrayLike) -> Floats:
 
 
 def shoulder_mm(chain: JointChain) -> Floats:
-    """[3] the point of axis 1 nearest to joint 2, in the base frame."""
+    """Return the point [3] of axis 1 that is nearest to joint 2, in the base frame."""
     first, direction = np.array(chain.origins_mm[0]), _directions(chain)[0]
     along: Floats = first + (np.array(chain.origins_mm[1]) @ direction) * direction
     return along
@@ -137,7 +137,7 @@ def shoulder_mm(chain: JointChain) -> Floats:
 
 @lru_cache(maxsize=32)
 def structure_of(chain: JointChain) -> Structure | None:
-    """The chain's solvable structure; None if it has neither."""
+    """Return the chain's solvable structure; None if it has neither."""
     for structure in (_spherical_wrist(chain), _parallel_axes(chain)):
         if structure is not None and all(_solves(structure, chain, joints_deg) for joints_deg in _PROOF_DEG):
             return structure
@@ -145,7 +145,8 @@ def structure_of(chain: JointChain) -> Structure | None:
 
 
 def branches(chain: JointChain, base_from_flange: Transform) -> list[Floats]:
-    """Joint angles [6] in degrees that reach the pose, at most eight, wrapped to +-180, regardless of limits.
+    """Return at most eight sets of joint angles [6] in degrees that reach the pose, wrapped to +-180. Limits are
+    ignored.
 
     Raises ValueError for a chain that `structure_of` does not know.
     """
@@ -174,7 +175,7 @@ def _solves(structure: Structure, chain: JointChain, joints_deg: tuple[float, ..
 
 
 def _directions(chain: JointChain) -> Floats:
-    """[6, 3] axes of rotation with all angles 0."""
+    """Return [6, 3], the axes of rotation with all angles 0."""
     return np.array(chain.senses)[:, None] * np.eye(3)[list(chain.axis_numbers)]
 
 
@@ -182,7 +183,8 @@ def _directions(chain: JointChain) -> Floats:
 
 
 def _spherical_wrist(chain: JointChain) -> SphericalWrist | None:
-    """The lengths of a chain if it is one, read off with all angles 0; not proven yet."""
+    """Return the lengths of a chain if it may have this structure, read off with all angles 0. The structure is
+    not proven yet."""
     if chain.axis_numbers[:3] != (2, 1, 1) or chain.axis_numbers[4] != 1:
         return None
     at, turns = np.cumsum(np.array(chain.origins_mm), axis=0), _directions(chain)
@@ -235,7 +237,7 @@ def _solver(wrist: SphericalWrist) -> Any:
 
 
 def _raw_branches(wrist: SphericalWrist, base_from_opw: Transform) -> Floats:
-    """[8, 6] in degrees, wrapped to +-180, regardless of limits; NaN where a branch does not exist."""
+    """Return [8, 6] in degrees, wrapped to +-180; NaN for a branch that does not exist. Limits are ignored."""
     from py_opw_kinematics import RigidTransform
 
     branches_deg: Floats = _solver(wrist)[0].reach(RigidTransform.from_matrix(base_from_opw)).joints[0]
@@ -243,7 +245,7 @@ def _raw_branches(wrist: SphericalWrist, base_from_opw: Transform) -> Floats:
 
 
 def _branches_of_spherical_wrist(wrist: SphericalWrist, base_from_flange: Transform) -> list[Floats]:
-    """The existing branches [6], plus those that py-opw-kinematics misses when the wrist is stretched."""
+    """Return the existing branches [6], and those that py-opw-kinematics misses when the wrist is stretched."""
     base_from_opw = base_from_flange @ _solver(wrist)[1]
     raw = _raw_branches(wrist, base_from_opw)
     branches_deg = [branch for branch in raw if not np.isnan(branch).any()]
@@ -269,7 +271,8 @@ def _branches_of_spherical_wrist(wrist: SphericalWrist, base_from_flange: Transf
 
 
 def _forearm_rotation(first: float, fore: float) -> Floats:
-    """3x3, Rz(first) Ry(fore): the forearm's orientation by OPW's angles (Brandstoetter 2014, eq. 1 to 5)."""
+    """Return the 3x3 rotation Rz(first) Ry(fore), the forearm's orientation by OPW's angles (Brandstoetter 2014,
+    eq. 1 to 5)."""
     c1, s1, c, s = np.cos(first), np.sin(first), np.cos(fore), np.sin(fore)
     return np.array([[c1 * c, -s1, c1 * s], [s1 * c, c1, s1 * s], [-s, 0.0, c]])
 
@@ -278,7 +281,8 @@ def _forearm_rotation(first: float, fore: float) -> Floats:
 
 
 def _parallel_axes(chain: JointChain) -> ParallelAxes | None:
-    """The lengths of a chain if it is one, read off with all angles 0; not proven yet."""
+    """Return the lengths of a chain if it may have this structure, read off with all angles 0. The structure is
+    not proven yet."""
     at, turns = np.cumsum(np.array(chain.origins_mm), axis=0), _directions(chain)
     numbers = chain.axis_numbers
     if (
@@ -322,9 +326,10 @@ def _parallel_axes(chain: JointChain) -> ParallelAxes | None:
 
 
 def _branches_of_parallel_axes(arm: ParallelAxes, base_from_flange: Transform) -> list[Floats]:
-    """Derived from the chain: n, along axes 2 to 4, is (sin t1, -cos t1, 0) in the first frame; the last frame's
-    origin lies d4 along n; n in the last frame is (sin t5 cos t6, -sin t5 sin t6, cos t5); axis 5 there is
-    (-sin t6, -cos t6, 0); what is left are two links in the plane across n."""
+    """Return the branches, by a derivation from the chain. The vector n, along axes 2 to 4, is (sin t1, -cos t1,
+    0) in the first frame. The last frame's origin lies d4 along n. In the last frame, n is (sin t5 cos t6, -sin t5
+    sin t6, cos t5), and axis 5 is (-sin t6, -cos t6, 0). The rest is a chain of two links in the plane across
+    n."""
     last = inverse(np.array(arm.base_from_first)) @ base_from_flange @ inverse(np.array(arm.last_from_flange))
     rotation, place_mm = last[:3, :3], last[:3, 3]
     out_mm = float(np.hypot(place_mm[0], place_mm[1]))
@@ -362,5 +367,5 @@ def _branches_of_parallel_axes(arm: ParallelAxes, base_from_flange: Transform) -
 
 
 def _rows(matrix: Transform) -> tuple[tuple[float, ...], ...]:
-    """Rounded where only rounding keeps a rotation from ones and zeros."""
+    """Return the rows, rounded if only rounding errors keep the entries of a rotation from ones and zeros."""
     return tuple(tuple(row) for row in matrix.round(13).tolist())

@@ -54,7 +54,7 @@ class Arm:
 
 
 def slowed_arm(arm: Arm, *, speed_fraction: float, acceleration_deg_s2: float, jerk_deg_s3: float) -> Arm:
-    """The same arm with a fraction of its speeds and one acceleration and jerk for all axes."""
+    """Return the same arm with a fraction of its speeds, and with one acceleration and jerk for all axes."""
     return replace(
         arm,
         velocity_deg_s=tuple(v * speed_fraction for v in arm.velocity_deg_s),
@@ -64,16 +64,16 @@ def slowed_arm(arm: Arm, *, speed_fraction: float, acceleration_deg_s2: float, j
 
 
 def forward(arm: Arm, joints_deg: ArrayLike) -> Transform:
-    """`base_from_flange` [..., 4, 4] of joint angles [..., 6]."""
+    """Return `base_from_flange` [..., 4, 4] for joint angles [..., 6]."""
     pose: Transform = joint_chain.link_frames(arm.chain, joints_deg)[..., FLANGE, :, :]
     return pose
 
 
 def link_frames(arm: Arm, joints_deg: ArrayLike) -> NDArray[np.float64]:
-    """`base_from_link` [..., 8, 4, 4] of joint angles [..., 6]: base, the six links, the flange.
+    """Return `base_from_link` [..., 8, 4, 4] for joint angles [..., 6]: base, the six links, the flange.
 
-    A link's frame has its origin in its joint and, with all angles 0, is parallel to the base frame; the flange's
-    is that of `forward`.
+    A link's frame has its origin in its joint and, with all angles 0, is parallel to the base frame. The flange's
+    frame is that of `forward`.
     """
     return joint_chain.link_frames(arm.chain, joints_deg)
 
@@ -84,11 +84,11 @@ def structure_of(arm: Arm) -> SphericalWrist | ParallelAxes | None:
 
 
 def inverse(arm: Arm, base_from_flange: Transform) -> NDArray[np.float64]:
-    """All joint angles [k, 6] within the limits that reach the pose; k is 0 where there are none.
+    """Return all joint angles [k, 6] within the limits that reach the pose; k is 0 if there are none.
 
-    Full turns of an axis within its limits count as separate solutions. With the wrist stretched two axes are
-    parallel: of the family of solutions one is given, with A4 = 0 of a spherical wrist, with A6 = 0 of an arm with
-    three parallel axes. Raises ValueError for an arm without `structure_of`.
+    Full turns of an axis within its limits count as separate solutions. With the wrist stretched, two axes are
+    parallel, and there is a family of solutions. One of them is given: with A4 = 0 for a spherical wrist, with A6
+    = 0 for an arm with three parallel axes. Raises ValueError for an arm without `structure_of`.
     """
     solutions = [
         angles_deg
@@ -99,8 +99,8 @@ def inverse(arm: Arm, base_from_flange: Transform) -> NDArray[np.float64]:
 
 
 def nearest(arm: Arm, solutions_deg: ArrayLike, from_joints_deg: ArrayLike) -> NDArray[np.float64]:
-    """The solution [6] that is reached first at the joint speed limits; of equally fast ones (1 ms), the one
-    farthest from its limits.
+    """Return the solution [6] that is reached first at the joint speed limits. If several are equally fast (within
+    1 ms), it is the one farthest from its limits.
 
         Raises ValueError if there is no solution: check with `unreachable_reason` first.
     """
@@ -114,7 +114,7 @@ def nearest(arm: Arm, solutions_deg: ArrayLike, from_joints_deg: ArrayLike) -> N
 
 
 def limit_margin_deg(arm: Arm, joints_deg: ArrayLike) -> NDArray[np.float64]:
-    """Degrees [...] between joint angles [..., 6] and the nearest limit; negative outside."""
+    """Return the degrees [...] between joint angles [..., 6] and the nearest limit; negative outside."""
     joints = np.asarray(joints_deg, dtype=np.float64)
     low, high = np.array(arm.limits_deg).T
     margin: NDArray[np.float64] = np.minimum(joints - low, high - joints).min(axis=-1)
@@ -127,7 +127,7 @@ def within_limits(arm: Arm, joints_deg: ArrayLike) -> bool:
 
 
 def limit_violations(arm: Arm, joints_deg: ArrayLike) -> str:
-    """Say which axes of [6] are out of their limits, as a phrase for messages; empty if none is."""
+    """Return the axes of [6] that are out of their limits, as a phrase for messages; empty if there are none."""
     phrases = [
         f"A{axis} would be {angle:.3f} deg, its limits are {low:g} to {high:g} deg"
         for axis, (angle, (low, high)) in enumerate(
@@ -139,7 +139,7 @@ def limit_violations(arm: Arm, joints_deg: ArrayLike) -> str:
 
 
 def unreachable_reason(arm: Arm, base_from_flange: Transform) -> str:
-    """Say why `inverse` finds nothing, as a phrase for messages; empty if it finds something.
+    """Return why `inverse` finds nothing, as a phrase for messages; empty if it finds something.
 
     Among solutions with axes out of their limits, the one with the least excess is reported.
     """
@@ -160,18 +160,18 @@ def unreachable_reason(arm: Arm, base_from_flange: Transform) -> str:
 
 
 def move_duration_s(arm: Arm, from_joints_deg: ArrayLike, to_joints_deg: ArrayLike) -> float:
-    """`move_durations_s` of one motion."""
+    """Return the `move_durations_s` of one motion."""
     return float(move_durations_s(arm, from_joints_deg, to_joints_deg))
 
 
 def move_durations_s(arm: Arm, from_joints_deg: ArrayLike, to_joints_deg: ArrayLike) -> NDArray[np.float64]:
-    """Durations [...] of jerk-limited motions from rest to rest on straight lines in joint space [..., 6], as fast
-    as the axes that limit them allow: the profile that the driver uses.
+    """Return the durations [...] of jerk-limited motions from rest to rest on straight lines in joint space [...,
+    6]. The motions are as fast as the slowest axis allows, with the profile that the driver uses.
 
     The profile is symmetric: speed is gained for `ramp_s`, kept, and lost as it was gained. A distance d at the
-    highest speed v then takes d / v + ramp_s(v), with ramp_s(v) = v / a + a / j where the acceleration a is
-    reached and 2 sqrt(v / j) where it is not (Biagiotti, Melchiorri, "Trajectory Planning for Automatic Machines
-    and Robots", 2008, sec. 3.4). Distances count in whole motions: d is 1.
+    highest speed v then takes d / v + ramp_s(v). Here ramp_s(v) is v / a + a / j if the acceleration a is reached,
+    and 2 sqrt(v / j) otherwise (Biagiotti, Melchiorri, "Trajectory Planning for Automatic Machines and Robots",
+    2008, sec. 3.4). Distances are measured in units of the whole motion, so d is 1.
     """
     way_deg = np.abs(np.asarray(to_joints_deg, dtype=np.float64) - np.asarray(from_joints_deg))
     share_of_deg = 1.0 / np.maximum(way_deg, 1e-9)
@@ -192,7 +192,7 @@ def move_durations_s(arm: Arm, from_joints_deg: ArrayLike, to_joints_deg: ArrayL
 
 
 def _turns(angle_deg: float, limits: tuple[float, float]) -> list[float]:
-    """The same angle in all turns that the limits allow."""
+    """Return the same angle in all turns that the limits allow."""
     return [
         angle_deg + turn
         for turn in (-360.0, 0.0, 360.0)

@@ -1,9 +1,9 @@
-"""Times for which the arm may move, and lamps may shine, without news of whoever supervises them.
+"""Times for which the arm may move, and lamps may shine, without news from their supervisor.
 
-An arm or a lamp is never left alone by something that merely *stops*: a frozen process, a hung call, a cable. So
-whoever moves or shines hears a beat of whoever watches, and makes itself safe when the beats end. A beat comes
-from the supervising thread itself, when it has looked at the arm; a helper thread, which would live on beside a
-hung one, never beats for it. The chain, from the arm backwards:
+A moving arm or a lit lamp never depends on a single process that may simply *stop*, such as a frozen process, a
+hung call or a cut cable. So each moving or shining part receives beats from its supervisor, and makes itself safe
+when the beats end. The supervising thread itself gives a beat, when it has looked at the arm. A helper thread
+never gives the beat, because it would live on beside a hung thread. The chain, from the arm backwards:
 
 ======================  =====================================  ======================  ==========================
 moves or shines         beaten by                              silent for at most      then
@@ -20,10 +20,10 @@ the LED box             the session, by any command            the rig's `watchd
 children of a session   their parent's life                    0.05 s                  they brake and end
 ======================  =====================================  ======================  ==========================
 
-All of these are times of the machine's monotonic clock, whatever the rig's clock does. A motion is watched from
-its command until its axes are at rest. After a freeze of `ASKS_FROM_S` a person is asked; after a shorter one,
-or a lapse that a busy machine explains, the session goes on along the checked path by itself.
-docs/reference/safety.md has the table.
+All these times are on the machine's monotonic clock, whatever the rig's clock does. A motion is watched from its
+command until its axes are at rest. After a freeze of `ASKS_FROM_S` a person is asked. After a shorter freeze, or a
+lapse that a busy machine explains, the session goes on along the checked path by itself. docs/reference/safety.md
+has the table.
 """
 
 from __future__ import annotations
@@ -36,11 +36,13 @@ ATTENTION_S = 0.1
 LOOK_S = 0.02
 """The supervisor of a moving arm checks it again after at most this time, on the machine's clock."""
 ASKS_FROM_S = 1.0
-"""A process that did not run for so long was frozen, or its machine slept: a person decides whether to go on."""
+"""A process that did not run for this time was frozen, or its machine slept. A person then decides whether to go
+on."""
 HEARD_WITHIN_S = 0.5
-"""A freeze is heard of (SIGCONT) within this time after it runs again."""
+"""A process that runs again after a freeze learns of the freeze (SIGCONT) within this time."""
 ASKS_AFTER_LAPSE_S = 5.0
-"""The same for a lapse of attention that nothing explains: a busy machine, or a call that took its time."""
+"""A person also decides after a lapse of attention of this length that is not a freeze: the machine was busy, or a
+call took long."""
 _LISTENED_NS = 100_000_000
 
 
@@ -53,8 +55,8 @@ class Silence:
         self._silent_ns = 0
 
     def after(self, beat: int) -> float:
-        """Seconds since the last new beat, `beat` being the latest. A gap between two calls counts at most 0.1 s:
-        a listener that was frozen, or whose machine slept, has not listened."""
+        """Return the seconds since the last new beat; `beat` is the latest one. A gap between two calls counts as
+        at most 0.1 s, because a listener that was frozen, or whose machine slept, has not listened."""
         now_ns = time.monotonic_ns()
         gap_ns, self._heard_ns = now_ns - self._heard_ns, now_ns
         waits = beat == self._beat != 0  # 0: it has not begun
@@ -64,10 +66,11 @@ class Silence:
 
 
 class Attention:
-    """The beats of the thread that watches a motion, on the watching side: `drivers` give one to each arm.
+    """The beats of the thread that watches a motion, on the watching side. `drivers` give each arm one such
+    object.
 
-    The watching thread is the one that began the motion. Its gaps are measured where it looks; whether a motion
-    was ended for one is decided where the motion is made.
+    The watching thread is the one that began the motion. Its gaps are measured here, where it looks. The part that
+    makes the motion decides whether a gap ends the motion.
     """
 
     def __init__(self) -> None:
@@ -76,13 +79,13 @@ class Attention:
         self._longest_ns = 0
 
     def begin(self) -> int:
-        """This thread commands a motion, and watches it from now on; the time of this beat, ns."""
+        """Begin to watch a motion that this thread commands. Return the time of this beat, ns."""
         self._thread, self._longest_ns = threading.get_ident(), 0
         self._looked_ns = time.monotonic_ns()
         return self._looked_ns
 
     def look(self) -> int | None:
-        """The time of a beat, ns, to be passed on; None in any other thread than the one that watches."""
+        """Return the time of a beat, ns, to be passed on; None in a thread that does not watch the motion."""
         if threading.get_ident() != self._thread:
             return None
         now_ns = time.monotonic_ns()
@@ -91,7 +94,7 @@ class Attention:
         return now_ns
 
     def longest_gap_s(self) -> float:
-        """Longest time between two looks of the motion under way, or of the last one; asked for by the thread that
-        watches, this is a look: it may have been frozen since the last one."""
+        """Return the longest time between two looks at the present or last motion. A call from the watching thread
+        is also a look, because the thread may have been frozen since the last one."""
         self.look()
         return self._longest_ns / 1e9

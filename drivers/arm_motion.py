@@ -1,4 +1,4 @@
-"""Parts that the arm drivers share: checks of targets, stopping times and angles, waiting, age of the last
+"""Functions that the arm drivers share: checks of targets, stopping times and angles, waiting, age of the last
 message.
 
 Angles are degrees of the arm's six axes; speeds, accelerations and jerks are of the same axes.
@@ -20,19 +20,19 @@ _LIMIT_TOLERANCE_DEG = 1e-9
 
 
 def refusal(expectation: str, observation: str) -> DeviceRefused:
-    """The error of a motion that is refused, or of a wait for it."""
+    """Return the error for a refused motion, or for a wait for it."""
     return DeviceRefused("robot", expected=expectation, happened=observation, remedy="Ask for another pose")
 
 
 def overtaken() -> DeviceRefused:
-    """The error of a wait for a motion that another command has ended."""
+    """Return the error for a wait that another command has ended."""
     return refusal("the arm to continue to its target", "another command ended the motion")
 
 
 def checked_target(
     joints_deg: ArrayLike, limits_deg: Sequence[tuple[float, float]]
 ) -> tuple[float, float, float, float, float, float]:
-    """Six finite angles within the limits of each axis; raises DeviceRefused, which names the axes."""
+    """Return six finite angles within the limits of each axis. Raises DeviceRefused, which names the axes."""
     target = np.asarray(joints_deg, dtype=np.float64)
     if target.shape != (6,) or not np.all(np.isfinite(target)):
         raise refusal("six finite joint angles in degrees", f"got {joints_deg!r}")
@@ -48,23 +48,24 @@ def checked_target(
 
 
 def checked_speed(speed: float) -> float:
-    """A share of the driver's speeds; raises DeviceRefused for any other number."""
+    """Return a share of the driver's speeds. Raises DeviceRefused for any other number."""
     if not 0.0 < speed <= 1.0:
         raise refusal("a speed above 0, at most 1, as a share of the arm's", f"got {speed!r}")
     return float(speed)
 
 
 def longest_stop_s(velocity_deg_s: Sequence[float], acceleration_deg_s2: float, jerk_deg_s3: float) -> float:
-    """Longest time that any axis needs to come to rest: v/a, and twice a/jerk to build it up."""
+    """Return the longest time that any axis needs to come to rest: v/a, and twice a/jerk for the rise of the
+    deceleration."""
     return max(velocity_deg_s) / acceleration_deg_s2 + 2.0 * acceleration_deg_s2 / jerk_deg_s3
 
 
 def farthest_stop_deg(
     velocity_deg_s: Sequence[float], acceleration_deg_s2: float, jerk_deg_s3: float, delay_s: float
 ) -> NDArray[np.float64]:
-    """Largest angle that each axis [6] can turn after a stop command: highest speed times braking time.
+    """Return the largest angle that each axis [6] can turn after a stop command: highest speed times braking time.
 
-    To brake from speed v takes v/a + a/j, at half the speed on average; an axis that is still accelerating needs
+    Braking from speed v takes v/a + a/j, at half the speed on average. An axis that is still accelerating needs
     a/j before that. All axes take the time of the slowest one. `delay_s`, from the call until the arm begins to
     brake, is added.
     """
@@ -108,7 +109,7 @@ def wait_for(
 
 
 class MessageTime:
-    """Rig time of the controller's latest message; it stays as it is while no message comes."""
+    """Rig time of the controller's latest message. It does not change while no message comes."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -116,7 +117,7 @@ class MessageTime:
         self._since_ns = 0
 
     def since_ns(self, count: int) -> int:
-        """Rig time at which the message count was first seen to be `count`."""
+        """Return the rig time at which the message count was first found to be `count`."""
         if count != self._count:
             self._count, self._since_ns = count, self._clock.now_ns()
         return self._since_ns

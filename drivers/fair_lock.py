@@ -9,7 +9,8 @@ from types import TracebackType
 class FairLock:
     """A waiting thread gets the lock before the thread that has just released it can take it again.
 
-    With a plain lock, a thread that polls a device without pause could starve the others. Not re-entrant.
+    With a plain lock, a thread that polls a device without pause could starve the others. The lock is not
+    re-entrant.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Needs of drivers of the machine that they run on, looked at without touching a device."""
+"""Drivers' needs of the machine on which they run, checked without touching a device."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from pathlib import Path
 from coupole.devices import HostNeed
 
 LEAST_RECEIVE_BUFFER_BYTES = 32 * 2**20
-"""A frame of 12 megapixels, packed, as packets of 1500 bytes occupy the kernel's memory."""
+"""Least receive buffer: the kernel's memory for a packed frame of 12 megapixels in packets of 1500 bytes."""
 _RECEIVE_LIMIT = Path("/proc/sys/net/core/rmem_max")
 _HUGE_PAGES = Path("/sys/kernel/mm/transparent_hugepage/enabled")
 
 
 def serial_port(port: str) -> list[HostNeed]:
-    """A port of the machine: it is there, and this user may use it. Nothing for addresses as `socket://`."""
+    """Check a port of the machine: it exists, and this user may use it. Addresses such as `socket://` have no
+    needs."""
     if "://" in port or port.startswith("usbtmc:"):
         return []
     path, what = Path(port), f"serial port {port}"
@@ -81,8 +82,8 @@ def folder_of_pictures(path: Path) -> HostNeed:
 
 
 def own_address(address: str, *, kind: socket.SocketKind) -> list[HostNeed]:
-    """An address host:port at which a driver listens: this machine has it, and the port is free. Nothing for port
-    0, which any free port serves."""
+    """Check an address host:port at which a driver listens: this machine has it, and the port is free. Port 0 has
+    no needs, because any free port serves."""
     host, port = address.rsplit(":", 1)
     if port == "0":
         return []
@@ -100,7 +101,7 @@ def own_address(address: str, *, kind: socket.SocketKind) -> list[HostNeed]:
 
 
 def receive_buffer() -> HostNeed:
-    """The kernel's limit for a socket that receives frames."""
+    """Check the kernel's limit for a socket that receives frames."""
     limit_bytes, least = _number(_RECEIVE_LIMIT), f"{LEAST_RECEIVE_BUFFER_BYTES >> 20} MB"
     remedy = "Run `sudo sysctl -w net.core.rmem_max=67108864` (and write it into /etc/sysctl.d)."
     return HostNeed(
@@ -113,7 +114,7 @@ def receive_buffer() -> HostNeed:
 
 
 def huge_pages() -> HostNeed:
-    """Transparent huge pages for buffers of frames."""
+    """Check transparent huge pages for buffers of frames."""
     try:
         words = _HUGE_PAGES.read_text()
     except OSError:

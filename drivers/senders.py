@@ -1,4 +1,4 @@
-"""Whom a driver that waits for its controller takes for it."""
+"""Rules for the sender that a waiting driver accepts as its controller."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def only_here(address: str) -> bool:
 
 
 def refuse_anybody(address: str, controller: object, any_controller_by: str) -> None:
-    """Raises ValueError where other machines can reach `address`, no controller is named, and nobody has taken
-    that upon themselves."""
+    """Raises ValueError if other machines can reach `address`, no controller is named, and nobody has taken
+    responsibility for this."""
     if not (only_here(address) or controller or any_controller_by):
         raise ValueError(
             f"expected `controller`, the address of the arm's controller: at {address} the first sender would be "

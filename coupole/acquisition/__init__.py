@@ -1,1 +1,2 @@
-"""Runs a schedule: moves the arm to each view, runs bursts, proves frames while a burst runs, and records them."""
+"""Runs a schedule: moves the arm to each view, runs the bursts, proves and records the frames of each burst as it
+runs."""

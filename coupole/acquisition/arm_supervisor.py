@@ -28,7 +28,7 @@ from coupole.supervision import ASKS_AFTER_LAPSE_S, LOOK_S
 
 _POLL_S = 0.01
 _SPEED_OVER_NS = 30_000_000
-"""Least time between two readings for the axes' speeds: some cycles of any controller."""
+"""Least time between the two readings that give the axes' speeds. It is several cycles of any controller."""
 _NEWS_S = 1.0
 _SPRING_BACK_S = 2.0
 """Time that a pushed arm has to come back by itself."""
@@ -47,7 +47,7 @@ class SettledPose:
 
 
 class ArmSupervisor:
-    """One session's motions. Every method that waits can be ended by the operator's stop or a fault of the arm."""
+    """One session's motions. The operator's stop or a fault of the arm ends every method that waits."""
 
     def __init__(
         self,
@@ -59,8 +59,8 @@ class ArmSupervisor:
         stand: Callable[[], None] | None = None,
         tell_lapse: Callable[[str], None] = lambda message: None,
     ) -> None:
-        """`stand` waits until a person lets a session that is held go on; without it what held a motion is raised.
-        `tell_lapse` is called for a motion that was braked because it was not checked.
+        """`stand` waits until a person lets a held session go on. Without `stand`, the error that held a motion is
+        raised. `tell_lapse` is called when a motion was braked because this process did not check it.
         """
         self._stand, self._tell_lapse = stand, tell_lapse
         self._rig, self._robot, self._clock, self._control = rig, cell.robot, cell.clock, control
@@ -72,13 +72,14 @@ class ArmSupervisor:
         """Joint angles at which the next leg begins."""
         speeds_deg_s = np.array(self._arm.velocity_deg_s)
         self._stopping_s = float((self._robot.stopping_deg() / speeds_deg_s).max())
-        """Time within which the arm comes to rest from its highest speed, s; from lower speeds sooner."""
+        """Time within which the arm comes to rest from its highest speed, s. From lower speeds it takes less
+        time."""
         self._before: ArmState | None = None
         """An earlier reading during a motion, for the axes' speeds."""
         self._latest_deg_s = np.zeros(6)
 
     def itinerary(self, views: Sequence[ViewPose]) -> Itinerary:
-        """Paths to views from the arm's actual posture. Raises PreflightRefused if there is none."""
+        """Return the paths to views from the arm's actual posture. Raises PreflightRefused if there is no path."""
         self.begin_here()
         itinerary = self._paths.itinerary(views, self._from_deg.tolist())
         if itinerary.refusals:
@@ -86,7 +87,7 @@ class ArmSupervisor:
         return itinerary
 
     def begin_here(self) -> Joints:
-        """The next leg begins where the arm stands; returns its joint angles."""
+        """Let the next leg begin where the arm is now; return its joint angles."""
         self._from_deg = np.array(self._robot.measured().joints_deg)
         return self._from_deg
 
@@ -99,8 +100,9 @@ class ArmSupervisor:
         the error is raised at once, while the arm still moves: the caller stops it. `speed`: share of the arm's
         speeds.
 
-        A motion that was braked because this thread did not look at it, or that is held, goes on from where it
-        stands on its checked line: by itself after a short lapse, by a person's word after all else."""
+        A motion may be held, or braked because this thread did not look at it. The arm then goes on from where it
+        is, along its checked line. After a short lapse it goes on by itself; in all other cases a person must
+        confirm."""
         self._settled = None
         path = (self._from_deg, *visit.leg.waypoints)
         from_deg, allowed_path, when = path[0], path, "before it started"
@@ -135,8 +137,8 @@ class ArmSupervisor:
             raise ArmUnattended(arm.unattended_s)
 
     def _stand_after(self, error: Exception) -> None:
-        """The motion was braked, or is to be: come to rest, then wait for a person unless the lapse was short.
-        Other errors are raised.
+        """Bring the arm to rest after a motion was braked or must be; then wait for a person unless the lapse was
+        short. Other errors are raised.
         """
         lapse_s = error.silent_s if isinstance(error, ArmUnattended) else 0.0
         if self._control.stop.is_set() or not (self.was_held(error) or lapse_s):
@@ -155,8 +157,8 @@ class ArmSupervisor:
             self._stand()
 
     def was_held(self, error: BaseException) -> bool:
-        """Tell whether this error came because the session is to stand (`Control.stands`). While that is not known
-        yet, lights go off and the arm stops first."""
+        """Tell whether this error came because the session is being held (`Control.stands`). While this is not
+        known yet, the lights are switched off and the arm is stopped first."""
         if not isinstance(error, DeviceError):
             return isinstance(error, Held)
         if self._control.awaits_word:
@@ -166,7 +168,8 @@ class ArmSupervisor:
     def await_return(self, moved_error: ArmMovedError) -> SettledPose:
         """Wait after a push for the arm to spring back by itself; return the newly measured pose.
 
-        Raises DeviceFault if it does not: then only a person may say that it can move again.
+        Raises DeviceFault if it does not spring back. In that case only a person may say that the arm can move
+        again.
         """
         assert self._settled is not None
         deadline = Deadline(self._clock, _SPRING_BACK_S)
@@ -183,8 +186,8 @@ class ArmSupervisor:
         )
 
     def heard_at_rest(self) -> int:
-        """Time of the arm's last reading, on the rig's clock; raises ArmMovedError if the arm is not at its
-        measured posture."""
+        """Return the time of the arm's last reading, on the rig's clock. Raises ArmMovedError if the arm is not at
+        its measured posture."""
         assert self._settled is not None
         arm = self._checked_state()
         off_deg = self._off_deg(arm)
@@ -208,11 +211,11 @@ class ArmSupervisor:
         return self._robot.measured()
 
     def hurry(self, seconds: float) -> None:
-        """The caller only waits for these seconds: the clock of a dry run may run fast."""
+        """Say that the caller only waits for these seconds. The clock of a dry run may then run fast."""
         self._clock.hurry(self._clock.now_ns() + int(max(0.0, seconds) * 1e9))
 
     def _off_deg(self, arm: ArmState) -> float:
-        """Largest distance of an axis from its settled place."""
+        """Return the largest angle between an axis and its settled place."""
         assert self._settled is not None
         return float(np.abs(np.subtract(arm.joints_deg, self._settled.arm.joints_deg)).max())
 
@@ -229,7 +232,8 @@ class ArmSupervisor:
         return arm
 
     def _keep_to(self, path: Sequence[Joints], arm: ArmState, when: str) -> None:
-        """Stop the arm if, stopped now, it would come to rest off its path by more than the tolerance."""
+        """Stop the arm if it is too far off its path: a stop now would end farther from the path than the
+        tolerance."""
         off_mm = deviation_at_rest_mm(
             path,
             np.array(arm.joints_deg),
@@ -250,8 +254,8 @@ class ArmSupervisor:
         )
 
     def _speeds_deg_s(self, arm: ArmState) -> NDArray[np.float64]:
-        """[6] between two readings, so far apart that their rounding and the network's delays do not matter; 0
-        before the second one."""
+        """Return the speeds [6] between two readings; 0 before the second reading. The two are so far apart in
+        time that rounding and delays of the network do not matter."""
         before = self._before
         if before is None:
             self._before, self._latest_deg_s = arm, np.zeros(6)

@@ -31,7 +31,7 @@ from coupole.viewing.progress import Outcome
 
 _POLL_S = 0.05
 _STALL_S = 5.0
-"""A box that logs no step for a step's duration plus this has stopped."""
+"""Time beyond the duration of a step. A box that logs no step for longer than this has stopped."""
 _LAST_STRETCH_S = 0.3
 """The last part of a burst runs in real time, so that a host that fell behind in a dry run catches up."""
 _BOX_JITTER_US = 20.0
@@ -87,7 +87,7 @@ class BurstRunner:
         """Durations of the bursts, from the start to the last proof of each, on the rig's clock."""
 
     def end(self) -> None:
-        """No more bursts come: end the thread that uploads tables, once it is done. Does not wait for it."""
+        """End the thread that uploads tables, once it is done: no more bursts come. Does not wait for it."""
         self._uploader.end_soon()
 
     def exposure(self, burst: Burst) -> Exposure:
@@ -95,7 +95,7 @@ class BurstRunner:
         return Exposure(burst.timing.exposure_us, self._gain_db, burst.hardware)
 
     def prepare(self, burst: Burst) -> None:
-        """Begin to upload the burst's table, in another thread: the arm is watched meanwhile."""
+        """Begin to upload the burst's table in another thread, so that the arm is watched meanwhile."""
         if burst.hardware:
             box = table_box(self._cell.ledbox)
             self._upload = self._uploader.submit(box.load, burst.table)
@@ -107,13 +107,14 @@ class BurstRunner:
             upload.result()
 
     def forget_upload(self) -> None:
-        """Lights were switched off, which ends an upload: `fire` uploads anew."""
+        """Forget the upload: the lights were switched off, which ends an upload. `fire` uploads the table
+        again."""
         upload, self._upload = self._upload, None
         if upload is not None:
             futures.wait([upload], timeout=_STALL_S)
 
     def _await_upload(self) -> None:
-        """Wait with an eye on the arm until the table is in the box. Raises the error of the upload."""
+        """Wait until the table is in the box, and watch the arm meanwhile. Raises the error of the upload."""
         while self._upload is not None:
             self._arm.attend()
             if futures.wait([self._upload], timeout=_POLL_S).done:
@@ -259,7 +260,7 @@ class BurstRunner:
                 running.proven.add(frame)
 
     def _see_marks(self, running: _RunningBurst) -> None:
-        """Show the recorder the marks without a label, which are not kept."""
+        """Show the recorder the frames of marks that have no label. These frames are not kept."""
         steps = running.match.step_of_frame if running.match is not None else ()
         for frame, row in enumerate(steps):
             step = int(running.log[row]["step"]) if row != UNLABELLED else UNLABELLED
@@ -293,9 +294,9 @@ class BurstRunner:
         )
 
     def _dark_ns(self, running: _RunningBurst) -> int:
-        """Return the time until which the burst may have given light. This is now, or the time when the box had
-        switched all off before, as it does when somebody suspends the program. An answer to a call that was made
-        before the table ran says nothing of it."""
+        """Return the time until which the burst may have given light. This time is now. It is earlier if the box
+        has already switched all lights off, for example because somebody suspended the program. A call that was
+        made before the table ran does not count."""
         since_ns, now_ns = running.runs_since_ns, self._cell.clock.now_ns()
         offs = self._cell.switched_off_ns if since_ns is not None else ()
         return next((dark_ns for told_ns, dark_ns in offs if told_ns >= (since_ns or 0)), now_ns)
@@ -311,7 +312,7 @@ class BurstRunner:
         panel_s: float,
         **figures: Any,
     ) -> None:
-        """Count the burst's light, and write its line in the journal before the ledger has it."""
+        """Count the burst's light. Write it to the journal first, then to the ledger."""
         given_lux_h = self._dose.count(burst, log, table_ran_s=table_ran_s, panel_s=panel_s)
         self._recorder.note(
             BurstEnded(

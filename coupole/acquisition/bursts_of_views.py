@@ -32,7 +32,8 @@ class BurstsOfViews:
         self._frames: dict[int, int] = {}
         """Frames of each view, as far as they are chosen."""
         self._boards = BoardHeat(job.cell.rig.led_limits, job.cell.leds)
-        """Boards after the session's chosen bursts; moves and waits, in which they cool, are left out."""
+        """Heat of the boards after the session's chosen bursts. Moves and waits, in which the boards cool, are not
+        counted."""
         recorder.sample_frames(is_wanted=self._chooser is not None)
 
     def bursts(self, number: int) -> tuple[Burst, ...]:
@@ -42,7 +43,7 @@ class BurstsOfViews:
         return chosen_bursts(self._open_view(number), self._choices_of(number))
 
     def bursts_left(self, number: int) -> list[Burst]:
-        """The bursts with unproven frames, reduced to these."""
+        """Return the bursts with unproven frames. Each contains only these frames."""
         return schedule.bursts_left(self.bursts(number), self._recorder.proven())
 
     def may_want_more(self, number: int) -> bool:
@@ -50,11 +51,12 @@ class BurstsOfViews:
         return self._chooser is not None and not has_enough(self._choices_of(number))
 
     def bound(self, number: int) -> tuple[Burst, ...]:
-        """Bursts that cost at least as much as all bursts of a view."""
+        """Return bursts that cost at least as much as all bursts of a view."""
         return self._job.schedule.bursts[number] if self.may_want_more(number) else self.bursts(number)
 
     def expected_frames(self, number: int) -> int:
-        """Frames that a view gets, as far as it is known; one of each LED, and marks, if nothing is chosen yet."""
+        """Return the frames that a view gets, as far as this is known. If nothing is chosen yet, it is one frame
+        for each LED, and marks."""
         if self._chooser is None or self._choices_of(number):
             return self._frames.get(number) or self._frames.setdefault(number, _frames(self.bursts(number)))
         return len(self._open_view(number).burst(0).labels)
@@ -64,8 +66,8 @@ class BurstsOfViews:
         return _frames(self.bound(number))
 
     def more(self, number: int) -> list[Burst]:
-        """The next bursts of a view all of whose bursts were fired; none if it has enough. The choice is on the
-        disk when this returns. Raises RuntimeError if it exceeds the view's bound."""
+        """Return the next bursts of a view, after all its known bursts were fired; none if the view has enough.
+        The choice is on the disk when this returns. Raises RuntimeError if it exceeds the view's bound."""
         if self._chooser is None or not self.may_want_more(number):
             return []
         view, choices = self._open_view(number), self._choices_of(number)
@@ -91,8 +93,8 @@ class BurstsOfViews:
         return self._choices.setdefault(self._job.schedule.views[number].name, [])
 
     def _cool(self, bursts: list[Burst]) -> list[Burst]:
-        """The same bursts, slowed down if boards would get too hot after what this session has lit: LEDs that are
-        chosen may lie together on one board."""
+        """Return the same bursts, slowed down if boards would get too hot after the light of this session so far.
+        Chosen LEDs may all be on one board."""
         for duty in (1.0, *LED_DUTIES):
             cool_bursts, boards = [_at_duty(burst, duty) for burst in bursts], deepcopy(self._boards)
             boards.light(cool_bursts)
@@ -107,7 +109,7 @@ def _frames(bursts: Iterable[Burst]) -> int:
 
 
 def _at_duty(burst: Burst, duty: float) -> Burst:
-    """The burst with an LED lit for at most that share of a step."""
+    """Return the burst with its LEDs lit for at most this share of a step."""
     period_us = int(np.ceil(burst.timing.on_us / duty))
     if period_us <= burst.timing.period_us:
         return burst

@@ -1,10 +1,11 @@
 """Marks of cells whose devices a process has open, in the user's runtime folder.
 
-A mark is a lock of an open file (`F_OFD_SETLK` of Linux): it ends with its process, however that ends. A process
-that only asks queries the lock (`F_OFD_GETLK`) and never takes it, so a session can always mark its cell.
+A mark is a lock of an open file (`F_OFD_SETLK` of Linux). It ends with its process, however the process ends. A
+process that only asks queries the lock (`F_OFD_GETLK`) and never takes it, so a session can always mark its cell.
 
-There is one for each place of the cell's arm (`coupole.plan.controller_places`): rigs that name the same
-controller exclude each other. Sessions that have a simulated world each share no device, and do not.
+There is one mark for each place of the cell's arm (`coupole.plan.controller_places`). So rigs that name the same
+controller exclude each other. Sessions with simulated worlds of their own share no device, and do not exclude each
+other.
 """
 
 from __future__ import annotations
@@ -38,8 +39,9 @@ _GRACE_S, _NAP_S = 2.0, 0.01
 def in_use(cell: Cell) -> Iterator[None]:
     """Mark the cell as in use: while the context lasts, `is_in_use` is true of it.
 
-    Raises InputError: another session has the devices of a cell that one session can have; StorageError: it cannot
-    be marked, so that others would not know. A session that has a world of its own does without.
+    Raises InputError if another session has the devices of a cell that only one session can have. Raises
+    StorageError if the cell cannot be marked, because others would not know of this session. A session with a
+    world of its own needs no mark.
     """
     alone = _alone(cell)
     with contextlib.ExitStack() as stack:
@@ -67,7 +69,7 @@ def _alone(cell: Cell) -> bool:
 
 
 def _lock(fd: int, *, alone: bool) -> None:
-    """Raises BlockingIOError: somebody else has it."""
+    """Raises BlockingIOError if another process has the lock."""
     kind = fcntl.F_WRLCK if alone else fcntl.F_RDLCK
     end_s = time.monotonic() + _GRACE_S
     while True:

@@ -1,4 +1,5 @@
-"""Tells what happened to a job's files on the disk since they were read; the run uses and keeps what was read."""
+"""Tells if a job's files on the disk have changed since they were read. The run uses and keeps the files as they
+were read."""
 
 from __future__ import annotations
 

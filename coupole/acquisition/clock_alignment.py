@@ -17,7 +17,7 @@ PENDING = -2
 UNDECIDABLE = -3
 """Two steps lie within the tolerance of one frame."""
 DOUBTFUL = -4
-"""Leaving out the frame is necessary, or possible, to make the others fit one line."""
+"""The others fit one line only if this frame is left out, or this frame is one that can be left out for it."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -27,7 +27,7 @@ def _align(  # type: ignore[no-untyped-def]
     """Fill `steps_out` [frames] under one hypothesis; returns the number of surplus frames.
 
     It stops and returns `max_surplus + 1` as soon as there are too many. If several frames fall on one step, all
-    but one are counted as surplus; it does not matter here which one is not.
+    but one are counted as surplus. It does not matter here which one is not counted.
     """
     surplus = pending = 0
     n_frames, n_steps = len(frame_ns), len(step_ns)
@@ -64,7 +64,8 @@ def _align(  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def _misfit(box_ns, excess_ns, left_out, jitter_ns, triple):  # type: ignore[no-untyped-def]  # noqa: PLR0912
     """True if no line passes within `jitter_ns` of all points that are not left out; `triple` [3] then holds three
-    points that prove it. Exchange algorithm for the best line in the maximum norm, stopped at the first proof.
+    points that prove it. It is the exchange algorithm for the best line in the maximum norm, stopped at the first
+    proof.
     """
     n = len(box_ns)
     count = 0
@@ -108,8 +109,8 @@ def _misfit(box_ns, excess_ns, left_out, jitter_ns, triple):  # type: ignore[no-
 
 @numba.njit(cache=True, nogil=True)
 def _leave_out(frame_ns, step_ns, view, may_leave_out, jitter_ns):  # type: ignore[no-untyped-def]  # noqa: PLR0912
-    """Mark as DOUBTFUL in `view` the frames that some solution leaves out so that the others fit one line; False
-    if no solution leaves out `may_leave_out` frames or fewer."""
+    """Mark in `view` the frames as DOUBTFUL that some solution leaves out. A solution leaves out at most
+    `may_leave_out` frames so that the others fit one line. Returns False if there is no solution."""
     n_frames = len(view)
     frames = np.empty(n_frames, np.int64)
     n = 0
@@ -162,9 +163,10 @@ def _leave_out(frame_ns, step_ns, view, may_leave_out, jitter_ns):  # type: igno
 def agree_on_steps(  # type: ignore[no-untyped-def]
     frame_ns, step_ns, jitter_ns, drift, max_surplus, in_flight, first_view, agrees
 ):
-    """Try all hypotheses; `first_view` [frames] is the first candidate's view, `agrees` where all others share it.
+    """Try all hypotheses. `first_view` [frames] becomes the first candidate's view; `agrees` becomes True where
+    all other candidates share it.
 
-    Returns the number of candidates (the same alignment may count more than once), or -1 if one of them could
+    Returns the number of candidates (the same alignment may count more than once), or -1 if one hypothesis could
     not be decided.
     """
     n_frames, n_steps = len(frame_ns), len(step_ns)

@@ -1,8 +1,9 @@
 """Python's collector of reference cycles, kept out of motions and bursts.
 
-A full collection looks at every object and stops all threads meanwhile: 0.1 to 0.3 s with the 500,000 objects of a
-session of 300,000 frames. In a motion that is a lapse of attention (`coupole.supervision`), in a burst the box is
-not asked. So a session collects only when it asks to, at rest and dark, and looks at each object once.
+A full collection looks at every object and stops all threads meanwhile. This takes 0.1 to 0.3 s with the 500,000
+objects of a session of 300,000 frames. In a motion it is a lapse of attention (`coupole.supervision`); in a burst
+the box is not asked meanwhile. So a session collects only when it asks for it, at rest and in the dark, and looks
+at each object once.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from contextlib import contextmanager
 
 @contextmanager
 def collected_when_asked() -> Iterator[Callable[[], None]]:
-    """Inside, cycles are collected only by calls of the yielded function. Objects that outlive this call are
-    examined again only after the context.
+    """Collect cycles only by calls of the yielded function, while the context lasts. Objects that survive such a
+    call are examined again only after the context.
     """
     was_enabled = gc.isenabled()
     gc.disable()

@@ -1,5 +1,5 @@
-"""Compiles the kernels of a run before its devices are open: on a fresh machine this takes seconds to a minute, in
-which the arm and the lamps would wait, and frames with them."""
+"""Compiles the kernels of a run before its devices are open. On a fresh machine this takes seconds to a minute;
+otherwise arm, lamps and frames would wait for it."""
 
 from __future__ import annotations
 

@@ -29,8 +29,8 @@ def open_for_session(run: Run) -> None:
 
 
 def complete_views(run: Run) -> list[str]:
-    """Files of the views whose frames are all proven, relative to the run: nothing writes into them any more.
-    Where frames are discarded, that is so when they are."""
+    """Return the files of the views whose frames are all proven, relative to the run. Nothing writes into them any
+    more. If the plan discards frames, a view counts only when its frames are discarded."""
     views, gone_views = run.complete_views(), discarded_views(run)
     files = (run.view_path(view) for view in views if view in gone_views or not run.discards)
     return [str(path.relative_to(run.folder)) for path in files if path.is_file()]
@@ -49,8 +49,9 @@ def renew_report(run: Run) -> Path:
 
 
 def close_complete(run: Run, console: Console, result: Path | None = None) -> float:
-    """A session of a run whose frames are all there, perhaps killed before it could say so: no device is opened.
-    `result` is the folder of the result that is asked for beside it. Returns the light of the run in lux hours."""
+    """End a session of a run whose frames are all there, for example because it was killed before it could record
+    this. No device is opened. `result` is the folder of the result that is requested beside the run. Returns the
+    run's light in lux hours."""
     console.print("all frames are there; no device is opened")
     open_for_session(run)
     writer = journal.Journal(run.journal_path)
@@ -65,8 +66,8 @@ def close_complete(run: Run, console: Console, result: Path | None = None) -> fl
 
 
 def conclude(run: Run, console: Console) -> None:
-    """Write the report and enter the complete files in the manifest. Never raises: the run itself has ended. A
-    disk that hung in the session is not asked again; a folder that is lost leaves nothing to conclude.
+    """Write the report and enter the complete files in the manifest. Never raises, because the run itself has
+    ended. A disk that hung in the session is not used again. If the folder is lost, nothing is done.
     """
     if run.is_lost:
         return
@@ -93,7 +94,8 @@ def conclude(run: Run, console: Console) -> None:
 
 
 def _report(run: Run) -> tuple[list[str], int]:
-    """Write the report, list what is small and complete; complete views that are not listed, and their bytes."""
+    """Write the report, and list the small complete files. Also return the complete views that are not listed, and
+    their bytes."""
     report.write(run, in_use=False)
     unlisted_files = {
         name for name in manifest.unlisted_files(run.folder) if not name.startswith(f"{manifest.VIEWS}/")
@@ -105,13 +107,15 @@ def _report(run: Run) -> tuple[list[str], int]:
 
 
 def _enter(run: Run, views: list[str], size: int) -> None:
-    """It hashes at the lowest priority: beside others it may take its time, as long as it goes on."""
+    """Enter the files in the manifest. Hashing has the lowest priority: it may be slow beside other work, but it
+    must go on."""
     with under_way(DISK, str(run.folder), size / _SLOWEST_BYTES_S) as reading:
         manifest.enter(run.folder, views, on_read=reading.goes_on)
 
 
 def note_unread(recorder: RunRecorder) -> None:
-    """The journal's line, if the session's text was not read: it was not waited for."""
+    """Note in the journal that the session's text was not read, so that the session did not wait for its
+    reader."""
     if unread_text := unread():
         recorder.note(
             TextUnread(

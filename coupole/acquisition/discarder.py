@@ -1,4 +1,4 @@
-"""Discards frames while a session goes on, when the processing beside it says that their samples are safe; and
+"""Discards frames while a session goes on, when the processing beside it says that their samples are safe. It also
 tells whether there is room for the next view."""
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Discarder:
     def __init__(
         self, run: Run, note: Callable[[FramesDiscarded], None], room: DiscardRoom, console: Console
     ) -> None:
-        """`note` brings an event into the journal, on the disk; `room` is what each view needs."""
+        """`note` writes an event to the journal on the disk; `room` is the room that each view needs."""
         self._run, self._note, self._room, self._console = run, note, room, console
         self._views = set(discarded_views(run))
         """Views that are discarded."""
@@ -42,25 +42,25 @@ class Discarder:
         self._thread.start()
 
     def ask(self, event: FramesDiscarded) -> None:
-        """Discard these frames, soon, in a thread of its own."""
+        """Discard these frames soon, in a thread of its own."""
         self._asked_count += 1
         self._asked.put(event)
 
     def keep(self, view: str, why: str) -> None:
-        """The frames of a view stay."""
+        """Keep the frames of a view."""
         self._reasons[view] = why
         self._console.print(f"reflectance: the frames of {view} are kept: {why}", markup=False)
 
     def end(self) -> None:
-        """End after what is under way; what was asked for and is not begun is done after the session."""
+        """End after the present work. Requests that have not begun are done after the session."""
         self._is_ending = True
         self._asked.put(None)
         self._thread.join(_ENDS_WITHIN_S)
 
     def has_room(self, view: str, hope: Callable[[], str]) -> bool:
-        """Tell whether the disk has room for a view that is about to begin, and for the samples that will come.
+        """Tell whether the disk has room for a view that is about to begin, and for samples still to come. Returns
         False if there may be room when more frames are discarded. Raises DiskFull if no more frames will be
-        discarded: `hope` returns the reason, or an empty text while some may be."""
+        discarded. `hope` returns the reason for this, or an empty text while frames may still be discarded."""
         if self._run.view_path(view).exists():
             return True
         needed_bytes = self._room.needed_bytes(view, self._waiting_views())
@@ -77,7 +77,7 @@ class Discarder:
         )
 
     def _waiting_views(self) -> set[str]:
-        """Views with a file whose samples may still be to come."""
+        """Return views with a file whose samples may not be written yet."""
         return {path.stem for path in (self._run.folder / "views").glob("*.h5")} - self._views
 
     def _work(self) -> None:

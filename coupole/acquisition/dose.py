@@ -1,9 +1,11 @@
-"""The light that a session gives the object: entered in its ledger before it is given, corrected afterwards.
+"""The light that a session gives the object. It is entered in the object's ledger before it is given, and
+corrected afterwards.
 
 Every caller that gives light asks here first, burst by burst (`DoseMeter`) or flash by flash (`FlashMeter`). The
-object's budget is checked after all entries of its ledger at that moment, and the planned light is on the disk
-before the first lamp is lit. Lights that the host switches are asked for once more each. A session that ends
-without a word (kill -9, power cut) leaves the plan of one burst, which is at least what was given.
+object's budget is checked with all entries of its ledger at that moment. The planned light is on the disk before
+the first lamp is lit. For lights that the host switches, the budget is asked again before each light. A session
+that ends suddenly (kill -9, power cut) leaves the planned light of one burst, which is at least the light that was
+given.
 """
 
 from __future__ import annotations
@@ -35,14 +37,15 @@ from coupole.storage.run import user_name
 LuxHours = NDArray[np.float64]
 """[points] at each of the object's dose points."""
 _CLOCKS_PPM, _START_US = 1000, 1000
-"""Allowance for the box's clock, and for its start of a table, where steps are counted that its log lacks."""
+"""Allowances for steps that the box's log lacks: for the error of the box's clock, and for the time that the box
+needs to start a table."""
 _DIGITS = 9
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class _Planned:
-    """Light that is entered, and perhaps being given."""
+    """Light that is entered in the ledger, and perhaps being given."""
 
     at_most: LuxHours
     w_per_lm: float | None
@@ -53,7 +56,8 @@ class _Planned:
 class LightOnObject:
     """Light on one object in one session. The dose is that of the point which has received most.
 
-    In a simulated cell nothing is entered; the budget is asked as in a real one. Without an object there is none.
+    In a simulated cell nothing is entered in the ledger, but the budget is checked as in a real cell. Without an
+    object there is no budget.
     """
 
     def __init__(
@@ -85,17 +89,18 @@ class LightOnObject:
 
     @property
     def lux_h_at_most(self) -> float:
-        """The same, with all planned light whose true amount is not entered yet."""
+        """Dose of the run so far, or of the live view, with all planned light whose true amount is not entered
+        yet."""
         return self.lux_h if self._planned is None else float((self._given_lux_h + self._planned.at_most).max())
 
     @property
     def given_lux_h(self) -> LuxHours:
-        """[points] of the run so far, or of the live view."""
+        """[points] light of the run so far, or of the live view."""
         return self._given_lux_h
 
     @property
     def total_lux_h(self) -> float:
-        """Dose of the object's life, by its ledger as it is now, without the light that is being given."""
+        """Dose of the object's life, by its ledger as it is now. Light that is being given is not included."""
         planned_lux_h = self._history.planned_lux_h(self._planned.plan_id) if self._planned else 0.0
         return self._history.total_lux_h - planned_lux_h + self._unentered_lux_h
 
@@ -107,7 +112,7 @@ class LightOnObject:
 
     @property
     def warning(self) -> str:
-        """Reason why the object's light is to be watched; empty if it is not."""
+        """Reason why the object's light needs attention; empty if there is none."""
         limit = self._history.warn_above_lux_h
         if limit is None or self.total_lux_h <= limit:
             return ""
@@ -120,10 +125,11 @@ class LightOnObject:
     def begin(
         self, at_most: LuxHours, expected_lux_h: LuxHours | None = None, w_per_lm: float | None = None
     ) -> None:
-        """Light is about to be given, `at_most` this; the budget is asked for what is `expected_lux_h` (default:
-        the same). `w_per_lm`: its damaging power, if known.
+        """Enter light that is about to be given: at most `at_most`. The budget is checked for `expected_lux_h`
+        (default: the same). `w_per_lm` is the light's damaging power, if known.
 
-        Raises DoseBudgetReached, and StorageError if it cannot be entered: no light may then be given.
+        Raises DoseBudgetReached, and StorageError if the light cannot be entered. After an error no light may be
+        given.
         """
         request = replace(
             self._asked, lux_h=self.more_lux_h(at_most if expected_lux_h is None else expected_lux_h)
@@ -138,8 +144,8 @@ class LightOnObject:
         self._planned = _Planned(at_most, w_per_lm, plan_id)
 
     def ask_again(self, so_far: LuxHours) -> None:
-        """Ask the budget once more, for what has been given of the last `begin` and what is given next together.
-        Raises DoseBudgetReached, StorageError."""
+        """Check the budget again, for the light given since the last `begin` together with the next light. Raises
+        DoseBudgetReached, StorageError."""
         if self._ledger is None or self._planned is None:
             return
         request = replace(self._asked, lux_h=self.more_lux_h(so_far))
@@ -150,8 +156,8 @@ class LightOnObject:
             request.refuse_beyond(self._id, newest, self._unentered_lux_h)
 
     def end(self, given_lux_h: LuxHours | None) -> LuxHours:
-        """The light of the last `begin` is over; `given_lux_h` None: what was planned stands. Returns what
-        counts."""
+        """Note that the light of the last `begin` is over. If `given_lux_h` is None, the planned light counts.
+        Returns the light that counts."""
         plan = self._planned
         if plan is None:
             return np.zeros_like(self._given_lux_h)
@@ -166,7 +172,7 @@ class LightOnObject:
 
     @property
     def planned_lux_h(self) -> LuxHours:
-        """[points] of the last `begin`, until its `end`."""
+        """[points] planned light of the last `begin`, until its `end`."""
         return np.zeros_like(self._given_lux_h) if self._planned is None else self._planned.at_most
 
     def more_lux_h(self, lux_h: LuxHours) -> float:
@@ -180,7 +186,7 @@ class LightOnObject:
 
 
 def _ask_ledger(ledger: Ledger, do: Callable[[], T]) -> T:
-    """Noted, since the ledger's disk may hang; it waits for other writers by itself."""
+    """Note the call, since the ledger's disk may hang. The ledger waits for other writers by itself."""
     with under_way(DISK, str(ledger.path), LOCK_S):
         return do()
 
@@ -203,7 +209,7 @@ class FlashMeter:
 
     @property
     def total_lux_h(self) -> float:
-        """Dose of the object's life, by its ledger, with what is planned."""
+        """Dose of the object's life, by its ledger, with the planned light."""
         return self._light.total_lux_h + self._light.more_lux_h(self._given_lux_h)
 
     @property
@@ -212,9 +218,9 @@ class FlashMeter:
         return self._light.left_lux_h
 
     def begin(self, lux_h: LuxHours, at_most_lux_h: LuxHours, w_per_lm: float | None = None) -> None:
-        """A flash of `lux_h` [points] is about to be given; should this process be killed, the box may give
-        `at_most_lux_h` instead. `w_per_lm`: its damaging power, if known. Raises DoseBudgetReached and
-        StorageError: it may then not be given."""
+        """Enter a flash of `lux_h` [points] that is about to be given. If this process is killed, the box may give
+        `at_most_lux_h` instead. `w_per_lm` is the light's damaging power, if known. Raises DoseBudgetReached and
+        StorageError; the flash may then not be given."""
         if not self._left or self._flash_lux_h is None or not np.array_equal(lux_h, self._flash_lux_h):
             self.settle()
             count = self._at_once if self._at_once * lux_h.max() <= self._light.left_lux_h else 1
@@ -230,11 +236,12 @@ class FlashMeter:
         self._given_lux_h = self._given_lux_h + lux_h
 
     def add(self, lux_h: LuxHours) -> None:
-        """The last flash gave so much more."""
+        """Add light that the last flash gave in addition."""
         self._given_lux_h = self._given_lux_h + lux_h
 
     def settle(self) -> None:
-        """Enter what was given of the last plan; all of it if it is not sure that the lights are off."""
+        """Enter the light that was given of the last plan. If it is not sure that the lights are off, all planned
+        light counts."""
         self._light.end(self._given_lux_h if self._cell.lights_confirmed else None)
         self._given_lux_h, self._left = np.zeros_like(self._given_lux_h), 0
 
@@ -250,7 +257,8 @@ class DoseMeter:
         self._job, self._cell, self._recorder = job, cell, recorder
         self._light = LightOnObject(job, cell, recorder.name, recorder.light_before_lux_h())
         self._under_way_lux_h = np.zeros(1)
-        """[steps + 1] of the run after so many steps of the burst under way, where it ends highest."""
+        """[steps + 1] dose of the run after each step of the present burst, at the point that has received most at
+        the burst's end."""
 
     @property
     def lux_h(self) -> float:
@@ -259,19 +267,19 @@ class DoseMeter:
 
     @property
     def lux_h_in_all(self) -> float:
-        """Dose of the run, all its sessions, as journal and ledger have it: a burst whose light nobody could count
-        counts as planned."""
+        """Dose of the run in all its sessions, as in journal and ledger. If nobody could count a burst's light,
+        its planned light counts."""
         return self._light.lux_h_at_most
 
     def lux_h_after(self, steps: int) -> float:
-        """Return the dose of the run so far, with so many steps of the burst under way. A panel of it counts when
-        it has ended."""
+        """Return the dose of the run so far, with this number of steps of the present burst. The light of a panel
+        counts when it has ended."""
         return max(self.lux_h, float(self._under_way_lux_h[min(steps, len(self._under_way_lux_h) - 1)]))
 
     def begin(self, burst: Burst) -> None:
-        """Plan the light of a burst before it is given: the plan is on the disk when this returns.
+        """Enter the planned light of a burst before it is given. It is on the disk when this returns.
 
-        Raises DoseBudgetReached and StorageError: no light may then be given.
+        Raises DoseBudgetReached and StorageError: after an error no light may be given.
         """
         rig, cell = self._job.cell.rig, self._job.cell
         expected_lux_h = self._of_leds(burst.table["led"], burst.table["on_us"])
@@ -303,11 +311,12 @@ class DoseMeter:
     def count(
         self, burst: Burst, log: NDArray[np.void], *, table_ran_s: float, panel_s: float
     ) -> tuple[float, ...]:
-        """Return what a burst has given [points]: by its `log` (STEP_RECORD_DTYPE [n]); steps that the log lacks
-        and that may have begun while the box ran the table for `table_ran_s`; and a panel that was on for
-        `panel_s`.
+        """Return the light that a burst has given [points]. It is the light of the steps in its `log`
+        (STEP_RECORD_DTYPE [n]), of steps that the log lacks but that may have begun in `table_ran_s`, and of a
+        panel that was on for `panel_s`.
 
-        If it is not sure that the lights are off, all that was planned counts. For the journal, then for `end`.
+        If it is not sure that the lights are off, all planned light counts. Pass the result to the journal, then
+        to `end`.
         """
         if not self._cell.lights_confirmed:
             return tuple(np.round(self._light.planned_lux_h, _DIGITS).tolist())
@@ -318,18 +327,20 @@ class DoseMeter:
         return tuple(np.round(of_leds_lux_h + self._of_panel(panel_s), _DIGITS).tolist())
 
     def end(self, given_lux_h: tuple[float, ...]) -> None:
-        """Enter what `count` has found, once the journal has it. Until then all that was planned counts: so
-        journal and ledger say the same, whatever keeps the journal from it."""
+        """Enter the result of `count` once it is in the journal. Until then all planned light counts. So journal
+        and ledger agree even if the journal could not be written."""
         self._under_way_lux_h = np.zeros(1)
         self._light.end(np.array(given_lux_h) if self._cell.lights_confirmed else None)
 
     def give_up(self) -> None:
-        """Nobody will tell how the burst under way ended: all that was planned counts, as in the ledger."""
+        """Let all planned light of the present burst count, as in the ledger, because nobody will know how the
+        burst ended."""
         self._under_way_lux_h = np.zeros(1)
         self._light.end(None)
 
     def _course(self, leds: NDArray[np.int64], on_us: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[steps + 1] of the run, step by step, at the point that has received most when the burst is over."""
+        """Return [steps + 1], the dose of the run step by step, at the point that has received most when the burst
+        is over."""
         before = self._light.given_lux_h
         highest = int(np.argmax(before + self._of_leds(leds, on_us)))
         lux = np.array([self._lux[highest, self._row_of_led[int(led)]] if led != NO_LED else 0.0 for led in leds])
@@ -354,7 +365,7 @@ def steps_without_log(burst: Burst, log: NDArray[np.void], table_ran_s: float) -
 
 
 def led_time_s(burst: Burst, log: NDArray[np.void], table_ran_s: float) -> float:
-    """Return how long LEDs were on in a burst, each by itself: by its log; steps that the log lacks and that may
-    have begun count whole."""
+    """Return the sum of the times for which LEDs were on in a burst, by its log. Steps that the log lacks and that
+    may have begun count fully."""
     parts = (log, steps_without_log(burst, log, table_ran_s))
     return float(sum(part["on_us"][part["led"] != NO_LED].sum() for part in parts)) * 1e-6

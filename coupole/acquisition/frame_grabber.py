@@ -36,7 +36,7 @@ def buffers_for(frames: int, frame_bytes: int, period_s: float, memory_bytes: in
 class FrameGrabber:
     """Grabber that stores every frame of the camera, from `start()` to `stop()`, and returns its buffer.
 
-    `keep(frame)` runs on `writers` threads and returns the slot. Frames are listed in order of arrival.
+    `keep(frame)` runs on `writers` threads and returns the slot. Frames are listed in the order of arrival.
     """
 
     def __init__(self, camera: Camera, keep: Callable[[Frame], int], *, writers: int = WRITERS) -> None:
@@ -92,19 +92,19 @@ class FrameGrabber:
         )
 
     def is_written(self, frame: int) -> bool:
-        """True if the frame's bytes are written. Raises what writing raised."""
+        """True if the frame's bytes are written. Raises the error of writing."""
         if not self._slots[frame].done():
             return False
         self._slots[frame].result()
         return True
 
     def slot(self, frame: int) -> int:
-        """The frame's slot; waits for its bytes to be written. Raises what writing raised."""
+        """Return the frame's slot; waits for its bytes to be written. Raises the error of writing."""
         return self._slots[frame].result()
 
     def stop(self) -> None:
-        """Take no more frames; those taken are still written. Never raises; to be called where a hang of camera or
-        disk is noticed (`coupole.bounded`)."""
+        """Take no more frames; frames that were taken are still written. Never raises. Call it where a hang of
+        camera or disk is noticed (`coupole.bounded`)."""
         self._stopping.set()
         if self._thread.ident is not None:
             self._thread.join()

@@ -3,26 +3,26 @@ timestamps.
 
 The box logs when each step sent its edge, on its own clock; the camera stamps each frame that reaches the host, on
 another clock. A *hypothesis* is one alignment of the two clocks: frame `a` was fired by step `i`. It assigns a
-step to every other frame, or none (*surplus*). Alignments that differ by whole periods fit the LED steps equally
-well and are distinguished by the coded dark marks (`coupole.plan.marks`).
+step to every other frame, or no step (*surplus*). Alignments that differ by whole periods fit the LED steps
+equally well; the coded dark marks (`coupole.plan.marks`) distinguish them.
 
-**Fault model.** Any number of frames may be missing (lost in transfer, trigger missed, at the start, at the
-end, anywhere). At most `max_surplus` frames of a burst were fired by something other than a step (a bounce, an
-interference); one that starts within twice the jitter of an edge whose own frame is missing gets that step's
-label, and was exposed under that step's light. Timestamps deviate from their edges by at most `jitter_us`; the
-clocks drift apart steadily, by at most `drift_ppm`.
+**Fault model.** Any number of frames may be missing (lost in transfer, trigger missed, at the start, at the end,
+anywhere). At most `max_surplus` frames of a burst were fired by something other than a step (a bounce, an
+interference). If a surplus frame starts within twice the jitter of an edge, and the edge's own frame is missing,
+the surplus frame gets that step's label. It was exposed under that step's light. Timestamps deviate from their
+edges by at most `jitter_us`; the clocks drift apart steadily, by at most `drift_ppm`.
 
-**Proof.** Under that model the true alignment leaves at most `max_surplus` frames unexplained. So it is among
-the hypotheses that do, the *candidates*; and a label on which all candidates agree is true. Frames on which
-they disagree, and steps that two frames claim, are ambiguous and get no label. All alignments are tried: the
-true one assigns a step to at least one of the first `max_surplus + 1` frames, so one of these is its anchor.
-With fewer frames nothing is proven; while the burst runs, `in_flight` frames more are needed.
+**Proof.** Under that model the true alignment leaves at most `max_surplus` frames unexplained. The hypotheses that
+leave at most so many are the *candidates*. The true alignment is one of them, so a label on which all candidates
+agree is true. Frames on which they disagree, and steps that two frames claim, are ambiguous and get no label. All
+alignments are tried: the true one assigns a step to at least one of the first `max_surplus + 1` frames, so one of
+these is its anchor. With fewer frames nothing is proven. While the burst runs, `in_flight` more frames are needed.
 
-*Explained* means two things. Counted from the anchor, a frame lies within the jitter plus the drift of the time
-between: wide, but the true alignment always passes. And the frames so labelled lie within the jitter of one
-straight line, camera time over box time, except for as many as `max_surplus` still allows. Which frames to leave
-out is searched exhaustively: of three points that no line fits, at least one is a surplus frame. A frame that any
-solution of this search leaves out gets no label.
+*Explained* means two things. First, a frame lies within the jitter plus the drift since the anchor. This limit is
+wide, but the true alignment always passes it. Second, the frames with these labels lie within the jitter of one
+straight line of camera time over box time. As many frames as `max_surplus` still allows may be off this line.
+Which frames to leave out is searched exhaustively: of three points that no line fits, at least one is a surplus
+frame. A frame that any solution of this search leaves out gets no label.
 
 Everything here is a pure function of its arguments and is run again on all frames while a burst continues.
 """
@@ -48,8 +48,8 @@ class FaultModel:
     drift_ppm: float = 100.0
     max_surplus: int = 3
     in_flight: int = 2
-    """Frames that may reach the host before their step is in the log; the log must have been read to its end
-    after the last of the frames was taken."""
+    """Frames that may reach the host before their step is in the log. The log must have been read to its end after
+    the last frame was taken."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class _Aligned:
     candidate_rows: NDArray[np.int64]
     """[frames] row of `edge_rows` by the first candidate, or a negative code for no step."""
     agrees: NDArray[np.bool_]
-    """[frames] all candidates give the same row or code."""
+    """[frames] True where all candidates give the same row or code."""
 
 
 def match(
@@ -112,8 +112,8 @@ def match(
     id_modulus : first and last frame id; after the last comes the first.
     complete : the burst is over and no frame is still in transfer.
 
-    Within the fault model of the module's docstring a label is never wrong; if it could be, none is given and
-    `ambiguous` is set.
+    Within the fault model of the module's docstring a label is never wrong. If a label could be wrong, it is not
+    given, and `ambiguous` is set.
     """
     model = model or FaultModel()
     n_frames, n_steps = len(frame_ids), len(log)
@@ -165,7 +165,7 @@ def _obstacle(
 def _match_without_labels(
     n_frames: int, n_steps: int, *, missing: NDArray[np.intp] | None = None, reason: str = ""
 ) -> Match:
-    """The verdict where no frame gets a label; `missing` are rows of the log."""
+    """Return the verdict if no frame gets a label. `missing` are rows of the log."""
     no_step = np.zeros(n_steps, np.bool_)
     is_missing = no_step.copy()
     if missing is not None:
@@ -184,8 +184,8 @@ def _match_without_labels(
 def _verdict(
     log: NDArray[np.void], timestamps_ns: NDArray[np.int64], id_steps: NDArray[np.int64], alignment: _Aligned
 ) -> Match:
-    """The match: labels on which all candidates agree and that only one frame claims, missing steps, and questions
-    that stay open."""
+    """Return the match. A label is given if all candidates agree on it and only one frame claims it. The match
+    also has the missing steps and the open questions."""
     edge_steps, agreed_steps, agrees = alignment.edge_rows, alignment.candidate_rows, alignment.agrees
     steps = np.full(len(agreed_steps), UNLABELLED, np.int64)
     claims = np.bincount(agreed_steps[agreed_steps >= 0], minlength=len(edge_steps))

@@ -1,9 +1,9 @@
 """A burst that the host fires, light by light, with any box and any camera that takes a software trigger.
 
 **Proof.** A frame belongs to a light if it is the only frame that was exposed, and it was exposed entirely while
-that light was on. The camera is armed in the dark, the light is switched on, and after the box has confirmed it
-the camera is triggered; the light must still be on, without interruption, when the frame has arrived. For a box
-without a log (`Burst.marks` is `plain`) the only evidence is the host's clock and the box's confirmation, and an
+that light was on. The camera is armed in the dark, and the light is switched on. After the box has confirmed this,
+the camera is triggered. The light must still be on, without interruption, when the frame has arrived. For a box
+without a log (`Burst.marks` is `plain`) the only evidence is the host's clock and the box's confirmation. There an
 LED that cannot be switched off would light all later frames. So a burst begins and ends with dark frames as marks,
 and no frame of the burst is proven until both marks have been found dark.
 """
@@ -35,11 +35,11 @@ from coupole.storage.step_fields import step_fields
 
 _ONE_SHOT_BUFFERS = 8
 _UNCOUNTED = -1
-"""A camera without an exposure counter: the proof rests on no other frame having arrived while the light was
-on."""
+"""Stands for a camera without an exposure counter. The proof then rests on the fact that no other frame arrived
+while the light was on."""
 DARK_QUANTILE, DARK_SHARE = 0.99, 0.02
-"""A mark is dark if this share of its pixels is less than this share of the camera's range above black. Noise is
-far below this; an LED that lights a hundredth of the picture is detected."""
+"""A mark is dark if the first share of its pixels is less than the second share of the camera's range above black.
+Noise is far below this limit. An LED that lights a hundredth of the picture is detected."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class _Kept:
 
 
 class Dose(Protocol):
-    """The object's light (`coupole.acquisition.dose`); both raise DoseBudgetReached and StorageError."""
+    """Light on the object (`coupole.acquisition.dose`). Both methods raise DoseBudgetReached and StorageError."""
 
     def begin(self, burst: Burst) -> None: ...
 
@@ -72,8 +72,8 @@ class Dose(Protocol):
 
 
 class HostBurst:
-    """Fires bursts with software trigger. The `dose` is asked before the burst and before each light of it;
-    `tell(burst, step)` is called during a burst; `note` counts its light and writes its journal line."""
+    """Fires bursts with software trigger. The `dose` is asked before the burst and before each of its lights.
+    `tell(burst, step)` is called during a burst. `note` counts the burst's light and writes its journal line."""
 
     def __init__(
         self,
@@ -91,8 +91,8 @@ class HostBurst:
         """Greatest time for which the panel of this burst can have been on."""
 
     def fire(self, burst: Burst, frame_format: FrameFormat) -> Verdict:
-        """Fire one light after the other; the dose is recorded even if this raises, that of the light which was on
-        then included. Raises ArmMovedError."""
+        """Fire one light after the other. The dose is recorded even if this raises, with the dose of the light
+        that was on. Raises ArmMovedError."""
         records: list[StepRecord] = []
         taken_frames = 0
         dead: list[ShotId] = []
@@ -139,7 +139,8 @@ class HostBurst:
         return Verdict(replace(NOTHING_TO_MATCH, reason=reason), dead)
 
     def _keep(self, exposure: _Taken, frame: Frame, burst: Burst, step: int) -> list[_Kept]:
-        """The frame, stored but not proven yet; nothing if it cannot be proven, or is a mark without a label."""
+        """Return the frame, stored but not proven yet. Returns nothing if the frame cannot be proven, or is a mark
+        without a label."""
         if not exposure.alone or exposure.record.invalid_exposure:
             frame.release()
             return []
@@ -158,8 +159,8 @@ class HostBurst:
             self._recorder.prove(kept_frame.slot, kept_frame.shot, kept_frame.fields)
 
     def _fire_one(self, burst: Burst, index: int, step_records: list[StepRecord]) -> _Taken:
-        """Light one step, trigger the camera, wait for the light's end, and keep the burst's period. The light is
-        appended to `step_records` even if this raises."""
+        """Light one step, trigger the camera, wait for the light's end, and keep the burst's period. The record of
+        the light is appended to `step_records` even if this raises."""
         box, camera, clock = self._cell.ledbox, self._cell.camera, self._cell.clock
         step, timing = burst.table[index], burst.timing
         record: StepRecord | None = None
@@ -204,7 +205,8 @@ def _gives_light(burst: Burst, index: int) -> bool:
 
 
 def _cut_short(led: int, on_us: float) -> StepRecord:
-    """Return the record of a flash whose end the box did not report: it may have shone for all of this time."""
+    """Return the record of a flash whose end the box did not report. The flash may have lasted for all of this
+    time."""
     return StepRecord(
         step=0,
         led=led,
@@ -221,7 +223,8 @@ def _cut_short(led: int, on_us: float) -> StepRecord:
 
 
 def too_bright(frame: Frame, frame_format: FrameFormat) -> str:
-    """Return why a mark's frame is not dark; empty if it is dark, or has no picture (in a dry run)."""
+    """Return why a mark's frame is not dark. The text is empty if the frame is dark, or has no picture (in a dry
+    run)."""
     if not frame.rendered:
         return ""
     black_dn, white_dn = frame_format.black_dn, frame_format.white_dn

@@ -18,7 +18,7 @@ class CellSource:
     def __init__(
         self, opened_cell: OpenedCell, shots: SingleShots, leds: tuple[int, ...], meter: FlashMeter | None
     ) -> None:
-        """`leds` may be chosen; `meter` for an object whose light is counted."""
+        """The user may choose from `leds`. `meter` is for an object whose light is counted."""
         self.leds = leds
         self._opened, self._shots, self._meter = opened_cell, shots, meter
 
@@ -56,7 +56,7 @@ class CellSource:
             self._shots.rest()
 
     def _waits_for_a_viewer(self, studio: Studio, choice: Choice) -> bool:
-        """True, after a moment, if an LED is chosen and nobody has a page open: then it is not lit."""
+        """True, after a moment, if an LED is chosen but nobody has a page open. The LED is then not lit."""
         if choice.led is None or studio.is_watched:
             studio.remark = self._meter.warning if self._meter else ""
             return False

@@ -45,7 +45,7 @@ from coupole.viewing.terminal import LiveFigures, RunObserver, alarm
 
 _FIGURES_EVERY_S = 0.2
 LOOKS_ON = "this process only observes the run: the run continues"
-"""Message when a live view of a run is to stop all: it has nothing to make safe."""
+"""Message when the stop of everything reaches a live view of a run, which has nothing to make safe."""
 
 
 def meter(
@@ -127,14 +127,15 @@ def watch_cell(
 
 
 def lux_of_leds(cell: Cell, job: Job | None) -> NDArray[np.float64]:
-    """[points, LEDs of the table] at the object's dose points; without a job at the support's centre."""
+    """Return [points, LEDs of the table] at the object's dose points, or at the support's centre if there is no
+    job."""
     base_from_support = cell.rig.support.base_from_support.matrix()
     points = apply(base_from_support, job.shape.dose_points_mm) if job else base_from_support[None, :3, 3]
     return cell.leds.illuminance_lux(points, emission=cell.rig.dome.emission)
 
 
 def _ask_the_ledger(job: Job, console: Console) -> None:
-    """Raise PreflightRefused if the object may receive no more light; print what its ledger warns of."""
+    """Raise PreflightRefused if the object may receive no more light. Print the warnings of its ledger."""
     assert job.plan.object is not None
     history = ledger_of(job.cell, job.plan.object.id).read_history()
     if refusals := light_refusals(job, history):
@@ -157,7 +158,7 @@ def _show_live(
     longest_us: int,
     halt: Act,
 ) -> None:
-    """Show the live view until the operator stops it; `halt` is called as soon as he does."""
+    """Show the live view until the operator stops it. `halt` is called as soon as this happens."""
     try:
         server = serve(studio, source.leds, longest_us, port)
     except OSError as error:

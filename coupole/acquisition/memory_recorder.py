@@ -22,8 +22,8 @@ _NOTHING_EARLIER = "{}: no frames of an earlier session are kept"
 
 
 class MemoryRecorder:
-    """Part of a `coupole.acquisition.recorder.Recorder`: keeps events and proven shots in memory. Its kinds store
-    frames in ways of their own."""
+    """Part of a `coupole.acquisition.recorder.Recorder`: keeps events and proven shots in memory. Each kind of
+    recorder stores frames in its own way."""
 
     name = "memory"
 
@@ -41,7 +41,7 @@ class MemoryRecorder:
         return self._proven
 
     def has_room(self, view: str) -> bool:
-        """Nothing is stored."""
+        """Always true: nothing is stored."""
         return True
 
     def begin_view(
@@ -70,7 +70,7 @@ class MemoryRecorder:
         self._proven.add(shot)
 
     def see_mark(self, slot: int, burst: Burst, step: int) -> None:
-        """Nothing of it is kept."""
+        """Keep nothing of the mark."""
 
     def free(self, slot: int) -> None:
         self._samples.free(slot)
@@ -82,11 +82,11 @@ class MemoryRecorder:
         return ""
 
     def commit(self, *, now: bool) -> None:
-        """Nothing lasts."""
+        """Do nothing: no data are kept for later."""
 
 
 class DryRecorder(MemoryRecorder):
-    """Recorder for a dry run: evaluates the exposure of frames with a picture."""
+    """Recorder for a dry run. It judges the exposure of frames that have a picture."""
 
     name = "dry run"
 

@@ -1,8 +1,8 @@
-"""Devices whose calls are noted (`coupole.bounded`), so that one that never returns is noticed and left behind.
+"""Devices whose calls are noted (`coupole.bounded`), so that a call that never returns is noticed and left behind.
 
-The limit of a call is derived from its work. Drivers have their own time-outs, which are shorter. Once the cell
-was made safe, calls that light a lamp or move the arm are refused: a thread that was left behind in a call may go
-on when that call returns after all.
+The time limit of a call is derived from its work. Drivers have their own time-outs, which are shorter. After the
+cell was made safe, calls that light a lamp or move the arm are refused. The reason is that a thread which was left
+behind may go on when its call returns after all.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from coupole.plan.rig import Rig
 NAMES = {"ledbox": "led box", "camera": "camera", "robot": "robot"}
 """Names of the devices in errors."""
 _DEADLINE_SHARE = 10.0
-"""`coupole.clock.Deadline` waits this many times as long by the machine's clock, if the rig's clock stands."""
+"""`coupole.clock.Deadline` waits this many times as long by the machine's clock if the rig's clock stands
+still."""
 _STEP_BYTES, _SLOWEST_BYTES_S = 16, 480.0
 """Size of a step of a table; speed of a serial line of 4800 baud."""
 
@@ -31,11 +32,11 @@ _WORK_S: Mapping[str, Callable[..., float]] = {
 }
 _LIGHTS_OR_MOVES = frozenset({"flash", "move_to", "start"})
 _SETTLES = 2.0
-"""Times of a motion for which drivers wait at most."""
+"""Drivers wait at most this many times the duration of a motion."""
 
 
 class NotedDevice:
-    """A device, but for the notes."""
+    """A device whose calls are noted. Otherwise it is the same device."""
 
     def __init__(self, device: Any, kind: str, rig: Rig, made_safe: threading.Event) -> None:
         """`made_safe` is set before the lights are switched off and the arm is stopped at the end."""

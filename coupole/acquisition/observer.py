@@ -21,14 +21,14 @@ _WORD_EVERY_S = 0.01
 
 
 class Observer(Protocol):
-    """Observes a run. Called in the sequencer's thread, so methods must return quickly."""
+    """Observes a run. The sequencer's thread calls it, so methods must return quickly."""
 
     def progress(self, progress: Progress) -> None:
-        """Frames were proven, or some time passed."""
+        """Tell that frames were proven, or that some time passed."""
         ...
 
     def note(self, message: str) -> None:
-        """A message for the operator."""
+        """Show a message to the operator."""
         ...
 
 
@@ -36,33 +36,32 @@ class Unwatched:
     """An `Observer` that does nothing."""
 
     def progress(self, progress: Progress) -> None:
-        """Nobody asks."""
+        """Do nothing: nobody watches."""
 
     def note(self, message: str) -> None:
-        """Nobody listens."""
+        """Do nothing: nobody listens."""
 
 
 class Held(Exception):
-    """The session is to stand at once, until a person says that it goes on: raised where it would command a
-    device."""
+    """Raised instead of a command to a device, when the session must stop at once and wait for a person."""
 
 
 def frozen(seconds: float) -> str:
-    """Return why a session is held whose process did not run."""
+    """Return why a session is held whose process did not run for a while."""
     return f"the program did not run for {seconds:.1f} s: it was stopped, or its machine slept"
 
 
 @dataclass
 class Control:
-    """The operator's stop and pause: set from signal handlers and other threads.
+    """The operator's stop and pause. Signal handlers and other threads set them.
 
-    A *pause* waits for the end of the burst. A *hold* does not: something stopped the program, or the arm, that
-    nobody had asked for, or that cannot wait. A hold switches lights off and stops the arm (`halting`), and only a
-    person ends it.
+    A *pause* waits for the end of the burst. A *hold* does not wait: something stopped the program or the arm
+    without anybody's request, or the cause is urgent. A hold switches the lights off and stops the arm
+    (`halting`), and only a person ends it.
     """
 
     session: Control | None = None
-    """The session that this is a part of, whose stop and holds count here too; None: it is the session."""
+    """The session that this is a part of: its stop and holds count here too. None: this is the session itself."""
     stop: threading.Event = field(default_factory=threading.Event)
     pause: threading.Event = field(default_factory=threading.Event)
     standing: threading.Event = field(default_factory=threading.Event)
@@ -72,22 +71,23 @@ class Control:
     hold_pending: threading.Event = field(default_factory=threading.Event)
     """Set from a hold until the session stands."""
     halting: threading.Event = field(default_factory=threading.Event)
-    """Set while lights are switched off and the arm is stopped for a hold: nobody can let the session go on."""
+    """Set while a hold switches the lights off and stops the arm. During this time nobody can let the session go
+    on."""
     held_because: str = ""
     unsure: Sequence[str] = ()
-    """Sentences on devices that a hold could not confirm to be safe: then the session ends."""
+    """Sentences on devices that are perhaps not safe after a hold. If there are any, the session ends."""
     pulse_s: float = math.inf
     """Time when this process last proved that it runs, monotonic s. A thread that does nothing else sets it
-    (`coupole.acquisition.signals`); infinite where there is none."""
+    (`coupole.acquisition.signals`). It is infinite without this thread."""
     stood_at_s: float = -math.inf
     """Time when that thread last found that it had not run for a while, monotonic s."""
     signal_number: int = signal.SIGINT
-    """The signal that set `stop`, or as whose the session ends."""
+    """The signal that set `stop`, or the signal that the session's end is reported as."""
     stopped_by: str = ""
     """Cause that set `stop`, in words; empty: the signal."""
 
     def stop_by(self, number: int, cause: str = "") -> None:
-        """Stop for this signal, or for `cause` as if by it; the first one counts."""
+        """Stop for this signal, or for `cause` as if this signal had come. Only the first call counts."""
         if not self.stop.is_set():
             self.signal_number, self.stopped_by = number, cause
             self.stop.set()
@@ -97,18 +97,19 @@ class Control:
         (self.let_go_on if self.pause.is_set() else self.pause.set)()
 
     def let_go_on(self) -> None:
-        """A person's word ends a pause, but no hold that is still being made safe, or at which the session does
-        not stand yet: it has not said what happened, and would then be held without a pause to stand in."""
+        """End a pause when a person asks for it. This does not end a hold before all is safe and the session
+        stands: the session has not said yet what happened, and without a pause it could not stand later."""
         if not self.coming_to_stand:
             self.pause.clear()
 
     @property
     def coming_to_stand(self) -> bool:
-        """True from a hold until all is safe and the session stands: no word is heard."""
+        """True from a hold until all is safe and the session stands. Meanwhile a person's request to go on is
+        ignored."""
         return self.halting.is_set() or self.hold_pending.is_set()
 
     def hold(self, why: str) -> None:
-        """Stand at once, wherever the session is; the first reason counts until it stands."""
+        """Hold the session at once, wherever it is. The first reason counts until the session stands."""
         if not self.can_stand:
             if not self.stop.is_set():  # else another reason came first
                 self.held_because = why
@@ -121,7 +122,8 @@ class Control:
 
     @property
     def stopped_by_hand(self) -> bool:
-        """Stopped as by Ctrl-C, and not by a hold: so a live view or a bench ends as it should."""
+        """True if the session was stopped as by Ctrl-C, and not by a hold. A live view or a bench then ends
+        normally."""
         return self.stop.is_set() and self.signal_number == signal.SIGINT and not self.held_because
 
     def interruption(self) -> Interrupted:
@@ -135,17 +137,17 @@ class Control:
 
     @property
     def stands(self) -> bool:
-        """True while the session is to stand, and does not yet: devices fail then because they were stopped, or
-        because this process was. If it did not run for a while, this waits for the word of the thread that hears
-        of SIGCONT: whether it was frozen, or the machine only busy."""
+        """True from a hold until the session stands. Meanwhile devices may fail because they or this process were
+        stopped. If the process did not run for a while, this waits for the thread that hears of SIGCONT. That
+        thread tells whether the process was frozen, or the machine only busy."""
         if self.session is not None:
             return self.session.stands
         self.await_word()
         return self.hold_pending.is_set()
 
     def await_word(self) -> None:
-        """Wait, if this process did not run for a while, until it is known why: before an arm that stands is moved
-        again."""
+        """Wait until it is known why this process did not run for a while, if it did not. Call this before an arm
+        that stands is moved again."""
         if self.session is not None:
             self.session.await_word()
             return
@@ -155,7 +157,8 @@ class Control:
 
     @property
     def awaits_word(self) -> bool:
-        """True if `stands` would wait: this process did not run for a while, and it is not known yet why."""
+        """True if `stands` would wait, because this process did not run for a while and the reason is not known
+        yet."""
         if self.session is not None:
             return self.session.awaits_word
         now_s = time.monotonic()
@@ -163,8 +166,8 @@ class Control:
         return late and not self.hold_pending.is_set()
 
     def go_on(self) -> None:
-        """Raise Interrupted if the session is to stop, Held if it is to stand: to be called before each command
-        that lights or moves."""
+        """Raise Interrupted if the session must stop, or Held if it must stand. Call it before each command that
+        lights or moves."""
         if self.session is not None:
             self.session.go_on()
         if self.stop.is_set():

@@ -61,8 +61,8 @@ class OpenedCell:
     lights_confirmed: bool = True
     """False if the lights were not confirmed to be off at the end."""
     switched_off_ns: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=16))
-    """Times on the rig's clock, the newest last: when the box was told to switch the lights off, and when it had
-    answered."""
+    """Pairs of times on the rig's clock, the newest last: when the box was told to switch the lights off, and when
+    it had answered."""
     _made_safe: threading.Event = field(default_factory=threading.Event, repr=False)
     """Shared with the devices, which light and move nothing once it is set."""
     _first: threading.Lock = field(default_factory=threading.Lock, repr=False)
@@ -70,7 +70,7 @@ class OpenedCell:
 
     @property
     def made_safe(self) -> bool:
-        """`make_safe` was called: nothing is lit or moved any more."""
+        """True after `make_safe` was called: nothing is lit or moved any more."""
         return self._made_safe.is_set()
 
     def halt(self) -> list[Safeguard]:
@@ -81,7 +81,7 @@ class OpenedCell:
         ]
 
     def switch_off(self) -> None:
-        """Lights off, and since when they are is noted; whatever becomes of the clock, they go off."""
+        """Switch the lights off, and note the time. The lights go off even if the clock fails."""
         times_ns = []
         with contextlib.suppress(Exception):
             times_ns.append(self.clock.now_ns())
@@ -91,9 +91,9 @@ class OpenedCell:
             self.switched_off_ns.append((begun_ns, ended_ns))
 
     def make_safe(self) -> None:
-        """Lights off and arm stopped, side by side, then the camera disarmed; each is tried even if another fails
-        or hangs. Signals wait. Only the first call acts, others wait for it: nothing may be lit or moved after
-        it."""
+        """Switch the lights off and stop the arm, side by side, then disarm the camera. Each is tried even if
+        another fails or hangs. Signals wait. Only the first call acts; other calls wait for it. Nothing may be lit
+        or moved afterwards."""
         with self._first:
             is_first = not self.made_safe
             self._made_safe.set()
@@ -129,7 +129,7 @@ def open_cell(
 ) -> Iterator[OpenedCell]:
     """Open the rig's devices (its twins in a dry run) and its world, if it has one; close all of it at the end.
 
-    Raises DeviceError if one cannot be opened; those opened before it are closed.
+    Raises DeviceError if a device cannot be opened; devices that were opened before it are closed.
     """
     with contextlib.ExitStack() as stack:
         if not dry_run:
@@ -185,8 +185,8 @@ def _open_device(
 
 
 def _close(device: Any, name: str, _: object, failing: BaseException | None, __: object) -> None:
-    """Close a device, unless a call of it hangs. Raises what that raises; DeviceTimeout if it does not return,
-    which is only told if something has failed already."""
+    """Close a device, unless a call of it hangs. Raises the device's errors, and DeviceTimeout if the call does
+    not return. If something has failed already, the time-out is only reported."""
     if call := hangs(name):
         alarm(f"{name}: not closed, because the call `{call}` has not returned; it ends with this process")
         return
@@ -214,7 +214,7 @@ def _get_world(cell: Cell, job: Job | None, sensor: Sensor, *, dry_run: bool, sp
 
 @contextmanager
 def told_if_slow(words: str) -> Iterator[None]:
-    """Tell a user who waits the reason."""
+    """Tell a waiting user the reason for the wait."""
     timer = threading.Timer(_SLOW_START_S, alarm, (words,))
     timer.daemon = True
     timer.start()

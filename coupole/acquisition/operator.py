@@ -18,7 +18,7 @@ from coupole.preflight.preflight import Report
 from coupole.viewing.terminal import ask
 
 UNLIMITED_BYTES = 2**62
-"""A dry run stores nothing, so the disk does not matter."""
+"""Free bytes that a dry run assumes, because it stores nothing."""
 
 
 def refuse(report: Report) -> None:
@@ -41,7 +41,7 @@ def ask_to_begin(cell: Cell, *, confirm: bool) -> None:
 
 
 def longest_exposure_us(rig: Rig) -> int:
-    """Longest exposure that the LEDs' longest on-time allows."""
+    """Return the longest exposure that the LEDs' longest on-time allows."""
     return rig.led_limits.on_us[1] - rig.led_limits.rise_us - EXPOSURE_MARGIN_US
 
 

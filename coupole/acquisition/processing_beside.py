@@ -1,8 +1,8 @@
-"""The acquisition's end of the processing beside it: begins its process, hears of its progress, ends it.
+"""The acquisition's part of the processing beside it: begins its process, listens to its progress, and ends it.
 
-The process has the lowest priority and reads the run's folder alone (`coupole.reflectance.beside`). Here a thread
-waits for its lines, of which there is about one a second at most; the sequencer knows nothing of it. Whatever
-becomes of the process, the acquisition goes on, and says so.
+The process has the lowest priority and reads only the run's folder (`coupole.reflectance.beside`). Here a thread
+waits for its lines, at most about one a second. The sequencer does not know of the process. If the process fails,
+the acquisition goes on and says so.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ _READY_WITHIN_S = 120.0
 """Longer than its imports take on a busy machine."""
 _TOLD_AFTER_S = 1.0
 _SILENT_S, _LEAST_CPU_S = 120.0, 1.0
-"""A process that neither tells anything nor computes for so long, when all frames are there, hangs."""
+"""A process hangs if, with all frames there, it reports nothing and computes nothing for this time."""
 _IDLE_S = 20.0
-"""A process that waits for a complete view, and has found none for so long, will find none."""
+"""A process that waits this long for a complete view, and finds none, will find none."""
 _LOOK_EVERY_S, _ENDS_WITHIN_S = 0.5, 5.0
 Say = Callable[[str, int, int], None]
 
@@ -51,8 +51,9 @@ class ProcessingBeside:
     def __init__(
         self, plan: Path, rig: Path, result: Path | None, console: Console, *, resumed_run: Path | None = None
     ) -> None:
-        """Begin the process, which checks whether plan and rig can have a result; `result` is its folder, None for
-        one beside the run's, in which only a resumed run may find anything: its own."""
+        """Begin the process. It checks whether plan and rig can have a result. `result` is the result's folder;
+        None is a folder beside the run's folder. That folder must be empty, unless it holds the earlier result of
+        a resumed run."""
         self._console, self._result = console, None if result is None else result.absolute()
         self._run: Path | None = None
         self._progress = Progress()
@@ -61,13 +62,13 @@ class ProcessingBeside:
         self._has_answered = threading.Event()
         self._told = threading.Event()
         self._discarder: Discarder | None = None
-        """Set from the begin of a session whose frames are discarded to its end."""
+        """Set while a session lasts whose frames are discarded."""
         self._heard_s, self._cpu_at_s = 0.0, 0.0
-        """Time of the newest line, monotonic, and what the process had computed by then."""
+        """Monotonic time of the newest line, and the CPU time that the process had used by then."""
         self._has_ended = threading.Event()
         self._is_ending = False
         self._why = ""
-        """Reason that is known here why the result is not whole."""
+        """Known reason why the result is not complete."""
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
         self._process = subprocess.Popen(
             [sys.executable, "-m", _PROGRAM, str(os.getpid())],
@@ -88,7 +89,7 @@ class ProcessingBeside:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the process, if it has not ended; its results are kept."""
+        """End the process if it has not ended. Its results are kept."""
         if self._end() and self._run is not None:
             self._why = "the processing ended with the run, which is not complete"
             self._console.print(
@@ -105,7 +106,7 @@ class ProcessingBeside:
     # -- before anything moves --------------------------------------------------------------------------------
 
     def refusals(self) -> list[str]:
-        """List why no result could be made; to be asked before anything moves."""
+        """Return the reasons why a result cannot be made. Call it before anything moves."""
         if not self._has_answered.wait(_TOLD_AFTER_S):
             self._console.print("reflectance: checking plan, mesh and records ...", markup=False)
         if not self._has_answered.wait(_READY_WITHIN_S):
@@ -117,7 +118,7 @@ class ProcessingBeside:
     # -- while the run is acquired ----------------------------------------------------------------------------
 
     def result_of(self, run: Path) -> Path:
-        """The folder of the result of a run."""
+        """Return the folder of a run's result."""
         return self._result or default_result(run)
 
     def follow(self, run: Path) -> None:
@@ -129,8 +130,8 @@ class ProcessingBeside:
     def discard(
         self, run: Run, note: Callable[[FramesDiscarded], None], room: DiscardRoom
     ) -> Callable[[str], bool]:
-        """Discard frames of this session's run when their samples are safe, as its plan says; `note` brings the
-        event into the journal, on the disk. Returns the function that tells whether there is room for a view."""
+        """Discard frames of this session's run when their samples are safe, as its plan says; `note` writes the
+        event to the journal on the disk. Returns the function that tells whether there is room for a view."""
         self._discarder = discarder = Discarder(run, note, room, self._console)
         waited_for_view = ""
 
@@ -144,14 +145,14 @@ class ProcessingBeside:
         return has_room
 
     def end_session(self) -> None:
-        """The session is about to let the run go: what is left to discard is discarded by the process that makes
-        the result."""
+        """Prepare for the end of the session, which is about to give up the run. The process that makes the result
+        discards the rest."""
         if self._discarder is not None:
             discarder, self._discarder = self._discarder, None
             discarder.end()
 
     def _why_no_more(self) -> str:
-        """Return why no more frames will be discarded; empty while some may be."""
+        """Return why no more frames will be discarded. The text is empty while some may still be discarded."""
         if self._has_ended.is_set():
             return f"the processing has ended ({self._reason})"
         if is_stopped(self._process.pid):
@@ -167,7 +168,7 @@ class ProcessingBeside:
 
     def wait(self) -> None:
         """Wait for the result, after all frames are there and no device is open. A signal ends the wait and the
-        process; the frames are what the run's exit code tells of."""
+        process. The run's exit code depends on the frames only."""
         if self._run is None:
             return
         try:
@@ -182,7 +183,7 @@ class ProcessingBeside:
             self._say_unfinished()
 
     def figures(self) -> dict[str, Any]:
-        """Content of `reflectance` in `--json`."""
+        """Return the content of `reflectance` in `--json`."""
         if self._run is None:
             return {}
         return {
@@ -216,7 +217,7 @@ class ProcessingBeside:
         self._why = why
 
     def _cpu_s(self) -> float:
-        """Time that the process has computed; 0 if it is not known."""
+        """CPU time of the process, s; 0 if it is not known."""
         with contextlib.suppress(OSError, ValueError, IndexError):
             words = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
             return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
@@ -249,7 +250,7 @@ class ProcessingBeside:
             self._process.stdin.flush()
 
     def _listen(self) -> None:
-        """Hear all lines, until the process has ended; for a thread of its own."""
+        """Listen to all lines until the process has ended. This runs in a thread of its own."""
         assert self._process.stdout is not None
         with self._process.stdout as lines:
             for line in lines:
@@ -294,7 +295,7 @@ class ProcessingBeside:
 
     @property
     def _last_words(self) -> str:
-        """Reason why the process ended, as far as it is known."""
+        """Return why the process ended, as far as this is known."""
         code = self._process.returncode
         if code is not None and code < 0:
             return f"its process was killed by signal {-code}" + (" (memory was short?)" if code == -9 else "")

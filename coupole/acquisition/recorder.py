@@ -1,4 +1,4 @@
-"""Recorders for a run's frames and events: what the sequencer needs of one, and that of a run folder."""
+"""Recorders for a run's frames and events: the one that the sequencer needs, and that of a run folder."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ COMMIT_EVERY_S = 0.5
 PICTURES = "watch"
 """Folder of a run with pictures of what was found while it was acquired."""
 _SLOWEST_SYNC_BYTES_S, _SLOWEST_ALLOCATION_BYTES_S = 5e6, 50e6
-"""Speeds of the slowest disks that still answer: an allocation may be written out."""
+"""Speeds of the slowest disks that still answer. An allocation may be written out."""
 
 
 class Recorder(Protocol):
-    """The recorder that the sequencer needs. `store` may be called from several threads, all else from one."""
+    """The recorder that the sequencer needs. Several threads may call `store`, only one all else."""
 
     name: str
     """Purpose of the light, in the object's dose ledger: the run's name, or `meter`."""
 
     def light_before_lux_h(self) -> tuple[float, ...]:
-        """Light that earlier sessions of the run gave each of the object's dose points; empty if none did."""
+        """Light of earlier sessions of the run at each dose point of the object; empty if there was none."""
         ...
 
     def proven(self) -> set[ShotId]:
@@ -53,8 +53,7 @@ class Recorder(Protocol):
         ...
 
     def has_room(self, view: str) -> bool:
-        """Tell whether the disk has room for a view that is about to begin. Raises DiskFull if it never will
-        have."""
+        """Tell whether the disk has room for a view that is about to begin. Raises DiskFull if it never will."""
         ...
 
     def begin_view(
@@ -66,7 +65,7 @@ class Recorder(Protocol):
         base_from_camera: Transform,
         collections: Collections,
     ) -> None:
-        """The next frames are of this view; may be called again after a new measurement of the pose.
+        """Begin a view: the next frames belong to it. It may be called again after a new measurement of the pose.
 
         `collections` are arrays to be stored with the frames: by group name, then by array name.
         """
@@ -77,23 +76,23 @@ class Recorder(Protocol):
         ...
 
     def sample_frames(self, *, is_wanted: bool) -> None:
-        """Sample the frames that come, for `sample`, or do not."""
+        """Switch on or off whether new frames are sampled for `sample`."""
         ...
 
     def sample(self, shot: ShotId) -> FrameSample:
-        """The sample of a proven frame of the current view; of a frame of an earlier session, from the disk.
-        Raises StorageError."""
+        """Return the sample of a proven frame of the current view. For a frame of an earlier session, it is made
+        from the disk. Raises StorageError."""
         ...
 
     def earlier_pixels(self, shot: ShotId) -> NDArray[np.uint16]:
-        """[H, W], DN: a frame that an earlier session has proven, from the disk. Raises StorageError."""
+        """Return [H, W], DN: a frame that an earlier session has proven, from the disk. Raises StorageError."""
         ...
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None: ...
 
     def see_mark(self, slot: int, burst: Burst, step: int) -> None:
-        """See the frame of a mark that has no label and is freed afterwards. Such marks are those of a burst that
-        is taken again, or that a resumed run completes: the frames of its first marks are kept already."""
+        """See the frame of a mark that has no label; the frame is freed afterwards. A burst has these marks if it
+        is taken again or if a resumed run completes it, because the frames of its first marks are kept already."""
         ...
 
     def free(self, slot: int) -> None: ...
@@ -125,8 +124,8 @@ class RunRecorder:
         *,
         is_packed: bool = False,
     ) -> None:
-        """`collections` is stored in each view's file, beside the view's own collections. Frames may be stored
-        `is_packed`, two pixels in three bytes."""
+        """`collections` is stored in each view's file, beside the view's own collections. If `is_packed`, frames
+        may be stored as two pixels in three bytes."""
         self._run, self._metadata, self._packed = run, dict(metadata), is_packed
         self.name = run.folder.name
         self._described = dict(collections or {})
@@ -137,14 +136,14 @@ class RunRecorder:
         self._file = ""
         self._pose = 0
         self._read_back: dict[str, tuple[View, dict[ShotId, FrameProven]]] = {}
-        """The view's file and its frames of an earlier session, once one of them is asked for."""
+        """The view's file and its frames of an earlier session. It is read when one of these frames is needed."""
         self._committed_s = time.monotonic()
         self._committer = Workers(1, "commit")
         self._committing: Future[None] | None = None
         self._unsynced_bytes = 0
         self._uncommitted: list[ShotId] = []
         self.has_room_for: Callable[[str], bool] = lambda view: True
-        """Answer of `has_room`; where frames are discarded meanwhile, room may come."""
+        """Answer of `has_room`. If frames are discarded during the session, more room may become free."""
         self.committed = set(self._proven)
         """Proven shots whose lines are on the disk."""
 
@@ -245,7 +244,7 @@ class RunRecorder:
         self._uncommitted.append(shot)
 
     def see_mark(self, slot: int, burst: Burst, step: int) -> None:
-        """Nothing of it is kept."""
+        """Keep nothing of the mark."""
 
     def free(self, slot: int) -> None:
         self._samples.free(slot)
@@ -255,7 +254,7 @@ class RunRecorder:
         self._journal.write(event)
 
     def note_at_once(self, event: Event) -> None:
-        """Note an event from any thread; on the disk when this returns. Raises StorageError."""
+        """Note an event from any thread. It is on the disk when this returns. Raises StorageError."""
         self._journal.append([event_line(event)])
 
     def keep_picture(self, name: str, content: bytes) -> str:
@@ -275,8 +274,8 @@ class RunRecorder:
         return str(path.relative_to(self._run.folder))
 
     def commit(self, *, now: bool) -> None:
-        """A disk may take seconds to sync, so this is done in another thread unless it must be `now`, and a
-        running burst does not wait for the disk. Errors of that thread are raised by the next call."""
+        """Syncing a disk may take seconds. So another thread does it, unless it must be done `now`, and a running
+        burst does not wait for the disk. The next call raises the errors of that thread."""
         if self._committing is not None and (now or self._committing.done()):
             committing, self._committing = self._committing, None
             committing.result()
@@ -289,13 +288,13 @@ class RunRecorder:
             )
 
     def _take_uncommitted(self) -> tuple[list[str], list[ShotId]]:
-        """Lines that are to be written, and the shots that they prove."""
+        """Return lines that are not written yet, and the shots that they prove."""
         shots, self._uncommitted = self._uncommitted, []
         return self._journal.take(), shots
 
     def _commit_in_place(self, writer: ViewWriter | None, lines: list[str], shots: list[ShotId]) -> None:
-        """Raises StorageError after that if the run's folder is no longer at its path, or the view's file is not
-        as it was."""
+        """Write the lines. Then raise StorageError if the run's folder is no longer at its path, or if the view's
+        file has changed."""
         self._commit(writer, lines, shots)
         self._refuse_moved()
         if writer is not None:
@@ -323,7 +322,7 @@ class RunRecorder:
             )
 
     def _follow_folder(self) -> None:
-        """Have the run know where its folder is, if that was moved: the journal that is open goes with it."""
+        """Tell the run where its folder is now, if the folder was moved. The open journal moves with it."""
         if not self._journal.is_at_its_path:
             place = self._journal.place
             self._run.is_lost = place is None
@@ -339,8 +338,8 @@ class RunRecorder:
         self.committed.update(shots)
 
     def refuse_lost(self) -> None:
-        """Raise StorageError if the disk does not have what was proven in this session and before it: lines of the
-        journal, files of the views."""
+        """Raise StorageError if the disk does not have all that was proven in this session and before: lines of
+        the journal and files of the views."""
         proven_shots = self._run.proven()
         if lost_shots := self.committed - set(proven_shots):
             raise StorageError(
@@ -366,7 +365,7 @@ class RunRecorder:
 
     def close_quietly(self) -> None:
         """Commit the last events if possible; a failure here must not hide the error that ended the run. A disk
-        that hangs with frames may still take the other lines, which are written then."""
+        that hangs with frames may still take other lines; these are written."""
         lines, shots = self._take_uncommitted()
         try:
             if not hangs(DISK):
@@ -387,8 +386,8 @@ class RunRecorder:
         self._follow_folder()
 
     def close(self) -> None:
-        """Release everything; frames that were not committed remain unproven. Nothing is released that a thread
-        which was left behind may still use."""
+        """Release everything; frames that were not committed remain unproven. Resources that a thread left behind
+        may still use are not released."""
         if not left_behind():
             with contextlib.suppress(StorageError):
                 run_bounded(self._close)

@@ -1,14 +1,13 @@
 """Pause, stop and state of a running acquisition, for other processes of the same user on the same machine.
 
-Whoever acquires serves a Unix socket (`RunControl`), named after its run's folder, in a folder that only this user
-can enter (`user_socket`); commands and consoles ask it (`ask`, `running`)::
+The process that acquires serves a Unix socket (`RunControl`). The socket is named after the run's folder, and lies
+in a folder that only this user can enter (`user_socket`). Commands and consoles ask it (`ask`, `running`)::
 
     {"version": 1, "command": "pause"}      pause | go-on | stop | state
     {"version": 1, "run": "/runs/...", "pid": 4711, "state": "pausing", "view": "top", "proven": 52, ...}
 
-`stop` is answered when the lights are off
-and the arm was told to stop, or after 4 s with what is not sure (`trouble`); what the process still has to do
-(store, conclude) goes on after that.
+`stop` is answered when the lights are off and the arm was told to stop. After 4 s it is answered in any case, with
+the devices that are perhaps not safe (`trouble`). After the answer the process still stores and concludes.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ if TYPE_CHECKING:
 VERSION = 1
 Command = Literal["pause", "go-on", "stop", "state"]
 State = dict[str, Any]
-"""`run`, `rig`, `pid`, `light_after_lux_h`, `state` (running, pausing, paused, stopping); from the first burst on
-`Progress` too."""
+"""`run`, `rig`, `pid`, `light_after_lux_h`, `state` (running, pausing, paused, stopping). From the first burst on
+it also has the fields of `Progress`."""
 _SAFE_WITHIN_S = 4.0
 _UNHEARD = "the process did not run for a while, and is making the cell safe; when the cell is safe, ask again"
 _LOOK_PATIENCE_S = 0.5
@@ -45,8 +44,8 @@ _LOOK_PATIENCE_S = 0.5
 
 
 class RunControl:
-    """Serves the socket of a run while a context lasts; a machine on which that is not possible does without, and
-    `trouble` says why."""
+    """Serves the socket of a run while a context lasts. If this is not possible on a machine, the run goes on
+    without a socket, and `trouble` says why."""
 
     def __init__(
         self,
@@ -57,8 +56,9 @@ class RunControl:
         progress: Callable[[], Progress | None],
         light_after_lux_h: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
-        """`halt` switches lights off and stops the arm, at once, from any thread; `progress` is the newest;
-        `light_after_lux_h` is all light of the object (by its id) when the run is complete, by its preflight."""
+        """`halt` switches the lights off and stops the arm, at once, from any thread. `progress` is the newest
+        progress. `light_after_lux_h` is the total light of each object (by its id) when the run is complete, as
+        preflight expects it."""
         self._about: State = {"version": VERSION, "run": str(run), "rig": str(rig.resolve()), "pid": os.getpid()}
         self._about["light_after_lux_h"] = dict(light_after_lux_h)
         self._run, self._control, self._halt, self._progress = run, control, halt, progress
@@ -77,7 +77,7 @@ class RunControl:
         self._served.close()
 
     def state(self) -> State:
-        """Return the answer to every request."""
+        """Return the state, which is the answer to every request."""
         control = self._control
         state = "running"
         if control.pause.is_set():
@@ -129,10 +129,10 @@ _WHEN_GIVEN_UP = {
 
 
 def ask(run: Path, command: Command, say: Callable[[str], object] = lambda _: None) -> State:
-    """Send a command to the process that acquires into `run`; its state after it. `say` is told within 2 s why it
-    does not answer, and of a command that is given up without an answer what becomes of it.
+    """Send a command to the process that acquires into `run`; return its state afterwards. `say` gets a message
+    within 2 s if the process does not answer, and another if this gives up: it says what becomes of the command.
 
-    Raises InputError: none does, on this machine and by this user; NoAnswer.
+    Raises InputError if no process of this user on this machine acquires into `run`, and NoAnswer.
     """
     path = named_after(run, "sock")
     try:
@@ -145,8 +145,8 @@ def ask(run: Path, command: Command, say: Callable[[str], object] = lambda _: No
 
 
 def running() -> list[State]:
-    """States of all acquisitions of this user on this machine, the newest last; one that does not answer is
-    `silent`, and known only by its `socket`, a file's name."""
+    """Return the states of all acquisitions of this user on this machine, the newest last. An acquisition that
+    does not answer is `silent`, and has only its `socket`, a file's name."""
     return sorted(_running(), key=lambda state: str(Path(state["run"]).name))
 
 

@@ -1,4 +1,4 @@
-"""Description of a run: what run.json says, and the cell in every view's file, so that it can be used without rig
+"""Description of a run in run.json, and of the cell in every view's file. With it the run can be used without rig
 and plan."""
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ _MODEL = "OpenCV's: pinhole, distortion k1 k2 p1 p2 k3; pixel (0, 0) has its cen
 
 
 def described_cell(job: Job) -> Collections:
-    """The LEDs as the rig's table has them, and the lens: of the camera record in force, or else of the rig."""
+    """Return the LEDs as in the rig's table, and the lens: from the camera record in force, or otherwise from the
+    rig."""
     leds = job.cell.leds
     return {
         "instrument/leds": {
@@ -65,7 +66,7 @@ def _pinhole(values: Mapping[str, float]) -> dict[str, Quantity]:
 
 
 def _nominal(rig: Rig) -> dict[str, Quantity]:
-    """A pinhole without distortion that is focused at the rig's distance."""
+    """Return a pinhole camera without distortion, focused at the rig's distance."""
     image_mm = 1 / (1 / rig.lens.focal_length_mm - 1 / rig.lens.focus_distance_mm)
     f_px = image_mm / (rig.sensor.pixel_pitch_um * 1e-3)
     centre_px = (rig.sensor.width_px - 1) / 2, (rig.sensor.height_px - 1) / 2

@@ -1,4 +1,5 @@
-"""The folder of one user on one machine for what holds while processes run: sockets, locks of opened devices."""
+"""The folder of one user on one machine for files that live as long as processes: sockets, and locks of opened
+devices."""
 
 from __future__ import annotations
 
@@ -10,11 +11,12 @@ from pathlib import Path
 from coupole.errors import InputError
 
 _BASE = Path("/tmp")
-"""A user's own runtime folder would be gone after the last log-out, a run is not."""
+"""A user's usual runtime folder is removed after the last log-out, but a run goes on."""
 
 
 def runtime_folder() -> Path:
-    """The folder, made if it is missing. Raises InputError: another user owns it or may enter it; OSError."""
+    """Return the folder; make it if it is missing. Raises InputError if another user owns it or may enter it;
+    OSError."""
     folder = _BASE / f"coupole-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
     status = folder.stat(follow_symlinks=False)
@@ -24,5 +26,5 @@ def runtime_folder() -> Path:
 
 
 def named_after(path: Path, kind: str) -> Path:
-    """A file in the folder for something with this path, short enough for a socket."""
+    """Return a file in the folder for the thing at this path. Its name is short enough for a socket."""
     return runtime_folder() / f"{hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:24]}.{kind}"

@@ -1,4 +1,5 @@
-"""Actions that make a cell safe, each by itself; actions that are not surely done are reported."""
+"""Actions that make a cell safe, each independent of the others. Actions that are perhaps not done are
+reported."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from collections.abc import Callable, Sequence
 from coupole.bounded import leave_behind, waited_for
 
 _SAFE_WITHIN_S = 15.0
-"""Longer than any driver's time-outs for switching off and stopping; a call that hangs longer is given up and
+"""Longer than any driver's time-outs for switching off and stopping. A call that hangs longer is given up and
 reported.
 """
 
@@ -41,7 +42,7 @@ class Safeguard:
 
 
 def unsure(safeguards: Sequence[Safeguard], within_s: float) -> list[str]:
-    """Wait for the actions for a while; list those that are not surely done then."""
+    """Wait for the actions for a while; return those that are perhaps not done."""
     end_s = time.monotonic() + within_s
     for safeguard in safeguards:
         safeguard.wait(max(0.0, end_s - time.monotonic()))

@@ -61,14 +61,14 @@ class Sequencer:
         control: Control | None = None,
         can_stand: bool = True,
     ) -> None:
-        """`can_stand`: a person can let the session go on after a hold; else a hold ends it."""
+        """`can_stand`: a person can let the session go on after a hold. Otherwise a hold ends it."""
         self._job, self._cell = job, cell
         self._observer, self._control = observer or Unwatched(), control or Control()
         self._recorder = recorder = WatchedRecorder(recorder, job, self._observer, self._control)
         self._dose = DoseMeter(job, cell, recorder)
         self._bursts = BurstsOfViews(job, recorder)
         self._ahead_s = 0.0
-        """Expected duration of all that follows the burst under way."""
+        """Expected duration of all work after the present burst."""
         self._view_number = 0
         self._view_name = ""
         self.outcome = Outcome(shots=job.schedule.shots, dose_lux_h=self._dose.lux_h_in_all)
@@ -136,7 +136,7 @@ class Sequencer:
         return self.outcome
 
     def conclude(self, proven_shots: set[ShotId]) -> None:
-        """The outcome's figures, if these shots are proven."""
+        """Set the outcome's figures, with these shots as the proven ones."""
         self.outcome.dose_lux_h = self._dose.lux_h_in_all
         self.outcome.proven = sum(shot.is_shot for shot in proven_shots)
         bursts = (burst for n in range(len(self._job.schedule.views)) for burst in self._bursts.bursts(n))
@@ -148,14 +148,14 @@ class Sequencer:
         ]
 
     def give_up(self, proven_shots: set[ShotId]) -> None:
-        """Conclude the figures of a session whose thread was left behind, with these proven shots, whose lines are
-        on the disk. The light of a burst under way counts as planned."""
+        """Set the figures of a session whose thread was left behind. `proven_shots` are the shots whose lines are
+        on the disk. For a burst under way the planned light counts."""
         self._dose.give_up()
         self.conclude(proven_shots)
 
     def _remaining(self, number: int) -> list[Burst]:
-        """Bursts that are left of a view. If an earlier session has fired all of them, more bursts are chosen now.
-        A view that has not begun chooses when the arm is about to go there."""
+        """Return the bursts that are left of a view. If an earlier session has fired all its bursts, more bursts
+        are chosen now. For a view that has not begun, bursts are chosen when the arm is about to go there."""
         bursts = self._bursts.bursts_left(number)
         return bursts or (self._bursts.more(number) if self._bursts.bursts(number) else [])
 
@@ -227,8 +227,8 @@ class Sequencer:
     def _acquire_burst(self, burst: Burst, following: Burst | None, begin: Callable[[SettledPose], None]) -> None:
         """Fire a burst and then its unproven shots again, up to the plan's limit.
 
-        If an arm that was pushed springs back, `begin` is called again for the frames after that. It is never
-        driven back: a person may be what pushed it.
+        If somebody pushed the arm and it springs back, `begin` is called again for the next frames. The arm is
+        never driven back, because a person may have pushed it.
         """
         todo = burst
         attempt = 0

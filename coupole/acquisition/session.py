@@ -73,7 +73,7 @@ if TYPE_CHECKING:
     from coupole.acquisition.processing_beside import ProcessingBeside
 
 _ASKED_BOARDS = 12
-"""Number of boards, spread over the dome, whose temperature is read."""
+"""Number of boards, spread over the dome, at which the temperature is read."""
 
 
 # -- the run ----------------------------------------------------------------------------------------------
@@ -90,10 +90,10 @@ def acquire_plan(
     with_mesh: bool = False,
     beside: ProcessingBeside | None = None,
 ) -> None:
-    """Run a plan into a run folder; `figures` is filled with the figures of `--json`, also when this raises.
+    """Run a plan into a run folder. `figures` is filled with the figures of `--json`, even if this raises.
 
-    A mesh of more than 100 MB is copied into the folder only `with_mesh`. `beside` processes the run's views while
-    it is acquired.
+    A mesh of more than 100 MB is copied into the folder only if `with_mesh` is set. `beside` processes the run's
+    views while it is acquired.
     """
     with contextlib.ExitStack() as stack:
         run = Run(resume) if resume else None
@@ -180,14 +180,15 @@ def _acquire_into(
 
 
 def _end_recording(recorder: RunRecorder, beside: ProcessingBeside | None) -> None:
-    """Nothing is discarded any more when the recorder closes the journal."""
+    """End the processing's session, then close the recorder: nothing may be discarded when the journal is
+    closed."""
     if beside is not None:
         beside.end_session()
     recorder.close()
 
 
 def _refuse_without_result(job: Job) -> list[str]:
-    """A plan whose frames are discarded needs the result that stands for them."""
+    """Refuse a plan that discards frames but cannot have the result that replaces them."""
     why = job.plan.why_with_result
     return [str(job.document.problem(("discard",), why))] if why else []
 
@@ -195,7 +196,7 @@ def _refuse_without_result(job: Job) -> list[str]:
 def _close_complete(
     run: Run, job: Job, console: Console, beside: ProcessingBeside | None, figures: dict[str, Any]
 ) -> None:
-    """The session of a run whose frames are all there; what is missing may be its result."""
+    """Run the session of a run whose frames are all there. Its result may still be missing."""
     dose_lux_h = close_complete(run, console, beside.result_of(run.folder) if beside else None)
     if beside is not None:
         beside.follow(run.folder)
@@ -205,7 +206,7 @@ def _close_complete(
 
 
 def _begin_processing(job: Job, run: Run, recorder: RunRecorder, beside: ProcessingBeside) -> None:
-    """Process the run's views from now on; a resumed run knows of it by its journal."""
+    """Process the run's views from now on. The journal notes it, so that a resumed run knows of it."""
     recorder.note(ProcessingAsked(result=str(beside.result_of(run.folder))))
     recorder.commit(now=True)
     if job.plan.discard is not None:
@@ -239,8 +240,8 @@ def _acquire(
     *,
     figures: dict[str, Any],
 ) -> None:
-    """The session itself; its object will have received `light`, lux hours by id. First the cell is made safe,
-    whatever ended it; then the disk hears of it."""
+    """Run the session itself. At its end the objects will have received `light`, lux hours by id. However the
+    session ends, the cell is made safe first; then the end is written to the disk."""
     control = Control()
     observer = RunObserver(console, job.cell.rig.frame_bytes, len(recorder.proven()))
     sequencer = run_bounded(partial(Sequencer, job, cell, recorder, observer=observer, control=control))
@@ -291,7 +292,7 @@ def _acquire(
 
 
 def _say_what_comes_first(job: Job, faults: ArmFaults) -> None:
-    """A run whose arm is in a fault is not resumed before a person has confirmed it."""
+    """Say that a person must confirm an arm in a fault before the run can be resumed."""
     with contextlib.suppress(StorageError):
         if run_bounded(faults.standing):
             alarm(
@@ -301,13 +302,14 @@ def _say_what_comes_first(job: Job, faults: ArmFaults) -> None:
 
 
 def _refuse_unsafe_end(cell: OpenedCell) -> None:
-    """Raise DeviceError if it is not sure that all is off and at rest, though every frame is there."""
+    """Raise DeviceError if it is not sure that the lights are off and the arm is at rest, even if every frame is
+    there."""
     if cell.trouble:
         raise unsafe_end("; ".join(cell.trouble), "Look at the cell; all frames are stored.")
 
 
 def _figures(run: Run, job: Job, outcome: Outcome, proven: Collection[ShotId]) -> dict[str, Any]:
-    """The figures of `--json`; `proven` are shots whose lines are on the disk."""
+    """Return the figures of `--json`; `proven` are shots whose lines are on the disk."""
     frames = len(proven)
     return {
         "run": str(run.folder),
@@ -343,7 +345,8 @@ def _say_outcome(console: Console, run: Run, outcome: Outcome, ending: str) -> N
 
 
 def rehearse(job: Job, console: Console, *, speed: float, figures: dict[str, Any]) -> None:
-    """Run a whole plan on the rig's twin, faster than real time, and report what preflight cannot compute."""
+    """Run a whole plan on the rig's twin, faster than real time. Report the figures that preflight cannot
+    compute."""
     job = without_hidden(job)
     job, preflight = check_job(job, StorageFacts(UNLIMITED_BYTES))
     show_preflight(console, preflight, name=job.plan.name, rig=f"the twin of {job.cell.rig.name}")

@@ -1,4 +1,4 @@
-"""Notes of a session's end on what went wrong: each file call on the way out is bounded."""
+"""Notes what went wrong at a session's end. Each call to the file system is bounded."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from coupole.viewing.terminal import alarm
 
 
 def statistics(cell: OpenedCell) -> dict[str, float]:
-    """Return the statistics of the arm's link; empty if its driver has none to give any more."""
+    """Return the statistics of the arm's link; empty if its driver can no longer give them."""
     try:
         return {} if hangs("robot") else dict(run_bounded(cell.robot.statistics, stop=NOW))
     except Exception:  # noqa: BLE001  the session's end is told without them
@@ -26,7 +26,8 @@ def statistics(cell: OpenedCell) -> dict[str, float]:
 
 
 def note_failure(error: BaseException, cell: OpenedCell, run: Run, recorder: RunRecorder) -> None:
-    """The journal's line; an unexpected error also leaves its trace in the run's folder and says so."""
+    """Note the failure in the journal. For an unexpected error, also write its trace to the run's folder, and tell
+    this."""
     device = error.device if isinstance(error, DeviceError) else ""
     recorder.note(FaultNoted(kind=type(error).__name__, message=str(error), device=device))
     if isinstance(error, CoupoleError):
@@ -40,14 +41,14 @@ def note_failure(error: BaseException, cell: OpenedCell, run: Run, recorder: Run
 
 
 def note_what_hangs(error: BaseException, cell: OpenedCell, run: Run, recorder: RunRecorder) -> None:
-    """A stop has ended the session; if a call was given up meanwhile, this is reported too."""
+    """Report a call that was given up before the operator's stop ended the session."""
     if left_behind():
         alarm(str(error))
         note_failure(error, cell, run, recorder)
 
 
 def note_faults_of_the_arm(failure: BaseException | None, cell: OpenedCell, run: Run, faults: ArmFaults) -> None:
-    """They stay with the cell until a person confirms that the arm may move again."""
+    """Keep the arm's faults with the cell until a person confirms that the arm may move again."""
     fault = str(failure) if isinstance(failure, DeviceError) and failure.device == "robot" else ""
     if not fault and not cell.arm_confirmed:
         fault = "; ".join(cell.trouble)

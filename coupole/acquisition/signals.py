@@ -1,12 +1,12 @@
-"""Signals that end a session: Ctrl-C, SIGTERM, and SIGHUP when the terminal is gone; and what stops its process.
+"""Signals that end a session (Ctrl-C, SIGTERM, and SIGHUP when the terminal is gone), and signals that stop its
+process.
 
-Outside a session they raise `SignalReceived` in the main thread. In a session (`obeyed_by`) they are obeyed at
-once from a thread of their own, whatever the main thread waits for, and the main thread learns of it from
-`Control`. While a cell is made safe (`drop_signals`) they do nothing, so that a second Ctrl-C does not cut it
-short.
+Outside a session they raise `SignalReceived` in the main thread. In a session (`obeyed_by`) a thread of their own
+obeys them at once, whatever the main thread waits for. The main thread learns of them from `Control`. While a cell
+is made safe (`drop_signals`) they do nothing, so that a second Ctrl-C does not cut it short.
 
-Ctrl-Z (SIGTSTP) makes the cell safe before the process stops. SIGSTOP cannot be heard, nor a machine that falls
-asleep: when the process runs again, the session is held, and a person is asked (`Control.hold`).
+Ctrl-Z (SIGTSTP) makes the cell safe before the process stops. A process cannot notice SIGSTOP, or the machine's
+sleep, in advance. When it runs again, the session is held, and a person is asked (`Control.hold`).
 """
 
 from __future__ import annotations
@@ -32,19 +32,21 @@ from coupole.viewing.text_outlet import say_now
 Act = Callable[[], Sequence["Safeguard | str"]]
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _heard_s = deque([-math.inf], maxlen=1)
-"""Time when the main thread last heard of a signal, outside sessions."""
+"""Time when the main thread last received a signal, outside sessions."""
 
 _PULSE_S, _TOLD_WITHIN_S = 0.25, 0.1
 _LEAVES_WITHIN_S = 300.0
-"""Longer than devices that hang when they are closed, and a report."""
+"""Longer than the closing of hanging devices and the writing of a report take."""
 _STOPS_WITHIN_S = 0.1
-"""A process that stops itself may run on for a moment: the time that it stood is not to be taken for a freeze."""
+"""A process that stops itself may run on for a moment. This allows for it, so that the time of the stop does not
+count as a freeze."""
 _SAFE_WITHIN_S = 4.0
-"""Ctrl-Z stops the process after this time even if it is not sure that the cell is safe; a message says so."""
+"""Ctrl-Z stops the process after this time even if the cell is perhaps not safe; a message says so."""
 
 
 class SignalReceived(BaseException):
-    """One of `ENDING`, outside a session. No KeyboardInterrupt: typer would make exit code 130 of each."""
+    """One of `ENDING`, outside a session. It is not a KeyboardInterrupt, because typer would give exit code 130
+    for each signal."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -52,8 +54,8 @@ class SignalReceived(BaseException):
 
 
 def raise_outside_sessions() -> None:
-    """Have each signal raise SignalReceived from now on. A hang-up that is ignored (`nohup`) stays so; Ctrl-C and
-    SIGTERM always count, also in the background of a script."""
+    """Have each signal raise SignalReceived from now on. A hang-up that is ignored (`nohup`) stays ignored. Ctrl-C
+    and SIGTERM always count, even in the background of a script."""
     for number in ENDING:
         if not _stays_ignored(number):
             signal.signal(number, _raise)
@@ -74,9 +76,10 @@ def _drop(number: int, _: Any) -> None:
 
 @contextmanager
 def unheard_end() -> Iterator[None]:
-    """Outside sessions nothing shines or moves. If the main thread then does not hear of a signal for `STOPPED_S`,
-    because it waits in a call that never returns (a dead network disk), the process ends without it; also if it
-    has heard, and is still there after `_LEAVES_WITHIN_S`, because it waits for a thread that hangs."""
+    """End the process after a signal outside sessions even if the main thread hangs; nothing shines or moves then.
+    The process ends if the main thread has not received the signal after `STOPPED_S`, because a call never returns
+    (a dead network disk). It also ends if the main thread is still there `_LEAVES_WITHIN_S` after the signal,
+    because it waits for a thread that hangs."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -109,7 +112,7 @@ def _end_unheard(read_fd: int) -> None:
 
 @contextmanager
 def drop_signals() -> Iterator[None]:
-    """Drop signals that arrive within the context: whoever uses this is ending the session already."""
+    """Drop signals that arrive within the context, because the caller is ending the session already."""
     with _handlers(dict.fromkeys(ENDING, _drop)):
         yield
 
@@ -118,10 +121,10 @@ def drop_signals() -> Iterator[None]:
 def obeyed_by(control: Control, act: Act, *, is_watched: bool = True) -> Iterator[None]:
     """A signal that ends the session sets `control.stop` and calls `act` at once, in another thread; SIGUSR1
     pauses the session or continues it; Ctrl-Z calls `act`, stops the process, and holds the session. `act` begins
-    to make the cell safe; it returns its `Safeguard`s, and in words what is not sure already.
+    to make the cell safe. It returns its `Safeguard`s, and sentences on devices that are perhaps not safe.
 
-    Without `is_watched` another process watches the arm and the lamps: that this one did not run for a while holds
-    nothing.
+    Without `is_watched` another process watches the arm and the lamps. A freeze of this process then causes no
+    hold.
 
     Signals are delivered to Python's main thread only between two of its steps, and a disk or a device may hold it
     for seconds within one. The interpreter writes each signal's number to a pipe without delay; a thread reads it.
@@ -152,7 +155,8 @@ def obeyed_by(control: Control, act: Act, *, is_watched: bool = True) -> Iterato
 
 
 def _obey(read_fd: int, control: Control, act: Act, *, is_watched: bool) -> None:
-    """Obey the signals whose numbers come through a pipe, until it is closed; and prove that the process runs."""
+    """Obey the signals whose numbers come through a pipe, until the pipe is closed. Also record again and again
+    that the process runs."""
     has_acted, stood_s, noticed_s = False, 0.0, 0.0
     slept_s = _slept_s()
     control.pulse_s = time.monotonic()
@@ -190,7 +194,7 @@ def _slept_s() -> float:
 
 
 def _hold(control: Control, act: Act, why: str) -> None:
-    """Hold the session, and have lights off and the arm at rest."""
+    """Hold the session: switch the lights off and bring the arm to rest."""
     control.halting.set()
     try:
         control.hold(why)
@@ -203,7 +207,7 @@ def _hold(control: Control, act: Act, why: str) -> None:
 
 
 def _suspend(control: Control, act: Act) -> None:
-    """Ctrl-Z: first the cell is safe, then the process stops; when it goes on, a person is asked."""
+    """Obey Ctrl-Z: first make the cell safe, then stop the process. When it goes on, ask a person."""
     _hold(control, act, "suspended by Ctrl-Z: the lights were switched off and the arm was stopped first")
     state = "; ".join(control.unsure) or "lights are off, the arm is at rest"
     then = "the run then asks" if control.can_stand else "which then ends"
@@ -214,14 +218,14 @@ def _suspend(control: Control, act: Act) -> None:
 
 
 def _tell(text: str) -> None:
-    """Write to the terminal, if it takes the text within a moment: the process is about to stop, and its queue of
-    text too."""
+    """Write to the terminal, if it takes the text within a moment. The queue of messages cannot be used, because
+    the process is about to stop."""
     say_now(text, _TOLD_WITHIN_S)
 
 
 @contextmanager
 def _handlers(new_handlers: dict[signal.Signals, Any]) -> Iterator[None]:
-    """These handlers, in the main thread; the former ones at the end."""
+    """Set these handlers in the main thread, and restore the former handlers at the end."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""One picture at a time under one light, for who focuses and exposes: the live view and the bench.
+"""One picture at a time under one light, for focus and exposure. The live view and the bench use it.
 
 A light is on for one exposure only, and off before the next; nothing has to be switched off later.
 """
@@ -25,7 +25,7 @@ _FRAME_S = 2.0
 """Longest time from the end of an exposure until the frame reaches the host."""
 _BUFFERS = 8
 _PANEL_OVERHEAD_S = 1.0
-"""Expected of a panel's light beyond the exposure."""
+"""Expected time for which a panel is lit in addition to the exposure."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Shot:
 
 class SingleShots:
     """Pictures of a cell's camera, each under one LED, one panel or no light; the light is counted before it is
-    given. The caller must let only one thread in at a time.
+    given. Only one thread may use it at a time.
     """
 
     def __init__(
@@ -49,8 +49,8 @@ class SingleShots:
         meter: FlashMeter | None,
         every_s: float = 0.0,
     ) -> None:
-        """`lux` [points, LEDs of the table]; `meter` for an object whose light is counted; LEDs are lit every
-        `every_s` at most."""
+        """`lux` [points, LEDs of the table]. `meter` is for an object whose light is counted. LEDs are lit at most
+        once every `every_s`."""
         self._cell, self._rig, self._opened = cell, cell.rig, opened_cell
         self._lux, self._meter, self._every_s = lux, meter, every_s
         self._row_of_led = {int(led): row for row, led in enumerate(cell.leds.ids)}
@@ -58,10 +58,10 @@ class SingleShots:
         self._coding = Coding("MONO", 0, 1)
         self._rest_until_ns, self._period_s = 0, 0.0
         self.given_lux_h = np.zeros(len(lux))
-        """[points] by all pictures so far."""
+        """[points] light of all pictures so far."""
 
     def take(self, led: int, exposure_us: int, gain_db: float = 0.0, panel: int = 0) -> Shot:
-        """A picture under an LED (NO_LED: none) or a panel (0: none), not both. Raises DeviceError, and
+        """Take a picture under an LED (NO_LED: none) or a panel (0: none), not both. Raises DeviceError. Raises
         DoseBudgetReached or StorageError before the light is given."""
         opened_cell, timing = self._opened, self._timing(exposure_us)
         self._arm(Exposure(exposure_us, gain_db, opened_cell.ledbox.runs_tables))
@@ -88,7 +88,7 @@ class SingleShots:
             clock.sleep(max(0.0, (self._rest_until_ns - clock.now_ns()) / 1e9))
 
     def disarm(self) -> None:
-        """The camera is free for others."""
+        """Disarm the camera, so that others can use it."""
         self._opened.camera.disarm()
         self._armed_for = None
 
@@ -125,7 +125,8 @@ class SingleShots:
         self.given_lux_h = self.given_lux_h + lux_h
 
     def _under_panel(self, panel: int, fire: Callable[[], Frame], timing: BurstTiming) -> Frame:
-        """The picture while a panel is on, whose light is counted from command to confirmation."""
+        """Take the picture while a panel is on. The panel's light is counted from the command to the
+        confirmation."""
         box, clock = self._opened.ledbox, self._opened.clock
         points, lux = len(self._lux), self._rig.dome.panel_lux
         expected_lux_h = np.full(points, lux * (timing.on_us * 1e-6 + _PANEL_OVERHEAD_S) / 3600.0)

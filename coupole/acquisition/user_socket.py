@@ -1,7 +1,7 @@
-"""A Unix socket by which processes of one user on one machine ask another: a line of JSON each way.
+"""A Unix socket by which processes of one user on one machine ask another process: a line of JSON each way.
 
-One connection is one request and one answer. Each is obeyed by a thread of its own, whatever the others do. Nobody
-but the user (and root) can enter the socket's folder, open the socket, or is answered.
+One connection is one request and one answer. A thread of its own obeys each request, whatever the others do. Only
+the user (and root) can enter the socket's folder, open the socket and get an answer.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class UserSocket:
     """Serves a socket at a path while a context lasts. Raises OSError if it cannot."""
 
     def __init__(self, path: Path, answer: Callable[[bytes, Gone], Mapping[str, Any]]) -> None:
-        """`answer` makes an answer of a request's line, and begins nothing for who has `Gone`. A file at the path
-        was left by a process that was killed: the caller knows that no such process is alive.
+        """`answer` makes the answer to a request's line. It begins nothing if the other end has `Gone`. If there
+        is a file at the path, a killed process left it; the caller knows that this process is not alive.
         """
         self.path, self._answer = path, answer
 
@@ -86,19 +86,19 @@ def peer_uid(connection: socket.socket) -> int:
 
 
 def peer_pid(connection: socket.socket) -> int:
-    """The process at the other end; of a server the one that listens."""
+    """Return the process at the other end; for a server, the process that listens."""
     return _peer(connection)[0]
 
 
 def _peer(connection: socket.socket) -> tuple[int, int, int]:
-    """Process, user and group at the other end; of a server the process that listens."""
+    """Return process, user and group at the other end; for a server, those of the process that listens."""
     credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     pid, uid, gid = struct.unpack("3i", credentials)
     return pid, uid, gid
 
 
 def _hung_up(connection: socket.socket) -> bool:
-    """Tell whether the other end is closed; one that only sends nothing more is not."""
+    """Tell whether the other end is closed. An open end that only sends nothing more does not count."""
     poll = select.poll()
     poll.register(connection, 0)
     return any(events & (select.POLLHUP | select.POLLERR) for _, events in poll.poll(0))
@@ -110,8 +110,8 @@ def exchange(
     patience_s: float = PATIENCE_S,
     say: Callable[[str], object] = lambda _: None,
 ) -> dict[str, Any]:
-    """The answer to a request; `say` is told, within 2 s, why there is none yet. Raises OSError, and ValueError
-    for data that are not an answer.
+    """Return the answer to a request. If there is none yet, `say` gets the reason within 2 s. Raises OSError, and
+    ValueError for data that are not an answer.
     """
     begun_s = time.monotonic()
     with socket.socket(socket.AF_UNIX) as connection:
@@ -134,7 +134,8 @@ def exchange(
 
 @contextmanager
 def told_if_given_up(words: str, say: Callable[[str], object]) -> Iterator[None]:
-    """`say` is told `words`, if there are any, when a request ends without an answer of whoever is there."""
+    """Give `words` to `say`, if there are any, when a request ends without an answer from a process that is
+    there."""
     try:
         yield
     except (FileNotFoundError, ConnectionRefusedError):

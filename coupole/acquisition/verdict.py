@@ -15,7 +15,7 @@ PROOF_BY: dict[Marks, str] = {
     "none": "one light, one exposure, one frame; box log",
     "plain": "one light, one exposure, one frame; host's clock",
 }
-"""The kind of proof that a run states, by the marks of its bursts; from the strongest to the weakest
+"""The kind of proof that a run states, by the marks of its bursts. The strongest proof is first, the weakest last
 (docs/reference/run-folder.md)."""
 
 
@@ -28,7 +28,7 @@ class Verdict:
     """Shots whose LED drew no current."""
 
     def because(self, reason: str) -> Verdict:
-        """The same with another reason why frames are not proven, if there is one."""
+        """Return the same verdict, with another reason for unproven frames if there are any."""
         return replace(self, match=replace(self.match, reason=reason)) if reason else self
 
 

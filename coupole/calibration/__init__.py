@@ -1,4 +1,5 @@
-"""Calibrations: from observations to a result with its uncertainty. One package for each thing that is calibrated.
+"""Calibrations: from observations to a result with its uncertainty. There is one package for each thing that is
+calibrated.
 
 ::
 

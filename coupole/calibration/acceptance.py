@@ -1,7 +1,8 @@
 """Acceptance limits of a calibration, and how an operator sets one.
 
 A calibration lists its limits once, as `Allowed`. Its command uses the list for `--limit NAME=VALUE` and for its
-help, its workflow for the record (`against_limits`). The record keeps the default beside the limit asked for.
+help. Its workflow uses the list for the record (`against_limits`). The record keeps the default beside the
+operator's limit.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ def words_of(limits: Sequence[Allowed]) -> str:
 
 
 def parse_limits(words: Sequence[str], limits: Sequence[Allowed]) -> dict[str, float]:
-    """`NAME=VALUE` as operators write it. Raises InputError: no such limit, given twice, not a positive number."""
+    """Read limits as operators write them: `NAME=VALUE`. Raises InputError for an unknown limit, for one that is
+    given twice, and for a value that is not a positive number."""
     limit_by_name: dict[str, float] = {}
     names = {limit.name for limit in limits}
     for word in words:
@@ -57,8 +59,8 @@ def parse_limits(words: Sequence[str], limits: Sequence[Allowed]) -> dict[str, f
 def against_limits(
     limits: Sequence[Allowed], operator_limits: Mapping[str, float], figures: Mapping[str, float]
 ) -> tuple[Limit, ...]:
-    """Figures compared with their limits, as the record keeps them. `operator_limits` are the limits that the
-    operator set; `figures` has a figure for each limit."""
+    """Compare figures with their limits, in the form that the record keeps. `operator_limits` are the limits that
+    the operator set; `figures` has a figure for each limit."""
     from coupole.calibration.record import Limit
 
     return tuple(

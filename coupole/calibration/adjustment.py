@@ -1,13 +1,13 @@
 """Least squares with variance components: values, covariance, and the dominant sources of uncertainty.
 
-Observations come in blocks. A block has residuals divided by their stated noise, derivatives by the few parameters
-that it depends on, and belongs to one group (corners, robot's positions, robot's orientations, ...). The normal
-matrix is summed block by block, so the full Jacobian is never built. After convergence the noise of each group is
-estimated from its residuals and its redundancy (Foerstner, Photogrammetric Engineering 1979; the iterated estimate
-is REML), and the adjustment is repeated until the estimates no longer change.
+Observations come in blocks. A block has residuals divided by their stated noise, and derivatives by the few
+parameters that it depends on. It belongs to one group (corners, robot's positions, robot's orientations, ...). The
+normal matrix is summed block by block, so the full Jacobian is never built. After convergence the noise of each
+group is estimated from its residuals and its redundancy (Foerstner, Photogrammetric Engineering 1979; the iterated
+estimate is REML). The adjustment is repeated until the estimates no longer change.
 
 Two more results follow from the normal matrix: the contribution of each group to each parameter's variance (from C
-= C N C with N the sum over the groups), and the effective degrees of freedom of each standard uncertainty
+= C N C, where N is the sum over the groups), and the effective degrees of freedom of each standard uncertainty
 (Welch-Satterthwaite, GUM annex G.4).
 """
 
@@ -28,19 +28,19 @@ S = TypeVar("S")
 
 HUBER = 2.0
 REJECT_SIGMA = 5.0
-"""The norm of an image point's residual with normal noise exceeds this once in 270,000 points."""
+"""Bound of the norm of an image point's residual: with normal noise, one point in 270,000 exceeds it."""
 _MAX_STEPS = 60
 _MAX_ROUNDS = 30
 _SETTLED = 1e-3
-"""Noise factors have converged when they change by less than this, relative."""
+"""Noise factors have converged when their relative change is below this."""
 _SINGULAR = 1e-6
-"""Least diagonal element of the Cholesky factor of the scaled normal matrix; its square is the share of a
-parameter's information that is left when the parameters before it are unknown too."""
+"""Least diagonal element of the Cholesky factor of the scaled normal matrix. Its square is the share of a
+parameter's information that is left if the earlier parameters are unknown too."""
 _LEAST_REDUNDANCY = 3.0
-"""Least redundancy: with less, the residuals do not determine the noise."""
+"""Least redundancy. With less redundancy the residuals do not determine the noise."""
 _LEAST_FACTOR = 1e-4
-"""Lower bound of a noise factor (estimated over stated noise), as residuals of nearly zero would give a group
-unlimited weight."""
+"""Lower bound of a noise factor (estimated over stated noise). Without it, residuals of nearly zero would give a
+group unlimited weight."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +49,17 @@ class Group:
 
     name: str
     is_estimated: bool
-    """Estimate the noise from residuals. Where False, or where observations are too few, the stated noise is
-    used."""
+    """True if the noise is estimated from residuals. If it is False, or if there are too few observations, the
+    stated noise is used."""
     rejects: int = 0
-    """Number of residuals of one observation (2 for an image point) if single observations may be rejected; else
-    0."""
+    """Number of residuals of one observation (2 for an image point) if single observations may be rejected;
+    otherwise 0."""
 
 
 @dataclass(frozen=True)
 class Block:
     """Some observations: residuals [m] (observed minus computed, over the stated noise), derivatives of the
-    computed values [m, k], the columns of the k parameters, and the number of the group."""
+    computed values [m, k], columns of the k parameters, and the group's number."""
 
     residuals: Floats
     jacobian: Floats
@@ -73,7 +73,7 @@ class Component:
 
     name: str
     factor: float
-    """Estimated over stated noise; 1 where it was not to be estimated."""
+    """Estimated over stated noise; 1 if the noise was not to be estimated."""
     rejected_count: int
     redundancy: float
     chi2: float
@@ -102,7 +102,7 @@ class Adjusted(Generic[S]):
 
 
 def coverage_factor(degrees: Floats | float, coverage: float = 0.95) -> Floats:
-    """k for a two-sided interval, from Student's distribution."""
+    """Return k for a two-sided interval, from Student's distribution."""
     return np.asarray(stdtrit(np.maximum(degrees, 1.0), 0.5 + coverage / 2))
 
 
@@ -117,7 +117,7 @@ def adjust(
 ) -> Adjusted[S]:
     """Minimise the sum of squared residuals (Levenberg-Marquardt), estimate the noise, reject gross errors.
 
-    Huber's weights first limit the influence of gross errors; then residuals beyond `REJECT_SIGMA` are left out
+    First, Huber's weights limit the influence of gross errors. Then residuals beyond `REJECT_SIGMA` are left out,
     and the others are weighted by their noise alone. `calibration_name` names the calibration in errors. Raises
     InputError if the observations do not determine all parameters.
     """
@@ -155,7 +155,7 @@ def adjust(
 def _normals(
     blocks: Sequence[Block], weights: Sequence[Floats], groups: int, parameters: int
 ) -> tuple[Floats, Floats]:
-    """Normal matrices [groups, p, p] and right-hand sides [groups, p], with the stated noise."""
+    """Return the normal matrices [groups, p, p] and right-hand sides [groups, p], with the stated noise."""
     matrices, sides = np.zeros((groups, parameters, parameters)), np.zeros((groups, parameters))
     for block, weight in zip(blocks, weights, strict=True):
         weighted_jacobian = block.jacobian * weight[:, None]
@@ -181,7 +181,7 @@ def _descend(
     parameters: int,
     calibration_name: str,
 ) -> tuple[S, list[Block], int]:
-    """Levenberg-Marquardt with fixed weights, until a step no longer lowers the cost."""
+    """Run Levenberg-Marquardt with fixed weights, until a step no longer lowers the cost."""
     damping, cost = 1e-6, _cost(blocks, weights, factors)
     for step in range(1, _MAX_STEPS + 1):
         matrices, sides = _normals(blocks, weights, len(factors), parameters)
@@ -210,7 +210,8 @@ def _descend(
 
 
 def _cholesky_factor(normal: Floats, calibration_name: str) -> tuple[Floats, bool]:
-    """Cholesky factor of the normal matrix, scaled to a unit diagonal for the test of its rank."""
+    """Return the Cholesky factor of the normal matrix, which is scaled to a unit diagonal for the test of its
+    rank."""
     diagonal = np.diag(normal)
     if (diagonal > 0).all():
         scale = diagonal**-0.5
@@ -229,7 +230,7 @@ def _cholesky_factor(normal: Floats, calibration_name: str) -> tuple[Floats, boo
 
 
 def _observations(values: Floats, size: int) -> Floats:
-    """Root mean square of the residuals of each observation, which has `size` of them."""
+    """Return the root mean square of the residuals of each observation, which has `size` residuals."""
     return np.asarray(np.sqrt(np.mean(values.reshape(-1, size) ** 2, axis=1)))
 
 
@@ -241,8 +242,8 @@ def _huber(block: Block, size: int, factor: float) -> Floats:
 
 
 def _robust_factors(blocks: Sequence[Block], groups: Sequence[Group], factors: Floats) -> Floats:
-    """Noise from the median of absolute residuals, for groups that may have gross errors; unchanged for the
-    others."""
+    """Return the noise from the median of absolute residuals for groups that may have gross errors. The noise of
+    the other groups is unchanged."""
     new_factors = factors.copy()
     for number, group in enumerate(groups):
         if group.rejects and group.is_estimated:
@@ -260,7 +261,7 @@ def _seen_factors(
     parameters: int,
     calibration_name: str,
 ) -> Floats:
-    """Noise of each group from its squared residuals over its redundancy."""
+    """Return the noise of each group from its squared residuals over its redundancy."""
     matrices, _ = _normals(blocks, weights, len(groups), parameters)
     covariance = _covariance(matrices, factors, calibration_name)
     new_factors = factors.copy()
@@ -294,7 +295,7 @@ def _reject(
     accepted_masks: Sequence[np.ndarray[tuple[int], np.dtype[np.bool_]]],
     factors: Floats,
 ) -> list[np.ndarray[tuple[int], np.dtype[np.bool_]]] | None:
-    """Return masks of the residuals of each block that are within `REJECT_SIGMA`; None if no further one was
+    """Return masks of the residuals of each block that are within `REJECT_SIGMA`; None if no further residual was
     rejected."""
     result = []
     for block, before in zip(blocks, accepted_masks, strict=True):

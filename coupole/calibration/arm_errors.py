@@ -1,4 +1,4 @@
-"""Motion of an arm's flange by errors of its axes: the bundle's `axis_sensitivity`."""
+"""Motion of an arm's flange by errors of its axes, the `axis_sensitivity` of the adjustment."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ _STEP_DEG = 1e-3
 
 
 def axis_sensitivity(arm: Arm, joints_deg: ArrayLike) -> Floats:
-    """[n, 6, 6] for joints [n, 6]: step of the flange in its own frame (mm, radians) by degrees of each axis."""
+    """Return [n, 6, 6] for joints [n, 6]: the step of the flange in its own frame (mm, radians) for one degree of
+    each axis."""
     joints = np.asarray(joints_deg, dtype=np.float64)
     sensitivity = np.empty((len(joints), 6, 6))
     for number, at in enumerate(joints):

@@ -1,8 +1,8 @@
-"""Artefacts: the things with a certificate that calibrations are made from, and what a record keeps of them.
+"""Artefacts: things with a certificate that calibrations use, and the data of them that a record keeps.
 
-A description of a board, tile, chart or target may have a block `artefact`. It says which thing it is, what its
-certificate states, and at what temperature that holds. Uncertainties are stated as certificates state them:
-expanded, with the factor k and the coverage.
+A description of a board, tile, chart or target may have a block `artefact`. The block identifies the thing, and
+gives the certificate's figures and their temperature. Uncertainties are written as in certificates: expanded, with
+the factor k and the coverage.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from coupole.plan.base_model import FilePath, Model, Words
 
 Celsius = Annotated[float, Field(ge=-50.0, le=100.0)]
 Geometry = Literal["0/h", "8/h", "0/45"]
-"""Illumination and observation of a reflectance: light along the normal or at 8 degrees and all reflected light
-(gloss included), or light along the normal, seen at 45 degrees, over a perfect diffuser."""
+"""Illumination and observation of a reflectance. `0/h`, `8/h`: light along the normal or at 8 degrees, and all
+reflected light (gloss included). `0/45`: light along the normal, seen at 45 degrees, over a perfect diffuser."""
 NOT_TRACEABLE = "not traceable: no certificate"
 RUN_U_K = 2.0
-"""Standard uncertainty of an artefact's temperature that is taken from a run's coolest LED board."""
+"""Standard uncertainty of an artefact's temperature, if it is taken from a run's coolest LED board."""
 UNKNOWN_U_K = 5.0
-"""The same where nothing is known: within 9 K of the certificate's."""
+"""Standard uncertainty of an artefact's temperature if nothing is known: it is within 9 K of the certificate's."""
 _BANDS_NM: dict[Literal["R", "G", "B"], tuple[float, float]] = {
     "R": (580.0, 680.0),
     "G": (490.0, 580.0),
     "B": (430.0, 500.0),
 }
 _BAND_SHIFT_NM = 20.0
-"""Largest error of a band's place."""
+"""Largest error of the place of a band."""
 
 
 def _not_said(value: object) -> bool:
@@ -60,7 +60,7 @@ class CertifiedValue(Model):
         return self.expanded_u / self.k
 
     def words(self, unit: str) -> str:
-        """The figure as text."""
+        """Return the figure as text."""
         return f"{self.value:g} {unit}, U {self.expanded_u:g} {unit} (k = {self.k:g}, {self.coverage:.0%})"
 
 
@@ -72,9 +72,9 @@ class Certificate(Model):
     date: datetime.date
     """Date of the calibration."""
     due: datetime.date | None = Field(default=None, exclude_if=_not_said)
-    """Date on which its owner wants it calibrated again."""
+    """Date on which its owner wants it to be calibrated again."""
     file: FilePath | None = Field(default=None, exclude_if=_not_said)
-    """The certificate itself, beside the description: its checksum goes into records."""
+    """The file of the certificate, beside the description. Its checksum goes into records."""
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = Field(default=None, exclude_if=_not_said)
     """Checksum of the certificate's file."""
 
@@ -88,7 +88,7 @@ class CertifiedReflectance(Model):
     values: Annotated[tuple[tuple[float, float, float], ...], Field(min_length=1, max_length=1000)]
     """Wavelength in nm, reflectance, its expanded uncertainty."""
     bands_nm: dict[Literal["R", "G", "B"], tuple[float, float]] = Field(default_factory=lambda: dict(_BANDS_NM))
-    """First and last wavelength that each channel of the camera sees (assumed, if not stated)."""
+    """First and last wavelength that each channel of the camera sees. They are assumed if they are not stated."""
 
     @field_validator("values")
     @classmethod
@@ -112,12 +112,12 @@ class CertifiedReflectance(Model):
         return bands_nm
 
     def in_channel(self, channel: str, light: LightSpectrum | None) -> tuple[float, float]:
-        """Mean reflectance in a channel, and its standard uncertainty.
+        """Return the mean reflectance in a channel, and its standard uncertainty.
 
-        Weighted by the light within the channel's band, or by the band alone. Errors of a certificate's
-        wavelengths count as fully correlated, so their uncertainties add up linearly. A band is known within 20
-        nm: the change of the mean by this shift is the half width of a rectangular distribution. Raises
-        InputError for a band of which the certificate says nothing.
+        The mean is weighted by the light within the channel's band, or by the band alone. Errors at a
+        certificate's wavelengths count as fully correlated, so their uncertainties add up linearly. A band is
+        known within 20 nm. The change of the mean by this shift is the half width of a rectangular distribution.
+        Raises InputError for a band that the certificate does not cover.
         """
         first, last = self.bands_nm[channel]  # type: ignore[index]  # a sensor's channel
         wavelengths = np.array(self.values)[:, 0]
@@ -139,7 +139,7 @@ class CertifiedReflectance(Model):
         return value, float(np.hypot(u, u_band))
 
     def _mean_of_band(self, first: float, last: float, light: LightSpectrum | None) -> tuple[float, float] | None:
-        """Mean and standard uncertainty; None for a band without light."""
+        """Return mean and standard uncertainty; None for a band without light."""
         grid = np.linspace(first, last, 101)
         weights = np.ones_like(grid) if light is None else light.at(grid)
         if weights.sum() <= 0:
@@ -155,32 +155,33 @@ class LightSpectrum:
 
     wavelengths_nm: Floats
     power: Floats
-    """[n] of each wavelength."""
+    """[n] power at each wavelength."""
     source: str
-    """Name of the file or model that says so."""
+    """Name of the file or model that the power comes from."""
 
     def at(self, wavelengths_nm: Floats) -> Floats:
-        """Power at other wavelengths, 0 outside."""
+        """Return the power at other wavelengths, 0 outside."""
         return np.interp(wavelengths_nm, self.wavelengths_nm, self.power, left=0.0, right=0.0)
 
 
 class Artefact(Model):
-    """A thing by its certificate. All but name and serial number may be left out."""
+    """A thing with its certificate. All fields but name and serial number may be left out."""
 
     name: Words
     serial: Words
-    """Serial number: a check refuses artefacts whose number stands in the records that it checks."""
+    """Serial number. A check refuses artefacts with a number that is in the records that it checks."""
     certificate: Certificate | None = None
     temperature_c: Celsius = 20.0
-    """Temperature at which the certified figures hold."""
+    """Temperature for which the certified figures hold."""
     expansion_ppm_per_k: CertifiedValue | None = Field(default=None, exclude_if=_not_said)
     """Linear thermal expansion."""
     square_mm: CertifiedValue | None = Field(default=None, exclude_if=_not_said)
-    """Side of a board's squares, the mean over the whole board."""
+    """Side of a board's squares, as the mean over the whole board."""
     corner_um: CertifiedValue | None = Field(default=None, exclude_if=_not_said)
-    """Departure of a corner from its place by `square_mm`, per coordinate: value 0, and U of each corner."""
+    """Departure of a corner from its place according to `square_mm`, per coordinate: value 0, and U of each
+    corner."""
     flatness_um: CertifiedValue | None = Field(default=None, exclude_if=_not_said)
-    """Distance of two planes between which the surface lies."""
+    """Distance of two planes that enclose the surface."""
     reflectance: CertifiedReflectance | None = Field(default=None, exclude_if=_not_said)
 
     @property
@@ -190,7 +191,7 @@ class Artefact(Model):
 
 
 class Described(Model):
-    """A description of a thing that may have a certificate."""
+    """A description of a thing, which may have a certificate."""
 
     artefact: Artefact | None = None
     """Certificate and identity of the thing."""
@@ -207,7 +208,7 @@ class Temperature:
 
 
 class UsedArtefact(Model):
-    """Part of a record: an artefact that it was made from."""
+    """Part of a record: an artefact that was used for it."""
 
     role: Literal["board", "tile", "chart", "glare target"]
     artefact: Artefact
@@ -233,13 +234,13 @@ def used_as(
     artefact: Artefact | None,
     figures: dict[str, float] | None = None,
 ) -> tuple[UsedArtefact, ...]:
-    """Part of a record for an artefact whose lengths do not matter; nothing without one."""
+    """Return the part of a record for an artefact whose lengths do not matter; empty without an artefact."""
     return () if artefact is None else (UsedArtefact(role=role, artefact=artefact, figures=figures or {}),)
 
 
 def temperature_of(celsius: float | None, u_k: float, of_run_c: tuple[float, float] | None) -> Temperature:
-    """The temperature that was entered, else that of a run's coolest LED board (`of_run_c`, from and to), which is
-    nearest to the room's."""
+    """Return the temperature that was entered, or otherwise that of a run's coolest LED board (`of_run_c`, from
+    and to), which is nearest to the room's."""
     if celsius is not None:
         return Temperature(celsius, u_k, "entered by hand")
     if of_run_c is not None:
@@ -248,8 +249,9 @@ def temperature_of(celsius: float | None, u_k: float, of_run_c: tuple[float, flo
 
 
 def expansion_of(artefact: Artefact, temperature: Temperature) -> tuple[float, float]:
-    """Relative change of an artefact's lengths from its certificate to a temperature, and its standard
-    uncertainty. Where the temperature is not known nothing is changed, and the uncertainty allows for it."""
+    """Return the relative change of an artefact's lengths from its certificate's temperature to another one, and
+    its standard uncertainty. If the temperature is not known, nothing is changed, and the uncertainty allows for
+    this."""
     if artefact.expansion_ppm_per_k is None:
         return 0.0, 0.0
     per_k, u_per_k = 1e-6 * artefact.expansion_ppm_per_k.value, 1e-6 * artefact.expansion_ppm_per_k.u
@@ -262,8 +264,8 @@ D = TypeVar("D", bound=Described)
 
 
 def read_described(path: Path, model: type[D]) -> D:
-    """A description (YAML) with the checksum of its certificate's file. Raises InputError with all problems: also
-    for a certificate that is not there, or has another checksum than was stated."""
+    """Read a description (YAML), with the checksum of its certificate's file. Raises InputError with all problems,
+    also if the certificate is missing or does not have the stated checksum."""
     document = yamlfile.read_document(path)
     description = document.validate(model)
     artefact = description.artefact
@@ -289,7 +291,7 @@ def read_described(path: Path, model: type[D]) -> D:
 
 
 def facts_of(used_artefact: UsedArtefact) -> dict[str, str]:
-    """Facts of an artefact, by the names that pages show."""
+    """Return facts of an artefact, by the names that pages show."""
     artefact, certificate = used_artefact.artefact, used_artefact.artefact.certificate
     facts = {used_artefact.role: artefact.title, "certificate": NOT_TRACEABLE}
     if certificate is not None:
@@ -321,7 +323,7 @@ def facts_of(used_artefact: UsedArtefact) -> dict[str, str]:
 
 
 def sentence_of(used_artefact: UsedArtefact) -> str:
-    """One line: thing, certificate, or that there is none."""
+    """Return one line with the thing and its certificate, or that there is no certificate."""
     certificate = used_artefact.artefact.certificate
     certificate_words = (
         NOT_TRACEABLE

@@ -1,8 +1,9 @@
-"""The arm as a hand-eye calibration found it: zero errors of its axes, with the hand-eye's own uncertainty.
+"""The arm as a hand-eye calibration describes it: zero errors of its axes, and the uncertainty of the hand-eye.
 
 A hand-eye record that was made with the arm's model (`coupole calibrate hand-eye --rig`) holds for poses that are
-corrected by its axis zeros. In poses as reported, an error of 0.02 degrees in the zero of an axis shifts
-everything that the camera sees by a third of a millimetre, alike in every view, so no residual shows it.
+corrected by its axis zeros. Without this correction, an error of 0.02 degrees in the zero of an axis shifts
+everything that the camera sees by a third of a millimetre. The shift is the same in every view, so no residual
+shows it.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from coupole.calibration.rotations import Floats, rotation
 from coupole.kinematics import Arm
 
 ZEROS = tuple(f"axis_zero.a{axis}_deg" for axis in range(2, 7))
-"""Not A1's: it is a rotation of everything about the base and cannot be distinguished from the direction of the
-base's x axis."""
+"""Axis zeros that are estimated. A1 is not among them: it rotates everything about the base, and cannot be
+distinguished from the direction of the base's x axis."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,8 @@ class CalibratedArm:
     zeros_deg: Floats
     """[6]; A1 stays 0."""
     covariance: Floats
-    """[f + 6 + 5, f + 6 + 5] of the lens, the hand-eye's step (mm, rad) and the zeros of A2 to A6 (deg)."""
+    """[f + 6 + 5, f + 6 + 5] covariance of the lens, of the hand-eye's step (mm, rad) and of the zeros of A2 to A6
+    (deg)."""
 
 
 def has_axis_zeros(hand_eye: Path) -> bool:
@@ -40,7 +42,7 @@ def has_axis_zeros(hand_eye: Path) -> bool:
 
 
 def read_arm(hand_eye: Path, model: Arm) -> CalibratedArm:
-    """The arm by a hand-eye record that `has_axis_zeros`."""
+    """Return the arm from a hand-eye record that `has_axis_zeros`."""
     record = read_record(hand_eye)
     names = [parameter.name for parameter in record.parameters]
     zeros_deg = np.array([0.0, *(record.value(name) for name in ZEROS)])
@@ -54,15 +56,15 @@ def read_arm(hand_eye: Path, model: Arm) -> CalibratedArm:
 def calibrated_poses(
     base_from_flange: Floats, joints_deg: Floats, arm: CalibratedArm, prior: CameraPrior
 ) -> tuple[Floats, CameraPrior]:
-    """Reported poses [v, 4, 4] corrected by the axis zeros, and the camera's prior for them, which includes the
-    uncertainty of the zeros."""
+    """Return the reported poses [v, 4, 4] corrected by the axis zeros, and the camera's prior for them. The prior
+    includes the uncertainty of the zeros."""
     sensitivity = axis_sensitivity(arm.model, joints_deg)
     arm_prior = replace(prior, covariance=arm.covariance, axis_sensitivity=sensitivity[:, :, 1:])
     return _poses_with_zeros(base_from_flange, sensitivity, arm), arm_prior
 
 
 def corrected_poses(base_from_flange: Floats, joints_deg: Floats, arm: CalibratedArm) -> Floats:
-    """Reported poses [v, 4, 4] corrected by the axis zeros."""
+    """Return the reported poses [v, 4, 4] corrected by the axis zeros."""
     return _poses_with_zeros(base_from_flange, axis_sensitivity(arm.model, joints_deg), arm)
 
 

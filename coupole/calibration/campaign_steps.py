@@ -1,4 +1,5 @@
-"""The steps in which a cell is calibrated: what is acquired, what stands on the support, what comes of it."""
+"""The steps that calibrate a cell. Each says which pictures are acquired, what is on the support, and which
+records are made."""
 
 from __future__ import annotations
 
@@ -12,20 +13,20 @@ OBJECT: Mapping[str, Any] = {
     "abc_deg": [25.0, 0.0, 0.0],
     "stickers": {"count": 24},
 }
-"""The object on a simulated cell's support for the mesh, which the simulated scanner scans."""
+"""The object on a simulated cell's support for the mesh step. The simulated scanner scans it."""
 MESH = "mesh"
 
 
 @dataclass(frozen=True)
 class Step:
-    """One acquisition and the records made from it."""
+    """One acquisition and the records that are made from it."""
 
     name: str
     """Name of the plan, and of its template."""
     stands: str
-    """Text that tells the operator what must be on the support."""
+    """Text that tells the operator what to put on the support."""
     things: tuple[Mapping[str, Any], ...]
-    """The same for a simulated cell, which places it itself (`world.settings.things`)."""
+    """The same things for a simulated cell, which places them itself (`world.settings.things`)."""
     records: tuple[str, ...]
 
 
@@ -44,4 +45,4 @@ STEPS = (
     Step(MESH, "the scanned object with its stickers", (OBJECT,), (MESH,)),
 )
 BESIDE = (Step("glare", "the white card with black traps at the centre", ({"kind": "glare_target"},), ("glare",)),)
-"""Steps that `calibrate all` does not take."""
+"""Steps that are not part of `calibrate all`."""

@@ -1,8 +1,8 @@
-"""Quality of a fit's predictions for views that it did not have: each is left out in turn, without fitting anew.
+"""Quality of a fit's predictions for views that it did not have. Each view is left out in turn, without a new fit.
 
-With H the part of the hat matrix that belongs to a view, the residuals that it would have if it had been left out
-are (I - H)^-1 r, and their covariance is (I - H)^-1 (Allen's PRESS, Technometrics 16, 1974, for blocks).
-Quantities that only the view itself determines, such as the board's pose in it, do not count.
+Let H be the part of the hat matrix that belongs to a view. If the view is left out, its residuals are (I - H)^-1
+r, and their covariance is (I - H)^-1 (Allen's PRESS, Technometrics 16, 1974, for blocks). Quantities that only the
+view itself determines, such as the board's pose in it, do not count.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from coupole.calibration.adjustment import Block
 from coupole.calibration.rotations import Floats
 
 _OWN = 1e-6
-"""Directions of a view's residuals with less than this redundancy are determined by the view alone."""
+"""Least redundancy of a direction of a view's residuals. A direction with less redundancy is determined by the
+view alone."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,8 @@ def left_out(
     covariance: Floats,
     group: int = 0,
 ) -> LeftOut:
-    """`views` are the numbers of each view's blocks; `covariance` is that of all parameters, with these noises."""
+    """Return the predictions. `views` are the numbers of each view's blocks; `covariance` is the covariance of all
+    parameters, with these noises."""
     ratios, off = np.zeros(len(views)), np.zeros(len(views))
     for number, members in enumerate(views):
         columns = np.unique(np.concatenate([blocks[i].columns for i in members]))

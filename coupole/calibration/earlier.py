@@ -1,4 +1,4 @@
-"""Earlier records that a calibration uses: they must be accepted and hold for its images."""
+"""Earlier records that a calibration uses. They must be accepted, and must hold for its images."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ from coupole.errors import InputError
 
 _SAME_FIGURE = 1e-3
 SHAPE_SIGNAL = ("response", "flat-field")
-"""Kinds of records that say how signal follows from DN."""
+"""Kinds of records that give the signal for a DN value."""
 GLARE = "glare"
-"""The same of what is subtracted from it; a record of LEDs' powers says only if it was."""
+"""Kind of record whose veil is subtracted from the signal. A record of LEDs' powers says only whether it was
+used."""
 READ_WITH = "read_with."
-"""Begins the names of a powers' record's figures that say with which of them it was made: 1, or 0."""
+"""First part of the names of figures in a record of LEDs' powers. Such a figure says whether a kind of record was
+used for it: 1, or 0."""
 
 
 def read_earlier(path: Path, kind: Kind, about: About, size_px: tuple[int, int]) -> Record:
-    """A record of this kind for images that `about` and `size_px` (width, height) describe.
+    """Return a record of this kind for images that `about` and `size_px` (width, height) describe.
 
-    Raises InputError: another kind, limits exceeded, expired, another camera, focus, aperture, frame size or
-    temperature, a simulated record for a real cell.
+    Raises InputError for a record of another kind, with exceeded limits, or that has expired; for another camera,
+    focus, aperture, frame size or temperature; and for a simulated record for a real cell.
     """
     record = read_accepted(path, kind)
     _refuse_other(path, record, about, size_px)
@@ -31,7 +33,7 @@ def read_earlier(path: Path, kind: Kind, about: About, size_px: tuple[int, int])
 
 
 def read_accepted(path: Path, kind: Kind) -> Record:
-    """A record of this kind that met its limits. Raises InputError for another."""
+    """Return a record of this kind that met its limits. Raises InputError for any other record."""
     record = read_record(path)
     if record.kind != kind:
         raise InputError(f"{path}: expected a record of the kind `{kind}`, found one of `{record.kind}`")
@@ -46,9 +48,9 @@ def read_accepted(path: Path, kind: Kind) -> Record:
 
 
 def refuse_read_otherwise(path: Path, record: Record, given_kinds: Collection[str]) -> None:
-    """Raise InputError if a record of LEDs' powers was made with a response, a flat field or a glare and none is
-    among the kinds `given_kinds`, or the other way round: frames must be read as those were that the powers come
-    from."""
+    """Raise InputError if frames would be read differently from those that a record of LEDs' powers was made from.
+    This is so if it was made with a response, a flat field or a glare, and this kind is not among `given_kinds`,
+    or the reverse."""
     for kind in (*SHAPE_SIGNAL, GLARE):
         read_with = record.fixed.get(READ_WITH + kind, 0.0 if kind == GLARE else None)
         beside = _made_with(path, record, kind)
@@ -66,7 +68,7 @@ def refuse_read_otherwise(path: Path, record: Record, given_kinds: Collection[st
 
 
 def _made_with(path: Path, record: Record, kind: str) -> Path | None:
-    """A record of a kind that another was made with, if it lies beside it."""
+    """Return the record of a kind that another record was made with, if it lies beside that."""
     input_hashes = {line.sha256 for line in record.inputs if "/" not in line.name}
     for beside in sorted(path.parent.glob("*.yaml")):
         if hashlib.sha256(beside.read_bytes()).hexdigest() in input_hashes:
@@ -79,7 +81,7 @@ def _made_with(path: Path, record: Record, kind: str) -> Path | None:
 
 
 def refuse_same_images(path: Path, record: Record, inputs: Sequence[tuple[str, str]]) -> None:
-    """Raise InputError if a record was made from some of these images: they would count twice."""
+    """Raise InputError if a record was made from some of these images, because they would count twice."""
     image_hashes = {line.sha256 for line in record.inputs if "/" in line.name}
     if common := [name for name, sha256 in inputs if "/" in name and sha256 in image_hashes]:
         raise InputError(

@@ -1,4 +1,4 @@
-"""An image as calibrations use it: RAW, grey or in three colours, one colour at a time."""
+"""An image for calibrations: RAW, grey or in three colours. It is used one colour at a time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CHANNELS: tuple[Channel, ...] = ("green", "red", "blue")
 """Green first: the others are compared with it."""
 MONO, COLOUR = "MONO", "COLOUR"
 _RESIZED = (np.uint8, np.uint16, np.float32, np.float64)
-"""Types of which OpenCV takes means."""
+"""Types for which OpenCV can compute means."""
 
 
 @dataclass(frozen=True)
@@ -25,14 +25,15 @@ class Picture:
     values: NDArray[Any]
     """[H, W]; of pattern `COLOUR` [H, W, 3]: red, green, blue."""
     pattern: str
-    """Names of the four pixels at a RAW frame's top left, row by row; or `MONO`, or `COLOUR`."""
+    """Names of the four pixels at the top left of a RAW frame, row by row; or `MONO`, or `COLOUR`."""
     white: float
     """Value of saturation."""
     name: str = "picture"
 
     @staticmethod
     def of_grey(values: NDArray[Any], *, white: float | None = None, name: str = "picture") -> Picture:
-        """A grey image [H, W]; without `white`, the largest number of its type."""
+        """Make a picture from a grey image [H, W]. Without `white`, saturation is the largest number of the
+        image's type."""
         if white is None:
             white = float(np.iinfo(values.dtype).max) if np.issubdtype(values.dtype, np.integer) else float("inf")
         return Picture(values, MONO, white, name)
@@ -43,7 +44,8 @@ class Picture:
         return self.values.shape[1], self.values.shape[0]
 
     def plane(self, channel: Channel = "green") -> NDArray[Any]:
-        """One colour at full size [H, W]; grey is green. Raises InputError for another colour of a grey image."""
+        """Return one colour at full size [H, W]; grey counts as green. Raises InputError for another colour of a
+        grey image."""
         if self.pattern == COLOUR:
             return np.asarray(self.values[..., ("red", "green", "blue").index(channel)])
         if self.pattern == MONO:
@@ -52,16 +54,17 @@ class Picture:
         return plane(self.values, self.pattern, channel)
 
     def values_and_mask(self, channel: Channel = "green") -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """The values [H, W] with the pixels of one colour not interpolated, and which pixels these are: a tile [h,
-        w] that repeats over the image."""
+        """Return the values [H, W], with the pixels of one colour not interpolated. The mask of these pixels is a
+        tile [h, w] that repeats over the image."""
         if self.pattern in (COLOUR, MONO):
             return self.plane(channel), np.ones((1, 1), np.bool_)
         mask = np.array([letter == channel[0].upper() for letter in self.pattern]).reshape(2, 2)
         return self.values, mask
 
     def reduced(self, factor: int) -> NDArray[Any]:
-        """Green (or grey) at a fraction of the size [H // factor, W // factor]: means over squares of pixels, RAW
-        ones of the green pixels alone. Its pixel (x, y) has its middle at factor (x, y) + (factor - 1) / 2."""
+        """Return green (or grey) at a fraction of the size [H // factor, W // factor], as means over squares of
+        pixels. In a RAW image only the green pixels count. Its pixel (x, y) has its middle at factor (x, y) +
+        (factor - 1) / 2."""
         import cv2
 
         if factor == 1:
@@ -80,7 +83,7 @@ class Picture:
         return np.asarray(cv2.resize(values, size_px, interpolation=cv2.INTER_AREA))
 
     def white_share(self, rows: slice, columns: slice) -> float:
-        """Share of saturated pixels in a part of the image: of its green (or grey) pixels."""
+        """Return the share of saturated pixels in a part of the image, among its green (or grey) pixels."""
         values, mask = self.values_and_mask()
         tile_rows, tile_columns = mask.shape
         first_row, first_column = max(rows.start, 0), max(columns.start, 0)
@@ -102,9 +105,9 @@ class Picture:
 
 
 def plane(frame: NDArray[Any], pattern: str, channel: Channel = "green") -> NDArray[np.float32]:
-    """One channel of a RAW frame [H, W] at full size [H, W], DN: edges in it are edges in the frame.
+    """Return one channel of a RAW frame [H, W] at full size [H, W], DN. Edges in it are edges in the frame.
 
-    `pattern` is the names of the four pixels at the frame's top left, row by row; `MONO` has one channel. The
+    `pattern` has the names of the four pixels at the frame's top left, row by row; `MONO` has one channel. The
     value is a mean over the channel's pixels with the weights 1 2 1 in both directions. The weights of green
     pixels always sum to 8, those of red and blue to 4, and are symmetric about each pixel, so the image is not
     shifted.
@@ -123,7 +126,7 @@ def plane(frame: NDArray[Any], pattern: str, channel: Channel = "green") -> NDAr
 
 
 def _mean_of_greens(frame: NDArray[Any], pattern: str) -> NDArray[Any]:
-    """[H / 2, W / 2] mean of the two green pixels in each square of four of a RAW frame."""
+    """Return [H / 2, W / 2], the mean of the two green pixels in each square of four of a RAW frame."""
     import cv2
 
     height, width = frame.shape

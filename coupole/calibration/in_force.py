@@ -1,4 +1,4 @@
-"""Check whether a plan may be acquired with the calibrations that it names: pure functions that give all reasons
+"""Checks whether a plan may be acquired with the calibrations that it names. Pure functions give all reasons
 against it."""
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from coupole.errors import InputError, Problem
 from coupole.intake.input_files import InputFiles
 
 NEEDED = ("camera", "hand-eye")
-"""Kinds that are needed to compute the ray of a pixel in the robot's base."""
+"""Kinds that are needed to compute the ray of a pixel in the base frame."""
 _SAME = 1e-3
-"""Greatest relative difference of figures from a rig and a record that count as equal."""
+"""Greatest relative difference between equal figures of a rig and a record."""
 
 
 @dataclass(frozen=True)
 class Situation:
-    """The cell that is to take the pictures. A value of None is not known and not checked."""
+    """The cell that is to take the pictures. A value of None is not known, and is not checked."""
 
     now: datetime
     """Time now, with a time zone."""
@@ -46,8 +46,8 @@ class InForce:
 
 
 def read_in_force(paths: Sequence[Path], files: InputFiles | None = None) -> tuple[InForce, ...]:
-    """The records that a plan names, read from `files` if they are given. Raises InputError with the problems of
-    all files."""
+    """Return the records that a plan names, read from `files` if they are given. Raises InputError with the
+    problems of all files."""
     records: list[InForce] = []
     problems: list[Problem] = []
     messages: list[str] = []

@@ -1,11 +1,12 @@
-"""Errors of a model, found in the structure of its residuals, and what they add to values and uncertainties.
+"""Errors of a model that are found in the structure of its residuals, and their effect on values and
+uncertainties.
 
-A least-squares fit takes residuals for independent noise. A cause that the model has no term for leaves a pattern
-in them: over the field, over the board, from view to view. Each suspected cause is a set of modes with one unknown
-amplitude, r = sum_k F_k c_k + noise with c_k ~ N(0, s_k^2). Amplitudes and noise maximise the likelihood of what
-the fit left over (restricted maximum likelihood: Patterson and Thompson, Biometrika 58, 1971). Then the modes are
-unknowns like all others, with that prior: they move the result and widen its covariance as far as the residuals
-leave open. Kennedy and O'Hagan (J. R. Stat. Soc. B 63, 2001) treat the error of a model so.
+A least-squares fit treats residuals as independent noise. If the model has no term for a cause, the cause leaves a
+pattern in the residuals: over the field, over the board, from view to view. Each suspected cause is a set of modes
+with one unknown amplitude, r = sum_k F_k c_k + noise with c_k ~ N(0, s_k^2). Amplitudes and noise maximise the
+likelihood of the residuals (restricted maximum likelihood: Patterson and Thompson, Biometrika 58, 1971). Then the
+modes are unknowns like all others, with this prior. They change the result, and widen its covariance as far as the
+residuals allow. Kennedy and O'Hagan (J. R. Stat. Soc. B 63, 2001) treat the error of a model in this way.
 """
 
 from __future__ import annotations
@@ -21,14 +22,15 @@ from coupole.calibration.adjustment import Block
 from coupole.calibration.rotations import Floats
 
 _NULL = 1e-7
-"""Directions of the modes with less than this share of their information left are the model's own."""
+"""Least share of the information of a direction of the modes. With less, the direction belongs to the model
+itself."""
 _LEAST_LOG = -60.0
 _ROUNDS, _SETTLED = 4, 0.01
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """A cause that the model has no term for: derivatives [observations, modes] of the computed values over their
+    """A cause for which the model has no term: derivatives [observations, modes] of the computed values over their
     stated noise, in the order of the blocks of the group."""
 
     name: str
@@ -37,18 +39,19 @@ class Suspect:
 
 @dataclass(frozen=True)
 class Suspected:
-    """One suspect by the evidence of the residuals."""
+    """One suspect, as judged by the evidence of the residuals."""
 
     name: str
     amplitude: float
     """Standard deviation of its modes' coefficients."""
     evidence: float
-    """Twice the gain of log-likelihood by it."""
+    """Twice the increase of log-likelihood that it brings."""
     coefficients: Floats
-    """[modes], most probable."""
+    """[modes] most probable coefficients."""
     coefficient_covariance: Floats
     pattern: float
-    """Root mean square of its pattern in the residuals, over the stated noise; what the model absorbs left out."""
+    """Root mean square of its pattern in the residuals, over the stated noise. The part that the model absorbs is
+    left out."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +81,8 @@ def with_suspects(
 ) -> ModelError:
     """Judge the suspects by the residuals of `group`, at the solution of an adjustment.
 
-    `weights` are 1 for a residual that was kept, else 0; `factors` [groups] are the estimated noises over the
-    stated ones, `redundancy` that of the group.
+    `weights` are 1 for a residual that was kept, otherwise 0. `factors` [groups] are the estimated noises over the
+    stated ones. `redundancy` is that of the group.
     """
     noise = float(factors[group])
     for _ in range(_ROUNDS):
@@ -96,7 +99,7 @@ def with_suspects(
 
 
 class _Fit:
-    """Normal equations with the modes, the parameters eliminated; the group's noise is 1 here."""
+    """Normal equations with the modes, after elimination of the parameters. The group's noise is 1 here."""
 
     def __init__(
         self,
@@ -137,7 +140,7 @@ class _Fit:
         self.seen = (vectors[:, usable].T @ side) / np.sqrt(values[usable])
 
     def _prior_variances(self, logs: Floats) -> Floats:
-        """[modes] prior variances."""
+        """Return [modes] prior variances."""
         return np.asarray(np.exp(logs[1:])[self.of_mode])
 
     def _variance(self, logs: Floats) -> Floats:
@@ -146,8 +149,8 @@ class _Fit:
         )
 
     def minus_twice_log_likelihood(self, logs: Floats, redundancy: float) -> float:
-        """Return minus twice the log-likelihood, by the logarithms of the noise's variance and of the suspects'
-        amplitudes squared."""
+        """Return minus twice the log-likelihood. The arguments are the logarithms of the noise's variance and of
+        the suspects' squared amplitudes."""
         factor = cho_factor(self._variance(logs), lower=True)
         modes_part = 2.0 * float(np.sum(np.log(np.diag(factor[0])))) + float(
             self.seen @ cho_solve(factor, self.seen)
@@ -157,7 +160,7 @@ class _Fit:
         return modes_part + rest * float(logs[0]) + unexplained_chi2 * float(np.exp(-logs[0]))
 
     def most_likely(self, redundancy: float, allowed_suspects: Sequence[bool]) -> Floats:
-        """[1 + suspects] those logarithms; suspects that are not allowed have none."""
+        """Return [1 + suspects], the most likely of these logarithms. Suspects that are not allowed have none."""
         free = np.flatnonzero([True, *allowed_suspects])
         start = np.full(1 + len(self.suspects), _LEAST_LOG)
         start[0] = 0.0
@@ -204,7 +207,7 @@ class _Fit:
         return ModelError(step, self.covariance + by @ covariance @ by.T, noise, tuple(suspects))
 
     def _pattern(self, coefficients: Floats, by: Floats) -> float:
-        """Root mean square of what these coefficients leave in the residuals."""
+        """Return the root mean square of the pattern that these coefficients leave in the residuals."""
         step = -by @ coefficients
         total, count = 0.0, 0
         for jacobian, block, weight, rows in self._own:

@@ -1,7 +1,7 @@
 """Points in space from detections of several cameras of known pose, without known correspondences.
 
-Two rays of different views that pass close to each other give a candidate, which is accepted if enough other views
-have a detection at its projection. Each detection is used once, by the candidate with the most views.
+If two rays of different views pass close to each other, they give a candidate. It is accepted if enough other
+views have a detection at its projection. Each detection is used once, by the candidate with the most views.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class CameraView:
 
 @dataclass(frozen=True)
 class SeenPoint:
-    """One point and its detections: numbers of views, and of pixels in them."""
+    """One point and its detections: numbers of the views, and of the pixels in them."""
 
     base_mm: Floats
     views: tuple[int, ...]
@@ -42,7 +42,7 @@ class SeenPoint:
 
 
 def unproject(pixels: Floats, intrinsics: Intrinsics) -> Floats:
-    """Unit directions [n, 3] in the camera frame that project to pixels [n, 2] (Newton's method).
+    """Return unit directions [n, 3] in the camera frame that project to pixels [n, 2] (Newton's method).
 
     Raises InputError where the distortion cannot be inverted.
     """
@@ -65,8 +65,8 @@ def seen_points(
     depth_mm: tuple[float, float],
     least_views: int = LEAST_VIEWS,
 ) -> list[SeenPoint]:
-    """Points [base frame] that at least `least_views` views agree on within a tolerance, those with the most views
-    first.
+    """Return points [base frame] on which at least `least_views` views agree within a tolerance. Points with the
+    most views are first.
 
     `depth_mm`: least and largest distance in front of a camera.
     """
@@ -103,7 +103,8 @@ def _crossings(
     depth_mm: tuple[float, float],
     tolerance_rad: float,
 ) -> Floats:
-    """Midpoints [n, 3] of all pairs of rays that intersect within the tolerance in pixels, at allowed depths."""
+    """Return midpoints [n, 3] of all pairs of rays that intersect within the tolerance in pixels, at allowed
+    depths."""
     apart = b.base_from_camera[:3, 3] - a.base_from_camera[:3, 3]
     cosine = rays_a @ rays_b.T
     along_a, along_b = (rays_a @ apart)[:, None], (rays_b @ apart)[None]
@@ -149,7 +150,7 @@ def _refined_points(
     rays: Sequence[Floats],
     views: Sequence[CameraView],
 ) -> Floats:
-    """Points nearest to all rays that agree (least squares of distances)."""
+    """Return the points nearest to all rays that agree (least squares of distances)."""
     normal, side = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
     for number, view in enumerate(views):
         rows = np.flatnonzero(agreeing[:, number])
@@ -172,7 +173,8 @@ def _best_points(
     tolerance_px: float,
     least_views: int,
 ) -> list[SeenPoint]:
-    """Candidates by number of views, then by residual, each with detections that no earlier one uses."""
+    """Return candidates by number of views, then by residual. Each has only detections that no earlier one
+    uses."""
     agreeing = off_px <= tolerance_px
     rms_px = np.sqrt(np.where(agreeing, off_px, 0.0) ** 2).mean(axis=1)
     taken_pairs: set[tuple[int, int]] = set()

@@ -1,4 +1,4 @@
-"""The camera of the processing: pinhole with Brown-Conrady distortion, and its derivatives.
+"""The camera model of the processing: a pinhole with Brown-Conrady distortion, and its derivatives.
 
 The camera frame has z forward, x to the right and y down; the centre of the first pixel is (0, 0) (OpenCV's
 convention). The simulator has its own implementation, so that the two check each other.
@@ -20,7 +20,7 @@ MODELS = {
     "brown4": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "brown5": NAMES,
 }
-"""Parameters that a calibration leaves free; all others are 0."""
+"""Models, with the parameters that a calibration estimates. All other parameters are 0."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Intrinsics:
     k3: float = 0.0
 
     def vector(self) -> Floats:
-        """All nine [9], in the order of `NAMES`."""
+        """All nine parameters [9], in the order of `NAMES`."""
         return np.array([getattr(self, name) for name in NAMES])
 
     def matrix(self) -> Floats:
@@ -46,7 +46,7 @@ class Intrinsics:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def distortion(self) -> Floats:
-        """k1, k2, p1, p2, k3 [5], OpenCV's order."""
+        """k1, k2, p1, p2, k3 [5], in OpenCV's order."""
         return self.vector()[4:]
 
 
@@ -56,7 +56,7 @@ class Projected:
 
     pixels: Floats
     by_intrinsics: Floats
-    """[n, 2, 9], in the order of `NAMES`."""
+    """[n, 2, 9], derivatives in the order of `NAMES`."""
     by_point: Floats
     """[n, 2, 3], px per mm in the camera frame."""
 
@@ -64,9 +64,9 @@ class Projected:
 def project(points_camera_mm: ArrayLike, intrinsics: ArrayLike) -> Projected:
     """Project points [n, 3] of the camera frame with intrinsics [9].
 
-    Brown, Close-range camera calibration, Photogrammetric Engineering 37(8), 1971; with x = X/Z, y = Y/Z,
-    r^2 = x^2 + y^2 and g = 1 + k1 r^2 + k2 r^4 + k3 r^6:
-    u = fx (x g + 2 p1 x y + p2 (r^2 + 2 x^2)) + cx, v = fy (y g + p1 (r^2 + 2 y^2) + 2 p2 x y) + cy.
+    The source is Brown, Close-range camera calibration, Photogrammetric Engineering 37(8), 1971. With x = X/Z, y =
+    Y/Z, r^2 = x^2 + y^2 and g = 1 + k1 r^2 + k2 r^4 + k3 r^6: u = fx (x g + 2 p1 x y + p2 (r^2 + 2 x^2)) + cx, v =
+    fy (y g + p1 (r^2 + 2 y^2) + 2 p2 x y) + cy.
     """
     points = np.asarray(points_camera_mm, dtype=np.float64)
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = np.asarray(intrinsics, dtype=np.float64)

@@ -1,9 +1,9 @@
-"""Assigns points found to points known, although some are missing and some are false.
+"""Assigns found points to known points, even if some are missing and some are false.
 
 Three neighbouring points form a triangle whose sides a rigid motion does not change. Triangles of the found points
-are looked up among those of the known ones; each pair that fits gives a motion, and the motion that brings most
-found points onto known ones is the result. If another motion is nearly as good, the layout is ambiguous, which is
-an error.
+are looked up among those of the known points. Each matching pair gives a motion. The result is the motion that
+brings most found points onto known ones. If another motion is nearly as good, the layout is ambiguous, which is an
+error.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from coupole.calibration.rotations import Floats, nearest_rotation
 from coupole.errors import InputError
 
 NEIGHBOURS = 7
-"""Triangles are made of each point and two of this number of nearest ones: enough if a third of them is
+"""Triangles are made of each point and two of this number of nearest points. This is enough if a third of them is
 missing."""
 LEAST_MATCHED, LEAST_SHARE = 4, 0.4
-"""Least number of points that agree, and least share of the smaller set: fewer may agree by chance."""
+"""Least number of points that agree, and least share of the smaller set. Fewer points may agree by chance."""
 _TRIES = 20_000
 _AMBIGUOUS_SHARE = 0.8
 _THINNEST = 0.1
-"""Triangles thinner than this (height over longest side) determine the motion too poorly."""
+"""Least height of a triangle over its longest side. Thinner triangles determine the motion too poorly."""
 
 
 Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
@@ -35,19 +35,20 @@ Pairs = tuple[Indices, Indices]
 
 @dataclass(frozen=True)
 class Matched:
-    """Pairs of points, and the motion between them by least squares."""
+    """Pairs of points, and the motion between them from least squares."""
 
     found_rows: Indices
     known_rows: Indices
     found_from_known: Floats
-    """4x4, mm."""
+    """4x4 transform, mm."""
     rms_mm: float
     rivals: int
-    """Points that the next best motion brings together."""
+    """Number of points that the next best motion brings together."""
 
 
 def rigid_motion(from_points: Floats, to_points: Floats) -> Floats:
-    """4x4 that brings points [n, 3] onto others by least squares (Arun, Huang, Blostein, PAMI 9(5), 1987)."""
+    """Return the 4x4 transform that brings points [n, 3] onto others by least squares (Arun, Huang, Blostein, PAMI
+    9(5), 1987)."""
     middle_from, middle_to = from_points.mean(axis=0), to_points.mean(axis=0)
     turn = nearest_rotation((to_points - middle_to).T @ (from_points - middle_from))
     motion = np.eye(4)
@@ -56,9 +57,9 @@ def rigid_motion(from_points: Floats, to_points: Floats) -> Floats:
 
 
 def match_points(found_mm: Floats, known_mm: Floats, tolerance_mm: float) -> Matched:
-    """Match points found [n, 3] with points known [m, 3]; those that belong together lie within the tolerance.
+    """Match found points [n, 3] with known points [m, 3]. Points that belong together lie within the tolerance.
 
-    Raises InputError if too few agree, or if two motions do.
+    Raises InputError if too few points agree, or if two motions fit.
     """
     if len(found_mm) < LEAST_MATCHED or len(known_mm) < LEAST_MATCHED:
         raise InputError(
@@ -97,7 +98,7 @@ def match_points(found_mm: Floats, known_mm: Floats, tolerance_mm: float) -> Mat
 
 
 def _triangles(points: Floats) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.intp]], Floats]:
-    """Corners [t, 3] ordered by the side against them, longest last, and those sides [t, 3]."""
+    """Return corners [t, 3], ordered by the opposite side, with the longest side last, and these sides [t, 3]."""
     neighbours = min(NEIGHBOURS, len(points) - 1)
     near = cKDTree(points).query(points, neighbours + 1)[1]
     triples = {tuple(sorted((row[0], a, b))) for row in near for a, b in combinations(row[1:], 2)}
@@ -114,7 +115,7 @@ def _triangles(points: Floats) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.
 
 
 def _motions(found_mm: Floats, known_mm: Floats, tolerance_mm: float) -> Iterator[Floats]:
-    """Motions known -> found of pairs of triangles with the same sides, the closest pairs first."""
+    """Yield motions known -> found of pairs of triangles with the same sides, the closest pairs first."""
     found_triangles, found_sides = _triangles(found_mm)
     known_triangles, known_sides = _triangles(known_mm)
     if not len(found_triangles) or not len(known_triangles):
@@ -128,7 +129,7 @@ def _motions(found_mm: Floats, known_mm: Floats, tolerance_mm: float) -> Iterato
 
 
 def _pairs(tree: cKDTree, motion: Floats, known_mm: Floats, tolerance_mm: float) -> Pairs:
-    """Each found point with the nearest known one, one to one."""
+    """Return each found point with the nearest known one, one to one."""
     off_mm, nearest = tree.query(known_mm @ motion[:3, :3].T + motion[:3, 3], distance_upper_bound=tolerance_mm)
     known_of_found: dict[int, int] = {}
     for known_row in np.argsort(off_mm):

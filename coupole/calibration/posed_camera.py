@@ -1,4 +1,4 @@
-"""Camera and hand-eye by their records: the ray of a pixel at a reported pose, with its uncertainty."""
+"""Camera and hand-eye from their records: the ray of a pixel at a reported pose, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -29,19 +29,21 @@ class CameraPrior:
     """Parameters of the lens that were estimated."""
     flange_from_camera: Floats
     covariance: Floats
-    """[free + 6 + k, free + 6 + k]: lens, the hand-eye's step (mm, rad), then the zeros of k axes (deg)."""
+    """[free + 6 + k, free + 6 + k] covariance of the lens, then of the hand-eye's step (mm, rad), then of the
+    zeros of k axes (deg)."""
     axis_sensitivity: Floats | None = None
     """[views, 6, k] step of the flange in its own frame (mm, rad) per degree of these axes, at each view; None: k
     is 0."""
 
     @property
     def hand_eye_covariance(self) -> Floats:
-        """[6, 6], mm and rad."""
+        """[6, 6] covariance, mm and rad."""
         hand_eye_part = slice(len(self.free), len(self.free) + 6)
         return self.covariance[hand_eye_part, hand_eye_part]
 
     def by_axes(self, base_from_flange: Floats) -> Floats:
-        """[v, 6, k] step of each pose [v, 4, 4], as in `rotations.moved`, per degree of the axes."""
+        """Return [v, 6, k], the step of each pose [v, 4, 4] per degree of the axes, in the form of
+        `rotations.moved_transforms`."""
         if self.axis_sensitivity is None:
             return np.zeros((len(base_from_flange), 6, 0))
         shift = base_from_flange[:, :3, :3] @ self.axis_sensitivity[:, :3]
@@ -49,11 +51,11 @@ class CameraPrior:
 
 
 def read_posed_camera(hand_eye: Path, camera: Path | None, about: About, size_px: tuple[int, int]) -> CameraPrior:
-    """Camera and hand-eye from a hand-eye record, whose lens is its own camera's.
+    """Read camera and hand-eye from a hand-eye record. It contains the lens of its own camera.
 
     `camera` may name that camera's record too, as a check. `about` and `size_px` describe the camera of the
-    images. Raises InputError: a record of another kind, camera, focus, aperture or size; two records of different
-    lenses.
+    images. Raises InputError for a record of another kind, camera, focus, aperture or size, and for two records of
+    different lenses.
     """
     record = read_earlier(hand_eye, "hand-eye", about, size_px)
     prior = _prior(record)

@@ -37,12 +37,12 @@ class Convention(Model):
     angle_unit: Literal["deg", "rad"] = "deg"
     rotation: Rotation = "abc"
     order: tuple[int, int, int] = (0, 1, 2)
-    """Order in which the three numbers of a rotation stand; (2, 1, 0): written backwards."""
+    """Order of the three numbers of a rotation. (2, 1, 0) means that they are written backwards."""
     gives: Literal["base_from_flange", "flange_from_base"] = "base_from_flange"
 
 
 class PoseFile(Convention):
-    """Poses of the robot by the name of the image that was taken there; image names are relative to this file."""
+    """Poses of the robot by the name of the image that was taken there. Image names are relative to this file."""
 
     schema_version: Literal[1]
     poses: Annotated[dict[str, tuple[float, ...]], Field(min_length=1)]
@@ -66,12 +66,12 @@ class ReportedPoses:
 
     @property
     def base_from_flange(self) -> Floats:
-        """[n, 4, 4], mm."""
+        """[n, 4, 4] poses, mm."""
         return base_from_flange(self.numbers, self.convention)
 
 
 def read_poses(path: Path) -> tuple[PoseFile, ReportedPoses]:
-    """A pose file. Raises InputError with every problem of the file."""
+    """Read a pose file. Raises InputError with every problem of the file."""
     document = yamlfile.read_document(path)
     file = document.validate(PoseFile)
     absurd = [
@@ -86,13 +86,13 @@ def read_poses(path: Path) -> tuple[PoseFile, ReportedPoses]:
 
 
 def kuka_poses(base_from_flange_mm: Floats) -> ReportedPoses:
-    """Transforms [n, 4, 4] as a KUKA controller would write them."""
+    """Return transforms [n, 4, 4] in the form that a KUKA controller writes."""
     numbers = [[*t[:3, 3], *abc_from_rotation(t[:3, :3])] for t in base_from_flange_mm]
     return ReportedPoses(np.array(numbers), Convention())
 
 
 def base_from_flange(numbers: Floats, convention: Convention) -> Floats:
-    """[n, 4, 4] in mm of poses [n, 6 or 7]."""
+    """Return [n, 4, 4] in mm for poses [n, 6 or 7]."""
     poses = np.broadcast_to(np.eye(4), (len(numbers), 4, 4)).copy()
     poses[:, :3, 3] = numbers[:, :3] * (1000.0 if convention.length_unit == "m" else 1.0)
     poses[:, :3, :3] = _rotations(numbers[:, 3:], convention)
@@ -117,5 +117,5 @@ def _rotations(numbers: Floats, convention: Convention) -> Floats:
 
 
 def _turns(convention: Convention) -> tuple[int, int, int]:
-    """Axes that the three angles turn about, the first angle's first."""
+    """Return the axes of the three angles, in the order of the angles."""
     return (2, 1, 0) if convention.rotation == "abc" else (0, 1, 2)

@@ -1,9 +1,9 @@
 """The record of a calibration: result, uncertainty, inputs and validity.
 
-A YAML file with a SHA-256 of its own content, so that a record which was edited by hand is refused. Values of a
-rigid transform are given in mm and KUKA's A B C; their uncertainty is that of a small step: `x_mm y_mm z_mm` along
-the axes of the frame on the left of the transform's name, `rx_deg ry_deg rz_deg` about those of the frame on the
-right.
+It is a YAML file with a SHA-256 of its own content, so that a record which was edited by hand is refused. Values
+of a rigid transform are given in mm and KUKA's A B C. Their uncertainty is that of a small step: `x_mm y_mm z_mm`
+along the axes of the frame on the left of the transform's name, and `rx_deg ry_deg rz_deg` about the axes of the
+frame on the right.
 """
 
 from __future__ import annotations
@@ -66,13 +66,13 @@ class Parameter(Model):
     name: Annotated[str, Field(min_length=1)]
     """Name with its unit: `fx_px`, `flange_from_camera.x_mm`."""
     value: float | None
-    """None for the rotations of a small step: the transform itself has the angles."""
+    """None for the rotations of a small step, because the transform itself has the angles."""
     u: NotNegative
     """Standard uncertainty, in the name's unit."""
     degrees_of_freedom: Positive
-    """Effective, of that uncertainty; intervals follow Student's distribution."""
+    """Effective degrees of freedom of this uncertainty. Intervals follow Student's distribution."""
     dominated_by: str
-    """The largest source of its variance."""
+    """Name of the largest source of its variance."""
 
 
 class Noise(Model):
@@ -96,18 +96,18 @@ class ImageResidual(Model):
 
 @dataclass(frozen=True)
 class LedFault:
-    """Something about LEDs that the operator should check."""
+    """A fault of LEDs that the operator should check."""
 
     kind: str
     """`dead`, `swapped`, `miswired`, `astray`, `moved` (a board) or `few` (too few frames show it)."""
     leds: tuple[int, ...]
-    """Ids; none for a board."""
+    """Ids of the LEDs; none for a board."""
     text: str
-    """Text that says what was seen and what to do."""
+    """Text that says what was found and what to do."""
 
     @property
     def is_wrong(self) -> bool:
-        """False for a board that was mounted anew, and for an LED of which views are missing."""
+        """False for a board that was mounted anew, and for an LED with missing views."""
         return self.kind not in ("moved", "few")
 
 
@@ -121,7 +121,7 @@ class Limit(Model):
     name: str | None = Field(default=None, exclude_if=_not_said)
     """Name for `--limit`; None if an operator cannot set it."""
     usual: float | None = Field(default=None, exclude_if=_not_said)
-    """Default of the limit if the operator set another; else None."""
+    """Default of the limit if the operator set another one; otherwise None."""
 
     @property
     def is_met(self) -> bool:
@@ -129,7 +129,7 @@ class Limit(Model):
 
 
 class Comparison(Model):
-    """A value that a calibrated cell measured on an artefact, beside the certified one."""
+    """A value that a calibrated cell measured on an artefact, with the certified value."""
 
     position: str
     """Place of the artefact: the name of its run or folder."""
@@ -141,7 +141,7 @@ class Comparison(Model):
     """U of the certified value at the temperature of the measurement, k = 2."""
     measured_value: float
     expanded_u_measured: NotNegative
-    """U of the measured value by the records in force, k = 2."""
+    """U of the measured value from the records in force, k = 2."""
     permissible: Positive | None = Field(default=None, exclude_if=_not_said)
     """Largest permissible error that the user stated (MPE), in the unit."""
 
@@ -152,7 +152,7 @@ class Comparison(Model):
 
     @property
     def en(self) -> float:
-        """E_n of ISO 13528, 9.7: the error over both expanded uncertainties together."""
+        """E_n of ISO 13528, 9.7: the error over both expanded uncertainties combined."""
         together = float(np.hypot(self.expanded_u_certified, self.expanded_u_measured))
         return abs(self.error) / max(together, 1e-300)
 
@@ -161,12 +161,12 @@ class Input(Model):
     """A file that the calibration was made from."""
 
     name: str
-    """Below the run's or the images' folder, that folder's own name included."""
+    """Path below the run's or the images' folder, with that folder's own name."""
     sha256: Sha256
 
 
 class Validity(Model):
-    """Conditions under which a record holds. A value of None was not known and is not checked."""
+    """Conditions under which a record holds. A value of None was not known, and is not checked."""
 
     expires: AwareDatetime
     camera: str | None = None
@@ -179,7 +179,7 @@ class Validity(Model):
     focus_tolerance_mm: Positive = 2.0
     f_number: Positive | None = None
     temperature_c: tuple[float, float] | None = None
-    """Temperature of the room, from and to."""
+    """Lowest and highest temperature of the room."""
 
 
 class Record(Model):
@@ -194,14 +194,14 @@ class Record(Model):
     """True if any image comes from a simulated camera."""
     validity: Validity
     transforms: dict[str, Pose]
-    """`flange_from_camera` and the like; none for a camera."""
+    """Transforms by name, such as `flange_from_camera`; none for a camera."""
     parameters: Annotated[tuple[Parameter, ...], Field(min_length=1)]
     fixed: dict[str, float]
-    """Figures that were held, by name."""
+    """Figures that were not estimated, by name."""
     covariance: tuple[tuple[float, ...], ...]
     """[parameters, parameters], in the units of their names."""
     files: tuple[Input, ...] = ()
-    """Tables and maps beside the record, too large for it; with their covariances where they have some."""
+    """Tables and maps beside the record that are too large for it, with covariances if they have some."""
     noise: tuple[Noise, ...]
     images: tuple[ImageResidual, ...]
     limits: tuple[Limit, ...]
@@ -211,10 +211,10 @@ class Record(Model):
     faults: tuple[LedFault, ...] = Field(default=(), exclude_if=_none_found)
     """Faults of LEDs; their texts are among the remarks."""
     artefacts: tuple[UsedArtefact, ...] = Field(default=(), exclude_if=_none_found)
-    """Boards, tiles, charts that it was made from, with their certificates; none in a record that is not
-    traceable, or that rests on other records."""
+    """Boards, tiles and charts that it was made from, with their certificates. There are none in a record that is
+    not traceable, or that rests on other records."""
     comparisons: tuple[Comparison, ...] = Field(default=(), exclude_if=_none_found)
-    """Values of a check by an independent artefact."""
+    """Values of a check with an independent artefact."""
     inputs: Annotated[tuple[Input, ...], Field(min_length=1)]
     sha256: Sha256
 
@@ -225,17 +225,17 @@ class Record(Model):
 
     @property
     def covariance_matrix(self) -> NDArray[np.float64]:
-        """[parameters, parameters], in the units of their names."""
+        """Covariance [parameters, parameters], in the units of their names."""
         return np.array(self.covariance)
 
     def value(self, name: str) -> float:
-        """A figure that was estimated or held. Raises KeyError if there is none."""
+        """Return a figure that was estimated or held. Raises KeyError if there is none."""
         figures = {p.name: p.value for p in self.parameters if p.value is not None} | self.fixed
         return figures[name]
 
 
 def seal_record(**content: Any) -> Record:
-    """A record of this content, with its hash. Raises pydantic's ValidationError for invalid content."""
+    """Return a record of this content, with its hash. Raises pydantic's ValidationError for invalid content."""
     draft = Record.model_construct(**content, schema_version=1, sha256="")
     plain = json.loads(draft.model_dump_json(exclude={"sha256"}))
     return Record.model_validate_json(json.dumps({**plain, "sha256": content_sha256(plain)}))
@@ -273,8 +273,8 @@ def write_sealed(path: Path, plain: dict[str, Any], head: str) -> None:
 
 
 def read_record(path: Path, files: InputFiles | None = None) -> Record:
-    """Read a record back, with the files beside it, from `files` if they are given. Raises InputError with all
-    problems: wrong keys, an edited record, an invalid covariance."""
+    """Read a record with the files beside it, from `files` if they are given. Raises InputError with all problems:
+    wrong keys, an edited record, an invalid covariance."""
     files = InputFiles() if files is None else files
     document = yamlfile.read_document(path, files)
     record = document.validate(Record)
@@ -290,7 +290,7 @@ def read_record(path: Path, files: InputFiles | None = None) -> Record:
 
 
 def records_named(paths: list[Path]) -> tuple[Path, ...]:
-    """Records, and those in folders that are named."""
+    """Return the named records, and the records in named folders."""
     records: list[Path] = []
     for path in paths:
         if path.is_dir():
@@ -302,19 +302,19 @@ def records_named(paths: list[Path]) -> tuple[Path, ...]:
 
 
 def rows_of(matrix: NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:
-    """A covariance as records keep it: exactly symmetric."""
+    """Return a covariance in the form of records, exactly symmetric."""
     symmetric = 0.5 * (matrix + matrix.T)
     return tuple(tuple(map(float, row)) for row in symmetric)
 
 
 def pose_of(transform: NDArray[np.float64]) -> Pose:
-    """A transform [4, 4] as records keep it."""
+    """Return a transform [4, 4] in the form of records."""
     x, y, z = map(float, transform[:3, 3])
     return Pose(translation_mm=(x, y, z), abc_deg=abc_from_rotation(transform[:3, :3]))
 
 
 def step_names(transform: str) -> tuple[str, ...]:
-    """Names of the six parameters of a transform's small step."""
+    """Return the names of the six parameters of a transform's small step."""
     return tuple(f"{transform}.{step}" for step in _STEPS)
 
 
@@ -346,7 +346,8 @@ def _file_problems(record: Record, folder: Path, files: InputFiles) -> Iterator[
 
 
 def _lines(plain: dict[str, Any]) -> Iterator[str]:
-    """YAML of a record: one line for each parameter, image, row; inside a line it is JSON, which YAML includes."""
+    """Yield the YAML of a record, one line for each parameter, image and row. Inside a line it is JSON, which is
+    part of YAML."""
     for key, value in plain.items():
         if isinstance(value, list) and value and isinstance(value[0], dict | list):
             yield f"{key}:\n" + "".join(f"  - {json.dumps(item, ensure_ascii=False)}\n" for item in value)
@@ -357,7 +358,7 @@ def _lines(plain: dict[str, Any]) -> Iterator[str]:
 
 
 def intrinsics_of(record: Record) -> tuple[Intrinsics, tuple[str, ...]]:
-    """The lens of a record, and its estimated parameters in the covariance's order."""
+    """Return the lens of a record, and its estimated parameters in the order of the covariance."""
     values = {p.name: p.value for p in record.parameters} | dict(record.fixed)
     value_of = {name.removesuffix("_px"): value for name, value in values.items()}
     lens = Intrinsics(**{name: float(value_of.get(name) or 0.0) for name in NAMES})

@@ -1,4 +1,4 @@
-"""The report of a calibration: one page (HTML) and one picture (PNG), and how both are written with the record."""
+"""The report of a calibration: one page (HTML) and one picture (PNG). Both are written with the record."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Outcome:
     files: Mapping[str, bytes] = field(default_factory=dict)
     """Files by name, as `record.files` lists them: tables and maps that are too large for YAML."""
     sections: Sequence[Section] = ()
-    """Parts of the page beside those that all records have."""
+    """Parts of the page in addition to those of all records."""
 
 
 def write_outcome(record_path: Path, outcome: Outcome) -> tuple[Path, Path]:
@@ -57,7 +57,7 @@ def write_outcome(record_path: Path, outcome: Outcome) -> tuple[Path, Path]:
 
 
 def draw(outcome: Outcome) -> bytes:
-    """The picture as PNG, 1600 x 1200."""
+    """Return the picture as PNG, 1600 x 1200."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -178,7 +178,7 @@ def _parameter(parameter: Parameter) -> tuple[str, ...]:
 
 
 def _decimals(uncertainty: float) -> int:
-    """Number of decimals of a value that shows two digits of its uncertainty."""
+    """Return the number of decimals of a value that shows two digits of its uncertainty."""
     return int(np.clip(1 - np.floor(np.log10(max(uncertainty, 1e-12))), 0, 12))
 
 

@@ -1,4 +1,4 @@
-"""Options of the operator that all calibrations have."""
+"""Options of the operator for all calibrations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coupole.calibration.sources import About
 
 @dataclass(frozen=True)
 class Request:
-    """Options beside the images."""
+    """Options in addition to the images."""
 
     name: str
     now: datetime
@@ -29,7 +29,7 @@ class Request:
         return _to_the_second(self.now + timedelta(days=self.valid_days))
 
     def head(self) -> dict[str, object]:
-        """Name, time and software version, with which every record begins."""
+        """Return name, time and software version, with which every record begins."""
         return {
             "name": self.name,
             "created": _to_the_second(self.now),
@@ -39,7 +39,7 @@ class Request:
     def validity(
         self, about: About, size_px: tuple[int, int], temperature_c: tuple[float, float] | None
     ) -> Validity:
-        """Validity of a record of one camera with one lens, made between two temperatures."""
+        """Return the validity of a record of one camera with one lens, made between two temperatures."""
         margin = self.temperature_margin_c
         return Validity(
             expires=self.expires,

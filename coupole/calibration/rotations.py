@@ -11,7 +11,8 @@ _SMALL_RAD = 1e-8
 
 
 def skew(vectors: ArrayLike) -> Floats:
-    """Matrices [..., 3, 3] that take the cross product with vectors [..., 3] from the left: skew(v) w = v x w."""
+    """Return matrices [..., 3, 3] that take the cross product with vectors [..., 3] from the left: skew(v) w = v x
+    w."""
     v = np.asarray(vectors, dtype=np.float64)
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
     nought = np.zeros_like(x)
@@ -19,7 +20,7 @@ def skew(vectors: ArrayLike) -> Floats:
 
 
 def rotation(vectors_rad: ArrayLike) -> Floats:
-    """Rotation matrices of rotation vectors (Rodrigues' formula)."""
+    """Return the rotation matrices of rotation vectors (Rodrigues' formula)."""
     v = np.asarray(vectors_rad, dtype=np.float64)
     angle = np.linalg.norm(v, axis=-1)[..., None, None]
     across = skew(v)
@@ -30,10 +31,10 @@ def rotation(vectors_rad: ArrayLike) -> Floats:
 
 
 def quaternion(rotations: ArrayLike) -> Floats:
-    """Unit quaternions [..., 4] (w, x, y, z), w >= 0, of rotation matrices.
+    """Return the unit quaternions [..., 4] (w, x, y, z), w >= 0, of rotation matrices.
 
-    The column of largest norm of q q^T, which is linear in R (Bar-Itzhack, J. Guidance 23(6), 2000), so that no
-    digits are lost near special angles.
+    The result is the column of q q^T with the largest norm; q q^T is linear in R (Bar-Itzhack, J. Guidance 23(6),
+    2000). So no digits are lost near special angles.
     """
     r = np.asarray(rotations, dtype=np.float64)
     outer = np.empty((*r.shape[:-2], 4, 4))
@@ -52,7 +53,7 @@ def quaternion(rotations: ArrayLike) -> Floats:
 
 
 def rotation_vector(rotations: ArrayLike) -> Floats:
-    """Rotation vectors of rotation matrices, angle from 0 to pi."""
+    """Return the rotation vectors of rotation matrices, with angles from 0 to pi."""
     q = quaternion(rotations)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     half = np.arctan2(sine, q[..., :1])
@@ -62,7 +63,7 @@ def rotation_vector(rotations: ArrayLike) -> Floats:
 
 
 def nearest_rotation(matrices: ArrayLike) -> Floats:
-    """The rotation nearest to a matrix [..., 3, 3] (polar decomposition; determinant +1)."""
+    """Return the rotation nearest to a matrix [..., 3, 3] (polar decomposition; determinant +1)."""
     u, _, vt = np.linalg.svd(np.asarray(matrices, dtype=np.float64))
     turn: Floats = np.asarray(u @ vt)
     signs = np.ones((*turn.shape[:-2], 3))
@@ -71,7 +72,8 @@ def nearest_rotation(matrices: ArrayLike) -> Floats:
 
 
 def moved_transforms(a_from_b: Floats, steps: Floats) -> Floats:
-    """Transforms [..., 4, 4] after small steps [..., 6]: translation added (mm), rotation from the right (rad)."""
+    """Return transforms [..., 4, 4] after small steps [..., 6]. The translation is added (mm); the rotation is
+    applied from the right (rad)."""
     result = a_from_b.copy()
     result[..., :3, 3] += steps[..., :3]
     result[..., :3, :3] = a_from_b[..., :3, :3] @ rotation(steps[..., 3:])
@@ -79,13 +81,14 @@ def moved_transforms(a_from_b: Floats, steps: Floats) -> Floats:
 
 
 def between(a_from_b: Floats, other_transforms: Floats) -> Floats:
-    """The step [..., 6] (mm, rad) that `moved_transforms` needs from the first transforms to the others."""
+    """Return the step [..., 6] (mm, rad) with which `moved_transforms` changes the first transforms into the
+    others."""
     turn = np.swapaxes(a_from_b[..., :3, :3], -1, -2) @ other_transforms[..., :3, :3]
     return np.concatenate([other_transforms[..., :3, 3] - a_from_b[..., :3, 3], rotation_vector(turn)], axis=-1)
 
 
 def inverses(a_from_b: Floats) -> Floats:
-    """`b_from_a` of transforms [..., 4, 4]."""
+    """Return `b_from_a` for transforms [..., 4, 4]."""
     result = np.zeros_like(a_from_b)
     inverse_turns = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
     result[..., :3, :3] = inverse_turns

@@ -32,13 +32,13 @@ from coupole.storage.view_reader import View, read_view
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
 POSES_NAME, BOARD_NAME = "poses.yaml", "board.yaml"
 _MOST_FRAMES = 64
-"""Largest number of frames of one view: more do not improve corners."""
+"""Largest number of frames of one view. More frames do not improve corners."""
 _CLIPPED = 0.02
 
 
 @dataclass(frozen=True)
 class About:
-    """The camera that took the images. A value of None is not known."""
+    """The camera that took the images. None means that a value is not known."""
 
     is_simulated: bool
     camera: str | None = None
@@ -46,9 +46,9 @@ class About:
     focus_distance_mm: float | None = None
     f_number: float | None = None
     temperature_c: tuple[float, float] | None = None
-    """Lowest and highest temperature of the LED boards, the only ones that a run has."""
+    """Lowest and highest temperature of the LED boards. A run has no other temperatures."""
     begun: datetime | None = None
-    """Time when the latest of the runs began."""
+    """Time when the newest of the runs began."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Sources:
 
     images: tuple[Source, ...]
     poses: ReportedPoses | None
-    """One for each image, None if there are none."""
+    """One pose for each image; None if there are no poses."""
     about: About
     inputs: tuple[tuple[str, str], ...]
     """Name and SHA-256 of every file that was or will be read."""
@@ -74,19 +74,19 @@ class Sources:
     """The board that the images show, with its certificate; none without a certificate."""
 
     def with_file(self, path: Path | None) -> Sources:
-        """The same with one more input file."""
+        """Return the same sources with one more input file."""
         return self if path is None else replace(self, inputs=(*self.inputs, (path.name, sha256(path))))
 
     def with_words(self, words: str) -> Sources:
-        """The same with one more input, which stood on the command line."""
+        """Return the same sources with one more input, which was given on the command line."""
         digest = hashlib.sha256(words.encode()).hexdigest()
         return replace(self, inputs=(*self.inputs, (words, digest)))
 
 
 def open_sources(paths: Sequence[Path], poses: Path | None) -> Sources:
-    """Runs, or one folder of pictures with poses in `poses` or its own `poses.yaml`.
+    """Open runs, or one folder of pictures with poses in `poses` or in its own `poses.yaml`.
 
-    Raises InputError: nothing there, poses without their image, pictures of runs and folders mixed.
+    Raises InputError if nothing is there, if poses have no image, or if runs and folders are mixed.
     """
     runs = [path for path in paths if (path / "run.json").is_file()]
     if runs and len(runs) == len(paths) and poses is None:
@@ -124,7 +124,7 @@ def _of_folder(folder: Path, poses: Path | None) -> Sources:
 
 
 def _picture(path: Path) -> Picture:
-    """The picture with the file's bit depth and colours. Raises InputError if it cannot be read."""
+    """Return the picture with the file's bit depth and colours. Raises InputError if it cannot be read."""
     import cv2
 
     image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
@@ -138,7 +138,7 @@ def _picture(path: Path) -> Picture:
 
 
 def _of_run(run: Run) -> Sources:
-    """One image and pose for each view that has frames with light."""
+    """Return one image and pose for each view that has frames with light."""
     by_view: dict[str, list[FrameProven]] = {}
     for shot, frame in run.proven().items():
         by_view.setdefault(shot.view, []).append(frame)
@@ -167,13 +167,14 @@ def _of_run(run: Run) -> Sources:
 
 
 def _at_one_pose(frames: Sequence[FrameProven], table: NDArray[np.void]) -> list[FrameProven]:
-    """The frames of the pose with most frames: a view has two poses if the arm was moved during it."""
+    """Return the frames of the pose with most frames. A view has two poses if the arm was moved during it."""
     frame_counts = Counter(int(table[frame.index]["pose"]) for frame in frames)
     return [frame for frame in frames if int(table[frame.index]["pose"]) == frame_counts.most_common(1)[0][0]]
 
 
 def _mean_frame(name: str, file: View, lit: Sequence[FrameProven], dark: Sequence[FrameProven]) -> Picture:
-    """Mean of the frames at the longest exposure with few clipped pixels, dark frames subtracted."""
+    """Return the mean of the frames at the longest exposure with few clipped pixels, with dark frames
+    subtracted."""
     exposures = {frame.shot: int(file.records[frame.index]["exposure_us"]) for frame in (*lit, *dark)}
     for exposure_us in sorted({exposures[frame.shot] for frame in lit}, reverse=True):
         exposure_frames = [frame for frame in lit if exposures[frame.shot] == exposure_us]
@@ -200,7 +201,7 @@ def _mean(frames: Sequence[NDArray[np.uint16]]) -> Floats:
 
 
 def _evenly_chosen(frames: Sequence[FrameProven]) -> Iterator[FrameProven]:
-    """Return at most `_MOST_FRAMES` of the frames, evenly over the list."""
+    """Yield at most `_MOST_FRAMES` of the frames, evenly over the list."""
     step = max(1, -(-len(frames) // _MOST_FRAMES))
     return iter(frames[::step])
 
@@ -212,7 +213,7 @@ def frames_sha256(frames: Sequence[FrameProven]) -> str:
 
 
 def about_of(run: Run, file: View) -> About:
-    """Camera and lens by the attributes of a view's file. Raises StorageError."""
+    """Return camera and lens from the attributes of a view's file. Raises StorageError."""
     camera = file.attributes.get("camera")
     return About(
         is_simulated=run.is_simulated,
@@ -224,7 +225,7 @@ def about_of(run: Run, file: View) -> About:
 
 
 def _joined_sources(parts: Sequence[Sources]) -> Sources:
-    """Several runs as one. Raises InputError if they were taken with different lenses or cameras."""
+    """Return several runs as one. Raises InputError if they were taken with different lenses or cameras."""
     first = parts[0]
     for part in parts[1:]:
         here, there = (replace(source.about, temperature_c=None, begun=None) for source in (part, first))

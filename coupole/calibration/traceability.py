@@ -1,4 +1,4 @@
-"""Words of records about the certificates that they rest on."""
+"""Sentences about the certificates on which records rest."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ WITHOUT_ARTEFACT: dict[Kind, str] = {
     "leds": "traceable through the records that it was made from",
     "mesh": "traceable through the records that it was made from, and through the scanner",
 }
-"""Kinds of records that are made from no artefact of their own."""
+"""Kinds of records that are made without an artefact of their own."""
 
 
 def trace_of(record: Record) -> tuple[str, ...]:
-    """One line for each artefact of a record; one line that says why there is none."""
+    """Return one line for each artefact of a record, or one line that says why there is none."""
     if record.artefacts:
         return tuple(sentence_of(item) for item in record.artefacts)
     return (WITHOUT_ARTEFACT.get(record.kind, NOT_TRACEABLE),)
 
 
 def is_traceable(record: Record) -> bool:
-    """True if all artefacts of a record have a certificate, or if it needs none of its own."""
+    """True if all artefacts of a record have a certificate, or if the record needs no artefact of its own."""
     if record.artefacts:
         return all(item.is_traceable for item in record.artefacts)
     return record.kind in WITHOUT_ARTEFACT
 
 
 def overdue_of(record: Record, day: datetime.date) -> tuple[str, ...]:
-    """Certificates of a record that were due for calibration before a day."""
+    """Return the certificates of a record that were due for calibration before a day."""
     certificates = [(item.artefact, item.artefact.certificate) for item in record.artefacts]
     return tuple(
         f"{record.kind} {record.name}: the certificate {certificate.number} of {artefact.title} was due on "
@@ -44,7 +44,7 @@ def overdue_of(record: Record, day: datetime.date) -> tuple[str, ...]:
 
 
 def traceability_section(record: Record) -> Section:
-    """The part of a record's page that says which certificates it rests on."""
+    """Return the part of a record's page that names the certificates on which it rests."""
     sections = [
         Section(f"artefact-{number}", f"The {item.role}", facts=dict(facts_of(item)))
         for number, item in enumerate(record.artefacts, start=1)

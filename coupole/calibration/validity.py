@@ -1,9 +1,9 @@
 """Validity by drift: whether a record's figures have changed by more than their uncertainty since it was made.
 
-Two things tell it. A `drift` record says how far the LEDs' powers are from their calibration, at equal
-temperature. An earlier record of the same kind says how fast a figure changes: if the change between both is
-significant (twice the standard uncertainty of the difference), the same rate since the later one must not exceed
-its uncertainty.
+There are two tests. A `drift` record says how far the LEDs' powers are from their calibration, at equal
+temperature. An earlier record of the same kind says how fast a figure changes. If the change between both records
+is significant (twice the standard uncertainty of the difference), the change at this rate since the later record
+must not exceed its uncertainty.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _SIGNIFICANT = 2.0
 
 
 def expired_by_drift(items: Sequence[InForce], earlier: Sequence[InForce], now: datetime) -> tuple[str, ...]:
-    """One line for each record whose drift exceeds its standard uncertainty."""
+    """Return one line for each record whose drift exceeds its standard uncertainty."""
     lines = [*_by_drift_records(items)]
     for item in items:
         for before in earlier:
@@ -58,13 +58,13 @@ def _by_drift_record(item: InForce, drift: Record) -> Iterator[str]:
 
 
 def _relative_u(record: Record) -> float:
-    """Relative standard uncertainty of the mean power in the channel by which drift is measured."""
+    """Return the relative standard uncertainty of the mean power in the channel in which drift is measured."""
     mean = next(parameter for parameter in record.parameters if parameter.name == f"mean_power.{CHANNEL}")
     return mean.u / max(abs(mean.value or 0.0), 1e-300)
 
 
 def _by_rate(item: InForce, before: Record, now: datetime) -> Iterator[str]:
-    """The figure whose drift exceeds its uncertainty most, if there is one."""
+    """Yield the figure whose drift exceeds its uncertainty most, if there is one."""
     record = item.record
     age_s = (now - record.created).total_seconds()
     between_s = (record.created - before.created).total_seconds()

@@ -1,4 +1,5 @@
-"""Simulated annealing over the order of groups and the place visited in each; compiled (`motion.ordering`)."""
+"""Simulated annealing over the order of groups and the place that is visited in each group. It is compiled, for
+`motion.ordering`."""
 
 from __future__ import annotations
 
@@ -8,15 +9,15 @@ import numpy as np
 
 @numba.njit(cache=True, nogil=True)
 def anneal(seconds, posture_cost_s, first, order, tour_places, rolls, hottest_s, coldest_s):  # type: ignore[no-untyped-def]
-    """The best order of groups [n], and the places chosen in it [n], found by random changes.
+    """Return the best order of groups [n] that random changes find, and the chosen places [n].
 
-    `seconds` [places, places] between places, symmetric; place 0 is the start, those of group g are `first[g]` to
-    `first[g + 1] - 1`; `posture_cost_s` [places] is added for each place that is used; `rolls` [changes, 5] are
-    random numbers from 0 to 1.
+    `seconds` [places, places] are the times between places, symmetric. Place 0 is the start; the places of group g
+    are `first[g]` to `first[g + 1] - 1`. `posture_cost_s` [places] is added for each place that is used. `rolls`
+    [changes, 5] are random numbers from 0 to 1.
 
-    A change reverses a section of the tour, moves a visit to another position and to any place of its group, or
-    changes its place only. A worse tour is accepted with the Metropolis probability at a temperature that falls
-    geometrically.
+    A change reverses a section of the tour, or moves a visit to another position and to any place of its group, or
+    changes only the place of a visit. A worse tour is accepted with the Metropolis probability at a temperature
+    that falls geometrically.
     """
     n = len(order)
     # visit i, from 1 to n, is at tour[i], of group order[i - 1]
@@ -55,7 +56,7 @@ def anneal(seconds, posture_cost_s, first, order, tour_places, rolls, hottest_s,
 
 @numba.njit(cache=True, nogil=True)
 def _reversed_s(seconds, tour, i, j):  # type: ignore[no-untyped-def]
-    """Additional cost of visits i to j in reversed order."""
+    """Return the additional cost of visits i to j in reversed order."""
     change_s = seconds[tour[i - 1], tour[j]] - seconds[tour[i - 1], tour[i]]
     if j + 1 < len(tour):
         change_s += seconds[tour[i], tour[j + 1]] - seconds[tour[j], tour[j + 1]]
@@ -64,7 +65,7 @@ def _reversed_s(seconds, tour, i, j):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _moved_s(seconds, tour, i, j, place):  # type: ignore[no-untyped-def]
-    """Additional cost of visit i as the j-th, at another place."""
+    """Return the additional cost if visit i becomes the j-th visit, at another place."""
     after_i, after_j = i + 1, j if j < i else j + 1
     before_j = tour[j] if j > i else tour[j - 1]
     change_s = seconds[before_j, place] - seconds[tour[i - 1], tour[i]]

@@ -1,5 +1,5 @@
-"""Bodies of the arm and its tool: spheres in the frames of the links, and their greatest distances from the
-axes."""
+"""Bodies of the arm and its tool: spheres in the frames of the links, and greatest distances of the bodies from
+the axes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from coupole.plan.link_meshes import LINKS, link_mesh_path
 LINK_MESH_STEP_MM = 12.0
 """Spacing of the points on a link's mesh, if meshes are used instead of capsules."""
 _METRES_BELOW = 10.0
-"""A link mesh no larger than this is taken as metres (the ROS convention), otherwise as mm."""
+"""A link mesh of at most this size is taken to be in metres (the ROS convention), a larger one in mm."""
 
 _LARGEST_MM = 5000.0
 _PARTS: Remembered[NDArray[np.bool_]] = Remembered(most=16)
@@ -52,7 +52,7 @@ class Body:
 
 
 def capsules_of(arm: ArmDescription) -> tuple[Capsule, ...]:
-    """The arm's capsules, from the base outwards as its description lists them."""
+    """Return the arm's capsules from the base outwards, in the order of its description."""
     return tuple(
         Capsule(link.name, link.link, part.from_mm, part.to_mm, part.radius_mm)
         for link in arm.links
@@ -61,7 +61,7 @@ def capsules_of(arm: ArmDescription) -> tuple[Capsule, ...]:
 
 
 def bodies_of_capsules(capsules: Sequence[Capsule]) -> list[Body]:
-    """One body for each name, in order."""
+    """Return one body for each name, in order."""
     bodies = []
     for name in dict.fromkeys(c.body for c in capsules):
         body_capsules = [c for c in capsules if c.body == name]
@@ -77,7 +77,8 @@ def bodies_of_capsules(capsules: Sequence[Capsule]) -> list[Body]:
 
 
 def bodies_of_meshes(folder: Path, arm: ArmDescription, files: InputFiles | None = None) -> list[Body]:
-    """The base and the six links from `base_link.stl` and `link_1.stl` to `link_6.stl`, in the links' frames, in
+    """Return the base and the six links from `base_link.stl` and `link_1.stl` to `link_6.stl`, in the links'
+    frames, in
         metres or mm, with the names of the arm's description. Raises InputError if one of them cannot
     be read."""
     names = {link.link: link.name for link in arm.links}
@@ -90,7 +91,7 @@ def bodies_of_meshes(folder: Path, arm: ArmDescription, files: InputFiles | None
 
 
 def link_corners(folder: Path, link: int, files: InputFiles | None = None) -> Floats:
-    """Triangles [n, 3, 3] of a link's mesh, mm, read from `files` if they are given. Raises InputError."""
+    """Return triangles [n, 3, 3] of a link's mesh, mm, read from `files` if they are given. Raises InputError."""
     import trimesh
 
     path = link_mesh_path(folder, link)
@@ -112,8 +113,8 @@ def link_corners(folder: Path, link: int, files: InputFiles | None = None) -> Fl
 
 
 def reach_mm(arm: Arm, body: Body, from_link: int = 0) -> Floats:
-    """[6] greatest distance of any point of a body from each axis; 0 for axes that do not move it relative to
-    `from_link`. Computed for links stretched out, so it bounds all postures."""
+    """Return [6], the greatest distance of any point of a body from each axis. It is 0 for axes that do not move
+    the body relative to `from_link`. It is computed for stretched links, so it is a bound for all postures."""
     centers, link = body.spheres.centers_mm, body.link
     if link == FLANGE:
         frames = link_frames(arm, np.zeros(6))
@@ -134,8 +135,8 @@ def reach_mm(arm: Arm, body: Body, from_link: int = 0) -> Floats:
 def part_apart(
     arm: Arm, body: Body, other_body: Body, postures_deg: Sequence[Sequence[float]], by_mm: float
 ) -> Body | None:
-    """The part of a body whose spheres are more than `by_mm` from another in all of some postures; None if there
-    is none."""
+    """Return the part of a body whose spheres are more than `by_mm` from another body in all of some postures;
+    None if there is none."""
     apart = _PARTS.result(
         (arm, body.link, *body.spheres, other_body.link, *other_body.spheres, np.array(postures_deg), by_mm),
         lambda: _are_apart(arm, body, other_body, postures_deg, by_mm),
@@ -148,7 +149,7 @@ def part_apart(
 def _are_apart(
     arm: Arm, body: Body, other_body: Body, postures_deg: Sequence[Sequence[float]], by_mm: float
 ) -> NDArray[np.bool_]:
-    """[spheres of the body] True for those that are apart."""
+    """Return [spheres of the body], True for those that are apart."""
     apart = np.ones(len(body.spheres.radii_mm), dtype=bool)
     for joints_deg in postures_deg:
         frames = link_frames(arm, joints_deg)

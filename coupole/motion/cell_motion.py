@@ -28,8 +28,8 @@ class CellMotion:
         targets_mm: Sequence[Sequence[float]],
         order: Literal["fastest", "as_written"],
     ) -> None:
-        """`object_corners_mm` [triangles, 3, 3] and `targets_mm` are in the support frame; the targets replace the
-        object if it has no mesh."""
+        """`object_corners_mm` [triangles, 3, 3] and `targets_mm` are in the support frame; the targets replace an
+        object without a mesh."""
         self._cell, self._object_corners_mm, self._order = cell, object_corners_mm, order
         self._targets_mm = targets_mm
         self._planned: list[tuple[tuple[str, ...], Sequence[float], Itinerary]] = []
@@ -47,12 +47,12 @@ class CellMotion:
         return occlusions_of(self._cell.rig, self._cell.leds, self._object_corners_mm, targets)
 
     def occluded_leds(self, occlusion: Occlusion) -> list[int]:
-        """Ids of the LEDs that light nothing that a view sees."""
+        """Return ids of the LEDs that light nothing that a view shows."""
         return [int(led) for led in self._cell.leds.ids[occlusion.occluded_leds()]]
 
     def itinerary(self, views: Sequence[ViewPose], start_deg: Sequence[float]) -> Itinerary:
-        """Collision-free paths to views from the arm's posture; cached, so that paths that preflight planned from
-        home are not planned again if the arm is at home."""
+        """Return collision-free paths to views from the arm's posture. They are cached: if the arm is at home,
+        preflight's paths from home are used again."""
         names = tuple(view.name for view in views)
         for planned_names, planned_deg, itinerary in self._planned:
             if planned_names == names and np.allclose(planned_deg, start_deg, rtol=0, atol=_SAME_PLACE_DEG):
@@ -62,5 +62,5 @@ class CellMotion:
         return itinerary
 
     def unchecked_itinerary(self, views: Sequence[ViewPose], start_deg: Sequence[float]) -> Itinerary:
-        """Postures and durations without regard to collisions."""
+        """Return postures and durations, without collision checks."""
         return plan_itinerary(views, self._cell.rig, None, start_deg, self._order)

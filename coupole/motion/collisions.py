@@ -1,10 +1,9 @@
 """Distances between the arm and the other bodies of the cell, and the clearances to keep.
 
-The arm is a set of capsules that enclose its links, or meshes of the links themselves; the camera and an
-allowance for its cables are capsules too. Obstacles are the object (its scanned mesh), the support disk, the
-dome seen from inside, and keep-out volumes. All distances are conservative: bodies are unions of spheres
-(`motion.sphere_tree`) that enclose the real ones, and no contact between two checked postures of a motion is
-missed.
+The arm is a set of capsules that enclose its links, or meshes of the links themselves; the camera and the space
+for its cables are capsules too. Obstacles are the object (its scanned mesh), the support disk, the dome seen from
+inside, and keep-out volumes. All distances are conservative. Bodies are unions of spheres (`motion.sphere_tree`)
+that enclose the real ones. No contact between two checked postures of a motion is missed.
 """
 
 from __future__ import annotations
@@ -34,7 +33,8 @@ from coupole.motion.sphere_tree import MESH_STEP_MM, Floats, Spheres, sphere_tre
 from coupole.plan.arm_description import TOOL, ArmDescription
 
 _NEIGHBOURLY_MM = 25.0
-"""Parts of a body that stay farther than this in the postures `near_by_design_deg` are checked all the same."""
+"""Distance in the postures `near_by_design_deg`. Parts of a body that stay farther away than this are checked all
+the same."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Contact:
     body: str
     other_name: str
     distance_mm: float
-    """Conservative; negative where they overlap."""
+    """A conservative distance; negative if the bodies overlap."""
     required_mm: float
 
     def __str__(self) -> str:
@@ -62,9 +62,8 @@ class Clearances:
     self_mm: float = 0.0
     keep_out_mm: float = 0.0
     path_tolerance_mm: float = 0.0
-    """Largest path deviation of the arm (`motion.path_deviation`): the clearance of every pair is at least as
-    large as
-its approach under such a deviation."""
+    """Largest path deviation of the arm (`motion.path_deviation`). The clearance of every pair is at least as
+    large as the approach of the pair under this deviation."""
 
 
 @dataclass(frozen=True)
@@ -77,14 +76,15 @@ class Surroundings:
     dome_top_deg: float
     """Elevation above which the dome is open."""
     object_points_mm: NDArray[np.float64]
-    """[n, 3] on the object's surface, of which no point is farther than MESH_STEP_MM from one of them."""
+    """[n, 3] points on the object's surface. No point of the surface is farther than MESH_STEP_MM from one of
+    them."""
     keep_out_spheres: tuple[tuple[str, tuple[float, float, float], float], ...] = ()
     keep_out_boxes: tuple[tuple[str, tuple[float, float, float], tuple[float, float, float]], ...] = ()
 
 
 @dataclass(frozen=True)
 class _Pair:
-    """A body and its obstacle: a solid (`kind`, `figures`) or another body (`SHAPE`)."""
+    """A body and its obstacle, which is a solid (`kind`, `figures`) or another body (`SHAPE`)."""
 
     body: Body
     other_name: str
@@ -102,7 +102,7 @@ class CellBodies:
     """The arm and its obstacles.
 
     `link_meshes` is a folder with the links' meshes (`motion.bodies.bodies_of_meshes`), which then replace the
-    capsules: closer, and slower to check. Raises InputError if they cannot be read.
+    capsules. Meshes fit more closely, but are slower to check. Raises InputError if they cannot be read.
     """
 
     def __init__(
@@ -124,23 +124,23 @@ class CellBodies:
 
     @cached_property
     def reach_mm(self) -> Floats:
-        """[6] greatest distance of any point of arm and tool from each axis."""
+        """Greatest distance [6] of any point of arm and tool from each axis."""
         reach: Floats = np.max([reach_mm(self._arm, body) for body in (*self._links, *self._tools)], axis=0)
         return reach
 
     def margins(self, joints_deg: ArrayLike, far_mm: float = np.inf) -> dict[tuple[str, str], Floats]:
-        """Distance minus clearance of each pair of bodies [n] at joint angles [n, 6]; mm, never more than the
-        true value, and at most `far_mm` (to save time)."""
+        """Return the distance minus clearance [n] of each pair of bodies at joint angles [n, 6], mm. It is never
+        more than the true value, and at most `far_mm` (to save time)."""
         margins = self._margins(np.atleast_2d(np.asarray(joints_deg, dtype=np.float64)), far_mm)
         return {(pair.body.name, pair.other_name): margins[:, n] for n, pair in enumerate(self._pairs)}
 
     def tightest_mm(self, joints_deg: ArrayLike) -> Floats:
-        """[n] the least of all margins if it is negative, else 0; for joint angles [n, 6]."""
+        """Return [n] the least of all margins if it is negative, otherwise 0, for joint angles [n, 6]."""
         tightest: Floats = self._margins(np.asarray(joints_deg, dtype=np.float64), 0.0).min(axis=1)
         return tightest
 
     def contacts(self, joints_deg: ArrayLike) -> list[Contact]:
-        """Pairs that are too close in one posture [6], nearest first."""
+        """Return the pairs that are too close in one posture [6], nearest first."""
         (margins,) = self._margins(np.asarray(joints_deg, dtype=np.float64)[None], 0.0)
         order = np.argsort(margins, kind="stable")
         return [self._pairs[n].contact(margins[n]) for n in order if margins[n] < 0.0]
@@ -152,7 +152,7 @@ class CellBodies:
         return bool(blocked_at(self._model, from_deg, to_deg)[0] == CLEAR)
 
     def contact_on_the_way(self, from_deg: ArrayLike, to_deg: ArrayLike) -> Contact | None:
-        """The first contact found on a straight motion in joint space, None if there is none."""
+        """Return the first contact found on a straight motion in joint space; None if there is none."""
         from coupole.motion.distances import CLEAR, blocked_at
 
         start, end = np.asarray(from_deg, dtype=np.float64), np.asarray(to_deg, dtype=np.float64)
@@ -233,15 +233,15 @@ class CellBodies:
         return kind == TOOL or not self._has_meshes
 
     def _required_mm(self, keep_mm: float, reach: Floats) -> float:
-        """Clearance of a pair: the rig's, but at least the pair's possible approach under the largest path
-        deviation. `deviation_at_rest_mm` multiplies each axis' deviation by `reach_mm`; the pair moves by the
-        deviation times its own reach."""
+        """Return the clearance of a pair: the rig's clearance, but at least the pair's possible approach under the
+        largest path deviation. `deviation_at_rest_mm` multiplies each axis' deviation by `reach_mm`; the pair
+        moves by the deviation times its own reach."""
         share = np.divide(reach, self.reach_mm, out=np.zeros(6), where=self.reach_mm > 0.0)
         return max(keep_mm, self._keep.path_tolerance_mm * float(share.max()))
 
     @cached_property
     def _model(self) -> Any:
-        """The pairs as arrays for the compiled functions."""
+        """Return the pairs as arrays for the compiled functions."""
         from coupole.motion.distances import SUPPORT_FRAME, Model
 
         all_bodies = [body for pair in self._pairs for body in (pair.body, pair.other_body) if body is not None]

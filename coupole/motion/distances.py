@@ -1,8 +1,8 @@
 """Compiled distances between an arm made of spheres and its obstacles; the interface is `motion.collisions`.
 
-Every obstacle is a signed distance function of a point, negative inside, that never changes by more
-than the point moves. So the least distance to a tree of spheres is found by visiting only those nodes
-whose bounding sphere could be nearer than the least distance found so far.
+Every obstacle is a signed distance function of a point, negative inside. Its value never changes by more than the
+point moves. So the search for the least distance to a tree of spheres visits only nodes whose bounding sphere may
+be nearer than the least distance so far.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ spheres."""
 SUPPORT_FRAME = 8
 """Index of the support's frame among the links' (0 the base, 1 to 6 the links, 7 the flange)."""
 RESOLUTION_MM = 2.0
-"""A segment of a motion as short as this that is not shown to be clear counts as blocked."""
+"""A segment of a motion that is as short as this, and is not shown to be clear, counts as blocked."""
 ROUNDING_MM = 1e-9
 CLEAR = -1
 
@@ -30,17 +30,16 @@ class Model(NamedTuple):
     base: NDArray[np.float64]
     """[4, 4] `support_from_base`, mm."""
     joints: NDArray[np.float64]
-    """[6, 5] for each joint its origin in the frame of the previous link (mm), sense (1 or -1) and axis (0 x,
-1 y, 2 z)."""
+    """[6, 5] for each joint: its origin in the frame of the previous link (mm), its sense (1 or -1) and its axis
+    (0 x, 1 y, 2 z)."""
     flange: NDArray[np.float64]
     """[4, 4] `link_6_from_flange`, mm."""
     nodes: NDArray[np.float64]
     trees: NDArray[np.int64]
     """The `SphereTrees` of all shapes."""
     numbers: NDArray[np.int64]
-    """[pairs, 6] a tree and its link; the kind of obstacle; of SHAPE the other tree and its link; the link
-    relative to
-which the tree moves (0 if the obstacle is fixed)."""
+    """[pairs, 6] a tree and its link; the kind of obstacle; for SHAPE, the other tree and its link; the link
+    relative to which the tree moves (0 if the obstacle is fixed)."""
     figures: NDArray[np.float64]
     """[pairs, 13] 0: clearance, mm; 1 to 6: largest relative motion of the two per radian of each axis, mm; 7 on:
     DISK radius; DOME radius, sine and cosine of the opening's elevation; SPHERE centre, radius; BOX lowest and
@@ -52,7 +51,7 @@ which the tree moves (0 if the obstacle is fixed)."""
 
 @numba.njit(cache=True, nogil=True)
 def place_links(base, joints, flange, joints_deg, frames):  # type: ignore[no-untyped-def]
-    """Fill `frames` [9, 3, 4], rotation and origin of each link's frame in the support's."""
+    """Fill `frames` [9, 3, 4], rotation and origin of each link's frame in the support frame."""
     for r in range(3):
         for q in range(4):
             frames[0, r, q] = base[r, q]
@@ -83,7 +82,7 @@ def _length(x, y, z):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _to_solid(kind, figures, pair, x, y, z):  # type: ignore[no-untyped-def]
-    """Distance of a point of the support frame to a DISK, DOME, SPHERE or BOX; negative inside."""
+    """Return the distance of a point of the support frame to a DISK, DOME, SPHERE or BOX; negative inside."""
     f0, f1, f2, f3 = figures[pair, 7], figures[pair, 8], figures[pair, 9], figures[pair, 10]
     if kind == SPHERE:
         return _length(x - f0, y - f1, z - f2) - f3
@@ -107,7 +106,7 @@ def _to_solid(kind, figures, pair, x, y, z):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _after(i):  # type: ignore[no-untyped-def]
-    """The node that follows node i and all below it; 0 after the last."""
+    """Return the node that follows node i and all nodes below it; 0 after the last."""
     while i & 1:
         i >>= 1
     return i + 1 if i else 0
@@ -120,8 +119,8 @@ def _to_node(nodes, n, x, y, z):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _to_tree(nodes, begin, first_leaf, x, y, z, best, hasty):  # type: ignore[no-untyped-def]
-    """Distance of a point, in the tree's own frame, to the nearest of its spheres, at most `best`. If `hasty`, to
-    the first sphere found that is nearer than `best`."""
+    """Return the distance of a point, in the tree's own frame, to the nearest sphere of the tree, at most `best`.
+    If `hasty`, it is the distance to the first sphere found that is nearer than `best`."""
     if _to_node(nodes, begin + 1, x, y, z) >= best:
         return best
     i = 1
@@ -149,8 +148,8 @@ def _to_tree(nodes, begin, first_leaf, x, y, z, best, hasty):  # type: ignore[no
 
 @numba.njit(cache=True, nogil=True)
 def _to_obstacle(nodes, trees, numbers, figures, frames, pair, n, best, hasty):  # type: ignore[no-untyped-def]
-    """Distance of node n, in the frame of the pair's link, to the pair's obstacle, at most `best`; `hasty` as in
-    `_to_tree`."""
+    """Return the distance of node n, in the frame of the pair's link, to the pair's obstacle, at most `best`.
+    `hasty` works as in `_to_tree`."""
     link, obstacle_link = numbers[pair, 1], numbers[pair, 4]
     bx, by, bz, radius = nodes[n, 0], nodes[n, 1], nodes[n, 2], nodes[n, 3]
     x = frames[link, 0, 0] * bx + frames[link, 0, 1] * by + frames[link, 0, 2] * bz + frames[link, 0, 3]
@@ -168,8 +167,8 @@ def _to_obstacle(nodes, trees, numbers, figures, frames, pair, n, best, hasty): 
 
 @numba.njit(cache=True, nogil=True)
 def _margin(nodes, trees, numbers, figures, frames, pair, far, hasty):  # type: ignore[no-untyped-def]
-    """Least distance of a pair minus its clearance, at most `far`. If `hasty`, the first value found below
-    `far`."""
+    """Return the least distance of a pair minus its clearance, at most `far`. If `hasty`, it is the first value
+    found below `far`."""
     begin, first_leaf = trees[numbers[pair, 0], 0], trees[numbers[pair, 0], 1]
     clearance_mm = figures[pair, 0]
     best = far
@@ -193,10 +192,12 @@ def _margin(nodes, trees, numbers, figures, frames, pair, far, hasty):  # type: 
 
 @numba.njit(cache=True, nogil=True)
 def _moved_mm(nodes, trees, numbers, figures, joints, frames, pair, turns_rad):  # type: ignore[no-untyped-def]
-    """Bound of the relative motion of a pair while the axes turn by at most `turns_rad` [6] from a posture.
+    """Return a bound of the relative motion of a pair while the axes turn by at most `turns_rad` [6] from a
+    posture.
 
-    A point moves by at most each axis' turn times its greatest distance from that axis during the turn, which is
-    its present distance plus its motion by the axes farther out.
+    The motion of a point is bounded by a sum over the axes: the turn of an axis times the point's greatest
+    distance from it during the turn. This distance is at most the present one plus the point's motion by the axes
+    farther out.
     """
     n, link = trees[numbers[pair, 0], 0] + 1, numbers[pair, 1]
     bx, by, bz, radius = nodes[n, 0], nodes[n, 1], nodes[n, 2], nodes[n, 3]
@@ -215,7 +216,7 @@ def _moved_mm(nodes, trees, numbers, figures, joints, frames, pair, turns_rad): 
 
 @numba.njit(cache=True, nogil=True)
 def margins_at(model, joints_deg, far_mm):  # type: ignore[no-untyped-def]
-    """Distance minus clearance [n, pairs] with the arm at `joints_deg` [n, 6], at most `far_mm`."""
+    """Return the distance minus clearance [n, pairs] with the arm at `joints_deg` [n, 6], at most `far_mm`."""
     frames = np.empty((9, 3, 4))
     margins = np.empty((joints_deg.shape[0], model.numbers.shape[0]))
     for n in range(margins.shape[0]):
@@ -229,11 +230,12 @@ def margins_at(model, joints_deg, far_mm):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def blocked_at(model, start_deg, end_deg):  # type: ignore[no-untyped-def]
-    """The first pair found to come too close on a straight motion in joint space, CLEAR if none does; its
-    parameter on the motion (0 to 1), and the bound of the pair's relative motion within the checked segment, mm.
+    """Return the first pair that is found to come too close on a straight motion in joint space, or CLEAR. Also
+    return its parameter on the motion (0 to 1), and the bound of the pair's relative motion within the checked
+    segment, mm.
 
-    A segment is clear if, at its middle, each pair is farther apart than it can approach from there to the
-    segment's ends; other segments are halved.
+    A segment is clear if the distance of each pair at the segment's middle is larger than its possible approach up
+    to the segment's ends. Other segments are halved.
     """
     numbers, figures = model.numbers, model.figures
     frames, here_deg, turns_rad = np.empty((9, 3, 4)), np.empty(6), np.empty(6)

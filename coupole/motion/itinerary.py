@@ -31,12 +31,12 @@ KeptOutSphere: TypeAlias = tuple[str, Vector, float]
 KeptOutBox: TypeAlias = tuple[str, Vector, Vector]
 
 POSTURE_COST_S = 0.3
-"""Longest additional time that is accepted for a posture farther from limits and singularities."""
+"""Longest additional time that is accepted for a posture that is farther from limits and singularities."""
 
 
 @dataclass(frozen=True)
 class Visit:
-    """One visited view: its joint angles [6] and the leg that leads there."""
+    """One visited view: its joint angles [6] and the leg to it."""
 
     joints_deg: Joints
     leg: Leg
@@ -44,7 +44,7 @@ class Visit:
 
 @dataclass(frozen=True)
 class Itinerary:
-    """Visits, one for each view, None if a view cannot be visited; the reasons are in `refusals`."""
+    """Visits, one for each view. It is None if a view cannot be visited; the reasons are in `refusals`."""
 
     visits: tuple[Visit | None, ...]
     refusals: tuple[str, ...]
@@ -54,8 +54,8 @@ left out."""
 
 
 def arm_of(rig: Rig) -> kinematics.Arm:
-    """The rig's arm with the speeds and limits for plans: those of its driver, within the posture limits of its
-    description. Raises InputError if the arm has no description."""
+    """Return the rig's arm with the speeds and limits for plans. These are the driver's, within the posture limits
+    of the arm's description. Raises InputError if the arm has no description."""
     arm, description = planning_arm(rig), described_arm(rig)
     if arm is None or description is None:
         raise undescribed_arm_error(rig)
@@ -64,7 +64,7 @@ def arm_of(rig: Rig) -> kinematics.Arm:
 
 
 def undescribed_arm_error(rig: Rig) -> InputError:
-    """The error of a rig whose arm has no description."""
+    """Return the error for a rig whose arm has no description."""
     return InputError(f"nothing describes the arm that `{rig.robot.driver}` moves: name its file under `arm:`")
 
 
@@ -75,10 +75,10 @@ def bodies_of(
     link_meshes: Path | None = None,
     files: InputFiles | None = None,
 ) -> CellBodies:
-    """The rig's arm, tool and obstacles, with the object's mesh ([triangles, 3, 3], support frame).
+    """Return the rig's arm, tool and obstacles, with the object's mesh ([triangles, 3, 3], support frame).
 
     `link_meshes` is a folder of meshes that replace the capsules of the arm's links, read from `files` if they are
-    given; InputError if they cannot be read, or if the arm has no description.
+    given. Raises InputError if they cannot be read, or if the arm has no description.
     """
     arm = described_arm(rig)
     if arm is None:
@@ -109,7 +109,8 @@ def bodies_of(
 
 
 def _keep_outs(rig: Rig) -> tuple[tuple[KeptOutSphere, ...], tuple[KeptOutBox, ...]]:
-    """The rig's keep-out volumes by shape: name, centre and radius; name, lowest and highest corner; mm."""
+    """Return the rig's keep-out volumes by shape. Spheres have name, centre and radius; boxes have name, lowest
+    and highest corner; mm."""
     spheres: list[KeptOutSphere] = []
     boxes: list[KeptOutBox] = []
     for volume in rig.keep_out:
@@ -124,7 +125,7 @@ def _keep_outs(rig: Rig) -> tuple[tuple[KeptOutSphere, ...], tuple[KeptOutBox, .
 
 
 def base_from_flange(view: ViewPose, rig: Rig) -> Transform:
-    """The flange's pose for a view that is given as a camera pose."""
+    """Return the flange's pose for a view that is given as a camera pose."""
     assert view.support_from_camera is not None
     base_from_camera = rig.support.base_from_support.matrix() @ view.support_from_camera
     flange: Transform = base_from_camera @ inverse(rig.flange_from_camera.matrix())
@@ -138,7 +139,8 @@ def plan_itinerary(
     start_deg: Sequence[float],
     order: Literal["fastest", "as_written"] = "fastest",
 ) -> Itinerary:
-    """Order, postures and legs of views with the least total time from the arm's posture; or in the given order.
+    """Return order, postures and legs of views with the least total time from the arm's posture, or in the given
+    order.
 
     Without `bodies` collisions are ignored: straight motions only.
     """
@@ -184,7 +186,8 @@ def _rig_refusals(rig: Rig) -> list[str]:
 
 
 def postures_of(view: ViewPose, rig: Rig, bodies: CellBodies | None) -> tuple[NDArray[np.float64], str]:
-    """Joint angles [k, 6] of a view without contacts and singularities, or the reason why there are none."""
+    """Return joint angles [k, 6] of a view without contacts and singularities, or the reason why there are
+    none."""
     arm = arm_of(rig)
     if view.joints_deg is not None:
         postures = np.array([view.joints_deg], dtype=np.float64)

@@ -1,9 +1,9 @@
-"""Occlusion: which LEDs light which parts of the object in a view, and what hides the others.
+"""Occlusion: which LEDs light which parts of the object in a view, and which bodies hide the other LEDs.
 
-From the point of each patch of the object's surface, rays to the LEDs (points, too) are tested against the
-object's own mesh, which is the same for all views, and against the capsules of arm and tool in the view's posture.
-Capsules enclose the real bodies, so occlusion is overestimated rather than underestimated. Coordinates are in the
-support frame, in mm.
+Rays are traced from the point of each patch of the object's surface to the LEDs (also points). They are tested
+against the object's own mesh, which is the same for all views, and against the capsules of arm and tool in the
+view's posture. Capsules enclose the real bodies, so occlusion is overestimated rather than underestimated.
+Coordinates are in the support frame, in mm.
 """
 
 from __future__ import annotations
@@ -30,17 +30,18 @@ from coupole.plan.rig_devices import described_arm
 
 REACHED, AWAY, BY_OBJECT, BY_ARM, BY_TOOL = range(5)
 """Codes of a patch and an LED. AWAY: the LED is below the patch's horizon, or the patch is behind the LED. If
-several apply, the smallest is given; REACHED if none does."""
+several codes apply, the smallest one after REACHED is given; REACHED means that none applies."""
 RAY_START_MM = 0.1
-"""Rays start this far off the surface, along the patch's normal, so that a patch does not hide itself by rounding
-(Embree computes with 24 bits: 0.00006 mm at 1 m). Lower steps of the surface cast no shadow."""
+"""Distance of the start of a ray from the surface, along the patch's normal. So a patch does not hide itself by
+rounding (Embree computes with 24 bits: 0.00006 mm at 1 m). Steps of the surface that are lower than this cast no
+shadow."""
 _OBJECTS: Remembered[tuple[Patches, NDArray[np.uint8]]] = Remembered(most=2)
 """Patches of objects, and their codes."""
 
 
 @dataclass(frozen=True)
 class Sight:
-    """A camera as a pinhole whose axis pierces the centre of the image."""
+    """A camera as a pinhole. Its axis passes through the centre of the image."""
 
     support_from_camera: Transform
     focal_px: float
@@ -48,7 +49,7 @@ class Sight:
     height_px: int
 
     def project(self, points_mm: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Column and row [..., 2] in pixels and depth [...] in mm of points [..., 3] of the support frame.
+        """Return column and row [..., 2] in pixels and depth [...] in mm of points [..., 3] of the support frame.
 
         The first pixel's centre is (0, 0). Pixels are meaningless where the depth is not positive.
         """
@@ -68,17 +69,18 @@ class Occlusion:
     is_seen: NDArray[np.bool_]
     """[patches] True where the camera sees the patch's point."""
     areas_mm2: NDArray[np.float64]
-    """[patches] their weights."""
+    """[patches] areas, which are the weights of the patches."""
 
     def share(self, code: int = REACHED) -> NDArray[np.float64]:
-        """[leds] share of the surface seen by the camera that has this code; 0 if the camera sees nothing of
-        it."""
+        """Return [leds] the share of the surface in the camera's view that has this code; 0 if the camera sees
+        nothing of the surface."""
         weights = np.where(self.is_seen, self.areas_mm2, 0.0)
         share: NDArray[np.float64] = weights @ (self.codes == code) / max(weights.sum(), 1e-300)
         return share
 
     def occluded_leds(self) -> NDArray[np.bool_]:
-        """[leds] True where an LED reaches no patch that the camera sees; all False if it sees none.
+        """Return [leds], True where an LED reaches no patch that the camera sees; all False if the camera sees no
+        patch.
 
         Parts smaller than a patch may be lit all the same.
         """
@@ -86,7 +88,7 @@ class Occlusion:
         return ~reaches & self.is_seen.any()
 
     def arrays(self, patches: Patches) -> dict[str, NDArray[np.generic]]:
-        """Arrays by name, to be stored with a view's frames and read without this module.
+        """Return arrays by name, which are stored with a view's frames and can be read without this module.
 
         `codes` uint8 [patches, leds] and `seen` [patches] as above; for the patches, in the support frame,
         `points_mm` and outward `normals` float32 [patches, 3] and `areas_mm2` float32 [patches].
@@ -102,7 +104,7 @@ class Occlusion:
 
 @dataclass(frozen=True)
 class Occlusions:
-    """Data common to all views, and the rig for the rest."""
+    """Data common to all views, and the rig for the other data."""
 
     rig: Rig
     arm: ArmDescription
@@ -115,7 +117,7 @@ class Occlusions:
     """[patches, leds] REACHED, AWAY or BY_OBJECT, of the object alone."""
 
     def at(self, joints_deg: ArrayLike) -> Occlusion:
-        """Occlusion in a view with the arm at joint angles [6].
+        """Return the occlusion in a view with the arm at joint angles [6].
 
         The tool is assumed not to obstruct the camera's view.
         """
@@ -137,7 +139,8 @@ class Occlusions:
     def _visible_patches(
         self, sight: Sight, axes_mm: NDArray[np.float64], radii_mm: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """[patches] True where a camera sees the patch: inside the image, facing the camera, unobstructed."""
+        """Return [patches], True where a camera sees the patch: inside the image, facing the camera,
+        unobstructed."""
         eye_mm = sight.support_from_camera[:3, 3]
         starts_mm = ray_starts(self.patches)
         pixels, depth_mm = sight.project(starts_mm)
@@ -155,10 +158,10 @@ class Occlusions:
 def occlusions_of(
     rig: Rig, leds: LedTable, corners_mm: NDArray[np.float64], targets_mm: ArrayLike, count: int = PATCHES
 ) -> Occlusions:
-    """The part of an object's occlusion that does not depend on the arm.
+    """Return the part of an object's occlusion that does not depend on the arm.
 
-    `corners_mm` [triangles, 3, 3] is its mesh in the support frame; without triangles `targets_mm` [n, 3] replace
-    it. Raises InputError if the rig's arm has no description.
+    `corners_mm` [triangles, 3, 3] is the object's mesh in the support frame. If there are no triangles,
+    `targets_mm` [n, 3] replace it. Raises InputError if the rig's arm has no description.
     """
     arm = described_arm(rig)
     if arm is None:
@@ -183,8 +186,8 @@ def own_codes(
     leds_mm: NDArray[np.float64],
     led_normals: NDArray[np.float64],
 ) -> NDArray[np.uint8]:
-    """Codes [patches, leds] of an object alone, with LEDs at [leds, 3] that emit into the half-space of their
-    normals."""
+    """Return codes [patches, leds] of an object alone. The LEDs are at [leds, 3] and emit into the half-space of
+    their normals."""
     starts_mm = ray_starts(patches)
     to_leds = leds_mm[None] - starts_mm[:, None]
     faces = np.einsum("plk,pk->pl", to_leds, patches.normals) > 0
@@ -196,13 +199,14 @@ def own_codes(
 
 
 def ray_starts(patches: Patches) -> NDArray[np.float64]:
-    """[patches, 3] starting points of rays from the patches: RAY_START_MM above their points."""
+    """Return [patches, 3], the starting points of rays from the patches: RAY_START_MM above the points of the
+    patches."""
     starts_mm: NDArray[np.float64] = patches.points_mm + RAY_START_MM * patches.normals
     return starts_mm
 
 
 def ray_mesh(corners_mm: NDArray[np.float64]) -> Any:
-    """A mesh [triangles, 3, 3] prepared for ray tracing (Embree); None without triangles."""
+    """Return a mesh [triangles, 3, 3] prepared for ray tracing (Embree); None without triangles."""
     if len(corners_mm) == 0:
         return None
     from embreex.mesh_construction import TriangleMesh
@@ -214,14 +218,14 @@ def ray_mesh(corners_mm: NDArray[np.float64]) -> Any:
 
 
 def blocked_segments(mesh: Any, starts_mm: NDArray[np.float64], ends_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """[n] True where the segment between two points [n, 3] meets a triangle of a `ray_mesh`."""
+    """Return [n], True where the segment between two points [n, 3] meets a triangle of a `ray_mesh`."""
     if mesh is None or len(starts_mm) == 0:
         return np.zeros(len(starts_mm), np.bool_)
     return blocked_along(mesh, starts_mm.astype(np.float32), (ends_mm - starts_mm).astype(np.float32))
 
 
 def blocked_along(mesh: Any, starts_mm: NDArray[np.float32], ways_mm: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """[n] True where the way [n, 3] from a start to its end meets a triangle of a `ray_mesh`."""
+    """Return [n], True where the way [n, 3] from a start to its end meets a triangle of a `ray_mesh`."""
     triangles = mesh.run(starts_mm, ways_mm, dists=np.ones(len(starts_mm), np.float32), query="OCCLUDED")
     are_blocked: NDArray[np.bool_] = triangles >= 0
     return are_blocked
@@ -230,7 +234,8 @@ def blocked_along(mesh: Any, starts_mm: NDArray[np.float32], ways_mm: NDArray[np
 def capsule_axes(
     capsules: Sequence[Capsule], frames: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Ends of the axes [n, 2, 3] and radii [n] of capsules, in the frame that `frames` [8, 4, 4] map links to."""
+    """Return ends of the axes [n, 2, 3] and radii [n] of capsules. They are in the frame to which `frames` [8, 4,
+    4] map the links."""
     ends = [apply(frames[c.link], (c.start_mm, c.end_mm)) for c in capsules]
     return np.array(ends), np.array([c.radius_mm for c in capsules], np.float64)
 
@@ -242,8 +247,8 @@ def hidden_by(
     radii_mm: NDArray[np.float64],
     is_asked: NDArray[np.bool_],
 ) -> NDArray[np.int16]:
-    """Find for each segment from a start [n, 3] to an end [m, 3] the first capsule (axes [k, 2, 3], radii [k])
-    that it meets, [n, m]; -1 where it meets none, or where `is_asked` [n, m] is False."""
+    """Find the first capsule (axes [k, 2, 3], radii [k]) that each segment from a start [n, 3] to an end [m, 3]
+    meets. The result [n, m] is -1 if a segment meets no capsule, or if `is_asked` [n, m] is False."""
     capsule_numbers = np.full(is_asked.shape, -1, np.int16)
     if len(starts_mm):
         center_mm = starts_mm.mean(axis=0)
@@ -268,7 +273,8 @@ def compile_now() -> None:
 
 
 def sight_of(rig: Rig, support_from_camera: Transform) -> Sight:
-    """The rig's camera at a pose, with the image distance from the lens equation for the focus distance."""
+    """Return the rig's camera at a pose. The image distance follows from the lens equation and the focus
+    distance."""
     image_mm = 1 / (1 / rig.lens.focal_length_mm - 1 / rig.lens.focus_distance_mm)
     return Sight(
         support_from_camera,
@@ -280,7 +286,7 @@ def sight_of(rig: Rig, support_from_camera: Transform) -> Sight:
 
 @numba.njit(cache=True, nogil=True)
 def segment_distance_mm(p, q, a, b):  # type: ignore[no-untyped-def]
-    """Distance between the segments from p to q and from a to b, points [3] each.
+    """Return the distance between the segments from p to q and from a to b, points [3] each.
 
     Ericson, Real-Time Collision Detection (2005), section 5.1.9: nearest points of the lines, clamped to the
     segments. For parallel lines any starting point is valid.

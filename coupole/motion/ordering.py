@@ -1,10 +1,10 @@
 """The order of views and their postures with the least total time.
 
-Order and choice of postures are one problem: a travelling salesman who visits one place of each group (a
-generalised TSP; Noon, Bean 1993), on an open tour from the arm's posture. The true time of a leg is expensive to
-compute; the time of the straight motion is cheap and a lower bound. So a tour is optimised with straight times;
-its legs are checked, and blocked ones are planned; their true times replace the straight ones, and this is
-repeated until the best tour consists of known legs.
+Order and choice of postures are one problem: a travelling salesman visits one place of each group (a generalised
+TSP; Noon, Bean 1993), on an open tour from the arm's posture. The true time of a leg is expensive to compute. The
+time of the straight motion is cheap and a lower bound. So a tour is optimised with straight times. Then its legs
+are checked, blocked legs are planned, and their true times replace the straight ones. This is repeated until the
+best tour consists of known legs.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ Floats = NDArray[np.float64]
 _RESTARTS, _ROUNDS = 3, 200
 _CHANGES_PER_PLACE, _MOST_CHANGES = 2_000, 600_000
 _AGAIN = 0.03
-"""Share of the changes, and of the first temperature, when a tour is optimised again after some legs became
+"""Share of the changes, and of the first temperature, when a tour is optimised again after some legs have become
 known."""
 _COLDEST_S = 1e-3
 _DETOUR_S = 0.5
-"""Typical least cost of a detour: one more stop. Added to a blocked leg until its true time is known."""
+"""Typical least cost of a detour, which is one more stop. It is added to a blocked leg until its true time is
+known."""
 
 
 @dataclass(frozen=True)
 class Tour:
-    """Groups in the order of the visits, the place chosen in each, and the leg that leads there."""
+    """Groups in the order of the visits, the chosen place in each group, and the leg to it."""
 
     order: tuple[int, ...]
     places: tuple[Joints, ...]
@@ -42,7 +43,7 @@ class Tour:
 
 @dataclass(frozen=True)
 class _Groups:
-    """Places as numbers: 0 is the start, those of group g are `first[g]` to `first[g + 1] - 1`."""
+    """Places as numbers: 0 is the start, the places of group g are `first[g]` to `first[g + 1] - 1`."""
 
     places: Floats
     first: NDArray[np.int64]
@@ -58,11 +59,12 @@ def shortest_tour(
     *,
     as_written: bool = False,
 ) -> Tour:
-    """One place of each group (`choices` [k, 6] each) and the legs between, with the least total time from
-    `start`.
+    """Return one place of each group (`choices` [k, 6] each) and the legs between them, with the least total time
+    from `start`.
 
-    `posture_cost_s` [k] each is added to a place's time, so that among nearly equal tours that with better
-    postures is chosen. With `as_written` the order of the groups is kept. The same arguments give the same tour.
+    `posture_cost_s` [k] of each group is added to the times of its places. So the tour with better postures is
+    chosen among nearly equal tours. With `as_written` the order of the groups is kept. The same arguments give the
+    same tour.
     """
     if not choices:
         return Tour((), (), ())
@@ -87,7 +89,7 @@ def shortest_tour(
 def _settled_order(
     times: _Times, groups: _Groups, order: NDArray[np.int64], seed: int, *, as_written: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """An order and its places that are still best when all legs of the tour are known."""
+    """Return an order and its places that are still the best when all legs of the tour are known."""
     place_indices = _best_places(times.seconds, groups, order)
     for count in range(_ROUNDS):
         if not as_written and len(order) > 1:
@@ -103,7 +105,8 @@ def _settled_order(
 
 
 class _Times:
-    """Times `seconds` [places, places] of legs: of straight motions until the true times are known."""
+    """Times `seconds` [places, places] of legs. These are times of straight motions until the true times are
+    known."""
 
     def __init__(self, planner: PathPlanner, places: Floats) -> None:
         self._planner, self._places = planner, places
@@ -112,8 +115,8 @@ class _Times:
         self._to_find: set[tuple[int, int]] = set()
 
     def learn_blocked(self, place_indices: NDArray[np.int64]) -> bool:
-        """Check the straight motions of a tour; True if one is blocked, whose time is then increased by a
-        detour."""
+        """Check the straight motions of a tour; return True if one is blocked. The time of a blocked motion is
+        then increased by a detour."""
         is_blocked = False
         for a, b in self._legs(place_indices):
             if not self._looked_at[a, b]:
@@ -125,7 +128,7 @@ class _Times:
         return is_blocked
 
     def learn_detours(self, place_indices: NDArray[np.int64]) -> bool:
-        """Plan the legs of a tour that are not straight; True if there was one to plan."""
+        """Plan the legs of a tour that are not straight; return True if there was one to plan."""
         detours = self._to_find.intersection(self._legs(place_indices))
         for a, b in sorted(detours):
             self._set(a, b, self._planner.leg(self._places[a], self._places[b]).duration_s)
@@ -145,7 +148,7 @@ def _way_s(seconds: Floats, groups: _Groups, place_indices: NDArray[np.int64]) -
 
 
 def _best_places(seconds: Floats, groups: _Groups, order: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The place of each group that gives the shortest tour in a given order, by dynamic programming."""
+    """Return the place of each group that gives the shortest tour in a given order, by dynamic programming."""
     before, total_s = slice(0, 1), np.zeros(1)
     came_from = []
     for group in order:
@@ -170,7 +173,8 @@ def _best_order(
     *,
     again: bool,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """A better order, by simulated annealing from the given one; at a lower temperature when called `again`."""
+    """Return a better order, found by simulated annealing from the given one. If `again`, it starts at a lower
+    temperature."""
     from coupole.motion.annealing import anneal
 
     share = _AGAIN if again else 1.0

@@ -1,7 +1,8 @@
-"""Rays by packets of 16, or one by one, called from compiled code: for hundreds of millions of them.
+"""Traces rays in packets of 16, or one by one, from compiled code. It is made for hundreds of millions of rays.
 
-embreex has the library Embree 4 in it, but gives it one ray after the other. Its C functions are found through the
-extension module that is linked to it (https://github.com/RenderKit/embree, the manual's API reference).
+embreex contains the library Embree 4, but passes it one ray after the other. The C functions of Embree are found
+through the extension module that is linked to it (https://github.com/RenderKit/embree, the manual's API
+reference).
 """
 
 from __future__ import annotations
@@ -33,13 +34,14 @@ _NONE = 0xFFFFFFFF
 
 @dataclass
 class PacketMesh:
-    """Triangles [n, 3, 3] in Embree's tree, exact at edges: no ray slips through between two of them."""
+    """Triangles [n, 3, 3] in Embree's tree. It is exact at edges: no ray passes between two neighbouring
+    triangles."""
 
     corners_mm: NDArray[Any]
     compact: bool = True
-    """A smaller tree, in which rays take 1.2 to 1.7 times as long."""
+    """True for a smaller tree, in which rays take 1.2 to 1.7 times as long."""
     scene: np.uint64 = field(init=False)
-    """Scene as `blocked16` takes it in compiled code."""
+    """Scene in the form that `blocked16` takes in compiled code."""
 
     def __post_init__(self) -> None:
         """Raises CoupoleError if Embree has too little memory."""
@@ -73,8 +75,8 @@ class PacketMesh:
     def first_met(
         self, start_mm: NDArray[np.float64], ways: NDArray[np.float32]
     ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """Numbers of the triangles that rays from one place along `ways` [n, 3] meet first, -1 for none, and how
-        far, in lengths of the ways, NaN for none."""
+        """Return the numbers of the triangles that rays from one place along `ways` [n, 3] meet first, and the
+        distances in lengths of the ways. A ray that meets nothing has -1 and NaN."""
         number, distance = np.empty(len(ways), np.int32), np.empty(len(ways), np.float32)
         _first_met(_address("rtcIntersect16"), self.scene, start_mm, ways, ARGUMENTS, number, distance)
         return number, distance
@@ -82,28 +84,29 @@ class PacketMesh:
     def blocked_rays(
         self, starts_mm: NDArray[np.float32], start_rows: NDArray[np.int64], end_mm: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """[start_rows] True where a triangle lies between a start, by its row in `starts_mm` [n, 3], and the
-        end."""
+        """Return [start_rows], True where a triangle lies between a start, given by its row in `starts_mm` [n, 3],
+        and the end."""
         are_blocked = np.empty(len(start_rows), np.bool_)
         _fill_blocked(blocked16(), self.scene, starts_mm, start_rows, end_mm, ARGUMENTS, are_blocked)
         return are_blocked
 
     def blocked_along(self, starts_mm: NDArray[np.float32], ways_mm: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """[n] True where the way [n, 3], or the one way [1, 3] of all, from a start [n, 3] to its end meets a
-        triangle. They are traced one by one: of ways that lead everywhere, packets would be slower."""
+        """Return [n], True where a way from a start [n, 3] to its end meets a triangle. There is one way for each
+        start [n, 3], or one for all [1, 3]. The rays are traced one by one, because packets are slower for ways in
+        all directions."""
         are_blocked = np.empty(len(starts_mm), np.bool_)
         _blocked_one_by_one(_address("rtcOccluded1"), self.scene, starts_mm, ways_mm, ARGUMENTS, are_blocked)
         return are_blocked
 
 
 def blocked16() -> np.uint64:
-    """Address of the function that tells which rays of a packet are blocked."""
+    """Return the address of the function that tells which rays of a packet are blocked."""
     return _address("rtcOccluded16")
 
 
 @cache
 def _library() -> Any:
-    """The C functions with their types."""
+    """Return the C functions with their types."""
     import embreex.rtcore_scene as linked_to_embree
 
     library = ctypes.CDLL(linked_to_embree.__file__)
@@ -133,7 +136,8 @@ def _address(name: str) -> np.uint64:
 
 
 def _call(words: int) -> Any:
-    """The kind, and what makes the code, of a call of a function of Embree that takes so many words."""
+    """Return the kind of a call of an Embree function with this number of words, and the function that makes its
+    code."""
 
     def generate(context, builder, _signature, values):  # type: ignore[no-untyped-def]
         kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64)] * words)
@@ -144,12 +148,12 @@ def _call(words: int) -> Any:
 
 
 def _call_for_packet(_context, _address, _valid, _scene, _rays, _arguments):  # type: ignore[no-untyped-def]
-    """A function for packets; its address is an argument, so that what calls it can be cached."""
+    """A call of a function for packets. Its address is an argument, so that the calling code can be cached."""
     return _call(4)
 
 
 def _call_for_ray(_context, _address, _scene, _ray, _arguments):  # type: ignore[no-untyped-def]
-    """A function for a single ray."""
+    """A call of a function for a single ray."""
     return _call(3)
 
 
@@ -159,7 +163,8 @@ _call_embree_of_one: Any = intrinsic(_call_for_ray)
 
 @numba.njit(cache=True, nogil=True)
 def packet():  # type: ignore[no-untyped-def]
-    """Rows of a packet of rays and hits, as float32 and as uint32, and its lanes' mask, aligned to 64 bytes."""
+    """Return the rows of a packet of rays and hits, as float32 and as uint32, and the mask of its lanes, aligned
+    to 64 bytes."""
     memory = np.zeros((_ROWS + 1) * LANES + LANES, np.float32)
     skip = np.int64((-np.int64(memory.ctypes.data) // 4) % LANES)
     rows = memory[skip : skip + (_ROWS + 1) * LANES].reshape(_ROWS + 1, LANES)
@@ -169,7 +174,7 @@ def packet():  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def trace(function, scene, rays, words, valid, lanes, far, arguments):  # type: ignore[no-untyped-def]
     """Trace the first `lanes` rays of a `packet` as far as `far`, in lengths of their ways, by the function at an
-    address (`blocked16`). In row `FAR` a blocked ray has then minus infinity."""
+    address (`blocked16`). Afterwards a blocked ray has minus infinity in row `FAR`."""
     for lane in range(LANES):
         valid[lane] = -1 if lane < lanes else 0
         rays[3, lane], rays[FAR, lane] = 0.0, far
@@ -199,7 +204,7 @@ def _fill_blocked(function, scene, starts, start_rows, end, arguments, are_block
 
 @numba.njit(cache=True, nogil=True)
 def _blocked_one_by_one(function, scene, starts, ways, arguments, are_blocked):  # type: ignore[no-untyped-def]
-    """A ray's numbers lie one behind the other as a packet's rows do."""
+    """Trace rays one by one. The numbers of a ray lie one behind the other, like the rows of a packet."""
     rays, words, _ = packet()
     ray, word = rays[0], words[0]
     address, more = np.uint64(ray.ctypes.data), np.uint64(arguments.ctypes.data)

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 PATCHES = 400
 _PIECE_EDGE, _LEAST_EDGE = 0.5, 1e-3
-"""Longest edge of the pieces of patches, as a share of a patch's width, but not less than that share of the
-object's size (otherwise slivers of a mesh would be split without end)."""
+"""Longest edge of the pieces of patches, as a share of a patch's width; and its lower bound, as a share of the
+object's size. Without the bound, slivers of a mesh would be split without end."""
 _TURN_WIDTHS = 2.0
 """Weight of normals in clustering: a difference of 1 in the normals counts like this many patch widths."""
 
@@ -28,10 +28,11 @@ class Patches:
     piece_patch: NDArray[np.int64]
     """[pieces] the patch that each piece of a triangle belongs to."""
     piece_triangle: NDArray[np.int64]
-    """[pieces] the mesh's triangle that it is a piece of."""
+    """[pieces] the mesh's triangle from which each piece was cut."""
 
     def of_triangles(self, triangles: int) -> NDArray[np.int64]:
-        """A patch for each of a mesh's triangles [triangles]: that of one of its pieces, -1 without area."""
+        """Return a patch for each of a mesh's triangles [triangles]: the patch of one of its pieces, or -1 for a
+        triangle without area."""
         patch_of_triangle = np.full(triangles, -1)
         patch_of_triangle[self.piece_triangle] = self.piece_patch
         return patch_of_triangle
@@ -40,9 +41,9 @@ class Patches:
 def patches_of(corners_mm: NDArray[np.float64], count: int = PATCHES) -> Patches:
     """Divide a mesh [triangles, 3, 3], corners counter-clockwise seen from outside, into about `count` patches.
 
-    Triangles are split into pieces smaller than a patch; these are repeatedly divided into halves of equal area,
-    across the direction of position and normal with the largest spread. The same mesh gives the same patches; a
-    mesh without area gives none.
+    Triangles are split into pieces smaller than a patch. The set of pieces is repeatedly divided into halves of
+    equal area, across the direction of position and normal with the largest spread. The same mesh gives the same
+    patches; a mesh without area gives none.
     """
     width_mm = float(np.sqrt(_areas_and_normals(corners_mm)[0].sum() / count))
     if width_mm == 0.0:
@@ -71,14 +72,14 @@ def patches_of(corners_mm: NDArray[np.float64], count: int = PATCHES) -> Patches
 
 
 def patches_at(points_mm: ArrayLike) -> Patches:
-    """Points [n, 3] in place of an object without a mesh: patches of equal weight that face up."""
+    """Return points [n, 3] in place of an object without a mesh, as patches of equal weight that face up."""
     points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 3)
     nothing = np.zeros(0, np.int64)
     return Patches(points, np.tile((0.0, 0.0, 1.0), (len(points), 1)), np.ones(len(points)), nothing, nothing)
 
 
 def _areas_and_normals(corners_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Areas [n] and unit normals [n, 3] of triangles [n, 3, 3]; zeros for those without area."""
+    """Return areas [n] and unit normals [n, 3] of triangles [n, 3, 3]; zeros for triangles without area."""
     across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     length = np.linalg.norm(across, axis=1)
     return length / 2, across / np.where(length > 0, length, 1.0)[:, None]
@@ -87,8 +88,8 @@ def _areas_and_normals(corners_mm: NDArray[np.float64]) -> tuple[NDArray[np.floa
 def _cut_triangles(
     corners_mm: NDArray[np.float64], edge_mm: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Triangles halved across their longest edge until none has an edge longer than `edge_mm`, and for each piece
-    the triangle that it comes from."""
+    """Halve triangles across their longest edge until no edge is longer than `edge_mm`. Return the pieces, and for
+    each piece the triangle that it comes from."""
     done_mm, done_of = [], []
     pieces_mm, of = corners_mm, np.arange(len(corners_mm))
     while len(pieces_mm):
@@ -106,7 +107,7 @@ def _cut_triangles(
 
 
 def _mean(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[k] of values [n, k]; `np.average` takes five times as long for a few of them."""
+    """Return the mean [k] of values [n, k]. `np.average` takes five times as long for a few of them."""
     return np.asarray(weights @ values / weights.sum())
 
 

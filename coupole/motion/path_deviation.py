@@ -1,4 +1,5 @@
-"""Path deviation: distance of the moving arm from its planned path, now and where it would come to rest."""
+"""Path deviation: distance of the moving arm from its planned path, now and at the place where it would come to
+rest."""
 
 from __future__ import annotations
 
@@ -18,13 +19,13 @@ def deviation_at_rest_mm(
     reach_mm: NDArray[np.float64],
     stopping_s: float,
 ) -> float:
-    """Upper bound of the distance of any point of arm and tool from the straight motions of `way_deg` ([6] each),
-    at the place where the arm comes to rest if it is stopped now.
+    """Return an upper bound of the distance of any point of arm and tool from the straight motions of `way_deg`
+    ([6] each). It is taken at the place where the arm comes to rest if it is stopped now.
 
-    With the axes at `joints_deg` [6]: for the nearest posture of the path, the sum over the axes of the deviation
-    times the greatest distance of any point from that axis, `reach_mm` [6] (`CellBodies.reach_mm`); and the speed
-    across the path that the axes have at `speeds_deg_s` [6], kept for `stopping_s`. An arm that is stopped brakes
-    along its path, so its speed along it does not count."""
+    The axes are at `joints_deg` [6]. The first part of the bound is a sum over the axes for the nearest posture of
+    the path: the deviation of an axis times the greatest distance of any point from it, `reach_mm` [6]
+    (`CellBodies.reach_mm`). The second part is the speed across the path at `speeds_deg_s` [6], kept for
+    `stopping_s`. An arm that is stopped brakes along its path, so its speed along it does not count."""
     off_mm, along = _nearest(way_deg, joints_deg, reach_mm)
     speeds_mm_s = np.radians(speeds_deg_s) * reach_mm
     length = float(along @ along)
@@ -35,7 +36,8 @@ def deviation_at_rest_mm(
 def _nearest(
     way_deg: Sequence[NDArray[np.float64]], joints_deg: NDArray[np.float64], reach_mm: NDArray[np.float64]
 ) -> tuple[float, NDArray[np.float64]]:
-    """Deviation from the nearest motion of the path, mm, and that motion [6], each axis times its reach."""
+    """Return the deviation from the nearest motion of the path, mm, and that motion [6], with each axis multiplied
+    by its reach."""
     best, nearest = np.inf, np.zeros(6)
     for a, b in pairwise(way_deg) if len(way_deg) > 1 else [(way_deg[0], way_deg[0])]:
         along, off = (b - a) * reach_mm, (joints_deg - a) * reach_mm

@@ -1,8 +1,8 @@
 """Collision-free paths of the arm between postures.
 
-A *leg* is the path from one view to the next: straight in joint space if that is clear, else through via
-points, else along paths that RRT-Connect finds (Kuffner, LaValle 2000: two trees that grow towards each other) to
-and from a resting posture, shortened afterwards.
+A *leg* is the path from one view to the next. It is straight in joint space if that is clear. Otherwise it leads
+through via points. If these fail too, RRT-Connect finds paths to and from a resting posture (Kuffner, LaValle
+2000: two trees that grow towards each other), which are shortened afterwards.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ NO_WAY_S = 1e6
 
 @dataclass(frozen=True)
 class Leg:
-    """One motion: `waypoints` [k, 6] in degrees after the start, the last is the goal; empty if there is none."""
+    """One motion: `waypoints` [k, 6] in degrees after the start, the last of which is the goal; empty if there is
+    no path."""
 
     waypoints: tuple[Joints, ...]
     duration_s: float
@@ -36,9 +37,9 @@ class Leg:
 
 
 class PathPlanner:
-    """Legs among the cell's bodies, cached; without bodies every straight motion counts as clear.
+    """Legs among the cell's bodies, cached. Without bodies every straight motion counts as clear.
 
-    The return path is the path reversed, and results do not depend on earlier queries.
+    The return path is the reversed path. Results do not depend on earlier queries.
     """
 
     def __init__(
@@ -51,8 +52,8 @@ class PathPlanner:
         self._from_via: dict[tuple[int, bytes], list[Joints] | None] = {}
 
     def straight_s(self, places_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Times [n, n] of straight motions between postures [n, 6], clear or not; lower bounds of the legs'
-        times."""
+        """Return times [n, n] of straight motions between postures [n, 6], clear or not. They are lower bounds of
+        the legs' times."""
         from coupole.motion.straight_times import pairwise_s
 
         arm = self._arm
@@ -69,7 +70,7 @@ class PathPlanner:
         return self._straight[key]
 
     def leg(self, start: Joints, goal: Joints) -> Leg:
-        """The leg from one posture to another."""
+        """Return the leg from one posture to another."""
         a, b = _sorted_pair(start, goal)
         key = (a.tobytes(), b.tobytes())
         if key not in self._chains:
@@ -81,7 +82,8 @@ class PathPlanner:
         return Leg(tuple(chain[1:]), self._chain_s(chain))
 
     def _find(self, start: Joints, goal: Joints) -> list[Joints] | Contact:
-        """Postures [k] from start to goal with clear straight motions between them, or the contact that blocks."""
+        """Return postures [k] from start to goal with clear straight motions between them, or the contact that
+        blocks the path."""
         if self.is_straight(start, goal):
             return [start, goal]
         for place in (start, goal):
@@ -112,11 +114,11 @@ class PathPlanner:
         return None
 
     def _is_cut_off(self, place: Joints) -> bool:
-        """True if no path to the posture was found from any resting posture."""
+        """Tell whether no path to the posture was found from any resting posture."""
         return all(self._way_from_via(number, place) is None for number in range(len(self._vias)))
 
     def _way_from_via(self, number: int, place: Joints) -> list[Joints] | None:
-        """Path from a resting posture to another posture; searched once."""
+        """Return the path from a resting posture to another posture. It is searched only once."""
         key = (number, place.tobytes())
         if key not in self._from_via:
             via = self._vias[number]
@@ -131,8 +133,8 @@ class PathPlanner:
         return float(move_durations_s(self._arm, chain[:-1], chain[1:]).sum())
 
     def _via_chains(self, start: Joints, goal: Joints) -> list[list[Joints]]:
-        """Via points to try: a resting posture of the arm, with axis 1 as at the start and then as at the goal, so
-        that the arm first retracts, then turns, then extends."""
+        """Return via points to try. They are a resting posture of the arm, with axis 1 first as at the start and
+        then as at the goal. So the arm first retracts, then turns, then extends."""
         chains = []
         for via in self._vias:
             drawn_back, before_goal = via.copy(), via.copy()
@@ -165,7 +167,8 @@ class PathPlanner:
         return None
 
     def _extend(self, tree: list[Joints], parents: list[int], target: Joints, *, greedy: bool) -> int | None:
-        """Grow a tree towards `target` by one step, or until blocked; returns the last node reached."""
+        """Grow a tree towards `target` by one step, or, if `greedy`, until it is blocked. Returns the last node
+        reached."""
         node = int(np.argmin(np.abs(np.array(tree) - target).max(axis=1)))
         last_node: int | None = None
         while True:
@@ -183,7 +186,7 @@ class PathPlanner:
                 return last_node
 
     def _shortened_chain(self, chain: list[Joints]) -> list[Joints]:
-        """Leave out via points that are not needed, then cut corners at random."""
+        """Leave out via points that are not needed, then shorten the corners at random."""
         random = np.random.default_rng(self._seed)
         chain = list(chain)
         i = 0

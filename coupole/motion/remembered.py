@@ -1,6 +1,6 @@
-"""The last few results of computations that depend on arrays, by the content of these arrays.
+"""Keeps the last few results of computations on arrays, by the content of these arrays.
 
-A process may check a cell several times: a console checks plans, a session checks again before it begins, and the
+A process may check a cell several times. A console checks plans, a session checks again before it begins, and the
 report needs the occlusion once more. The same arm and object give the same bodies and patches.
 """
 
@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 Result = TypeVar("Result")
 
 _LARGEST_BYTES = 64 * 2**20
-"""Results of larger arrays are computed each time: they would fill the memory."""
+"""Results of larger arrays are computed each time, because they would fill the memory."""
 
 
 class Remembered(Generic[Result]):
-    """A store of at most `most` results: the one that was asked for longest ago makes room. Threads may share the
-    store, and nobody may change a result."""
+    """A store of at most `most` results. The result that was not used for the longest time is removed first.
+    Threads may share the store. Nobody may change a result."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -33,7 +33,8 @@ class Remembered(Generic[Result]):
     def result(
         self, arguments: tuple[Hashable | NDArray[np.float64], ...], compute: Callable[[], Result]
     ) -> Result:
-        """The result for these arguments: arrays by their content, all others by themselves."""
+        """Return the result for these arguments. Arrays are compared by their content, all other arguments by
+        themselves."""
         if sum(argument.nbytes for argument in arguments if isinstance(argument, np.ndarray)) > _LARGEST_BYTES:
             return compute()
         key = tuple(map(_key, arguments))

@@ -1,12 +1,13 @@
-"""Singularities of the arm, where small motions of the camera need large motions of an axis, and distances from
-them.
+"""Singularities of the arm, where small motions of the camera need large motions of an axis, and the distances of
+postures from them.
 
-An arm with a spherical wrist has three (Siciliano et al., "Robotics", 2009, sec. 3.3): the wrist stretched, so
-that axes 4 and 6 turn about one line; the elbow stretched or folded, so that the arm cannot reach farther or
-nearer; and the wrist's centre on axis 1, whose angle is then undetermined. An arm with three parallel axes also
-has three: axis 6 parallel to them; the elbow; and the intersection of axes 5 and 6 in the plane of axes 1 and 2.
-Motions are straight in joint space and may cross singularities; views avoid them, because corrections of the pose
-and poses computed from the joints are ill-conditioned there.
+An arm with a spherical wrist has three singularities (Siciliano et al., "Robotics", 2009, sec. 3.3). The wrist is
+stretched, so that axes 4 and 6 turn about one line. The elbow is stretched or folded, so that the arm cannot reach
+farther or nearer. Or the wrist's centre is on axis 1, so that the angle of axis 1 is undetermined. An arm with
+three parallel axes also has three singularities: axis 6 is parallel to them; the elbow is stretched or folded; or
+the intersection of axes 5 and 6 is in the plane of axes 1 and 2. Motions are straight in joint space and may cross
+singularities. Views avoid singularities, because pose corrections and poses computed from the joints are
+ill-conditioned there.
 """
 
 from __future__ import annotations
@@ -27,20 +28,20 @@ class SingularityMargin:
     wrist_deg: float = 5.0
     """Least angle of A5 from the stretched wrist."""
     elbow_deg: float = 5.0
-    """Least angle between upper arm and forearm, from stretched and from folded."""
+    """Least difference of the angle between upper arm and forearm from the stretched and from the folded elbow."""
     shoulder_mm: float = 20.0
     """Least distance of the wrist's centre from axis 1, or from the plane of axes 1 and 2."""
 
 
 SINGULARITY_MARGIN = SingularityMargin()
 _FREE_MARGIN = 3.0
-"""Singularity margin beyond which the posture cost is zero."""
+"""Singularity margin above which the posture cost is zero."""
 _FREE_LIMIT_MARGIN_DEG = 10.0
 
 
 def distances(arm: Arm, joints_deg: ArrayLike) -> tuple[NDArray[np.float64], ...]:
-    """Distances of joint angles [..., 6] from the singularities of wrist (deg), elbow (deg) and shoulder (mm),
-    [...] each. Raises ValueError for an arm without `structure_of`."""
+    """Return the distances [...] of joint angles [..., 6] from the singularities of wrist (deg), elbow (deg) and
+    shoulder (mm). Raises ValueError for an arm without `structure_of`."""
     structure = structure_of(arm)
     if structure is None:
         raise ValueError(f"the singularities of {arm.name} are not known: its chain has no closed solution")
@@ -67,7 +68,7 @@ def distances(arm: Arm, joints_deg: ArrayLike) -> tuple[NDArray[np.float64], ...
 
 
 def _from_half_turn_deg(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance of an angle in radians from the nearest multiple of pi, in degrees."""
+    """Return the distance of an angle in radians from the nearest multiple of pi, in degrees."""
     off: NDArray[np.float64] = np.abs((np.degrees(angle) + 90.0) % 180.0 - 90.0)
     return off
 
@@ -75,7 +76,8 @@ def _from_half_turn_deg(angle: NDArray[np.float64]) -> NDArray[np.float64]:
 def margin(
     arm: Arm, joints_deg: ArrayLike, required_margin: SingularityMargin = SINGULARITY_MARGIN
 ) -> NDArray[np.float64]:
-    """[...] distance of a posture [..., 6] from the nearest singularity, over the least distance allowed."""
+    """Return [...] the distance of a posture [..., 6] from the nearest singularity, over the least distance
+    allowed."""
     wrist_deg, elbow_deg, shoulder_mm = distances(arm, joints_deg)
     shares = (
         wrist_deg / required_margin.wrist_deg,
@@ -87,7 +89,8 @@ def margin(
 
 
 def reason(arm: Arm, joints_deg: ArrayLike, required_margin: SingularityMargin = SINGULARITY_MARGIN) -> str:
-    """The singularity that a posture [6] is too near to, as a phrase for messages; empty if there is none."""
+    """Return the singularity that is too near to a posture [6], as a phrase for messages; empty if there is
+    none."""
     wrist_deg, elbow_deg, shoulder_mm = (float(distance) for distance in distances(arm, joints_deg))
     if wrist_deg < required_margin.wrist_deg:
         return (
@@ -109,7 +112,8 @@ def reason(arm: Arm, joints_deg: ArrayLike, required_margin: SingularityMargin =
 
 
 def posture_cost(arm: Arm, postures_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[k] 0 for postures [k, 6] far from singularities and limits, up to 1 for those just allowed."""
+    """Return [k]: 0 for postures [k, 6] far from singularities and limits, up to 1 for postures that are only just
+    allowed."""
     from_singular = (_FREE_MARGIN - margin(arm, postures_deg)) / (_FREE_MARGIN - 1.0)
     from_limit = 1.0 - limit_margin_deg(arm, postures_deg) / _FREE_LIMIT_MARGIN_DEG
     cost: NDArray[np.float64] = np.clip(np.maximum(from_singular, from_limit), 0.0, 1.0)

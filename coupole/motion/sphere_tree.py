@@ -1,6 +1,6 @@
 """Shapes as trees of spheres, the common representation for distances.
 
-A capsule is a chain of spheres, a mesh has one sphere about each of many points of its surface. Both enclose the
+A capsule is a chain of spheres; a mesh has a sphere about each of many points of its surface. Both enclose the
 real shape, so a distance between spheres is never more than the true one. The root of a tree bounds the whole
 shape, and each level halves it, down to single spheres (Quinlan, "Efficient Distance Computation between
 Non-Convex Objects", 1994).
@@ -33,21 +33,23 @@ class Spheres(NamedTuple):
 
 
 class SphereTrees(NamedTuple):
-    """Trees of spheres, concatenated (two arrays only, because numba's compile time grows with their number)."""
+    """Trees of spheres, concatenated. There are only two arrays, because numba's compile time grows with their
+    number."""
 
     nodes: Floats
-    """[m, 4] centre and radius of each node's sphere, mm: it bounds all its descendants; a leaf is a sphere of the
-    shape."""
+    """[m, 4] centre and radius of each node's sphere, mm. The sphere of a node bounds all its descendants; a leaf
+    is a sphere of the shape."""
     trees: NDArray[np.int64]
     """[k, 2] for each tree the index of its first node, and its first leaf. Nodes are numbered like a heap: the
     root is 1, the children of i are 2 i and 2 i + 1."""
 
 
 def spheres_of(segments_mm: Floats, radii_mm: Floats) -> Spheres:
-    """Chains of spheres that cover capsules: all within `radii_mm` [n] of segments [n, 2, 3].
+    """Return chains of spheres that cover capsules, which are all points within `radii_mm` [n] of segments [n, 2,
+    3].
 
-    The first and last sphere are at the ends. Between them, a point of the capsule at an axial distance of at most
-    h from the centre of a sphere is within sqrt(r^2 + h^2) of it.
+    The first and last sphere are at the ends. Between them, if a point of the capsule is at an axial distance of
+    at most h from the centre of a sphere, its distance from the centre is at most sqrt(r^2 + h^2).
     """
     centers, radii = [], []
     for (start, end), radius in zip(segments_mm, radii_mm, strict=True):
@@ -60,11 +62,11 @@ def spheres_of(segments_mm: Floats, radii_mm: Floats) -> Spheres:
 
 
 def surface_points(corners_mm: Floats, step_mm: float = MESH_STEP_MM) -> Floats:
-    """Points [n, 3] on a mesh of corners [triangles, 3, 3], so dense that no point of its surface is farther than
+    """Return points [n, 3] on a mesh of corners [triangles, 3, 3]. No point of the surface is farther than
     `step_mm` from one of them.
 
-    Each triangle is divided into similar ones whose edges are at most e; then none of their points is farther than
-    e / sqrt(3) from a corner. One of the corners in a cubic cell of edge c is kept, at most c sqrt(3) from the
+    Each triangle is divided into similar ones with edges of at most e. Then each of their points is at most e /
+    sqrt(3) from a corner. Of the corners in a cubic cell of edge c, one is kept; it is at most c sqrt(3) from the
     others.
     """
     edge_mm = 0.6 * step_mm
@@ -87,7 +89,7 @@ def _one_per_cell(points: Floats, cell_mm: float) -> Floats:
 
 
 def sphere_trees_of(shapes: Sequence[Spheres]) -> SphereTrees:
-    """Trees over shapes, in their order. Each shape has at least one sphere."""
+    """Return trees over shapes, in their order. Each shape has at least one sphere."""
     trees = [_TREES.result((*shape,), lambda shape=shape: _tree(shape)) for shape in shapes]  # type: ignore[misc]
     sizes = [len(nodes) for nodes in trees]
     return SphereTrees(
@@ -96,8 +98,8 @@ def sphere_trees_of(shapes: Sequence[Spheres]) -> SphereTrees:
 
 
 def _tree(shape: Spheres) -> Floats:
-    """[m, 4] nodes of a tree that halves a shape across its longest side; index 0 is unused, and the last sphere
-    is repeated to fill the leaves."""
+    """Return [m, 4] nodes of a tree that halves a shape across its longest side; index 0 is unused, and the last
+    sphere is repeated to fill the leaves."""
     spheres = np.column_stack([shape.centers_mm, shape.radii_mm])
     depth = int(np.ceil(np.log2(len(spheres))))
     spheres = spheres[np.minimum(np.arange(1 << depth), len(spheres) - 1)]

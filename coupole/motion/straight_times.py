@@ -1,4 +1,4 @@
-"""Times of straight motions between all pairs of many postures; compiled (`motion.path_planner`)."""
+"""Times of straight motions between all pairs of many postures. They are compiled, for `motion.path_planner`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 @numba.njit(cache=True, nogil=True)
 def pairwise_s(places_deg, velocity_deg_s, acceleration_deg_s2, jerk_deg_s3):  # type: ignore[no-untyped-def]
-    """Durations [n, n], in seconds, of the motions of `kinematics.move_durations_s` between postures [n, 6], whose
-    limits are [6] each. It holds one number per pair, however many postures there are."""
+    """Return the durations [n, n], s, of the motions of `kinematics.move_durations_s` between postures [n, 6]. The
+    limits are [6] each. The memory is one number per pair, however many postures there are."""
     n = len(places_deg)
     seconds = np.zeros((n, n))
     for a in range(n):

@@ -1,1 +1,1 @@
-"""The parts that all pages of results are made of, and the templates that write them."""
+"""The parts of all pages of results, and the templates that write them."""

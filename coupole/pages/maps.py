@@ -14,7 +14,7 @@ from coupole.pages import palettes
 from coupole.pages.page_parts import Map, Picture
 
 WIDTH_PX = 480
-"""Largest width of a map; wider ones are shown by every second pixel, or fewer."""
+"""Largest width of a map. Of a wider map every second pixel is shown, or fewer."""
 GAMMA = 2.2
 BRIGHTEST = 0.999
 """Quantile of a picture that is shown as white."""
@@ -23,7 +23,7 @@ BRIGHTEST = 0.999
 def value_map(
     title: str, values: NDArray[Any], unit: str, high: float, *, low: float = 0.0, palette: str = "amount"
 ) -> Map:
-    """A map of values [h, w] from `low` to `high` in a unit. Where they are NaN there is no colour."""
+    """Return a map of values [h, w] from `low` to `high` in a unit. NaN has no colour."""
     return _map_of(title, _some_pixels(values), unit, (low, high), palette)
 
 
@@ -37,7 +37,8 @@ def shaded_map(
     low: float = 0.0,
     palette: str = "amount",
 ) -> Map:
-    """A map as wide as the page, of values [h, w] on a solid; `shade` [h, w] is its brightness from 0 to 1."""
+    """Return a map as wide as the page, of values [h, w] on a solid. `shade` [h, w] is the brightness of the solid
+    from 0 to 1."""
     from PIL import Image
 
     black = np.zeros((*shade.shape, 2), np.uint8)
@@ -71,8 +72,7 @@ def colour_map(
     unit: str = "",
     gamma: float = 1.0,
 ) -> Map:
-    """A map of three values [h, w, 3], shown as red, green and blue. Where one is NaN there is
-    no colour."""
+    """Return a map of three values [h, w, 3], shown as red, green and blue. A pixel with a NaN has no colour."""
     from PIL import Image
 
     pixel_values = _some_pixels(values)
@@ -83,7 +83,8 @@ def colour_map(
 
 
 def eye_map(title: str, picture: NDArray[Any], white: float | None = None, unit: str = "") -> Map:
-    """A picture [h, w, 3] or [h, w] for the eye, by a power of 2.2; white is `white`, or the brightest part."""
+    """Return a picture [h, w, 3] or [h, w] for the eye, by a power of 2.2. The value `white`, or otherwise the
+    brightest part, is white."""
     three = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
     finite_values = three[np.isfinite(three)]
     high = white or max(float(np.quantile(finite_values, BRIGHTEST)) if finite_values.size else 1.0, 1e-12)
@@ -91,17 +92,17 @@ def eye_map(title: str, picture: NDArray[Any], white: float | None = None, unit:
 
 
 def normal_map(title: str, normals: NDArray[Any]) -> Map:
-    """A map of unit vectors [h, w, 3]."""
+    """Return a map of unit vectors [h, w, 3]."""
     return colour_map(title, normals, ("x", "y", "z"), 1.0, low=-1.0)
 
 
 def colour_picture(title: str, shares: NDArray[Any]) -> Picture:
-    """A picture of shares [h, w, 3] from 0 to 1 whose colours are no values."""
+    """Return a picture of shares [h, w, 3] from 0 to 1. Its colours stand for no values."""
     return Picture(title, picture_png(np.rint(255 * np.clip(_some_pixels(shares), 0, 1)).astype(np.uint8)))
 
 
 def picture_png(codes: NDArray[np.uint8]) -> bytes:
-    """A picture [h, w] or [h, w, 3] as PNG."""
+    """Return a picture [h, w] or [h, w, 3] as PNG."""
     from PIL import Image
 
     return _png(Image.fromarray(codes))

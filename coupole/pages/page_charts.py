@@ -28,7 +28,8 @@ class Curve:
 
 
 def chart(title: str, nm: Array, curves: Sequence[Curve]) -> Plot:
-    """Curves over the wavelengths [n] from 0 (or what is below) to the highest value or band."""
+    """Draw curves over the wavelengths [n]. The scale goes from 0 (or the lowest value, if it is below 0) to the
+    highest value or band."""
     ends = [end for curve in curves for end in (curve.values, curve.low, curve.high) if end is not None]
     top = max(float(np.nanmax(end)) for end in ends) * 1.05 or 1.0
     bottom = min(0.0, *(float(np.nanmin(end)) for end in ends))
@@ -60,7 +61,7 @@ def chart(title: str, nm: Array, curves: Sequence[Curve]) -> Plot:
 
 
 def patches(name: str, colours: Sequence[tuple[str, tuple[int, int, int]]]) -> Plot:
-    """Patches side by side without a gap: (name, sRGB) of each."""
+    """Draw patches side by side without a gap: (name, sRGB) of each."""
     shapes = [
         Shape("rect", {"x": 150 * at, "width": 150, "height": 70, "style": f"fill:rgb({red},{green},{blue})"})
         for at, (_, (red, green, blue)) in enumerate(colours)
@@ -70,8 +71,8 @@ def patches(name: str, colours: Sequence[tuple[str, tuple[int, int, int]]]) -> P
 
 
 def bars(title: str, shares: Sequence[tuple[str, float]], limit_words: str) -> Plot:
-    """A bar for each (name, share of its limit); those beyond 1 are red. The line is the limit, at half of the
-    width; longer bars are cut at twice it."""
+    """Draw a bar for each (name, share of its limit); bars beyond 1 are red. The line is the limit, at half of the
+    width. A longer bar is cut at twice the limit."""
     row, left_px, middle_px = 22, 300, 170
     shapes = []
     for number, (name, share) in enumerate(shares):
@@ -91,10 +92,10 @@ def bars(title: str, shares: Sequence[tuple[str, float]], limit_words: str) -> P
 
 
 def points(x: Array, y: Array) -> str:
-    """Corners of a line, as SVG has them."""
+    """Return the corners of a line in SVG form."""
     return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
 
 
 def mark(x: float, y: float, words: str, anchor: str) -> Shape:
-    """Words in a drawing; `anchor`: `start`, `middle_px` or `end` of them is at x."""
+    """Return words in a drawing. `anchor` says which part of the words is at x: `start`, `middle_px` or `end`."""
     return Shape("text", {"x": round(x, 1), "y": round(y, 1), "text-anchor": anchor}, words)

@@ -1,7 +1,7 @@
-"""The parts of a page. A page's author gives words and figures; HTML is written by the templates alone.
+"""The parts of a page. A page's author gives words and figures; only the templates write HTML.
 
-A page has one order, whatever it shows: title, picture, three sentences, facts, sections. A section has one
-order too: words, figures, facts, lists, tables, notes. Words are plain text: the templates escape them.
+Every page has the same order: title, picture, three sentences, facts, sections. Every section has the same order:
+words, figures, facts, lists, tables, notes. Words are plain text: the templates escape them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _NUMBER = re.compile(r"[-+]?[\d,]*\.?\d+(e[-+]?\d+)?( ?%)?")
 
 @dataclass(frozen=True)
 class Link:
-    """A link to a file beside the page, or to `#name` in it; without words its path is shown."""
+    """A link to a file beside the page, or to `#name` in the page. If it has no words, its path is shown."""
 
     kind: ClassVar = "link"
     path: str
@@ -28,13 +28,13 @@ class Link:
 
     @property
     def href(self) -> str:
-        """The link's address: letters that mean something in addresses are escaped."""
+        """The link's address. Characters with a meaning in addresses are escaped."""
         return self.path if self.path.startswith("#") else quote(self.path)
 
 
 @dataclass(frozen=True)
 class Code:
-    """Something to type, or to compare letter by letter."""
+    """Text to type, or to compare letter by letter."""
 
     kind: ClassVar = "code"
     words: str
@@ -42,7 +42,7 @@ class Code:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A word of judgement; the sign gives its colour, and the word says it without colour."""
+    """A word of judgement. The sign gives its colour; the word says the same without colour."""
 
     kind: ClassVar = "verdict"
     words: str
@@ -80,7 +80,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Lines and areas of `width` x `height` units, and what they show in words."""
+    """Lines and areas of `width` x `height` units, with a description in words."""
 
     kind: ClassVar = "drawing"
     title: str
@@ -114,17 +114,17 @@ class Picture:
     data: bytes
     coding: Literal["png", "jpeg"] = "png"
     alternative: str = ""
-    """Words for whoever does not see it; without them the title is said."""
+    """Words for a person who does not see the picture. Without them the title is used."""
     is_broad: bool = False
-    """True for a picture as wide as the page, where it is the first."""
+    """True for a picture as wide as the page, if it is the first picture."""
 
 
 @dataclass(frozen=True)
 class Map:
-    """An image whose pixels are values: it has a colour bar, and the page tells the value under the pointer.
+    """An image whose pixels are values. It has a colour bar, and the page shows the value under the pointer.
 
-    With a `palette` a pixel is one value: its colour's place in the palette, from `low` to `high`. Without one its
-    red, green and blue are the values of `names`, each from `low` to `high`, by the power `gamma`.
+    With a `palette` a pixel is one value: the place of its colour in the palette, from `low` to `high`. Without a
+    palette its red, green and blue are the values of `names`, each from `low` to `high`, by the power `gamma`.
     """
 
     kind: ClassVar = "map"
@@ -137,16 +137,16 @@ class Map:
     names: Sequence[str] = ()
     gamma: float = 1.0
     is_cut: bool = False
-    """Some values are beyond `high` and have its colour."""
+    """True if some values are beyond `high` and have its colour."""
     shade_png: bytes = b""
-    """Black of which more or less is seen, laid over the map: the shape of what it is a map of."""
+    """Black with varying opacity, laid over the map: it shows the shape of the mapped thing."""
     is_broad: bool = False
-    """True for a picture as wide as the page, where it is the first."""
+    """True for a map as wide as the page, if it is the first picture."""
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A drawing with its title below, and what its colours mean."""
+    """A drawing with its title below and the meaning of its colours."""
 
     kind: ClassVar = "plot"
     drawing: Drawing
@@ -174,7 +174,7 @@ class Table:
 
     @property
     def numeric_columns(self) -> frozenset[int]:
-        """Columns of numbers alone: they stand to the right, digit below digit."""
+        """Columns that contain only numbers. They are aligned to the right, digit below digit."""
         return frozenset(
             column
             for column in range(len(self.head))
@@ -185,7 +185,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page that links may lead to, as `#name`. Empty parts are left out."""
+    """A part of a page, to which links may lead as `#name`. Empty parts are left out."""
 
     name: str
     heading: Inline
@@ -193,14 +193,14 @@ class Section:
     figures: Sequence[Figure] = ()
     figure_size: Literal["small", "medium", "triples", "wide"] = "medium"
     legend: Legend | None = None
-    """The legend of all figures together."""
+    """One legend for all figures."""
     facts: Mapping[str, Inline] = field(default_factory=dict)
     items: Sequence[Inline] = ()
     tables: Sequence[Table] = ()
     notes: Sequence[Inline] = ()
     sections: Sequence[Section] = ()
     is_folded: bool = False
-    """True if only the heading is seen until it is asked for; paper has all."""
+    """True if only the heading is shown until the reader opens the section. On paper everything is shown."""
 
     @property
     def has_content(self) -> bool:
@@ -212,7 +212,8 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A page: of what object or work, and what was done; the first picture; three sentences; facts; sections."""
+    """A page. It names the object or work, says what was done, and has the first picture, three sentences, facts
+    and sections."""
 
     title: str
     pictures: Sequence[Figure]
@@ -223,7 +224,7 @@ class Page:
     next_step: Inline
     """One sentence: what the reader does next."""
     remark: Inline = ""
-    """Words that must be known before all else, as that it is simulated."""
+    """Words that must be known first, such as that the data are simulated."""
     facts: Mapping[str, Inline] = field(default_factory=dict)
     sections: Sequence[Section] = ()
 
@@ -232,7 +233,7 @@ class Page:
         return [section for section in self.sections if section.has_content]
 
     def maps(self) -> list[Map]:
-        """All maps of the page, those of its sections' sections too."""
+        """All maps of the page, with those in sections of its sections."""
         maps = [figure for figure in self.pictures if isinstance(figure, Map)]
         waiting = list(self.sections)
         while waiting:
@@ -243,5 +244,5 @@ class Page:
 
 
 def anchor(name: str) -> str:
-    """A name for links inside the page, from any text."""
+    """Return a name for links inside the page, made from any text."""
     return "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in name)

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 
 def render(page: Page, template: str = "page.html", **more: Any) -> str:
-    """The page as HTML, with style and pictures in it; a script only where it has maps. `more` is what another
-    template than that of all reports asks for."""
+    """Return the page as HTML, with style and pictures in it. It has a script only if it has maps. `more` has
+    values for a template that is not the one of all reports."""
     palette_names = sorted({figure.palette for figure in page.maps() if figure.palette})
     tables = {name: palettes.hexadecimal(name) for name in palette_names}
     return (

@@ -1,4 +1,4 @@
-"""Description of an arm: chain of joints, their limits and speeds, bodies of the links.
+"""Description of an arm: chain of joints, limits and speeds of the joints, bodies of the links.
 
 The files included with Coupole are in `configs/robots`; `shipped_arm` finds them. A rig names its arm's file under
 `arm:`; otherwise it is the default arm of the robot's driver.
@@ -38,20 +38,22 @@ Range = tuple[Annotated[float, Field(ge=-720, le=720)], Annotated[float, Field(g
 
 
 class JointDescription(Model):
-    """One joint, in the frame of the link before it; with all angles 0 that frame is parallel to the base's."""
+    """One joint, in the frame of the link before it. With all angles 0, this frame is parallel to the base
+    frame."""
 
     origin_mm: Vector
     """Origin of the joint, in the frame of the link before it."""
     axis: Axis
     """Axis of rotation, right-handed."""
     limits_deg: Range
-    """Lowest and highest angle, by the data sheet."""
+    """Lowest and highest angle, from the data sheet."""
     posture_limits_deg: Range | None = None
-    """Limits for planned postures: narrower where links come near each other, or cables would twist."""
+    """Limits for planned postures. They are narrower where links come near each other, or where cables would
+    twist."""
     speed_deg_s: Positive
-    """Greatest speed, by the data sheet."""
+    """Greatest speed, from the data sheet."""
     acceleration_deg_s2: Positive
-    """Greatest acceleration."""
+    """Greatest acceleration of the joint."""
     jerk_deg_s3: Positive = 3000.0
     """Greatest jerk."""
 
@@ -73,7 +75,7 @@ class LinkDescription(Model):
     name: BodyName
     """Name of the body in messages and pictures."""
     link: Annotated[int, Field(ge=0, le=6)]
-    """0 is the base, which is fixed; link k turns with joint k."""
+    """Number of the link: 0 is the base, which is fixed; link k turns with joint k."""
     capsules: Annotated[tuple[CapsuleDescription, ...], Field(min_length=1, max_length=100)]
     """Together they enclose the body."""
 
@@ -82,15 +84,16 @@ class KeptApart(Model):
     """Two bodies of the arm that could touch. Pairs that are not listed touch by design, or cannot touch."""
 
     body: BodyName
-    """One of the two."""
+    """One of the two bodies."""
     other: BodyName
-    """Nearer to the base than `body`."""
+    """The other body, nearer to the base than `body`."""
     near_by_design_deg: Annotated[
         tuple[Annotated[tuple[Degrees, ...], Field(min_length=1, max_length=360)], ...] | None,
         Field(min_length=6, max_length=6),
     ] = None
-    """Angles of each joint. Parts of `body` that are near `other` in all their combinations are always near
-    because of the joint between the two, or because their capsules are too large; they are not checked."""
+    """Angles of each joint. A part of `body` that is near `other` in all combinations of these angles is always
+    near it, because of the joint between them, or because their capsules are too large. This part is not
+    checked."""
 
     @model_validator(mode="after")
     def _few_combinations(self) -> KeptApart:
@@ -101,15 +104,15 @@ class KeptApart(Model):
 
 
 class ArmDescription(Model):
-    """One arm. Link frames have their origins in the joints and are parallel to the base frame with all angles
-    0."""
+    """One arm. Link frames have their origins in the joints, and are parallel to the base frame when all angles
+    are 0."""
 
     schema_version: Literal[1]
     """Version of the format of arms."""
     name: Annotated[str, Field(min_length=1, max_length=64)]
     """Model of the arm."""
     joints: Annotated[tuple[JointDescription, ...], Field(min_length=6, max_length=6)]
-    """Joints from the base on."""
+    """Joints, beginning at the base."""
     link_6_from_flange: Pose
     """Pose of the flange's frame in the frame of the last link."""
     links: Annotated[tuple[LinkDescription, ...], Field(min_length=1, max_length=100)]
@@ -121,7 +124,7 @@ class ArmDescription(Model):
 
     @cached_property
     def arm(self) -> Arm:
-        """The arm's kinematics, with limits, speeds and accelerations of the data sheet."""
+        """The arm's kinematics, with limits, speeds and accelerations from the data sheet."""
         flange = self.link_6_from_flange.matrix().round(15) + 0.0
         chain = JointChain(
             tuple(joint.origin_mm for joint in self.joints),
@@ -139,7 +142,7 @@ class ArmDescription(Model):
 
     @property
     def posture_limits_deg(self) -> tuple[tuple[float, float], ...]:
-        """Limits for plans: each joint's posture limits, or else its limits."""
+        """Limits for plans: each joint's posture limits, or otherwise its limits."""
         return tuple(joint.posture_limits_deg or joint.limits_deg for joint in self.joints)
 
 
@@ -158,7 +161,7 @@ def read_arm(path: Path, files: InputFiles | None = None) -> ArmDescription:
 
 
 def description_problems(document: Document, description: ArmDescription, at: KeyPath = ()) -> list[Problem]:
-    """Mistakes of a description that involve several keys; `at` is its key path in the document."""
+    """Return the mistakes of a description that involve several keys. `at` is its key path in the document."""
     problems = []
     for k, joint in enumerate(description.joints):
         (low, high), posture_limits_deg = joint.limits_deg, joint.posture_limits_deg or joint.limits_deg
@@ -200,7 +203,7 @@ def _body_problems(document: Document, description: ArmDescription, at: KeyPath)
 
 @cache
 def shipped_arm(name: str) -> ArmDescription:
-    """The included arm of this name. Raises InputError if there is none."""
+    """Return the included arm of this name. Raises InputError if there is none."""
     names = shipped_names("robots")
     if name in names:
         return read_arm(shipped_folder() / "robots" / f"{name}.yaml")
@@ -215,7 +218,7 @@ def arm_named(
     settings: Mapping[str, Any],
     files: InputFiles,
 ) -> tuple[ArmDescription | None, list[Problem]]:
-    """The arm under `arm:` in a rig's document, or else its driver's, and the problems found in it."""
+    """Return the arm under `arm:` in a rig's document, or otherwise its driver's, and the problems found in it."""
     if isinstance(arm_reference, ArmDescription):
         if arm_reference.link_meshes is not None:
             arm_reference = arm_reference.model_copy(
@@ -237,7 +240,7 @@ def arm_named(
 
 
 def arm_of_driver(driver: str, settings: Mapping[str, Any]) -> ArmDescription | None:
-    """A driver's default arm; None for a driver that is not included with Coupole.
+    """Return a driver's default arm; None for a driver that is not included with Coupole.
 
     Raises InputError if a UR's `model` has no description.
     """

@@ -1,4 +1,4 @@
-"""The ground of all models of plans and rigs: names, numbers with their bounds, poses.
+"""The base of all models of plans and rigs: names, numbers with their bounds, poses.
 
 Every model is frozen and refuses unknown keys.
 """
@@ -14,13 +14,13 @@ from coupole.geometry import Transform, transform
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
-"""Letters, digits, dot, underscore, hyphen: it becomes part of file names and shot ids."""
+"""Letters, digits, dot, underscore and hyphen, because it becomes part of file names and shot ids."""
 Words = Annotated[str, Field(min_length=1, max_length=500)]
 Millimetres = Annotated[float, Field(ge=-20_000, le=20_000)]
-"""A coordinate in a cell: 20 m are more than any has."""
+"""A coordinate in a cell. The bound of 20 m is larger than any cell."""
 Vector = tuple[Millimetres, Millimetres, Millimetres]
 Length = Annotated[float, Field(gt=0, le=20_000)]
-"""mm."""
+"""A length in mm."""
 Degrees = Annotated[float, Field(ge=-360.0, le=360.0)]
 Angles = tuple[Degrees, Degrees, Degrees]
 ExposureUs = Annotated[int, Field(ge=10, le=2_000_000)]
@@ -28,7 +28,7 @@ LedId = Annotated[int, Field(ge=0, le=65534)]
 
 
 def possible_path(path: Path) -> Path:
-    """The path itself. Raises ValueError if no file can have it."""
+    """Return the path itself. Raises ValueError if no file can have it."""
     if any(len(part.encode("utf-8", "replace")) > 255 for part in path.parts) or len(str(path)) > 2000:
         raise ValueError("a path of at most 2000 characters, each of its names of at most 255 bytes")
     if "\0" in str(path):
@@ -66,9 +66,9 @@ class Pose(Model):
     """A rigid transform in a file: translation in mm, KUKA's A, B, C in degrees."""
 
     translation_mm: Vector = (0.0, 0.0, 0.0)
-    """x, y, z."""
+    """x, y and z, mm."""
     abc_deg: Angles = (0.0, 0.0, 0.0)
-    """KUKA's A, B, C: turns about z, then the new y, then the new x."""
+    """KUKA's A, B, C, degrees: turns about z, then the new y, then the new x."""
 
     def matrix(self) -> Transform:
         return transform(self.translation_mm, self.abc_deg)

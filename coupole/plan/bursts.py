@@ -1,6 +1,6 @@
-"""Bursts: the shots of one table, executed by the box, or by the host light by light.
+"""Bursts: the shots of one table. The box executes them, or the host executes them light by light.
 
-Dark marks, dark frames, lights, marks again (`plan.marks`); all frames of a burst have one exposure.
+A burst has dark marks, dark frames, lights, and marks again (`plan.marks`). All its frames have one exposure.
 """
 
 from __future__ import annotations
@@ -21,19 +21,20 @@ from coupole.plan.shot_id import Dark, Led, Light, Panel, PanelMark, Sentinel, S
 EXPOSURE_MARGIN_US = 200
 """On-time of an LED after the exposure's nominal end, because the camera's exposure may start late."""
 PERIOD_MARGIN_US, PERIOD_MARGIN_PPM = 10, 200
-"""Margin for early edges, from jitter and from the drift between two quartzes; a camera at its limit would ignore
-them."""
+"""Margin for early edges: for jitter, and for the drift between two quartzes. A camera at its limit would ignore
+early edges."""
 LED_GAP_US = 100
 """Least dark time between two lights."""
 _COOLS_FOR = 3
-"""Steps between a sentinel and another shot of its LED: in them it rests for twice the time of a flash."""
+"""Least number of steps between a sentinel and another shot of its LED. During these steps the LED rests for twice
+the time of a flash."""
 SOFTWARE_LATENCY_US = 60_000
-"""Additional on-time of an LED with software trigger: the host's round trip to the camera."""
+"""Additional on-time of an LED with software trigger, for the host's round trip to the camera."""
 
 
 @dataclass(frozen=True)
 class Pace:
-    """Longer step periods than camera and LED need, because of disk or heat."""
+    """Limits that make step periods longer than camera and LED need, because of disk or heat."""
 
     disk_us: int = 0
     """Time in which the disk writes a frame."""
@@ -75,7 +76,7 @@ class Burst:
 
     @cached_property
     def duration_s(self) -> float:
-        """Duration of the table."""
+        """Duration of the table, s."""
         return float(self.table["period_us"].sum()) / 1e6
 
     @property
@@ -94,12 +95,12 @@ class Burst:
         return np.array([label is not None and label.is_shot for label in self.labels])
 
     def without(self, leds: Collection[int]) -> Burst:
-        """The same burst without the shots under these LEDs."""
+        """Return the same burst without the shots under these LEDs."""
         drops = np.isin(self.table["led"], list(leds)) & (self.table["led"] != NO_LED)
         return self.only({label for label, drop in zip(self.labels, drops, strict=True) if label and not drop})
 
     def only(self, wanted_labels: Collection[ShotLabel]) -> Burst:
-        """The same burst with those shots only, and new marks."""
+        """Return the same burst with only those shots, and with new marks."""
         inner = self.inner
         keep = [i for i in inner if self.labels[i] in wanted_labels]
         marks = [
@@ -120,7 +121,7 @@ def burst_timing(
     hardware: bool,
     pace: Pace = FASTEST,
 ) -> BurstTiming:
-    """Shortest times of a step that camera, LEDs and the given pace allow.
+    """Return the shortest times of a step that camera, LEDs and the given pace allow.
 
     The LED is on for its rise, the exposure and a margin; the period is the longest of the camera's readout, the
     exposure plus the sensor's gap, the LED's on-time plus a dark gap, and the limits of disk and heat.
@@ -149,16 +150,17 @@ def bursts_of_exposure(
     darks: int,
     marks: Marks,
 ) -> Iterator[Burst]:
-    """The bursts of one exposure, without a view: one for each list of LEDs, one for each panel. Dark frames are
-    the first one's."""
+    """Yield the bursts of one exposure, without a view: one for each list of LEDs, one for each panel. Dark frames
+    are in the first burst."""
     for number, lit in enumerate(lights):
         own_darks = darks if number == 0 else 0
         yield _burst(lit, own_darks, timing, exposure_index, repeat, marks=marks)
 
 
 def with_sentinels(lit: Sequence[Led], sentinels: Sequence[int], every: int) -> list[Led | Sentinel]:
-    """LEDs with `sentinels` among them: all at the begin and at the end, and one after the other in between, after
-    each `every` LEDs. They keep a distance from their LEDs' own shots, in which these cool."""
+    """Return the LEDs with `sentinels` among them. All sentinels are at the begin and at the end; between, there
+    is one of them in turn after each `every` LEDs. They keep a distance from the shots of the same LEDs, so that
+    the LEDs cool."""
     if not sentinels:
         return list(lit)
     between = range(every, len(lit) - every // 2, every)
@@ -177,7 +179,8 @@ def with_sentinels(lit: Sequence[Led], sentinels: Sequence[int], every: int) -> 
 
 
 def _cool_place(wanted_place: int, own_places: Sequence[int], led_count: int) -> int:
-    """The place among so many LEDs nearest to the wanted one that keeps the distance from these places."""
+    """Return the place nearest to the wanted one, among this number of LEDs, that keeps the distance from these
+    places."""
     cool = (p for p in range(led_count + 1) if not any(-_COOLS_FOR <= at - p < _COOLS_FOR for at in own_places))
     return min(cool, key=lambda p: (abs(p - wanted_place), p), default=wanted_place)
 
@@ -207,7 +210,7 @@ def _burst(
 
 
 def _led_of(light: Light) -> int:
-    """Id of the LED that is lit, or NO_LED."""
+    """Return the id of the LED that is lit, or NO_LED."""
     match light:
         case Led(id=led) | Sentinel(led=led):
             return led
@@ -222,6 +225,6 @@ def _darks(first: int, count: int) -> list[Dark]:
 
 
 def _dark_step(timing: BurstTiming, *, sends_edge: bool) -> NDArray[np.void]:
-    """One step (STEP_DTYPE [1]) without light."""
+    """Return one step (STEP_DTYPE [1]) without light."""
     step = Step(NO_LED, timing.on_us, timing.trigger_delay_us, timing.period_us, sends_edge)
     return np.array([astuple(step)], STEP_DTYPE)

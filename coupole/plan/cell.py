@@ -20,7 +20,7 @@ from coupole.plan.yamlfile import Document
 
 @dataclass(frozen=True)
 class Cell:
-    """A rig file, read, with its dome."""
+    """A rig file that was read, with its dome."""
 
     rig: Rig
     document: Document
@@ -40,7 +40,7 @@ class Cell:
 
     @property
     def link_meshes(self) -> Path | None:
-        """Folder of the link meshes: the rig's, or else the arm's."""
+        """Folder of the link meshes: the rig's, or otherwise the arm's."""
         if self.rig.link_meshes is not None:
             return self.document.resolve(self.rig.link_meshes)
         arm = described_arm(self.rig)
@@ -52,7 +52,7 @@ class Cell:
 
     @property
     def state_folder(self) -> Path:
-        """Folder for what is true of the cell whatever is acquired."""
+        """Folder for facts about the cell that do not depend on the acquisition."""
         folder = self.rig.storage.state
         return self.document.resolve(folder) if folder is not None else self.storage_folder / "state"
 
@@ -63,7 +63,7 @@ class Cell:
 
     @property
     def controllers_folder(self) -> Path:
-        """Folder for what is true of arms' controllers (`coupole.plan.controller_places`)."""
+        """Folder for facts about controllers of arms (`coupole.plan.controller_places`)."""
         folder = self.rig.controllers
         return self.document.resolve(folder) if folder is not None else users_data_folder() / "controllers"
 
@@ -74,20 +74,20 @@ class Cell:
 
 
 def users_ledger_folder() -> Path:
-    """Return the ledger folder of rigs that name none."""
+    """Return the ledger folder for rigs that do not name one."""
     return users_data_folder() / "ledger"
 
 
 def users_data_folder() -> Path:
-    """Return Coupole's folder in the user's data folder (XDG Base Directory Specification; a relative path is
-    ignored there)."""
+    """Return Coupole's folder in the user's data folder. It follows the XDG Base Directory Specification, which
+    ignores a relative path."""
     folder = Path(os.environ.get("XDG_DATA_HOME", ""))
     return (folder if folder.is_absolute() else Path.home() / ".local/share") / "coupole"
 
 
 def read_cell(path: Path, files: InputFiles | None = None) -> Cell:
-    """Read a rig (by its path, or a shipped one by its name) and its dome, into `files` if they are given. Raises
-    InputError with all problems."""
+    """Read a rig, given by its path or by the name of a shipped one, and its dome, into `files` if they are given.
+    Raises InputError with all problems."""
     files = InputFiles() if files is None else files
     document = yamlfile.read_document(file_of(path, "rigs"), files)
     rig, problems = document.problems(Rig)

@@ -1,9 +1,9 @@
-"""Bursts that are chosen during a run, from what has been proven of their view.
+"""Bursts that are chosen during a run, from the proven frames of their view.
 
-A plan with a `Chooser` leaves open which bursts a view gets. Before the run there are two lists for each view: the
-bursts *from which* is chosen (each exposure with all LEDs), and a *bound*, bursts that together are longer, hotter
-and larger than whatever may be chosen, and give more light; preflight checks the bound as if it were the plan. In
-the run the chooser is asked again and again, until it has enough:
+A plan with a `Chooser` does not say which bursts a view gets. Before the run there are two lists for each view.
+The first list has the bursts to choose *from* (each exposure with all LEDs). The second is a *bound*: its bursts
+together are longer, hotter and larger, and give more light, than any choice. Preflight checks the bound as if it
+were the plan. In the run the chooser is asked again and again, until it has enough:
 
     choice = chooser.choose(view, choices before, samples of the frames that are proven)
 
@@ -28,9 +28,9 @@ from coupole.plan.bursts import Burst
 from coupole.plan.shot_id import Dark, Led, Light, ShotLabel
 
 MOST_BURSTS = 16
-"""Bursts of one view, at most, where they are chosen."""
+"""Greatest number of bursts of one view, if bursts are chosen."""
 MOST_CHOICES = 6
-"""Choices for one view, at most: preflight reckons with the time that each takes."""
+"""Greatest number of choices for one view. Preflight includes the time that each choice takes."""
 Number = Annotated[int, Field(ge=0, le=100_000)]
 
 
@@ -46,41 +46,41 @@ class ChosenBurst(Model):
     leds: tuple[LedId, ...]
     """LEDs, in the order of the LED table."""
     darks: Number = 0
-    """Dark frames and marks that are kept of it: those of the first burst of an exposure."""
+    """Number of its dark frames and marks that are kept. Only the first burst of an exposure has them."""
 
     def labels(self) -> Iterator[ShotLabel]:
-        """Labels of the frames that it is to give."""
+        """Yield the labels of the frames that it will give."""
         lights: list[Light] = [*map(Led, self.leds), *map(Dark, range(self.darks))]
         for light in lights:
             yield ShotLabel(light, self.exposure, self.repeat)
 
 
 class Choice(Model):
-    """The next bursts of a view; none: it has enough."""
+    """The next bursts of a view. None means that the view has enough."""
 
     bursts: tuple[ChosenBurst, ...]
     """The bursts, in their order."""
     reason: str
     """The reason, in words for the journal and the report."""
     figures: dict[str, Any] = Field(default_factory=dict)
-    """Numbers behind the reason, and what else was weighed; JSON's values only."""
+    """Numbers behind the reason, and the alternatives that were weighed, with values of JSON only."""
 
 
 def has_enough(choices: Sequence[Choice]) -> bool:
-    """True if the last of a view's choices is that it needs no more."""
+    """True if the last of a view's choices says that the view needs no more."""
     return bool(choices) and not choices[-1].bursts
 
 
 @dataclass(frozen=True)
 class FrameSample:
-    """The pixels of one proven frame that a chooser knows."""
+    """The pixels of one proven frame that a chooser gets."""
 
     clipped_share: float
     """Share of all its pixels at the top of the range."""
     signal_dn: NDArray[np.int16]
-    """[n] pixels above black, of Bayer cells that are spread evenly over the frame."""
+    """[n] pixels above black, from Bayer cells that are spread evenly over the frame."""
     full_dn: int
-    """The top of the range above black."""
+    """Top of the range above black, DN."""
 
 
 @dataclass(frozen=True)
@@ -89,9 +89,10 @@ class OpenView:
 
     name: str
     target_mm: tuple[float, float, float] | None
-    """The point in the picture's middle, in the support frame; None where the plan gives joints."""
+    """The point in the picture's middle, in the support frame; None if the plan gives joints."""
     bursts: tuple[Burst, ...]
-    """Bursts from which the shots are chosen: one for each exposure and repeat, each with all LEDs of the view."""
+    """Bursts from which the shots are chosen. There is one for each exposure and repeat, with all LEDs of the
+    view."""
     bound: tuple[Burst, ...]
     """Bursts with at least as much light and time as any choice."""
 
@@ -115,7 +116,7 @@ class OpenView:
         raise KeyError(f"{self.name}: the plan has no e{exposure}/r{repeat} to choose")
 
     def burst_of(self, chosen_burst: ChosenBurst) -> Burst:
-        """Return the burst that a choice means. Raises KeyError if the view has no such burst, time or LED."""
+        """Return the burst of a choice. Raises KeyError if the view has no such burst, time or LED."""
         whole = self.burst(chosen_burst.exposure, chosen_burst.repeat)
         if chosen_burst.exposure_us != whole.timing.exposure_us:
             raise KeyError(
@@ -128,7 +129,8 @@ class OpenView:
         return replace(whole.only(wanted_labels), view=self.name)
 
     def with_darks(self, choices: Sequence[Choice], choice: Choice) -> Choice:
-        """The choice with dark frames in the first burst of each exposure, as `choices` before it have left it."""
+        """Return the choice with dark frames in the first burst of each exposure, unless earlier `choices` have
+        them."""
         with_darks = {burst.exposure for before in choices for burst in before.bursts}
         bursts = []
         for burst in choice.bursts:
@@ -143,21 +145,21 @@ def _darks(burst: Burst) -> int:
 
 
 class Chooser(Protocol):
-    """Chooses the bursts of views; one object for a whole plan."""
+    """Chooses the bursts of views. There is one object for a whole plan."""
 
     def choose(
         self, view: OpenView, choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
     ) -> Choice:
-        """The next bursts of a view after these `choices`, all of which have been fired. `samples` has the frames
-        of them that are proven; a frame of an earlier session is read when it is asked for. Same arguments, same
-        choice: a resumed run depends on it."""
+        """Return the next bursts of a view after these `choices`, all of which have been fired. `samples` has
+        their proven frames. A frame of an earlier session is read when it is requested. The same arguments must
+        give the same choice, because a resumed run depends on it."""
         ...
 
 
 def bound_of(whole: Sequence[Burst], frames_of_light: int, again: Collection[int]) -> tuple[Burst, ...]:
-    """The bound of a view from which `whole` bursts (shortest exposure first) can be chosen: the longest
-    `frames_of_light` of them with all LEDs, the longest two once more with the LEDs `again`, and marks and dark
-    frames of as many more as a view may have."""
+    """Return the bound of a view whose bursts are chosen from `whole` (shortest exposure first). It has the
+    longest `frames_of_light` bursts with all LEDs, the longest two once more with the LEDs `again`, and marks and
+    dark frames for all further bursts that a view may have."""
     in_first = [burst for burst in whole if burst.repeat == 0]
     longest = in_first[-1]
     bursts = in_first[-frames_of_light:]
@@ -180,8 +182,8 @@ def bound_of(whole: Sequence[Burst], frames_of_light: int, again: Collection[int
 
 
 def bound_of_lights(whole: Burst, sizes: Iterable[int]) -> tuple[Burst, ...]:
-    """The bound of a view whose LEDs are chosen among those of the burst `whole`: its first LEDs, in bursts of
-    these sizes."""
+    """Return the bound of a view whose LEDs are chosen among those of the burst `whole`. It has the first LEDs of
+    `whole`, in bursts of these sizes."""
     labels = [label for label in whole.labels if label and label.is_shot]
     darks = {label for label in whole.labels if label and label.is_dark}
     bursts, begin = [], 0
@@ -193,8 +195,9 @@ def bound_of_lights(whole: Burst, sizes: Iterable[int]) -> tuple[Burst, ...]:
 
 
 def refuse_beyond(bound: Sequence[Burst], bursts: Sequence[Burst]) -> None:
-    """Raise RuntimeError if `bursts`, all that were chosen for a view, are more than its bound: more bursts, more
-    frames, or LEDs lit for longer, the longest compared with the longest. Preflight would not have known of it."""
+    """Raise RuntimeError if `bursts`, all chosen bursts of a view, exceed its bound, which preflight has checked.
+    They must not have more bursts, more frames, or LEDs that are lit for longer. The LEDs are compared in the
+    order of their times."""
     allowed_us = sorted(_on_us(bound).values(), reverse=True)
     asked_us = sorted(_on_us(bursts).items(), key=lambda item: -item[1])
     allowed_us += [0] * (len(asked_us) - len(allowed_us))

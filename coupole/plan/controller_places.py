@@ -1,11 +1,13 @@
-"""Folders for what is true of the controller of a cell's arm, whatever its rig is called and wherever runs are.
+"""Folders for facts about the controller of a cell's arm. They do not depend on the rig's name and the place of
+the runs.
 
-A standing fault and a commissioning belong to the arm. So they are kept by the address at which its controller is
-reached, which is known before a device is opened, by its serial number, which is known afterwards, and in the
-rig's own state folder, as all who share that rig find it. Each is read; whoever writes, writes all. An address
-remembers the serial numbers that have answered there: what is kept by these is found before the next opening.
+A standing fault and a commissioning belong to the arm. So they are kept in three places. The first is named after
+the serial number of the arm's controller, which is known after a device is opened. The second is named after the
+controller's address, which is known before. The third is the rig's own state folder, for all who share that rig.
+All places are read, and all are written. The place of an address remembers the serial numbers that have answered
+there, so their places are found before the next opening.
 
-A simulated cell has its state folder alone: each of its worlds is another controller.
+A simulated cell has only its state folder, because each of its worlds is another controller.
 """
 
 from __future__ import annotations
@@ -25,13 +27,13 @@ from coupole.plan.rig_devices import device_for, in_world
 _SERIALS = "answered-here.txt"
 _OWN_SOCKET = "listen"
 _ADDRESSES = ("controller", "host", "address", _OWN_SOCKET)
-"""Settings of drivers that say where the arm's controller is, the most telling first. `listen` is this machine's
-own socket: all controllers that may speak to it count as one, which can only make too careful."""
+"""Settings of drivers that say where the arm's controller is. The most specific one is first. `listen` is this
+machine's own socket. All controllers that may use it count as one, which can only be too careful."""
 
 
 def places_of_arm(cell: Cell, identity: Identity | None = None) -> tuple[Path, ...]:
-    """Folders, perhaps not made yet; the controller's own first, the rig's state folder last. `identity`: of the
-    opened arm."""
+    """Return the folders, which may not exist yet. The controller's own is first, the rig's state folder last.
+    `identity` is that of the opened arm."""
     if in_world(cell.rig, dry_run=False):
         return (cell.state_folder,)
     by_address = _by_address(cell)
@@ -40,8 +42,8 @@ def places_of_arm(cell: Cell, identity: Identity | None = None) -> tuple[Path, .
 
 
 def remember_controller(cell: Cell, identity: Identity) -> None:
-    """An arm with this identity has answered: what is kept of it is found by its address from now on. A disk that
-    does not take it keeps nobody from working: the serial number is asked again at each opening."""
+    """Note that an arm with this identity has answered, so that its records are found by its address from now on.
+    An error of the disk is ignored, because the serial number is read again at each opening."""
     if in_world(cell.rig, dry_run=False):
         return
     by_address = _by_address(cell)
@@ -75,7 +77,8 @@ def _address(model: type[BaseModel], settings: dict[str, object]) -> tuple[str, 
 
 
 def _by_serial(identity: Identity | None) -> list[str]:
-    """Return the serial number's file name; empty for a stand-in, and for a driver that cannot know the number."""
+    """Return the serial number's file name. It is empty for a stand-in, and if the driver cannot know the
+    number."""
     if identity is None or identity.simulated or not identity.serial.strip(" 0"):
         return []
     return [_file_name("serial", identity.vendor, identity.serial)]

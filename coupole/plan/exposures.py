@@ -28,7 +28,7 @@ class FixedExposure(Model):
 
 
 class BracketExposure(Model):
-    """Each light at each of several exposures, shortest first as written."""
+    """Several exposures for each light, the shortest first as written."""
 
     kind: Literal["bracket"]
     """Several exposures for each light."""
@@ -49,13 +49,14 @@ class BracketExposure(Model):
 
 
 STEPS_PER_STOP = 4
-"""Exposure times of `auto` that lie within a factor of two of each other."""
+"""Number of exposure times of `auto` within a factor of two."""
 
 
 class AutoExposure(Model):
-    """Exposures that are chosen in the run, for each view and LED, from frames already proven of the view.
+    """Exposures that are chosen in the run, for each view and LED, from frames of the view that are already
+    proven.
 
-    The times among which is chosen are known beforehand, so that `e5` is the same time in all views and sessions.
+    The possible times are known before the run, so that `e5` is the same time in all views and sessions.
     """
 
     kind: Literal["auto"]
@@ -67,13 +68,14 @@ class AutoExposure(Model):
     clipped_share: Annotated[float, Field(ge=1e-6, le=0.5)] = 1e-3
     """Share of a picture's pixels that may be clipped in the shortest exposure of an LED."""
     snr: Annotated[float, Field(ge=1, le=1000)] = 30.0
-    """Signal over noise that pixels reach in an LED's exposures together."""
+    """Signal over noise that pixels must reach in an LED's exposures together."""
     object_share: Annotated[float, Field(ge=0.01, le=0.999)] = 0.9
-    """Share of the object's pixels under each LED's direct light that reach it."""
+    """Share of the object's pixels under each LED's direct light that must reach `snr`."""
     most_exposures: Annotated[int, Field(ge=2, le=4)] = 3
     """Greatest number of exposures of one LED in one view."""
     first_lights: Annotated[int, Field(ge=4, le=200)] = 24
-    """LEDs of the first pass, spread over the dome; never more than an eighth of the view's, but six."""
+    """LEDs of the first pass, spread over the dome. They are at most an eighth of the view's LEDs, but at least
+    six."""
 
     @model_validator(mode="after")
     def _a_range(self) -> AutoExposure:
@@ -85,7 +87,7 @@ class AutoExposure(Model):
 
     @property
     def exposures_us(self) -> tuple[int, ...]:
-        """Times among which is chosen, four to the stop: their places are those of shot ids."""
+        """Possible times, four to the stop. Their places in this list are those of shot ids."""
         stops = math.log2(self.longest_us / self.shortest_us)
         count = math.ceil(STEPS_PER_STOP * stops - 1e-9)
         times_us = {round(self.shortest_us * 2.0 ** (step / STEPS_PER_STOP)) for step in range(count)}

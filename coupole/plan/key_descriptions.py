@@ -1,7 +1,7 @@
 """Descriptions of the keys of a plan or a rig: the docstrings under their models' fields, read for a JSON schema.
 
-`use_attribute_docstrings` of pydantic reads them when a model is made, in every process. That took a third of the
-time of importing the models of plans and rigs.
+pydantic's `use_attribute_docstrings` would read them in every process, when a model is made. That took a third of
+the time of importing the models of plans and rigs.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 
 def key_descriptions(model: type[BaseModel]) -> dict[str, str]:
-    """Return the docstring of each field that has one, its own or inherited."""
+    """Return the docstring of each field that has one. The docstring may be inherited."""
     descriptions: dict[str, str] = {}
     for parent in reversed(model.__mro__):
         if issubclass(parent, BaseModel) and parent is not BaseModel:
@@ -27,7 +27,7 @@ def key_descriptions(model: type[BaseModel]) -> dict[str, str]:
 
 @lru_cache
 def _by_class(path: str) -> dict[str, dict[str, str]]:
-    """Return the fields' docstrings of the classes of a file, by class."""
+    """Return the docstrings of the fields in a file, by class."""
     tree = ast.parse(Path(path).read_text(encoding="utf-8"))
     return {node.name: dict(_docstrings(node)) for node in tree.body if isinstance(node, ast.ClassDef)}
 

@@ -23,7 +23,7 @@ _MOST_BYTES = 16 * 1024**2
 
 @dataclass(frozen=True)
 class LedTable:
-    """LEDs in the order of the file; positions and unit normals [n, 3] in the base frame."""
+    """LEDs in the order of the file, with positions and unit normals [n, 3] in the base frame."""
 
     ids: NDArray[np.int64]
     boards: NDArray[np.int64]
@@ -32,7 +32,7 @@ class LedTable:
     flux_lm: NDArray[np.float64]
 
     def illuminance_lux(self, points_base_mm: ArrayLike, *, emission: str = "lambertian") -> NDArray[np.float64]:
-        """Illuminance [points, leds] on a surface that faces each LED, the maximum at a point.
+        """Return the illuminance [points, leds] on a surface that faces each LED. This is the maximum at a point.
 
         E = Phi / (pi d^2) cos(emission angle) for a small Lambertian emitter; `paper` takes the cosine twice
         (seed 003, Eq. 2). Points are [points, 3] in mm in the base frame.
@@ -45,14 +45,14 @@ class LedTable:
         return lux
 
     def rows(self, ids: ArrayLike) -> NDArray[np.int64]:
-        """Rows of the table that hold these LED ids; KeyError for one that is not there."""
+        """Return the rows of the table that hold these LED ids. Raises KeyError for an id that is missing."""
         row_of_id = {int(led): row for row, led in enumerate(self.ids)}
         return np.array([row_of_id[int(led)] for led in np.asarray(ids).ravel()], np.int64)
 
 
 def read_led_table(path: Path, files: InputFiles | None = None) -> LedTable:
-    """Read a dome's CSV (`#` comments, then a header, then one LED a line), from `files` if they are given;
-    InputError with all its problems."""
+    """Read a dome's CSV (`#` comments, then a header, then one LED a line), from `files` if they are given. Raises
+    InputError with all problems."""
     files = InputFiles() if files is None else files
     try:
         if (size_bytes := path.stat().st_size if path not in files else 0) > _MOST_BYTES:
@@ -64,7 +64,7 @@ def read_led_table(path: Path, files: InputFiles | None = None) -> LedTable:
 
 @lru_cache(maxsize=4)
 def _parse_table(text: str, path: str) -> LedTable:
-    """Return the table of this text, whose arrays cannot be written; a session reads its dome several times."""
+    """Return the table of this text. Its arrays are read-only, because a session reads its dome several times."""
     problems: list[Problem] = []
     rows: list[list[float]] = []
     first_line_of_id: dict[int, int] = {}
@@ -107,7 +107,7 @@ def _parse_table(text: str, path: str) -> LedTable:
 
 
 def _mistakes(values: list[float]) -> Iterator[tuple[str, str]]:
-    """Columns and messages of the values of one LED that cannot be."""
+    """Yield columns and messages of impossible values of one LED."""
     for key, value, most in (("id", values[0], 65534), ("board", values[1], 65535)):
         if value != int(value) or not 0 <= value <= most:
             yield key, f"expected an integer from 0 to {most}, found {value:g}"

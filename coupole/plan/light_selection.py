@@ -28,13 +28,13 @@ from coupole.plan.watch import SENTINELS
 
 
 def leds_of_plan(plan: Plan, leds: LedTable, base_from_support: Transform) -> NDArray[np.int64]:
-    """Rows of the LED table that any view of the plan lights. Raises KeyError as `select_leds`."""
+    """Return the rows of the LED table that any view of the plan lights. Raises KeyError like `select_leds`."""
     rows = [select_leds(view.lights or plan.lights, leds, base_from_support) for view in plan.views]
     return np.unique(np.concatenate(rows))
 
 
 def select_leds(lights: Lights, leds: LedTable, base_from_support: Transform) -> NDArray[np.int64]:
-    """Rows of the LED table that are lit, in the order of the table; none for panels and darks.
+    """Return the rows of the LED table that are lit, in the order of the table; none for panels and darks.
 
     Raises KeyError for an LED or a board that the dome does not have (`missing_lights` gives messages).
     """
@@ -63,8 +63,8 @@ def select_leds(lights: Lights, leds: LedTable, base_from_support: Transform) ->
 
 
 def lit_in_bursts(lights: Lights, leds: LedTable, base_from_support: Transform) -> list[Sequence[Led] | Panel]:
-    """Return what each burst of one exposure lights: one burst for all LEDs, in which neighbours in time are on
-    different boards, or one for each panel. Raises KeyError as `select_leds`."""
+    """Return the lights of each burst of one exposure. There is one burst for all LEDs, in which neighbours in
+    time are on different boards, or one burst for each panel. Raises KeyError like `select_leds`."""
     match lights:
         case AllLights() | LightIds() | LightBoards() | EveryLight() | LightCone() | AdaptiveLights() | NoLights():
             rows = select_leds(lights, leds, base_from_support)
@@ -76,20 +76,21 @@ def lit_in_bursts(lights: Lights, leds: LedTable, base_from_support: Transform) 
 
 
 FEWEST_WATCHED = 12
-"""LEDs of a view, at least, for sentinels among them."""
+"""Least number of LEDs of a view that has sentinels."""
 FEWEST_FIRST_LIGHTS, FIRST_SHARE = 6, 8
 
 
 def first_lights(ids: NDArray[np.int64], leds: LedTable, most: int) -> NDArray[np.int64]:
-    """Ids of LEDs among `ids` [n] for a first pass, spread over the dome: `most`, but not more than an eighth of
-    them, nor fewer than six."""
+    """Return ids of LEDs among `ids` [n] for a first pass, spread over the dome. They are `most` LEDs, but at most
+    an eighth of `ids`, and at least six."""
     count = min(len(ids), most, max(FEWEST_FIRST_LIGHTS, len(ids) // FIRST_SHARE))
     return ids[spread_rows(leds.positions_mm[leds.rows(ids)], count)] if len(ids) else ids
 
 
 def sentinels_among(lit: Sequence[Sequence[Led] | Panel], leds: LedTable) -> tuple[int, ...]:
-    """Ids of the LEDs that a view's sentinels are, spread over the middle half of those `lit` by their height: low
-    ones graze, and the highest are alike. None if too few LEDs are lit to place them between.
+    """Return the ids of a view's sentinels. They are spread over the LEDs in the middle half of the `lit` ones by
+    height: low LEDs graze, and the highest ones are alike. There are none if too few LEDs are lit to place
+    sentinels between them.
     """
     ids = np.array([led.id for lights in lit if not isinstance(lights, Panel) for led in lights], np.int64)
     if len(ids) < FEWEST_WATCHED:
@@ -102,14 +103,15 @@ def sentinels_among(lit: Sequence[Sequence[Led] | Panel], leds: LedTable) -> tup
 
 
 def spread_rows(positions_mm: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """`count` of the positions [n, 3], each as far as possible from those before it."""
+    """Return the rows of `count` positions [n, 3], each as far as possible from those before it."""
     return np.array(sorted(row for row, _ in islice(farthest_first(positions_mm, 0), count)))
 
 
 def missing_lights(
     plan: Plan, leds: LedTable, base_from_support: Transform
 ) -> list[tuple[tuple[str | int, ...], str]]:
-    """Key path and message for each light of the plan that the dome does not have, and for a cone without any."""
+    """Return key path and message for each light of the plan that the dome does not have, and for a cone without
+    any LED."""
     view_lights = [
         (("views", i, "lights"), view.lights) for i, view in enumerate(plan.views) if view.lights is not None
     ]
@@ -147,7 +149,8 @@ def _missing(
 
 
 def interleave(boards: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Order of LEDs [n] in which consecutive LEDs are on different boards: one LED of each board in turn."""
+    """Return an order of LEDs [n] in which consecutive LEDs are on different boards: one LED of each board in
+    turn."""
     turn = np.zeros(len(boards), np.int64)
     for board in np.unique(boards):
         board_indices = np.flatnonzero(boards == board)

@@ -11,10 +11,10 @@ LINKS = 7
 
 
 def link_mesh_path(folder: Path, link: int) -> Path:
-    """`base_link.stl` for link 0, `link_1.stl` to `link_6.stl` for the others."""
+    """Return `base_link.stl` for link 0, `link_1.stl` to `link_6.stl` for the others."""
     return folder / (f"link_{link}.stl" if link else "base_link.stl")
 
 
 def missing_link_meshes(folder: Path, files: InputFiles) -> list[Path]:
-    """Files that a folder of link meshes lacks."""
+    """Return the files that a folder of link meshes lacks."""
     return [path for link in range(LINKS) if not files.there(path := link_mesh_path(folder, link))]

@@ -1,8 +1,8 @@
 """Dark marks at both ends of a burst, for the proof of its frames.
 
 *Coded* marks enclose a burst that the box runs: their periods identify the burst's beginning and end
-(`coupole.acquisition.frame_matching`). *Plain* marks enclose a burst that the host fires with a box without
-log: they must be dark, otherwise a lamp is on that should be off.
+(`coupole.acquisition.frame_matching`). *Plain* marks enclose a burst that the host fires with a box without a log.
+They must be dark; otherwise a lamp is on that should be off.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ Marks = Literal["coded", "plain", "none"]
 
 MARK_UNITS = 16
 START_MARK_EXTRA = (5, 1, 4, 2, 3)
-"""Additional period of each start mark, in sixteenths of the burst's period. Counted back from the first light the
-marks have phases 13, 11, 7, 6, 1 of 16: never on the lights' grid, and all different."""
+"""Additional period of each start mark, in sixteenths of the burst's period. Counted back from the first light,
+the marks have the phases 13, 11, 7, 6, 1 of 16. The phases are all different, and never on the lights' grid."""
 END_MARK_EXTRA = (2, 5, 1, 3, 1)
-"""The same for the last light and the end marks except the last: phases 2, 7, 8, 11, 12 after the grid."""
+"""The same for the end marks except the last one, counted from the last light. Their phases are 2, 7, 8, 11, 12
+after the grid."""
 MARKS = len(START_MARK_EXTRA) + len(END_MARK_EXTRA)
 MARKS_AT_ENDS: dict[Marks, tuple[int, int]] = {
     "coded": (len(START_MARK_EXTRA), len(END_MARK_EXTRA)),
@@ -34,8 +35,8 @@ MARKS_AT_ENDS: dict[Marks, tuple[int, int]] = {
 def with_marks(
     kind: Marks, steps: NDArray[np.void], labels: Sequence[L], mark_labels: Sequence[L], dark: NDArray[np.void]
 ) -> tuple[NDArray[np.void], list[L]]:
-    """Add marks before and after a burst's steps (STEP_DTYPE [n]): each is the `dark` step ([1]) with the period
-    of the other steps, lengthened if coded. Returns table and labels."""
+    """Add marks before and after a burst's steps (STEP_DTYPE [n]). Each mark is the `dark` step ([1]) with the
+    period of the other steps; a coded mark is longer. Returns table and labels."""
     count_start, count_end = MARKS_AT_ENDS[kind]
     inner = steps.copy()
     inner["period_us"] = dark["period_us"]

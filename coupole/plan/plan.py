@@ -34,7 +34,7 @@ class LookAt(Model):
     roll_deg: Degrees = 0.0
     """Roll of the camera about its line of sight."""
     lights: Lights | None = None
-    """Lights of this view; the plan's if not given."""
+    """Lights of this view. Without it, the plan's lights are used."""
 
 
 class Grid(Model):
@@ -43,7 +43,7 @@ class Grid(Model):
     kind: Literal["grid"]
     """Views from all pairs of azimuth and elevation."""
     name: Name
-    """Begins the names of the views."""
+    """First part of the names of the views."""
     target_mm: Vector
     """The point in the pictures' middle, in the support frame."""
     distance_mm: Annotated[float, Field(gt=0, le=3000)]
@@ -55,7 +55,7 @@ class Grid(Model):
     roll_deg: Degrees = 0.0
     """Roll of the camera about its line of sight."""
     lights: Lights | None = None
-    """Lights of these views; the plan's if not given."""
+    """Lights of these views. Without it, the plan's lights are used."""
 
 
 class Joints(Model):
@@ -66,9 +66,9 @@ class Joints(Model):
     name: Name
     """Name of the view, in shot ids and file names."""
     joints_deg: tuple[Degrees, Degrees, Degrees, Degrees, Degrees, Degrees]
-    """Angles of the six axes, from the base on."""
+    """Angles of the six axes, beginning at the base."""
     lights: Lights | None = None
-    """Lights of this view; the plan's if not given."""
+    """Lights of this view. Without it, the plan's lights are used."""
 
 
 View = Annotated[LookAt | Grid | Joints, Field(discriminator="kind")]
@@ -78,15 +78,15 @@ class MeasuredObject(Model):
     """The object on the support: its id, mesh, pose and dose budget."""
 
     id: Name
-    """Id of the object whose dose is kept in the ledger: an accession number."""
+    """Id of the object, under which the ledger keeps its dose: for example an accession number."""
     mesh: FilePath | None = None
-    """PLY, STL or OBJ; for collisions, occlusion, dose and pictures."""
+    """PLY, STL or OBJ file. It is used for collisions, occlusion, dose and pictures."""
     mesh_unit: Literal["mm", "m", "um"] = "mm"
     """Unit of the coordinates in the mesh."""
     support_from_object: Pose = Pose()
     """Pose of the mesh's frame on the support."""
     dose_budget_lux_h: Annotated[float, Field(gt=0, le=1e9)] | None = None
-    """Light that the object may receive in its life; not limited if not given."""
+    """Light that the object may receive in its life. Without it, there is no limit."""
 
 
 class Optics(Model):
@@ -108,15 +108,15 @@ class Plan(Model):
     schema_version: Literal[1]
     """Version of the format of plans."""
     name: Name
-    """Ends the name of the run's folder."""
+    """Name of the run: the last part of the run folder's name."""
     rig: FilePath
     """The rig's file, relative to the plan."""
     object: MeasuredObject | None = None
     """Object that lies on the support."""
     optics: Optics = Optics()
-    """The lens settings that are meant."""
+    """The intended lens settings."""
     calibrations: Literal["none"] | tuple[FilePath, ...] | None = None
-    """Records that must be in force; None: those that the rig names."""
+    """Records that must be in force. Without it, the records that the rig names are used."""
     views: Annotated[tuple[View, ...], Field(min_length=1)]
     """Views from which the camera takes its pictures."""
     order: Literal["fastest", "as_written"] = "fastest"
@@ -126,25 +126,26 @@ class Plan(Model):
     repeats: Annotated[int, Field(ge=1, le=1000)] = 1
     """Frames of each light at each exposure."""
     hidden_lights: Literal["mark", "skip"] = "mark"
-    """LEDs that arm, camera or object hide from everything that a view sees: taken and marked, or left out."""
+    """LEDs that arm, camera or object hide from everything that a view shows. They are taken and marked (`mark`),
+    or left out (`skip`)."""
     exposure: Exposures
-    """One exposure time, or several."""
+    """Exposure of the frames: one time, or several."""
     gain_db: Annotated[float, Field(ge=0, le=42)] = 0.0
     """Gain of the camera's amplifier."""
     darks_per_view: Annotated[int, Field(ge=0, le=1000)] = 2
     """Frames without light in each view."""
     trigger: Literal["hardware", "software"] = "hardware"
-    """The camera is triggered by the LED box, or by the host, light by light."""
+    """The LED box triggers the camera (`hardware`), or the host triggers it light by light (`software`)."""
     reshoot_limit: Annotated[int, Field(ge=0, le=20)] = 3
-    """Greatest number of times that frames which are not proven are taken again."""
+    """Greatest number of times that unproven frames are taken again."""
     discard: Literal["after_fit"] | None = None
-    """`after_fit`: frames are discarded when their samples are safe, but for those that the check needs."""
+    """`after_fit`: frames are discarded when their samples are safe, except the frames that the check needs."""
     watch: bool | Watch = DARKS_ONLY
-    """Watching of the run: `true`, `false`, or what of it. Without it dark frames are looked at."""
+    """Watching of the run: `true`, `false`, or its settings. Without it, only dark frames are watched."""
     licence: Words | None = None
-    """Terms under which the run's data may be used; None: the rig's. For the run's README.txt."""
+    """Terms under which the run's data may be used, for the run's README.txt. Without it, the rig's are used."""
     contact: Words | None = None
-    """Whom to ask about the data; None: the rig's."""
+    """Person to ask about the data. Without it, the rig's contact is used."""
 
     @field_validator("watch")
     @classmethod
@@ -182,12 +183,13 @@ class Plan(Model):
 
     @property
     def takes_sentinels(self) -> bool:
-        """True if LEDs are lit again and again to tell what changes."""
+        """True if some LEDs are lit again and again to show changes."""
         return self.watching.frames == "all"
 
     @property
     def skips_hidden_lights(self) -> bool:
-        """True if LEDs that light nothing that a view sees are left out of it: a choice never takes them."""
+        """True if LEDs that light nothing that a view shows are left out of the view. A choice never takes
+        them."""
         return self.hidden_lights == "skip" or self.chooses_lights
 
     @property

@@ -18,7 +18,7 @@ class LightIds(Model):
     kind: Literal["ids"]
     """LEDs by their ids in the LED table."""
     ids: Annotated[tuple[LedId, ...], Field(min_length=1)]
-    """Each once; lit in this order."""
+    """Ids of the LEDs, each once. They are lit in this order."""
 
     @field_validator("ids")
     @classmethod
@@ -43,9 +43,9 @@ class EveryLight(Model):
     kind: Literal["every"]
     """Every n-th LED of the table."""
     every: Annotated[int, Field(ge=1, le=65535)]
-    """n; 1 is each LED."""
+    """The n of "every n-th LED"; 1 means each LED."""
     offset: Annotated[int, Field(ge=0, le=65535)] = 0
-    """Rows of the table before the first."""
+    """Number of rows of the table before the first LED."""
 
 
 class LightCone(Model):
@@ -78,17 +78,18 @@ class NoLights(Model):
 
 
 MOST_ADAPTIVE_BURSTS = 128
-"""Greatest number of bursts of one view whose LEDs are chosen."""
+"""Greatest number of bursts of one view, if its LEDs are chosen."""
 LedSelection = Annotated[AllLights | LightIds | LightBoards | EveryLight | LightCone, Field(discriminator="kind")]
 
 
 class EnoughLights(Model):
-    """Ends of the choice of LEDs of a view; the first that is reached counts."""
+    """Limits that end the choice of LEDs of a view. The first one that is reached ends it."""
 
     lights: Annotated[int, Field(ge=6, le=65535)]
-    """LEDs of one view, at most: it bounds time, heat, bytes and light."""
+    """Greatest number of LEDs of one view. It bounds time, heat, bytes and light."""
     relit_rms: Annotated[float, Field(gt=0, le=1)] | None = None
-    """Expected rms error of pictures interpolated for the LEDs not lit, as a share of the view's bright level."""
+    """Expected rms error of pictures that are interpolated for the unlit LEDs, as a share of the view's bright
+    level."""
     seconds: Annotated[float, Field(gt=0)] | None = None
     """Greatest time of the view's bursts."""
     lux_h: Annotated[float, Field(gt=0)] | None = None
@@ -96,22 +97,22 @@ class EnoughLights(Model):
 
 
 class AdaptiveLights(Model):
-    """LEDs that are chosen in the run, by what those before them have shown of the view."""
+    """LEDs that are chosen in the run, from the frames under earlier LEDs of the view."""
 
     kind: Literal["adaptive"]
-    """LEDs that are chosen in the run, by what those before them have shown of the view."""
+    """LEDs that are chosen in the run, from the frames under earlier LEDs of the view."""
     until: EnoughLights
-    """The end of the choice."""
+    """Limits at which the choice ends."""
     among: LedSelection = AllLights(kind="all")
-    """LEDs from which is chosen."""
+    """LEDs that may be chosen."""
     first_lights: Annotated[int, Field(ge=6, le=200)] = 24
     """LEDs of the first burst, spread over the dome."""
     burst_lights: Annotated[int, Field(ge=1, le=256)] = 32
-    """LEDs of each burst after it."""
+    """Number of LEDs of each later burst."""
 
     @property
     def burst_sizes(self) -> tuple[int, ...]:
-        """LEDs of each burst of a view, if all are lit that may be."""
+        """Number of LEDs of each burst of a view, if all LEDs are lit that may be lit."""
         first = min(self.first_lights, self.until.lights)
         full, rest = divmod(self.until.lights - first, self.burst_lights)
         return (first, *(self.burst_lights,) * full, *((rest,) if rest else ()))

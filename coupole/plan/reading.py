@@ -20,7 +20,7 @@ from coupole.plan.yamlfile import Document
 
 @dataclass(frozen=True)
 class PlanFiles:
-    """A plan as written, with its cell, and the paths of the other files that it names."""
+    """A plan as written, with its cell, and with the paths of the other files that it names."""
 
     plan: Plan
     document: Document
@@ -32,8 +32,8 @@ class PlanFiles:
 
 
 def read_plan(plan_path: Path, rig_path: Path | None = None, *, text: str | None = None) -> PlanFiles:
-    """Read a plan with its rig, or with another one; `text` is read in place of the plan's file. Shipped ones may
-    be named. Raises InputError with all problems of all files."""
+    """Read a plan with its rig, or with another rig. With `text`, the text is read instead of the plan's file.
+    Names of shipped plans and rigs may be given. Raises InputError with all problems of all files."""
     files = InputFiles()
     plan_path = file_of(plan_path, "plans")
     document = yamlfile.read_document(plan_path, files) if text is None else yamlfile.parse(plan_path, text)
@@ -84,7 +84,8 @@ def _named_rig(document: Document) -> Path | None:
 
 
 def _named_records(document: Document, plan: Plan, cell: Cell) -> tuple[tuple[Path, ...] | None, list[Problem]]:
-    """Files of the records that the plan names, or else its rig (None for `none`), and the missing ones."""
+    """Return the files of the records that the plan names, or otherwise its rig (None for `none`), and a problem
+    for each missing file."""
     record_names = plan.calibrations
     if record_names is None:
         document, record_names = cell.document, cell.rig.calibrations
@@ -99,7 +100,7 @@ def _named_records(document: Document, plan: Plan, cell: Cell) -> tuple[tuple[Pa
 
 
 def _bad_exposures(document: Document, plan: Plan, rig: Rig) -> list[Problem]:
-    """Problems that do not depend on the order of the shots."""
+    """Return problems of exposures that do not depend on the order of the shots."""
     if plan.trigger == "software" and rig.led_limits.on_us[1] < max(plan.exposure.exposures_us):
         return [document.problem(("exposure",), "longer than the rig's LEDs may be on")]
     return []

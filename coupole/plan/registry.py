@@ -1,7 +1,8 @@
 """All classes named by strings (drivers, their stand-ins, the simulated world), and their loading.
 
-`coupole` imports neither `drivers` nor `sim`: a rig names a class (`driver: drivers.ledbox:LedBox`), and it is
-loaded from here on use. A driver's `settings:` are checked by the pydantic model `Settings` in the same module.
+`coupole` imports neither `drivers` nor `sim`. A rig names a class (`driver: drivers.ledbox:LedBox`), and this
+module loads the class on use. A driver's `settings:` are checked by the pydantic model `Settings` in the same
+module.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ DEFAULT_TWINS = {
     "camera": "sim.devices.memory_camera:MemoryCamera",
     "robot": "drivers.kuka.rsi:KukaRsi",
 }
-"""Used in a dry run in place of a real device whose driver has no stand-in."""
+"""Drivers that a dry run uses in place of a real device whose driver has no stand-in."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,9 @@ class StandIn:
     kind: str
     """Kind of the stand-in, in `world.settings.robot` or `world.settings.ledbox`."""
     alike: tuple[str, ...] = ()
-    """Settings of the driver that the stand-in shares, unless the rig's world gives its own."""
+    """Settings of the driver that the stand-in shares. The rig's world may replace them."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Further settings of the stand-in, unless the rig gives them."""
+    """Further settings of the stand-in. The rig may replace them."""
 
 
 ROBOT_STAND_INS = {
@@ -61,13 +62,13 @@ ROBOT_STAND_INS = {
     ),
     "drivers.ur:UrRobot": StandIn("ur", ("model",)),
 }
-"""Stand-ins for the included robot drivers; all choose a free address."""
+"""Stand-ins for the included robot drivers. Each stand-in chooses a free address."""
 ANSWER_JITTER = {"drivers.kuka.rsi:KukaRsi": "drivers.kuka.rsi.jitter:measure_jitter"}
-"""Measures how soon the driver answers its controller; of drivers that must in every cycle."""
+"""Functions that measure how soon a driver answers its controller, for drivers that must answer in every cycle."""
 ARMS_OF_DRIVERS = {"drivers.kuka.rsi:KukaRsi": "kr10_r1100_sixx", "drivers.kuka.eki:KukaEki": "kr10_r1100_sixx"}
 """The default arm (in `configs/robots`) of each driver."""
 UR = "drivers.ur:UrRobot"
-"""Moves the arm that its setting `model` names."""
+"""Driver that moves the arm that its setting `model` names."""
 LEDBOX_STAND_INS = {
     "drivers.ledbox:LedBox": StandIn("scpi"),
     "drivers.ledbox.text_lines:TextLineBox": StandIn("text", ("baud", "led_count", "first_led")),
@@ -87,22 +88,22 @@ RENAMED = {
     "sim.memory_camera:MemoryCamera": "sim.devices.memory_camera:MemoryCamera",
     "sim.client:World": WORLD,
 }
-"""Names of version 0.1, and those of today."""
+"""Names of version 0.1, with the present names."""
 
 
 def current_name(name: str) -> str:
-    """Present name of a class that may have a version 0.1 name in a rig."""
+    """Return the present name of a class that may have a version 0.1 name in a rig."""
     return RENAMED.get(name, name)
 
 
 def load_class(name: str) -> type[Any]:
-    """The class behind `package.module:Class`. Raises ImportError or AttributeError."""
+    """Return the class for `package.module:Class`. Raises ImportError or AttributeError."""
     module, _, attribute = current_name(name).partition(":")
     named_class: type[Any] = getattr(importlib.import_module(module), attribute)
     return named_class
 
 
 def settings_class(name: str) -> type[BaseModel]:
-    """The `Settings` model in the module of a driver's class."""
+    """Return the `Settings` model in the module of a driver's class."""
     settings_model: type[BaseModel] = load_class(current_name(name).partition(":")[0] + ":Settings")
     return settings_model

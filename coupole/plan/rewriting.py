@@ -1,4 +1,4 @@
-"""Paths in plans and rigs: find them in a file, and write its text with other paths."""
+"""Paths in plans and rigs: finds them in a file, and writes its text with other paths."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _BLANK = "(a path)"
 
 
 def named_paths(model: BaseModel) -> Iterator[tuple[KeyPath, Path]]:
-    """Every path in a plan or a rig, as written, with its key path."""
+    """Yield every path in a plan or a rig, as written, with its key path."""
     yield from _paths(model, ())
 
 
@@ -36,8 +36,8 @@ def _paths(value: Any, at: KeyPath) -> Iterator[tuple[KeyPath, Path]]:
 
 
 def differences(before: BaseModel, now: BaseModel, apart: Set[str] = frozenset()) -> list[str]:
-    """Keys whose values differ, with both values; paths count as equal: what they lead to is
-    compared apart, as are these top-level keys."""
+    """Return the keys whose values differ, with both values. Paths count as equal, because the files at the paths
+    are compared separately, as are the top-level keys in `apart`."""
     then, here = ({k: v for k, v in _without_paths(model).items() if k not in apart} for model in (before, now))
     return list(_differences(then, here, ""))
 
@@ -70,8 +70,8 @@ def _short(value: Any) -> str:
 
 
 def rewritten(document: Document, text: str, changes: Mapping[KeyPath, str]) -> str:
-    """The document's `text` with other values at these key paths; a key that is not there yet is added at the top
-    level. Comments stay where the file's form allows it; else the result is JSON, which is YAML too."""
+    """Return the document's `text` with other values at these key paths. A missing key is added at the top level.
+    Comments stay if the file's form allows it; otherwise the result is JSON, which is YAML too."""
     new_data = _with_changes(document.data, changes)
     try:
         edited_text = _edited_text(document, text, changes)
@@ -109,7 +109,7 @@ def _edited_text(document: Document, text: str, changes: Mapping[KeyPath, str]) 
 
 
 def _node(root: Node | None, at: KeyPath) -> ScalarNode:
-    """The scalar at a key path. Raises LookupError if it is not written there."""
+    """Return the scalar at a key path. Raises LookupError if it is not written there."""
     node = root
     for key in at:
         if isinstance(node, SequenceNode) and isinstance(key, int):

@@ -1,4 +1,4 @@
-"""The rig as described by its YAML file: devices, geometry and limits.
+"""The rig as its YAML file describes it: devices, geometry and limits.
 
 Lengths are in mm, angles in degrees; poses are in the robot's base frame unless their names say otherwise.
 """
@@ -15,7 +15,7 @@ from coupole.plan.registry import WORLD, current_name
 from coupole.plan.watch import WatchLimits
 
 DriverName = Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"), AfterValidator(current_name)]
-"""`package.module:Class`; names of version 0.1 are understood."""
+"""`package.module:Class`. Names of version 0.1 are understood."""
 
 
 Posture = tuple[Degrees, Degrees, Degrees, Degrees, Degrees, Degrees]
@@ -26,24 +26,24 @@ class Twin(Model):
     """The simulated counterpart that `--dry-run` opens in a device's place."""
 
     driver: DriverName
-    """Its class."""
+    """Class of the counterpart's driver."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """Settings that its driver asks for."""
+    """Settings that the driver needs."""
 
 
 class Device(Model):
     """A driver and its settings. On a simulated rig the world's endpoint fills in the address."""
 
     driver: DriverName
-    """Its class."""
+    """Class of the driver."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """Settings that its driver asks for: address, limits."""
+    """Settings that the driver needs: address, limits."""
     twin: Twin | None = None
-    """Driver that `--dry-run` opens in its place; a stand-in of its kind if not given."""
+    """Driver that `--dry-run` opens in its place. Without it, a stand-in of the same kind is opened."""
 
 
 class Sensor(Model):
-    """Format of the camera's frames; compared with the camera's report when it is opened."""
+    """Format of the camera's frames. It is compared with the camera's report when the camera is opened."""
 
     width_px: Annotated[int, Field(ge=8, le=65536)]
     """Width of a frame."""
@@ -58,7 +58,7 @@ class Sensor(Model):
     black_dn: Annotated[int, Field(ge=0, le=65535)] = 64
     """Value of a pixel without light."""
     max_frames_per_s: Annotated[float, Field(ge=0.001, le=100_000)] = 100.0
-    """Frame rate that camera and its link can keep up."""
+    """Frame rate that the camera and its link can sustain."""
     exposure_gap_us: Annotated[int, Field(ge=0, le=10_000_000)] = 100
     """Least time between the end of one exposure and the start of the next."""
 
@@ -75,7 +75,7 @@ class Sensor(Model):
 
 class Lens(Model):
     focal_length_mm: Annotated[float, Field(gt=0, le=5000)]
-    """Focal length as stated by its maker."""
+    """Focal length from the maker's data."""
     f_number: Annotated[float, Field(gt=0, le=1000)]
     """F-number to which its aperture is set."""
     focus_distance_mm: Length
@@ -94,7 +94,7 @@ class WhiteResponse(Model):
     dn_per_lux_s: Annotated[float, Field(gt=0, le=1e9)]
     """Value above black, per lux and second of exposure, in the most sensitive channel, at gain 0 dB."""
     f_number: Annotated[float, Field(gt=0, le=1000)]
-    """F-number with which the response was measured; at another one it does not hold."""
+    """F-number with which the response was measured. The response is not valid at another f-number."""
 
 
 class Dome(Model):
@@ -103,41 +103,42 @@ class Dome(Model):
     leds: FilePath
     """The table of LEDs, relative to the rig."""
     emission: Literal["lambertian", "paper"] = "lambertian"
-    """Fall-off of an LED's light with the angle: a cosine, or the paper's second one."""
+    """Fall-off of an LED's light with the angle: a cosine (`lambertian`), or the cosine twice (`paper`)."""
     panel_lux: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    """Illuminance at the support's centre with one flat panel on, for the light dose."""
+    """Illuminance at the support's centre with one flat panel on. It is used for the light dose."""
     spectrum: FilePath | None = None
-    """Relative spectral power of the LEDs (CSV: nm, power), for the radiant exposure weighted by damage."""
+    """Relative spectral power of the LEDs (CSV: nm, power). It is used for the radiant exposure weighted by
+    damage."""
     panel_spectrum: FilePath | None = None
-    """The same of the panels."""
+    """Relative spectral power of the panels, in the same form."""
 
 
 class BoardThermal(Model):
-    """First-order thermal model of an LED board: heated by each joule, cooling with one time constant."""
+    """First-order thermal model of an LED board. Each joule heats it; it cools with one time constant."""
 
     led_power_w: Annotated[float, Field(gt=0, le=10_000)] = 15.0
-    """Heat of an LED that is lit."""
+    """Heat of a lit LED."""
     rise_c_per_j: Annotated[float, Field(gt=0, le=1000)] = 0.02
-    """Temperature rise of the board."""
+    """Temperature rise of the board for each joule."""
     time_constant_s: Annotated[float, Field(ge=0.001, le=1e6)] = 240.0
     """Time constant of the board's cooling."""
     ambient_c: Annotated[float, Field(ge=-50, le=100)] = 22.0
-    """Temperature of a board that was long dark."""
+    """Temperature of a board that was dark for a long time."""
     limit_c: Annotated[float, Field(ge=-50, le=1000)] = 70.0
-    """Temperature that preflight lets no board exceed."""
+    """Highest temperature of a board that preflight allows."""
 
 
 class LedLimits(Model):
-    """Limits of LEDs and boards; the box also enforces its own."""
+    """Limits of LEDs and boards. The box also enforces its own limits."""
 
     on_us: tuple[OnTimeUs, OnTimeUs] = (1_000, 2_000_000)
     """Shortest and longest time for which an LED may be lit."""
     rise_us: Annotated[int, Field(ge=0, le=10_000_000)] = 1_000
-    """Time from switching on to full current: the trigger waits for it."""
+    """Time from switching on to full current. The trigger waits for this time."""
     cooldown_ratio: Annotated[float, Field(ge=0, le=100_000)] = 2.0
-    """An LED that was lit for t stays dark for at least `cooldown_ratio` * t."""
+    """Ratio for the dark time: an LED that was lit for t stays dark for at least `cooldown_ratio` * t."""
     board: BoardThermal = BoardThermal()
-    """Thermal model of how boards warm up."""
+    """Thermal model of the boards."""
 
     @model_validator(mode="after")
     def _shortest_first(self) -> LedLimits:
@@ -158,7 +159,8 @@ class Motion(Model):
     settle_dwell_s: Annotated[float, Field(ge=0, le=3600)] = 0.3
     """Time waited after the arm has come to rest."""
     still_deg: Annotated[float, Field(gt=0, le=10)] = 0.01
-    """Largest change of an axis during a burst. Beyond it, shots that were not proven before are taken again."""
+    """Largest change of an axis during a burst. If the change is larger, the shots that are not proven yet are
+    taken again."""
     home_joints_deg: Posture = (
         0.0,
         -170.0,
@@ -167,9 +169,9 @@ class Motion(Model):
         -70.0,
         0.0,
     )
-    """Assumed start posture when a plan is checked without the arm."""
+    """Assumed start posture if a plan is checked without the arm."""
     park_joints_deg: Posture | None = None
-    """Posture in which the arm is left when nobody works with it. Without it the arm cannot be sent to park."""
+    """Posture in which the arm is left when nobody works with it. Without it, the arm cannot be sent to park."""
 
 
 class Support(Model):
@@ -182,7 +184,7 @@ class Support(Model):
 
 
 class KeepOutSphere(Model):
-    """A volume of the support frame that the flange must stay out of."""
+    """A volume of the support frame that the flange must not enter."""
 
     kind: Literal["sphere"]
     """A ball."""
@@ -231,50 +233,51 @@ class Clearances(Model):
     """Clearances of the arm, mm."""
 
     object_mm: Annotated[float, Field(ge=0, le=5000)] = 50.0
-    """Clearance to the object."""
+    """Least distance to the object."""
     support_mm: Annotated[float, Field(ge=0, le=5000)] = 10.0
-    """Clearance to the disk."""
+    """Least distance to the disk."""
     dome_mm: Annotated[float, Field(ge=0, le=5000)] = 20.0
-    """Clearance to the dome."""
+    """Least distance to the dome."""
     self_mm: Annotated[float, Field(ge=0, le=5000)] = 0.0
-    """Clearance between parts of the arm."""
+    """Least distance between parts of the arm."""
     keep_out_mm: Annotated[float, Field(ge=0, le=5000)] = 0.0
-    """Clearance to the volumes to keep out of."""
+    """Least distance to the `keep_out` volumes."""
 
 
 class Storage(Model):
     folder: FilePath
-    """Folder in which runs are made, relative to the rig."""
+    """Folder for the runs, relative to the rig."""
     reserve_bytes: Annotated[int, Field(ge=0, le=2**60)] = 256 * 1024**2
     """Free space that a run leaves on the disk."""
     pixels: Literal["uint16", "packed12"] = "uint16"
     """Storage of pixels: two bytes each, or two pixels of at most 12 bits in three bytes."""
     state: FilePath | None = None
-    """Folder for what is true of the cell whatever is acquired, such as faults of the arm; the same for all who
-    use the cell. `state` in `folder` if not given."""
+    """Folder for facts about the cell that do not depend on the acquisition, such as faults of the arm. It must be
+    the same for all who use the cell. Default: `state` in `folder`."""
 
 
 class Consoles(Model):
     """The consoles from which people work with the cell."""
 
     at_the_cell: Annotated[tuple[Words, ...], Field(max_length=100)] = ()
-    """Addresses of those whose user sees the arm and reaches its emergency stop: only from these it is moved by
-    hand."""
+    """Addresses of consoles whose user sees the arm and can reach its emergency stop. The arm is moved by hand
+    only from these addresses."""
     enabling_switch: bool = False
-    """The LED box has an input for an enabling switch: without one the arm is not moved from a console."""
+    """True if the LED box has an input for an enabling switch. Without the switch, the arm is then not moved from
+    a console."""
 
 
 class WorldSection(Model):
-    """The stand-ins: started with the rig (or for dry runs only), or joined if they already run."""
+    """The stand-ins. They are started with the rig (or only for dry runs), or joined if they already run."""
 
     serves: Literal["always", "dry_run"] = "always"
-    """All sessions, or dry runs only."""
+    """Sessions that use the stand-ins: all, or only dry runs."""
     join: FilePath | None = None
     """File with the JSON line of a running `coupole sim`."""
     driver: DriverName = WORLD
     """Class of the stand-ins."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """Settings that say what the stand-ins simulate, and how."""
+    """Settings that say which things the stand-ins simulate, and how."""
 
 
 class Rig(Model):
@@ -295,18 +298,18 @@ class Rig(Model):
     sensor: Sensor
     """Format of the frames."""
     lens: Lens
-    """The lens as it is set."""
+    """The lens and its settings."""
     white_response: WhiteResponse | None = None
-    """Response to white. Without it, and without a record of the LEDs' power, exposures cannot be judged without
-    the camera."""
+    """Response to white. Exposures cannot be judged without the camera if both this response and a record of the
+    LEDs' power are missing."""
     flange_from_camera: Pose
-    """Pose of the camera's frame in the flange's, by drawing; a hand-eye record replaces it."""
+    """Pose of the camera frame in the flange frame, from the drawing. A hand-eye record replaces it."""
     dome: Dome
     """The LEDs and panels."""
     support: Support
     """The disk under the object."""
     tool: Annotated[tuple[ToolBody, ...], Field(max_length=100)]
-    """Camera, lens, cables: what collides besides the arm."""
+    """Camera, lens and cables: the bodies besides the arm that can collide."""
     link_meshes: FilePath | None = None
     """Folder of meshes (`base_link.stl`, `link_1.stl` to `link_6.stl`) that replace the capsules of the arm's
     links."""
@@ -315,7 +318,7 @@ class Rig(Model):
     keep_out: Annotated[tuple[KeepOut, ...], Field(max_length=1000)] = ()
     """Volumes that the arm must not enter."""
     led_limits: LedLimits = LedLimits()
-    """Limits of LEDs and boards: for how long LEDs may be lit."""
+    """Limits of LEDs and boards, such as the time for which an LED may be lit."""
     watch: WatchLimits = WatchLimits()
     """Figures of camera and LEDs from which the limits of a watched run follow."""
     motion: Motion = Motion()
@@ -323,21 +326,21 @@ class Rig(Model):
     storage: Storage
     """Storage of the runs."""
     ledger: FilePath | None = None
-    """Folder of the objects' dose ledgers, the same for all rigs under which they lie. `coupole/ledger` in the
-    user's data folder (XDG) if not given."""
+    """Folder of the objects' dose ledgers. It must be the same for all rigs on which the objects are measured.
+    Default: `coupole/ledger` in the user's data folder (XDG)."""
     controllers: FilePath | None = None
-    """Folder of what is true of arms' controllers, whatever rig names them: faults that stand, commissioning.
-    `coupole/controllers` in the user's data folder (XDG) if not given."""
+    """Folder of facts about controllers of arms, such as standing faults and commissioning. They do not depend on
+    the rig that names the controller. Default: `coupole/controllers` in the user's data folder (XDG)."""
     calibrations: Literal["none"] | tuple[FilePath, ...] = "none"
-    """Records that must be in force for plans without a list of their own."""
+    """Records that must be in force for plans that list no records."""
     console: Consoles = Consoles()
-    """Consoles that stand at the cell."""
+    """The consoles at the cell."""
     world: WorldSection | None = None
-    """The stand-ins of a simulated rig; none on a real one."""
+    """The stand-ins of a simulated rig. A real rig has none."""
     licence: Words | None = None
-    """Terms under which the data of its runs may be used, where the plan has none."""
+    """Terms under which the data of its runs may be used, if the plan has none."""
     contact: Words | None = None
-    """Whom to ask about them."""
+    """Person to ask about the data, if the plan names none."""
 
     @property
     def frame_bytes(self) -> int:

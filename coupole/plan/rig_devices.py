@@ -1,4 +1,4 @@
-"""Driver and settings of each device of a rig, in a run or in a dry run, and the problems found in them.
+"""Driver and settings of each device of a rig, in a run or in a dry run, and problems in these settings.
 
 A device is opened as the rig names it, or as its twin in a dry run. A world, if there is one, supplies the
 addresses.
@@ -37,7 +37,7 @@ NOWHERE = {
     "camera": {"address": "/nowhere"},
     "robot": {"listen": "127.0.0.1:0", "address": "127.0.0.1:0", "host": "127.0.0.1"},
 }
-"""Placeholder for the address from a world's endpoint, for checking settings before a world runs."""
+"""Placeholder for an address that a world's endpoint gives. It is used to check settings before a world runs."""
 _MOTION_SETTINGS = {
     "speed_fraction": "speed_fraction",
     "acceleration_deg_s2": "acceleration_deg_s2",
@@ -53,15 +53,15 @@ _WORDS = {
 
 
 def described_arm(rig: Rig) -> ArmDescription | None:
-    """The rig's arm, or else the arm of its driver; None if neither is given. A path is relative to the working
-    folder (reading a rig's file replaces the path by the description). Raises InputError."""
+    """Return the rig's arm, or otherwise the arm of its driver; None if neither is given. A path is relative to
+    the working folder (reading a rig's file replaces the path by the description). Raises InputError."""
     if isinstance(rig.arm, ArmDescription):
         return rig.arm
     return read_arm(rig.arm) if rig.arm else arm_of_driver(rig.robot.driver, rig.robot.settings)
 
 
 def planning_arm(rig: Rig) -> Arm | None:
-    """The arm of the robot's driver, with the rig's speeds; None if it has no description, so that neither
+    """Return the arm of the robot's driver, with the rig's speeds. None if it has no description; then neither
     postures nor collisions can be computed."""
     description = described_arm(rig)
     if description is None:
@@ -81,15 +81,15 @@ def planning_arm(rig: Rig) -> Arm | None:
 
 
 def robot_settings_here(rig: Rig) -> Any:
-    """Settings of the robot's driver as if its controller were on this machine, at the rig's cycle."""
+    """Return the settings of the robot's driver for a controller on this machine, at the rig's cycle."""
     driver, settings = device_for(rig, "robot", dry_run=False)
     model = settings_class(driver)
     return model(**settings | _known_settings(NOWHERE["robot"], model))
 
 
 def host_needs(rig: Rig) -> Iterator[tuple[str, HostNeed]]:
-    """Yield each need of a driver with its kind of device, where the driver tells what it needs of this machine.
-    An address that a world gives is none of them."""
+    """Yield each need of a driver with its kind of device, if the driver says what it needs of this machine. An
+    address that a world gives is not a need."""
     for kind in DEVICES:
         driver, settings = device_for(rig, kind, dry_run=False)
         model = settings_class(driver)
@@ -104,7 +104,8 @@ def runs_tables(rig: Rig) -> bool:
 
 
 def upload_s(rig: Rig, steps: int) -> float:
-    """Time to bring a table of so many steps into the rig's LED box, from its driver; 0 if unknown."""
+    """Return the time to bring a table with this number of steps into the rig's LED box, from its driver; 0 if
+    unknown."""
     settings = _ledbox_settings(rig)
     return float(settings.upload_s(steps)) if hasattr(settings, "upload_s") else 0.0
 
@@ -115,14 +116,14 @@ def _ledbox_settings(rig: Rig) -> BaseModel:
 
 
 def longest_light_s(rig: Rig, on_us: int) -> float:
-    """Longest time for which the rig's LED box leaves a light of `on_us` on if the host dies. It follows from the
-    settings of its driver; without such settings it is `on_us`."""
+    """Return the longest time for which the rig's LED box leaves a light of `on_us` on if the host dies. The time
+    follows from the settings of the driver; without such settings it is `on_us`."""
     settings = _ledbox_settings(rig)
     return float(settings.longest_light_s(on_us)) if hasattr(settings, "longest_light_s") else on_us * 1e-6
 
 
 def watchdog_s(rig: Rig) -> float:
-    """Time after which the rig's LED box switches its panels off, should the host die; 0 if unknown."""
+    """Return the time after which the rig's LED box switches its panels off if the host dies; 0 if unknown."""
     return float(getattr(_ledbox_settings(rig), "watchdog_s", 0.0))
 
 
@@ -132,7 +133,7 @@ def in_world(rig: Rig, *, dry_run: bool) -> bool:
 
 
 def device_for(rig: Rig, kind: str, *, dry_run: bool) -> tuple[DriverName, dict[str, Any]]:
-    """Driver and settings to open for a device: its twin in a dry run, itself otherwise."""
+    """Return the driver and settings to open for a device: those of its twin in a dry run, its own otherwise."""
     device: Device = getattr(rig, kind)
     settings = dict(device.settings)
     driver = device.driver
@@ -148,8 +149,9 @@ def device_for(rig: Rig, kind: str, *, dry_run: bool) -> tuple[DriverName, dict[
 
 
 def stand_in_for(rig: Rig, *, dry_run: bool) -> StandIn:
-    """Kind of the robot's stand-in in this rig's world: that of its driver, or of the twin's driver if the world
-    is for dry runs only. For a driver not included with Coupole the rig must give it."""
+    """Return the kind of the robot's stand-in in this rig's world. It follows from the driver, or from the twin's
+    driver if the world is for dry runs only. If the driver is not included with Coupole, the rig must give the
+    kind."""
     driver, _ = device_for(rig, "robot", dry_run=dry_run or not in_world(rig, dry_run=False))
     robot_settings = rig.world.settings.get("robot") if rig.world else None
     return ROBOT_STAND_INS.get(driver) or StandIn(
@@ -158,20 +160,20 @@ def stand_in_for(rig: Rig, *, dry_run: bool) -> StandIn:
 
 
 def ledbox_stand_in(rig: Rig, *, dry_run: bool) -> StandIn:
-    """Kind of the LED box's stand-in in this rig's world."""
+    """Return the kind of the LED box's stand-in in this rig's world."""
     driver, _ = device_for(rig, "ledbox", dry_run=dry_run or not in_world(rig, dry_run=False))
     return LEDBOX_STAND_INS.get(driver) or StandIn("scpi")
 
 
 def camera_kind(rig: Rig, *, dry_run: bool) -> str:
-    """Kind of the camera's stand-in in this rig's world."""
+    """Return the kind of the camera's stand-in in this rig's world."""
     driver, _ = device_for(rig, "camera", dry_run=dry_run or not in_world(rig, dry_run=False))
     return CAMERA_STAND_INS.get(driver, "memory")
 
 
 def trusted_by_name(rig: Rig) -> tuple[str, ...]:
-    """Return what a person has allowed in the settings of the rig's real devices, in words with the name. Return
-    nothing for a cell of stand-ins, whose devices nobody else can reach."""
+    """Return the permissions that a person has given in the settings of the rig's real devices, in words with the
+    person's name. A cell of stand-ins has none, because nobody else can reach its devices."""
     if in_world(rig, dry_run=False):
         return ()
     permissions = ((kind, key, getattr(rig, kind).settings.get(key)) for kind in DEVICES for key in _WORDS)
@@ -179,7 +181,7 @@ def trusted_by_name(rig: Rig) -> tuple[str, ...]:
 
 
 def driver_problems(document: Document, rig: Rig) -> list[Problem]:
-    """Drivers that cannot be found, and settings that drivers do not accept."""
+    """Return drivers that cannot be found, and settings that drivers do not accept."""
     problems = []
     for kind in DEVICES:
         device: Device = getattr(rig, kind)
@@ -209,8 +211,9 @@ def driver_problems(document: Document, rig: Rig) -> list[Problem]:
 
 
 def _unlike_stand_in(document: Document, rig: Rig) -> list[Problem]:
-    """An arm that the stand-in does not move, in a rig of stand-ins: poses would be the arm's, pictures the
-    stand-in's. (A UR's stand-in moves the driver's `model`, or its settings are refused.)"""
+    """Find an arm that the stand-in does not move, in a rig of stand-ins. Poses would then be those of the arm,
+    but pictures those of the stand-in. (A UR's stand-in moves the driver's `model`, or its settings are
+    refused.)"""
     moved_arm, arm = ARMS_OF_DRIVERS.get(rig.robot.driver), described_arm(rig)
     if moved_arm is None or arm is None or not in_world(rig, dry_run=False):
         return []
@@ -225,7 +228,7 @@ def _unlike_stand_in(document: Document, rig: Rig) -> list[Problem]:
 
 
 def world_problems(document: Document, rig: Rig, settings: Mapping[str, Any]) -> list[Problem]:
-    """Problems in the settings of the rig's world, completed with values from the rig."""
+    """Return problems in the settings of the rig's world, completed with values from the rig."""
     stand_in, robot = stand_in_for(rig, dry_run=False), settings.get("robot", {})
     if isinstance(robot, dict):
         if robot.get("kind", stand_in.kind) != stand_in.kind:
@@ -255,19 +258,19 @@ def _settings_problems(
 
 
 def _robot_settings(rig: Rig) -> dict[str, Any]:
-    """Settings for a robot's driver from the rig: from its `motion:`, and its arm."""
+    """Return settings for a robot's driver from the rig's `motion:` and arm."""
     description = described_arm(rig)
     arm = {"arm_model": asdict(description.arm)} if description else {}
     return arm | {setting: getattr(rig.motion, figure) for figure, setting in _MOTION_SETTINGS.items()}
 
 
 def _known_settings(settings: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
-    """The settings that the model has."""
+    """Return the settings that the model has."""
     return {name: value for name, value in settings.items() if name in model.model_fields}
 
 
 def renamed_drivers(document: Document) -> list[str]:
-    """A warning for each class that the rig's file names by its version 0.1 name."""
+    """Return a warning for each class that the rig's file names by its version 0.1 name."""
     places: list[tuple[str | int, ...]] = [(*at, "driver") for at in (*((kind,) for kind in DEVICES), ("world",))]
     places += [(kind, "twin", "driver") for kind in DEVICES]
     remarks = []

@@ -1,4 +1,4 @@
-"""Expansion of a plan into ordered views and their bursts. Pure: no device, no file."""
+"""Expands a plan into ordered views and their bursts. It uses no device and no file."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from coupole.plan.shot_id import MAX_CHARACTERS, Led, Panel, PanelMark, Sentinel
 from coupole.plan.watch import SENTINELS
 
 MOST_VIEWS, MOST_FRAMES = 2000, 5_000_000
-"""Largest numbers of views and frames of one plan, as many as fit into memory."""
+"""Largest numbers of views and frames of one plan. This number fits into memory."""
 TAKEN_TWICE = 4
-"""Each fourth light of a first pass is taken twice: noise is measured by pairs."""
+"""Each fourth light of a first pass is taken twice, because noise is measured from pairs."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,14 @@ class Schedule:
 
     views: tuple[ViewPose, ...]
     bursts: tuple[tuple[Burst, ...], ...]
-    """Bursts of each view; where they are chosen in the run, its bound (`coupole.plan.choices`)."""
+    """Bursts of each view. If they are chosen in the run, this is the view's bound (`coupole.plan.choices`)."""
     labels: tuple[tuple[ShotLabel, ...], ...]
-    """Labels of all frames that each view can have, before any was left out, in the order of its bursts."""
+    """Labels of all frames that each view can have, in the order of its bursts. Frames that were left out are
+    included."""
     choosable: tuple[tuple[Burst, ...], ...] = ()
-    """Bursts from which those of each view are chosen in the run; empty if the plan says them all."""
+    """Bursts from which those of each view are chosen in the run; empty if the plan gives all bursts."""
     burst_sizes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    """LEDs of the bursts in the bound of each view whose LEDs are chosen, by its name."""
+    """Number of LEDs of the bursts in a view's bound, by the view's name, for views whose LEDs are chosen."""
 
     @property
     def shots(self) -> int:
@@ -63,16 +64,16 @@ class Schedule:
         return bool(self.choosable)
 
     def open_view(self, number: int) -> OpenView:
-        """One of the views, where bursts are chosen."""
+        """Return one of the views, if bursts are chosen."""
         view = self.views[number]
         return OpenView(view.name, view.target_mm, self.choosable[number], self.bursts[number])
 
     def planned_bursts(self) -> tuple[tuple[Burst, ...], ...]:
-        """Bursts of each view with each frame that the plan allows."""
+        """Bursts of each view, with every frame that the plan allows."""
         return self.choosable or self.bursts
 
     def without(self, hidden_leds: Mapping[str, Collection[int]]) -> Schedule:
-        """The same without some LEDs in some views (LED ids by name of view)."""
+        """Return the same schedule without some LEDs in some views (LED ids by name of view)."""
 
         def without_hidden(bursts_of_views: tuple[tuple[Burst, ...], ...]) -> tuple[tuple[Burst, ...], ...]:
             return tuple(
@@ -85,7 +86,8 @@ class Schedule:
         return without.with_bounds_of_lights() if self.burst_sizes else without
 
     def with_bounds_of_lights(self) -> Schedule:
-        """The same with the bounds of the views whose LEDs are chosen, from the LEDs that they may have."""
+        """Return the same schedule with new bounds of the views whose LEDs are chosen. The bounds use the LEDs
+        that these views may have."""
         bounds: dict[tuple[int, tuple[int, ...]], tuple[Burst, ...]] = {}
         bursts_of_views = []
         for view, (whole, *_), bursts in zip(self.views, self.choosable, self.bursts, strict=True):
@@ -99,8 +101,8 @@ class Schedule:
         return replace(self, bursts=tuple(bursts_of_views))
 
     def with_choices(self, choices: Mapping[str, Sequence[Choice]]) -> Schedule:
-        """The same schedule with the chosen bursts of views (by name) in place of their bounds, if enough are
-        chosen. Raises KeyError for a choice that the plan does not allow."""
+        """Return the same schedule with the chosen bursts of views (by name) in place of their bounds, if enough
+        are chosen. Raises KeyError for a choice that the plan does not allow."""
         bursts = []
         for number, (view, bound) in enumerate(zip(self.views, self.bursts, strict=True)):
             view_choices = choices.get(view.name, ())
@@ -109,8 +111,8 @@ class Schedule:
         return replace(self, bursts=tuple(bursts))
 
     def without_proven(self, proven: Collection[ShotId]) -> Schedule:
-        """Return the schedule of what is still to be taken: views with unproven frames, with their bursts reduced
-        to these."""
+        """Return the schedule of the frames that are still to be taken: views with unproven frames, whose bursts
+        contain only these."""
         remaining_bursts = [bursts_left(bursts, proven) for bursts in self.bursts]
         numbers = [n for n, bursts in enumerate(remaining_bursts) if bursts]
         return replace(
@@ -123,12 +125,12 @@ class Schedule:
 
 
 def chosen_bursts(view: OpenView, choices: Sequence[Choice]) -> tuple[Burst, ...]:
-    """All bursts of these choices. Raises KeyError for one that the plan does not allow."""
+    """Return all bursts of these choices. Raises KeyError for a burst that the plan does not allow."""
     return tuple(view.burst_of(burst) for choice in choices for burst in choice.bursts)
 
 
 def bursts_left(bursts: Sequence[Burst], proven: Collection[ShotId]) -> list[Burst]:
-    """Bursts with unproven frames, reduced to these."""
+    """Return the bursts with unproven frames. Each contains only these frames."""
     remaining_bursts = []
     for burst in bursts:
         missing_labels = {shot.label for shot in burst.shots if shot and shot not in proven}
@@ -140,7 +142,7 @@ def bursts_left(bursts: Sequence[Burst], proven: Collection[ShotId]) -> list[Bur
 
 
 def views_of_grid(grid: Grid) -> list[LookAt]:
-    """Each of its views, named; whether a name is too long is asked elsewhere."""
+    """Return each of its views, with its name. The length of the names is checked elsewhere."""
     grid_keys = {
         key: getattr(grid, key) for key in grid.model_fields_set & LookAt.model_fields.keys() - {"kind", "name"}
     }
@@ -158,7 +160,7 @@ def views_of_grid(grid: Grid) -> list[LookAt]:
 
 
 def expand_view(view: View) -> list[ViewPose]:
-    """The poses of one entry of a plan's views: a grid has many."""
+    """Return the poses of one entry of a plan's views; a grid has many poses."""
     match view:
         case LookAt():
             pose = look_at(view.target_mm, view.distance_mm, view.azimuth_deg, view.elevation_deg, view.roll_deg)
@@ -182,9 +184,9 @@ def build_schedule(
     pace: Pace = FASTEST,
     runs_tables: bool = True,
 ) -> Schedule:
-    """All bursts of all views. Tables are shared between views, so that they need not be uploaded again.
+    """Return all bursts of all views. Views share tables, so that these need not be uploaded again.
 
-    For a box that does not run tables, and so has no log, only marks can show that its lights went off.
+    If a box does not run tables, it has no log. Then only marks can show that its lights went off.
     """
     bursts_of: dict[Lights, list[Burst]] = {}
     views: list[ViewPose] = []
@@ -231,7 +233,7 @@ def build_schedule(
 def _with_sentinels(
     lit: Sequence[Sequence[Led] | Panel], plan: Plan, leds: LedTable
 ) -> list[Sequence[Led | Sentinel] | Panel]:
-    """Lights of each burst of one exposure, with sentinels if the plan has them."""
+    """Return the lights of each burst of one exposure, with sentinels if the plan has them."""
     sentinels = sentinels_among(lit, leds) if plan.takes_sentinels else ()
     return [
         lights if isinstance(lights, Panel) else with_sentinels(lights, sentinels, plan.watching.every)
@@ -240,7 +242,7 @@ def _with_sentinels(
 
 
 def _with_open_lights(schedule: Schedule, plan: Plan) -> Schedule:
-    """The schedule of a plan whose LEDs are chosen in the run, in some of its views."""
+    """Return the schedule of a plan that chooses the LEDs of some of its views in the run."""
     burst_sizes = {
         pose.name: lights.burst_sizes
         for view in plan.views
@@ -251,7 +253,8 @@ def _with_open_lights(schedule: Schedule, plan: Plan) -> Schedule:
 
 
 def _with_open_exposures(schedule: Schedule, exposure: AutoExposure, leds: LedTable) -> Schedule:
-    """The schedule of a plan whose exposures are chosen in the run: of all that may be chosen, and its bound."""
+    """Return the schedule of a plan that chooses its exposures in the run: all bursts that may be chosen, and
+    their bound."""
     bounds: dict[int, tuple[Burst, ...]] = {}
     for bursts in schedule.bursts:
         first_table = id(bursts[0].table)  # views with the same lights share tables
@@ -267,7 +270,7 @@ def _with_open_exposures(schedule: Schedule, exposure: AutoExposure, leds: LedTa
 
 
 def too_large(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
-    """Key path and message if a plan has more views or frames than can be planned for."""
+    """Return key path and message if a plan has more views or frames than can be planned."""
     sizes = [
         len(view.azimuths_deg) * len(view.elevations_deg) if isinstance(view, Grid) else 1 for view in plan.views
     ]
@@ -282,7 +285,7 @@ def too_large(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], s
 
 
 def names_too_long(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
-    """Key path and message for each view whose shots' ids would not fit the frame table."""
+    """Return key path and message for each view whose shot ids do not fit the frame table."""
     longest_light = max(int(leds.ids.max()), 9999)
     longest = ShotLabel(Led(longest_light), len(plan.exposure.exposures_us) - 1, plan.repeats - 1)
     mark = ShotLabel(PanelMark(4, MARKS - 1), longest.exposure, longest.repeat)

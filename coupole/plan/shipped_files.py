@@ -1,8 +1,8 @@
 """Files that come with Coupole: rigs, plans, domes, arms, objects and records of the simulated cells.
 
 They are in `configs` of a checkout, and in `coupole/configs` of an installed package (pyproject.toml puts them
-there). Only this module knows which of the two it is. Where a rig or a plan is wanted, the name of a shipped one
-may stand for its path: `sim` is `configs/rigs/sim.yaml`.
+there). Only this module knows which of the two is used. The name of a shipped rig or plan may replace its path:
+`sim` is `configs/rigs/sim.yaml`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Literal
 
 Kind = Literal["rigs", "plans", "robots"]
 SIMULATED_CELL = Path("sim")
-"""Name of the rig that serves where none is named."""
+"""Name of the rig that is used if none is named."""
 _PACKAGE = Path(__file__).resolve().parents[1]
 _INSTALLED = _PACKAGE / "configs"
 
@@ -28,15 +28,16 @@ def shipped_names(kind: Kind) -> list[str]:
 
 
 def file_of(path: Path, kind: Kind) -> Path:
-    """The path itself; of a single word that is no file, the shipped file of that name, if there is one."""
+    """Return the path itself. If it is a single word and no such file exists, return the shipped file of that
+    name, if there is one."""
     if path.name != str(path) or path.is_file() or path.name not in shipped_names(kind):
         return path
     return shipped_folder() / kind / f"{path.name}.yaml"
 
 
 def place_to_write(folder: Path) -> Path:
-    """The folder itself; of one in an installed package, where nobody writes, the one of the same name in the
-    working folder."""
+    """Return the folder itself. Nobody writes into an installed package, so for a folder there, return the one of
+    the same name in the working folder."""
     if not _INSTALLED.is_dir() or not folder.is_relative_to(_PACKAGE):
         return folder
     return Path.cwd() / folder.relative_to(_PACKAGE)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 MAX_CHARACTERS = 80
-"""Greatest length of a shot id: the width of its field in the frame table."""
+"""Greatest length of a shot id, which is the width of its field in the frame table."""
 _LABEL = re.compile(
     r"(?:led(?P<led>\d{4,5})(?:-watch(?P<watch>\d+))?|panel(?P<panel>\d)(?:-mark(?P<mark>\d+))?|dark(?P<dark>\d+))"
     r"/e(?P<exposure>\d+)(?:/r(?P<repeat>[1-9]\d*))?"
@@ -36,7 +36,7 @@ class Led:
 
 @dataclass(frozen=True, slots=True)
 class Sentinel:
-    """One LED is lit to tell what has changed since it was lit before; the frame is not a shot of the plan."""
+    """One LED is lit to show changes since it was lit before. The frame is not a shot of the plan."""
 
     led: int
     number: int
@@ -57,7 +57,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class PanelMark:
-    """A coded step at the ends of a panel's burst: the panel is lit, but the frame is not a shot of the plan."""
+    """A coded step at the ends of a panel's burst. The panel is lit, but the frame is not a shot of the plan."""
 
     panel: int
     number: int
@@ -81,7 +81,7 @@ Light: TypeAlias = Led | Sentinel | Panel | PanelMark | Dark
 
 @dataclass(frozen=True, slots=True)
 class ShotLabel:
-    """A shot's id without its view: what bursts of all views have in common."""
+    """A shot's id without its view. Bursts of all views have these labels in common."""
 
     light: Light
     exposure: int
@@ -93,7 +93,7 @@ class ShotLabel:
 
     @property
     def is_shot(self) -> bool:
-        """True for a frame under a light that was asked for; False for dark frames, marks and sentinels."""
+        """True for a frame under a light of the plan; False for dark frames, marks and sentinels."""
         return isinstance(self.light, Led | Panel)
 
     @property
@@ -102,7 +102,7 @@ class ShotLabel:
 
     @staticmethod
     def parse(text: str) -> ShotLabel:
-        """The label that `str` wrote. Raises ValueError for any other text."""
+        """Return the label for a text that `str` wrote. Raises ValueError for any other text."""
         match = _LABEL.fullmatch(text)
         if match is None:
             raise ValueError(f"expected a shot such as led0417/e0, found {text[:MAX_CHARACTERS]!r}")
@@ -128,7 +128,7 @@ class ShotId:
 
     @property
     def is_shot(self) -> bool:
-        """True for a frame under a light that was asked for; False for dark frames, marks and sentinels."""
+        """True for a frame under a light of the plan; False for dark frames, marks and sentinels."""
         return self.label.is_shot
 
     @property
@@ -137,7 +137,7 @@ class ShotId:
 
     @staticmethod
     def parse(text: str) -> ShotId:
-        """The id that `str` wrote. Raises ValueError for any other text."""
+        """Return the id for a text that `str` wrote. Raises ValueError for any other text."""
         view, _, label = text.partition("/")
         if not view or len(text) > MAX_CHARACTERS:
             raise ValueError(f"expected a shot id of {MAX_CHARACTERS} characters at most, found {text[:200]!r}")

@@ -2,8 +2,8 @@
 
 
 def _board_views(count: int = 40) -> str:
-    """Views of a board at the support's centre, near the focus: tilted, rolled and shifted evenly (additive
-    recurrence with the root of x^7 = x + 1; Roberts 2018)."""
+    """Return views of a board at the support's centre, near the focus. They are tilted, rolled and shifted evenly
+    (additive recurrence with the root of x^7 = x + 1; Roberts 2018)."""
     root = 1.0
     for _ in range(60):
         root = (1.0 + root) ** (1.0 / 7.0)

@@ -3,9 +3,10 @@
 pydantic reports a flat list of errors whose locations mix keys with labels of unions. `mistakes_of` assigns them
 to the nodes of the model's core schema, which has the valid keys, tags, bounds and lengths of each level:
 
-- a tagged union gives mistakes of the chosen tag only, or lists the valid tags;
-- a plain union gives one mistake: that of the member with the shape of the value, or all that it accepts;
-- an unknown key that is nearly a valid one takes the place of the missing key.
+- a tagged union gives only mistakes of the chosen tag, or lists the valid tags;
+- a plain union gives one mistake: the mistake of the member with the shape of the value, or a list of everything
+  that the union accepts;
+- an unknown key that is nearly a valid one is reported instead of the missing key.
 """
 
 from __future__ import annotations
@@ -50,23 +51,23 @@ class Mistake:
     key_path: KeyPath
     message: str
     at_key: bool = False
-    """It concerns the key itself, not its value."""
+    """True if it concerns the key itself, not its value."""
 
 
 def key_text(key_path: KeyPath) -> str:
-    """`("views", 2, "distance_mm")` as `views[2].distance_mm`."""
+    """Return `("views", 2, "distance_mm")` as `views[2].distance_mm`."""
     text = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in key_path)
     return text.removeprefix(".")
 
 
 def mistakes_of(model: type[BaseModel], value: Any, error: ValidationError) -> list[Mistake]:
-    """The mistakes in `value` that made `model` raise `error`."""
+    """Return the mistakes in `value` that made `model` raise `error`."""
     errors: Errors = [(tuple(item["loc"]), dict(item)) for item in error.errors(include_url=False)]
     return list(_Explainer(dict(model.__pydantic_core_schema__)).mistakes((), value, errors))
 
 
 def did_you_mean(word: str, valid: Iterable[str]) -> str | None:
-    """The valid word nearest to a misspelt one, if any is near."""
+    """Return the valid word nearest to a misspelt one, if there is one that is near."""
     by_folded = {name.casefold(): name for name in valid}
     folded_word = word.casefold()
     near = difflib.get_close_matches(folded_word, by_folded, n=1, cutoff=0.6)
@@ -81,7 +82,7 @@ class _Explainer:
         self.kind: str = self.node["type"]
 
     def _peel(self, node: Schema) -> Schema:
-        """The node below validators, defaults and references."""
+        """Return the node below validators, defaults and references."""
         while True:
             if node["type"] == "definition-ref":
                 node = self.definitions[node["schema_ref"]]
@@ -102,7 +103,7 @@ class _Explainer:
     # ---- mistakes ----
 
     def mistakes(self, path: KeyPath, value: Any, errors: Errors) -> Iterator[Mistake]:
-        """Mistakes of `value`, which is at `path` and has this node's schema."""
+        """Yield the mistakes of `value`, which is at `path` and has this node's schema."""
         own_errors = [error for rest, error in errors if not rest]
         below: dict[str | int, Errors] = {}
         for rest, error in errors:
@@ -124,7 +125,8 @@ class _Explainer:
             yield from self._own_mistake(path, value, own_errors or [error for _, error in errors])
 
     def _own_mistake(self, path: KeyPath, value: Any, own_errors: list[dict[str, Any]]) -> Iterator[Mistake]:
-        """The first error of the value itself: a validator's message, or what was expected and found."""
+        """Yield the first error of the value itself: a validator's message, or the expected and the found
+        value."""
         for error in own_errors[:1]:
             if error["type"] in ("value_error", "assertion_error"):
                 yield Mistake(path, str(error["ctx"]["error"]))
@@ -139,7 +141,7 @@ class _Explainer:
         return f"; did you mean `{near}`?" if near else ""
 
     def _union(self, path: KeyPath, value: Any, by_member: list[Errors]) -> Iterator[Mistake]:
-        """All members of a plain union failed; gives the mistakes of the one with the value's shape."""
+        """Yield mistakes when all members of a plain union failed: those of the member with the value's shape."""
         members = [self._inner(choice) for choice in self._choices()]
         if len(members) == len(by_member):
             for member, errors in zip(members, by_member, strict=True):
@@ -204,7 +206,7 @@ class _Explainer:
     # ---- what the schema says ----
 
     def fields(self) -> dict[str, Schema]:
-        """Schemas by key of a model."""
+        """Schemas of a model's keys, by key."""
         fields = self.node["schema"] if self.kind == "model" else {}
         while fields and "fields" not in fields:
             fields = fields["schema"]
@@ -263,7 +265,7 @@ class _Explainer:
 
 
 def found_text(value: Any) -> str:
-    """A value as the operator would recognise it."""
+    """Return a value in a form that the operator recognises."""
     if value is None:
         return "nothing"
     if isinstance(value, bool):
@@ -282,5 +284,5 @@ def _quoted_list(words: Iterable[Any]) -> str:
 
 
 def _only(errors: Errors) -> str:
-    """The type of the error of the key itself, empty if the errors are deeper."""
+    """Return the type of the error of the key itself; empty if the errors are deeper."""
     return str(errors[0][1]["type"]) if not errors[0][0] else ""

@@ -1,10 +1,11 @@
 """The graph of nodes of a YAML text.
 
-ruamel.yaml reads YAML 1.2, in Python. libyaml (by PyYAML) makes the same nodes in a quarter of the time, but reads
-YAML 1.1. So plain texts are composed by libyaml: printable ASCII without anchors, aliases, tags, directives,
-escapes, block scalars, complex keys, several documents and empty values. For these both make the same nodes at the
-same places, once scalars are resolved by ruamel's rules; a property test checks this. All other texts, and all
-that libyaml refuses, are ruamel's: its graph, or its error with its place, counts.
+ruamel.yaml reads YAML 1.2, in Python. libyaml (through PyYAML) makes the same nodes in a quarter of the time, but
+reads YAML 1.1. So libyaml composes only plain texts: printable ASCII without anchors, aliases, tags, directives,
+escapes, block scalars, complex keys, several documents and empty values. For these texts both libraries make the
+same nodes at the same places, once scalars are resolved by ruamel's rules; a property test checks this. ruamel
+composes all other texts, and all texts that libyaml refuses. Its graph counts, or its error and the place of the
+error.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ _resolver = YAML(typ="safe", pure=True).resolver
 
 @functools.lru_cache(maxsize=4)
 def graph(text: str) -> Node | None:
-    """Compose a text into its nodes; None when it has no content. A text is composed once to be read and once to
-    be rewritten; nobody changes the nodes. Raises ruamel.yaml's YAMLError, and RecursionError."""
+    """Compose a text into its nodes; None if it has no content. The nodes must not be changed, because a text is
+    composed once for reading and rewriting. Raises ruamel.yaml's YAMLError, and RecursionError."""
     return _composed_quickly(text) or composed_by_ruamel(text)
 
 
 def composed_by_ruamel(text: str) -> Node | None:
-    """Compose any text by ruamel.yaml; None when it has no content."""
+    """Compose any text by ruamel.yaml; None if it has no content."""
     reader = YAML(typ="safe", pure=True)
     reader.composer.warn_double_anchors = False  # YAML 1.2 (3.2.2.2): a later anchor may replace an earlier one
     root: Node | None = reader.compose(text)
@@ -38,7 +39,7 @@ def composed_by_ruamel(text: str) -> Node | None:
 
 def _composed_quickly(text: str) -> Node | None:
     """Compose a text by libyaml; None if libyaml is missing, refuses the text, or might understand it
-    otherwise."""
+    differently."""
     if not yaml.__with_libyaml__ or _NOT_PLAIN.search(_COMMENT_LINES.sub("", text)):
         return None
     ends = text.endswith("\n")
@@ -52,11 +53,11 @@ def _composed_quickly(text: str) -> Node | None:
 
 
 class _EmptyError(Exception):
-    """A value that is not there: the two libraries place it differently."""
+    """Raised for an empty value, which the two libraries place differently."""
 
 
 def _ruamel_node(node: yaml.Node) -> Node:
-    """ruamel's node for PyYAML's, with the tag that ruamel gives it. Raises _EmptyError."""
+    """Return ruamel's node for PyYAML's, with the tag that ruamel gives it. Raises _EmptyError."""
     marks = node.start_mark, node.end_mark
     if isinstance(node, yaml.ScalarNode):
         if node.start_mark.index == node.end_mark.index:

@@ -1,4 +1,4 @@
-"""YAML files with file:line:column, all errors at once.
+"""Reads YAML files; reports all errors at once, with file:line:column.
 
 `read_document` turns a file into a `Document`: plain data, and the position of each key and value.
 `Document.validate` checks a part of it against a pydantic model; its errors become `Problem`s in the order of the
@@ -38,7 +38,7 @@ MAX_FILE_BYTES = 16 * 1024**2
 MAX_DEPTH = 50
 MAX_VALUES = 200_000
 MAX_DIGITS = 40
-"""Limits for plans and rigs; aliases that multiply each other reach MAX_VALUES."""
+"""Limits for plans and rigs. Aliases that multiply each other reach MAX_VALUES."""
 
 _YAML_TAG = "tag:yaml.org,2002:"
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
@@ -52,7 +52,7 @@ _PLAIN: tuple[tuple[re.Pattern[str], Callable[[str], int | float | bool | None]]
     (_FLOAT, float),
     (re.compile(r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"), lambda text: float(text.replace(".", ""))),
 )
-"""Forms of plain scalars in YAML 1.2's core schema (chapter 10.3.2), and their values."""
+"""Forms of plain scalars in YAML 1.2's core schema (chapter 10.3.2), and the functions that give their values."""
 
 
 @dataclass(frozen=True)
@@ -64,18 +64,18 @@ class Document:
     value_places: dict[KeyPath, Place] = field(repr=False)
     key_places: dict[KeyPath, Place] = field(repr=False)
     text: str = field(repr=False)
-    """Text that was parsed: without byte order mark, with LF line ends."""
+    """The parsed text, without byte order mark, with LF line ends."""
     _resolved_paths: dict[Path, Path] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def resolve(self, path: Path) -> Path:
-        """`path` made absolute; a relative one is relative to this document's folder. Links are followed once:
-        they lead to the same place as long as the document is used."""
+        """Return `path` made absolute. A relative path is relative to this document's folder. Links are followed
+        only once, so that they lead to the same place as long as the document is used."""
         if path not in self._resolved_paths:
             self._resolved_paths[path] = (self.path.parent / path.expanduser()).resolve()
         return self._resolved_paths[path]
 
     def problem(self, key_path: KeyPath, message: str) -> Problem:
-        """A problem at the value of `key_path`, or at the nearest parent key that exists."""
+        """Return a problem at the value of `key_path`, or at the nearest parent key that exists."""
         if key_path in self.value_places:
             return self._at(self.value_places[key_path], key_path, message)
         parent = key_path
@@ -84,7 +84,7 @@ class Document:
         return self._at(self.key_places.get(parent, self.value_places[parent]), key_path, message)
 
     def validate(self, model: type[M], at: KeyPath = ()) -> M:
-        """The part at key path `at` as a `model`; raises InputError with every problem."""
+        """Return the part at key path `at` as a `model`. Raises InputError with every problem."""
         value, problems = self.problems(model, at)
         if value is None:
             raise InputError(problems)
@@ -93,7 +93,7 @@ class Document:
     def problems(
         self, model: type[M], at: KeyPath = (), *, given_values: dict[str, Any] | None = None
     ) -> tuple[M | None, list[Problem]]:
-        """The part at key path `at` as a `model`, or None with all problems, in the order of the file.
+        """Return the part at key path `at` as a `model`, or None with all problems, in the order of the file.
 
         A part that is not in the file counts as an empty mapping. `given_values` need not be in the file.
         """
@@ -116,7 +116,8 @@ class Document:
         return part
 
     def _mistake(self, at: KeyPath, mistake: Mistake) -> Problem:
-        """Position of the key or the value; for a missing key that of the mapping or list that lacks it."""
+        """Return the position of the key or the value. For a missing key, it is the position of the mapping or
+        list that lacks it."""
         key_path = (*at, *mistake.key_path)
         if mistake.at_key and key_path in self.key_places:
             return self._at(self.key_places[key_path], key_path, mistake.message)
@@ -132,14 +133,14 @@ class Document:
 def read_document(path: Path, files: InputFiles | None = None) -> Document:
     """Read a YAML file whose root is a mapping.
 
-    Raises InputError: no file, not UTF-8, tabs as indentation, YAML syntax, duplicate keys, unknown
-    tags, empty file, root not a mapping.
+    Raises InputError for a missing file, text that is not UTF-8, tabs as indentation, wrong YAML syntax, duplicate
+    keys, unknown tags, an empty file, or a root that is not a mapping.
     """
     return parse(path, text_of(path, files))
 
 
 def parse(path: Path, text: str) -> Document:
-    """The same of a file's text; `path` is where it is, or was."""
+    """Parse a file's text. `path` is the place of the file, which may be gone."""
     try:
         data, value_places, key_places = pickle.loads(_parsed_bytes(text))
         return Document(path, data, value_places, key_places, text)
@@ -149,8 +150,9 @@ def parse(path: Path, text: str) -> Document:
 
 @functools.lru_cache(maxsize=64)
 def _parsed_bytes(text: str) -> bytes:
-    """Data and places of values and keys, pickled: one command reads some files several times, a record of a
-    calibration for a second each, and whoever reads one may change what he was given. Problems name no file."""
+    """Return data, and places of values and keys, pickled. One command reads some files several times; a record of
+    a calibration takes a second each time. Each caller gets a copy of its own, which it may change. Problems name
+    no file."""
     path = Path()
     tabs = [
         Problem(str(path), number, len(line) - len(line.lstrip(" ")) + 1, "", "a tab; indent with spaces")
@@ -172,7 +174,8 @@ def _parsed_bytes(text: str) -> bytes:
 
 
 def text_of(path: Path, files: InputFiles | None = None) -> str:
-    """The file as text, without byte order mark, with LF line ends; read from `files` if these are given."""
+    """Return the file as text, without byte order mark, with LF line ends. It is read from `files` if these are
+    given."""
     files = InputFiles() if files is None else files
     try:
         if path in files:
@@ -200,7 +203,7 @@ def _decoded_text(path: Path, raw: bytes) -> str:
 
 
 def compose(path: Path, text: str) -> Node | None:
-    """The graph of YAML nodes, None when the file has no content."""
+    """Return the graph of YAML nodes; None if the file has no content."""
     try:
         return graph(text)
     except MarkedYAMLError as error:
@@ -224,7 +227,8 @@ def _problem_after(path: Path, before: str, message: str) -> Problem:
 
 
 def _finite(value: Any) -> Any:
-    """`value` for JSON, which has no NaN or infinity: they become text, which no number field accepts."""
+    """Return `value` for JSON. NaN and infinity, which JSON does not have, become text, which no number field
+    accepts."""
     if isinstance(value, dict):
         return {key: _finite(inner) for key, inner in value.items()}
     if isinstance(value, list):
@@ -233,7 +237,7 @@ def _finite(value: Any) -> Any:
 
 
 class _Builder:
-    """Builds plain data from YAML nodes; collects positions and problems."""
+    """Builds plain data from YAML nodes, and collects positions and problems."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -264,7 +268,7 @@ class _Builder:
         return None
 
     def _entries(self, node: MappingNode, key_path: KeyPath, depth: int = 0) -> Iterator[tuple[str, Node]]:
-        """Keys and value nodes; keys of the mapping itself win over merged ones (`<<`)."""
+        """Yield keys and value nodes. Keys of the mapping itself replace merged ones (`<<`)."""
         own_entries: dict[str, tuple[ScalarNode, Node]] = {}
         merged_nodes: list[Node] = []
         for key_node, value_node in node.value:

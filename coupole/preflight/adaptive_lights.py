@@ -1,8 +1,8 @@
-"""Chooses LEDs in the run, by what those before them have shown of the view (`lights: {kind: adaptive}`).
+"""Chooses LEDs in the run, from the frames under earlier LEDs of the view (`lights: {kind: adaptive}`).
 
 The first burst is spread over the dome. After each burst `next_lights` gives the expected error of pictures for
 the LEDs not yet lit, and the LEDs that would add most information. Pixels are divided by the illuminance that the
-LED table gives at the view's target. Neither mesh nor records are needed: only the frames are used.
+LED table gives at the view's target. Mesh and records are not needed: only the frames are used.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from coupole.preflight.next_lights import FEWEST_TAKEN, NextLights, next_lights,
 Floats = NDArray[np.float64]
 
 _SITES = 2048
-"""Approximate number of pixels by which LEDs are judged."""
+"""Approximate number of pixels that are used to judge LEDs."""
 
 
 class AdaptiveLightsChooser:
@@ -37,7 +37,7 @@ class AdaptiveLightsChooser:
         *,
         emission: str = "lambertian",
     ) -> None:
-        """`lights`: by name of view."""
+        """`lights` has the plan's lights by name of view."""
         self._lights, self._leds, self._emission = lights, leds, emission
         self._base_from_support = base_from_support
 
@@ -90,8 +90,8 @@ class AdaptiveLightsChooser:
     def _affordable(
         self, view: OpenView, lights: AdaptiveLights, ids: list[int], lit_before: int, bursts_before: int
     ) -> list[int]:
-        """The first of the LEDs, as many as time and light allow, if `lit_before` were lit in `bursts_before`.
-        Each LED counts as bright as the brightest."""
+        """Return the first of the LEDs, as many as time and light allow after `lit_before` in `bursts_before`.
+        Each LED is assumed to be as bright as the brightest."""
         until, whole = lights.until, view.bursts[0]
         count = len(ids)
         if until.seconds is not None:
@@ -105,7 +105,7 @@ class AdaptiveLightsChooser:
         return ids[:count]
 
     def _values(self, view: OpenView, seen_ids: Sequence[int], samples: Mapping[ShotLabel, FrameSample]) -> Floats:
-        """[seen, sites] signal for unit illuminance."""
+        """Return [seen, sites], the signal for unit illuminance."""
         exposure = view.bursts[0].exposure_index
         signals = [samples[ShotLabel(Led(led), exposure, 0)].signal_dn for led in seen_ids]
         step = max(1, len(signals[0]) // _SITES) | 1  # odd: pixels of all colours
@@ -154,7 +154,7 @@ def _figures(view: OpenView, following: NextLights, lit: int) -> dict[str, Any]:
 
 
 def _enough(lights: AdaptiveLights, figures: Mapping[str, Any], affordable: int) -> str:
-    """The reason for no more LEDs; empty if there is none."""
+    """Return the reason why no more LEDs are lit; empty if there is none."""
     error_text, until = f"expected error {100.0 * figures['relit_rms']:.2f} %", lights.until
     if until.relit_rms is not None and figures["relit_rms"] <= until.relit_rms:
         return f"enough by `relit_rms`: {error_text} of at most {100.0 * until.relit_rms:g} %"

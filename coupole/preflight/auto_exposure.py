@@ -1,16 +1,17 @@
-"""Chooses exposures in the run, for each LED of a view, by what its frames show (`exposure: {kind: auto}`).
+"""Chooses exposures in the run for each LED of a view, from the view's frames (`exposure: {kind: auto}`).
 
-1. *First pass.* Some LEDs, spread over the dome, at the middle of the times; each fourth twice, which gives the
-   noise (`exposure_advice.noise_of_pairs`). LEDs that clip are taken again four stops shorter; if all is dark,
-   some are taken four stops longer.
-2. *All LEDs.* From the rates of the pixels (DN per us) under the first LEDs, two times follow for each: beyond the
-   one more than the allowed share is clipped, below the other too few of the object's pixels reach the
-   signal-to-noise ratio. Both go from LED to LED by the illuminance of the LED table, between the nearest LEDs of
-   the first pass by direction (inverse squares of the distance, logarithms). `exposure_times` chooses.
-3. *Corrections.* Each LED's own frames are judged, clipping by all pixels. An LED that is not exposed as asked for
-   gets one more exposure, twice at most.
+1. *First pass.* Some LEDs, spread over the dome, are taken at the middle one of the times. Each fourth LED is
+taken twice, which gives the noise (`exposure_advice.noise_of_pairs`). LEDs that clip are taken again four stops
+shorter; if all is dark, some are taken four stops longer.
+2. *All LEDs.* The rates of the pixels (DN per us) under the first LEDs give two times for each of these LEDs.
+Above the longest time, more than the allowed share of pixels is clipped. Below the shortest time, too few of the
+object's pixels reach the signal-to-noise ratio. Both times are scaled to other LEDs by the illuminance of the LED
+table, and interpolated by direction (logarithms, weighted by inverse squares of the distance). `exposure_times`
+chooses.
+3. *Corrections.* Each LED's own frames are judged; for clipping, all pixels count. An LED that does not meet the
+plan's limits gets one more exposure, at most twice.
 
-Light that a pixel gets only by way of other surfaces is not asked to reach the ratio (`exposure_evidence`).
+A pixel that gets light only from other surfaces need not reach the ratio (`exposure_evidence`).
 """
 
 from __future__ import annotations
@@ -40,11 +41,11 @@ _PROBE_STEPS = 4 * STEPS_PER_STOP
 """Steps between the exposures of the first pass, if one is not enough."""
 _CORRECTION_STEPS = 2 * STEPS_PER_STOP
 _DARK_SHARE = 0.02
-"""Share of full scale that bright pixels of the first pass reach, or it is taken longer."""
+"""Share of full scale that bright pixels of the first pass must reach; otherwise a longer exposure is taken."""
 _BRIGHT_QUANTILE = 0.999
 _NEIGHBOURS = 4
 _BURST_S = 0.14
-"""Time of a burst beside its steps, as preflight reckons it."""
+"""Time of a burst in addition to its steps, as preflight computes it."""
 _CORRECTIONS, _BURSTS_OF_A_CORRECTION = 2, 2
 _PROBE = "probe"
 
@@ -87,7 +88,7 @@ class AutoExposureChooser:
         return Choice(bursts=tuple(bursts), reason=_in_words("first pass over the dome", bursts))
 
     def _probes(self, view: OpenView, evidence: Evidence) -> list[ChosenBurst]:
-        """More exposures of the first LEDs, where one does not show their rates."""
+        """Choose more exposures of the first LEDs whose rates one exposure does not show."""
         leds, exposure = evidence.first_leds, self._exposure
         place = evidence.taken[leds[0]][0]
         first_samples = {led: evidence.sample(led, place) for led in leds}
@@ -133,9 +134,8 @@ class AutoExposureChooser:
 
     @staticmethod
     def _still_needed(places: Sequence[int], taken_places: Sequence[int]) -> list[int]:
-        """The places that exposures at `taken_places` do not replace. These are the ends of `places` that lie
-        beyond
-        `taken_places`."""
+        """Return the places that exposures at `taken_places` do not replace. These are the ends of `places` that
+        lie beyond `taken_places`."""
         if not taken_places:
             return list(places)
         ends = [places[0]] if places[0] < taken_places[0] else []
@@ -145,8 +145,8 @@ class AutoExposureChooser:
     def _limits(
         self, view: OpenView, evidence: Evidence, lux_of_led: Mapping[int, float]
     ) -> tuple[LightLimits, NDArray[np.int64]]:
-        """Limits of all LEDs, from those of the first pass, and the group [leds] of each: LEDs which clip, and
-        whose dim pixels reach the ratio, at the same times."""
+        """Return the limits of all LEDs, from those of the first pass, and the group [leds] of each LED. The LEDs
+        of a group clip at the same times, and their dim pixels reach the ratio at the same times."""
         judgements = [evidence.judge(led) for led in evidence.first_leds]
         lux = np.array([lux_of_led[led] for led in view.leds.tolist()])
         first_lux = np.array([lux_of_led[led] for led in evidence.first_leds])
@@ -171,7 +171,7 @@ class AutoExposureChooser:
         return LightLimits(pairs[:, 0], np.exp(log_rates).astype(np.float32), counts), group_of
 
     def _weights(self, view: OpenView, first_leds: Sequence[int]) -> Floats:
-        """[leds, first] of the first LEDs for each LED, by direction from the view's target."""
+        """Return the weights [leds, first] of the first LEDs for each LED, by direction from the view's target."""
         target_mm = apply(self._base_from_support, np.array([view.target_mm or (0.0, 0.0, 0.0)]))
         ways, first_ways = (
             way / np.linalg.norm(way, axis=1, keepdims=True)
@@ -187,8 +187,8 @@ class AutoExposureChooser:
     # -- corrections --------------------------------------------------------------------------------------
 
     def _correction(self, evidence: Evidence, *, is_over: bool, again: int) -> Choice:
-        """One more exposure for each LED that is not exposed as asked for; none if all are, or the rounds
-        `is_over`."""
+        """Choose one more exposure for each LED that does not meet the plan's limits; none if all meet them, or if
+        the rounds are over (`is_over`)."""
         exposure = self._exposure
         shorter: dict[int, int] = {}
         longer: dict[int, int] = {}
@@ -223,7 +223,7 @@ class AutoExposureChooser:
     # -- small things -------------------------------------------------------------------------------------
 
     def _lux(self, view: OpenView) -> Floats:
-        """[leds] illuminance at the view's target by the LED table, over its median."""
+        """Return [leds] illuminance at the view's target by the LED table, over its median."""
         target_mm = np.array([view.target_mm or (0.0, 0.0, 0.0)])
         lux = self._leds.illuminance_lux(apply(self._base_from_support, target_mm), emission=self._emission)
         of_view = lux[0, self._leds.rows(view.leds)]
@@ -236,7 +236,7 @@ class AutoExposureChooser:
 
 
 def _lit_rates(judgement: Judgement) -> Floats:
-    """[quantiles] DN per us; an LED that lights nothing is taken for one that lights all well."""
+    """Return [quantiles], DN per us. An LED that lights nothing counts as one that lights all well."""
     rates = judgement.lit_rates if len(judgement.lit_rates) else np.full(QUANTILES, judgement.full_rate)
     return np.maximum(rates.astype(np.float64), _LEAST_RATE)
 
@@ -250,8 +250,8 @@ def _period_s(burst: Any) -> float:
 
 
 def _in_groups(place_of_led: Mapping[int, int], representative: Any) -> dict[int, list[int]]:
-    """LEDs by place, of at most two places: where there are more, the widest gap divides them, and each part gets
-    what its outermost asks for."""
+    """Group LEDs into at most two places. More places are divided at the widest gap, and each part gets the place
+    that its outermost LED needs."""
     places = sorted(set(place_of_led.values()))
     if not places:
         return {}
@@ -267,7 +267,8 @@ def _in_groups(place_of_led: Mapping[int, int], representative: Any) -> dict[int
 
 
 def _one_for_each_exposure(bursts: Iterable[ChosenBurst]) -> list[ChosenBurst]:
-    """The same with one burst for each exposure, the smallest first: its table is in the box soonest."""
+    """Return the same bursts, joined to one for each exposure. The smallest is first, because its table is in the
+    box soonest."""
     leds_at: dict[int, ChosenBurst] = {}
     for burst in bursts:
         before = leds_at.get(burst.exposure)

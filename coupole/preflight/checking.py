@@ -45,12 +45,12 @@ def preflight_of(
     measure: bool = True,
     say: Callable[[str], object] = lambda _: None,
 ) -> tuple[Job, Report]:
-    """Preflight's report on a job whose run would be in `folder`, and the job at the pace that LEDs and the
-    measured speed of that disk allow.
+    """Return preflight's report on a job whose run would be in `folder`. Also return the job at the pace that the
+    LEDs and the measured speed of the disk allow.
 
-    Without `paths` collisions are not checked. For a resumed run, its views occupy some of the
-    disk and the `proven` frames are not taken again. The disk's speed is not known unless it is to `measure`;
-    `say` is called with each step in words.
+    Without `paths`, collisions are not checked. The views of a resumed run occupy `occupied_space` of the disk,
+    and its `proven` frames are not taken again. The disk's speed is known only with `measure`. `say` is called
+    with each step in words.
     """
     if measure:
         say("measuring the disk's speed")
@@ -71,7 +71,7 @@ def preflight_of(
 def storage_of(
     folder: Path, rig: Rig, occupied_space: Occupied = NOTHING, *, measure: bool = True
 ) -> StorageFacts:
-    """State of the disk on which `folder` is, or would be."""
+    """Return the state of the disk for this folder, which may not exist yet."""
     existing = _existing(folder)
     write_bytes_s, trouble = 0.0, "" if existing.is_dir() else f"{existing} is a file"
     free_bytes = shutil.disk_usage(existing).free
@@ -86,15 +86,15 @@ def storage_of(
 
 
 def _existing(folder: Path) -> Path:
-    """The folder, or the nearest above it that exists."""
+    """Return the folder, or the nearest parent that exists."""
     return next(place for place in (folder, *folder.absolute().parents) if place.exists())
 
 
 def check_job(
     job: Job, storage: StorageFacts, *, paths: bool = True, proven: Collection[ShotId] = ()
 ) -> tuple[Job, Report]:
-    """Preflight's report on a job, or on what the `proven` frames of its run leave of it, given the disk's state;
-    and the job at the pace that LEDs and disk allow."""
+    """Return preflight's report on a job, without the `proven` frames of its run, for this state of the disk. Also
+    return the job at the pace that LEDs and disk allow."""
     rig = job.cell.rig
     home_deg = rig.motion.home_joints_deg
     views = job.schedule.without_proven(proven).views if proven else job.schedule.views
@@ -153,8 +153,8 @@ def check_job(
 
 
 def _check_discarding(job: Job, report: Report, storage: StorageFacts, proven: Collection[ShotId]) -> None:
-    """The disk space of a run whose frames are discarded, and reasons why they cannot be; nothing if all are
-    kept."""
+    """Check the disk space of a run whose frames are discarded, and whether they can be. Does nothing if all
+    frames are kept."""
     if job.plan.discard is None:
         return
     report.refusals += refusals_of_discarding(job)
@@ -178,13 +178,13 @@ def _check_discarding(job: Job, report: Report, storage: StorageFacts, proven: C
 
 
 def allowed_lux_h(job: Job, history: History) -> float | None:
-    """Return the light that the job's object may receive in its life, by its ledger's `history` or by the plan if
-    that is stricter; None without a budget."""
+    """Return the light that the job's object may receive in its life; None without a budget. It is the budget of
+    its ledger's `history`, or the plan's budget if that is smaller."""
     return history.allowed_lux_h(job.plan.object.dose_budget_lux_h) if job.plan.object else None
 
 
 def light_refusals(job: Job, history: History) -> list[str]:
-    """Reasons why the object may receive no more light at all."""
+    """Return reasons why the object may receive no more light at all."""
     plan_object, budget = job.plan.object, allowed_lux_h(job, history)
     if plan_object is None or budget is None or history.total_lux_h < budget:
         return []
@@ -194,8 +194,7 @@ def light_refusals(job: Job, history: History) -> list[str]:
 
 
 def ledger_warnings(job: Job, history: History, more_lux_h: float) -> list[str]:
-    """Return what the operator should know of the object's ledger before the object receives so much more
-    light."""
+    """Return warnings about the object's ledger, for the case that the object receives this much more light."""
     if job.plan.object is None:
         return []
     name, warnings = job.plan.object.id, []
@@ -221,7 +220,7 @@ def ledger_warnings(job: Job, history: History, more_lux_h: float) -> list[str]:
 
 
 def _object_check(job: Job, itinerary: Itinerary, proven: Collection[ShotId]) -> ObjectCheck | None:
-    """The object in its views, as far as they are still to be taken; None without a mesh."""
+    """Check the object in the views that are not taken yet; None without a mesh."""
     if job.plan.object is None:
         return None
     schedule = job.schedule.without_proven(proven) if proven else job.schedule
@@ -240,8 +239,8 @@ def _badly_exposed(white: Sequence[ExposedWhite]) -> list[str]:
 
 
 def calibration_refusals(job: Job, *, camera: str | None = None, temperature_c: float | None = None) -> list[str]:
-    """Reasons why the records that plan or rig names are not valid here. Camera and temperature are compared
-    later, with the opened devices (`Situation`)."""
+    """Return reasons why the records that plan or rig names are not valid here. Camera and temperature are
+    compared later, with the opened devices (`Situation`)."""
     if job.calibrations is None:
         return []
     from coupole.calibration.in_force import refusals
@@ -261,7 +260,8 @@ def _disk_us(rig: Rig, storage: StorageFacts) -> int:
 
 
 def _at_cool_pace(job: Job, report: Report, check_at: Callable[[Pace], tuple[Job, Report]]) -> tuple[Job, Report]:
-    """The fastest pace at which LEDs do not get too hot; unchanged if none of the tried ones is sufficient."""
+    """Return the job at the fastest pace at which LEDs do not get too hot. The job is unchanged if none of the
+    tried paces is slow enough."""
     if not report.too_hot:
         return job, report
     paces = [replace(job.pace, led_duty=duty) for duty in LED_DUTIES]

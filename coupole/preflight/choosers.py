@@ -1,4 +1,4 @@
-"""Choosers of the bursts of a job's views in the run."""
+"""Choosers, which choose the bursts of a job's views during the run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from coupole.preflight.job import Job
 
 
 def refusals_of_choosers(job: Job) -> list[str]:
-    """Views of which the chooser would light nothing at all."""
+    """Return refusals of views for which the chooser would light nothing at all."""
     chooser = chooser_of(job)
     if chooser is None:
         return []
@@ -24,7 +24,7 @@ def refusals_of_choosers(job: Job) -> list[str]:
 
 
 def chooser_of(job: Job) -> Chooser | None:
-    """The chooser that the job's plan asks for; None if the plan says all bursts itself."""
+    """Return the chooser that the job's plan asks for; None if the plan itself gives all bursts."""
     plan, rig, leds = job.plan, job.cell.rig, job.cell.leds
     base_from_support = rig.support.base_from_support.matrix()
     if isinstance(plan.exposure, AutoExposure):

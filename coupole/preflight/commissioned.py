@@ -1,9 +1,9 @@
-"""The record of a cell's commissioning: `commissioning.yaml`, and whether it fits the cell. It is kept by the
-controller of the cell's arm, and in the rig's state folder (`coupole.plan.controller_places`).
+"""The record of a cell's commissioning: `commissioning.yaml`, and whether it fits the cell. It is kept in the
+place of the arm's controller, and in the rig's state folder (`coupole.plan.controller_places`).
 
-Each step keeps all of the rig that it covers (`commissioned_rig`) and the devices with which it was done. So a
-change of the rig, or another box, asks for the steps that it concerns and for no others. The file carries a
-SHA-256 of its own content, as calibrations do.
+Each step keeps all settings of the rig that it covers (`commissioned_rig`), and the devices with which it was
+done. So after a change of the rig, or with another box, only the steps that it concerns must be repeated. The file
+carries a SHA-256 of its own content, as calibrations do.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ _DEVICES: Mapping[Step, tuple[str, ...]] = {
     "presence": ("ledbox",),
     "emergency-stop": ("robot",),
 }
-"""The devices that a step is about."""
+"""The devices that each step is about."""
 _MOST_TOLD = 8
 _FILE = "commissioning.yaml"
 _HEAD = "# The commissioning of a cell. It carries its own checksum: do not edit it, use `coupole commission`."
 
 
 class Answer(Model):
-    """Question that the person was asked, and whether the answer was yes."""
+    """A question to the person, and whether the answer was yes."""
 
     question: str
     yes: bool
 
 
 class StepResult(Model):
-    """One step, as it ended."""
+    """One step, and how it ended."""
 
     step: Step
     person: Annotated[str, Field(min_length=1)]
@@ -60,9 +60,9 @@ class StepResult(Model):
     devices: dict[str, str]
     """Vendor, model, serial number and firmware of each device of the step."""
     settings: dict[str, JsonValue]
-    """All of the rig that the result depends on, by its place in it."""
+    """All settings of the rig that the result depends on, by their place in the rig."""
     covers: Literal["everything"] | None = Field(default=None, exclude_if=lambda value: value is None)
-    """None in records of versions that kept some settings only."""
+    """None in records of versions that kept only some of the settings."""
     limits: tuple[Limit, ...]
     answers: tuple[Answer, ...]
     remarks: tuple[str, ...]
@@ -115,10 +115,11 @@ def empty_record(cell: Cell) -> CommissioningRecord:
 
 
 def read_commissioning(cell: Cell) -> CommissioningRecord | None:
-    """The record of the cell, by the controller of its arm and in the rig's state folder; None if there is none.
+    """Return the cell's record, from the place of its arm's controller and from the rig's state folder; None if
+    there is none.
 
-    For each step the newest result that fits the rig is taken, otherwise the newest result. Raises InputError for
-    a record that was edited or cannot be read.
+    For each step the newest result that fits the rig is taken. If none fits, it is the newest result. Raises
+    InputError for a record that was edited or cannot be read.
     """
     paths = [place / _FILE for place in places_of_arm(cell)]
     records = {path: _read_record(path) for path in paths if path.exists()}
@@ -154,13 +155,13 @@ def write_commissioning(cell: Cell, record: CommissioningRecord) -> None:
 
 
 def settings_of(cell: Cell, step: Step) -> dict[str, JsonValue]:
-    """All of the rig that the result of a step depends on."""
+    """Return all settings of the rig that the result of a step depends on."""
     plain: dict[str, JsonValue] = json.loads(json.dumps(covered_settings(cell, step)))
     return plain
 
 
 def devices_of(step: Step, identities: Mapping[str, Identity]) -> dict[str, str]:
-    """The devices of a step, as its result keeps them."""
+    """Return the devices of a step, as its result keeps them."""
     return {
         kind: " ".join(
             filter(
@@ -195,8 +196,9 @@ def why_outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identi
 
 
 def commissioning_refusals(cell: Cell, identities: Mapping[str, Identity] | None = None) -> list[str]:
-    """Return why a cell that is not simulated must not be used: a step of its commissioning is missing, failed or
-    does not fit the rig any more, or the opened devices are others. Empty for a simulated cell."""
+    """Return why a cell that is not simulated must not be used. Either a step of its commissioning is missing, has
+    failed or does not fit the rig any more, or the opened devices are others. The list is empty for a simulated
+    cell."""
     if in_world(cell.rig, dry_run=False):
         return []
     command = f"coupole commission {cell.document.path} --name NAME"

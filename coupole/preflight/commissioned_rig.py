@@ -1,7 +1,8 @@
 """Parts of a rig that each step of a commissioning covers: everything, except what is named as harmless here.
 
 A key of the rig, of its arm's description or of a driver's settings is covered as soon as it exists. `_STEPS` says
-which steps a change of it asks for; one that it does not name asks for all of them. Files count by their content.
+which steps must be repeated after a change of a key. For a key that is not in `_STEPS`, all steps must be
+repeated. Files count by their content.
 """
 
 from __future__ import annotations
@@ -48,8 +49,9 @@ HARMLESS: Mapping[str, str] = {
     "robot.twin": "opened in dry runs only",
     "world": "stand-ins: nothing real is opened in their place",
 }
-"""Keys, with all below them, that no collision and no lamp depends on, and why. The addresses of `NOWHERE` are
-harmless too: what is found there is compared by its serial number when it is opened."""
+"""Keys, with all keys below them, that no collision and no lamp depends on, and the reason. The addresses of
+`NOWHERE` are harmless too, because the device at an address is identified by its serial number when it is
+opened."""
 
 _STEPS: Mapping[str, tuple[Step, ...]] = {
     "robot": ARM,
@@ -78,23 +80,25 @@ _STEPS: Mapping[str, tuple[Step, ...]] = {
     "dome": ("lamps",),
     "console": ("presence",),
 }
-"""The steps that a key, and all below it, concerns: the first that fits counts."""
+"""The steps that a key, and all keys below it, concerns. The first entry that fits counts."""
 
 
 def steps_of(key: str) -> tuple[Step, ...]:
-    """The steps that a change of this key of the rig asks for; none of a harmless one."""
+    """Return the steps that must be repeated after a change of this key of the rig; none for a harmless key."""
     if any(_is_at(key, place) for place in HARMLESS) or _is_address(key):
         return ()
     return next((steps for place, steps in _STEPS.items() if _is_at(key, place)), STEPS)
 
 
 def covered_settings(cell: Cell, step: Step) -> dict[str, Any]:
-    """All of the rig that the result of a step depends on: values by their key, as in `keep_out.0.min_mm`."""
+    """Return all settings of the rig that the result of a step depends on: values by their key, such as
+    `keep_out.0.min_mm`."""
     return {key: _value(cell, value) for key, value in everything(cell).items() if step in steps_of(key)}
 
 
 def everything(cell: Cell) -> dict[str, Any]:
-    """All of a rig, harmless or not: its own keys, its arm's, and its drivers' settings with their defaults."""
+    """Return all settings of a rig, harmless or not: its own keys, its arm's, and its drivers' settings with their
+    defaults."""
     rig = cell.rig
     plain = rig.model_dump()
     arm = described_arm(rig)
@@ -109,8 +113,8 @@ def everything(cell: Cell) -> dict[str, Any]:
 
 
 def _complete_settings(cell: Cell, kind: str) -> dict[str, Any]:
-    """Return the settings of the driver that a run opens, with its defaults; without the arm, which has keys of
-    its own."""
+    """Return the settings of the driver that a run opens, with its defaults. The arm is left out, because it has
+    keys of its own."""
     driver, settings = device_for(cell.rig, kind, dry_run=False)
     model = settings_class(driver)
     places = {name: value for name, value in NOWHERE[kind].items() if name in model.model_fields}
@@ -139,7 +143,7 @@ def _leaves(at: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _value(cell: Cell, value: Any) -> Any:
-    """Return a value as JSON has it; a file as the SHA-256 of its content."""
+    """Return a value in JSON form; a file becomes the SHA-256 of its content."""
     if isinstance(value, Path):
         path = cell.document.resolve(value)
         return cell.files.sha256(path) if cell.files.there(path) else str(value)

@@ -1,7 +1,8 @@
-"""Disk space of a run whose frames are discarded when their samples are safe: most that is occupied at a time.
+"""Disk space of a run whose frames are discarded when their samples are safe. The figure is the most that is
+occupied at any time.
 
-The sizes of samples and fits are upper bounds, from the triangles that face a view's camera and from the layout of
-their files (`tests/runs/test_discarded_frames.py` compares them with files).
+The sizes of samples and fits are upper bounds. They follow from the triangles that face a view's camera and from
+the layout of the files (`tests/runs/test_discarded_frames.py` compares them with files).
 """
 
 from __future__ import annotations
@@ -25,15 +26,16 @@ from coupole.storage.run import Occupied
 _BLOCK, _LANES = 4096, 8
 """Greatest numbers of triangles and LEDs of a chunk of samples."""
 _TRIANGLE_BYTES = 200
-"""Bytes of a triangle in a view's file beside its samples."""
+"""Bytes of a triangle in a view's file in addition to its samples."""
 _PICTURES = 12
 """Greatest number of pictures of a view for the check."""
 _FIT_BYTES, _MATERIAL_BYTES = 1250, 360
-"""Bytes of the fits of a view's triangle for each channel, and of those of a triangle of the mesh."""
+"""Bytes of the fits: first of a view's triangle for each channel, then of a triangle of the mesh."""
 _SMALL_BYTES = 4_000_000
-"""Bytes of reports and of what belongs to no triangle; those of a view are less."""
+"""Bytes of reports and of other data that belong to no triangle. Those of a view are less."""
 _LEAST_COSINE = -0.05
-"""Triangles that face the camera so little cannot be seen, also from a pose that is a little off."""
+"""Least cosine of a triangle's direction to the camera. A triangle below it cannot be seen, even if the pose is a
+little off."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +43,9 @@ class ViewRoom:
     """Bytes of a view."""
 
     frame_bytes: int
-    """Its file, while it is taken."""
+    """Bytes of its file while it is taken."""
     kept_bytes: int
-    """The file, when frames were discarded."""
+    """Bytes of its file after frames were discarded."""
     sample_bytes: int
     """Greatest size of its samples, with the pictures for the check."""
 
@@ -55,14 +57,14 @@ class DiscardRoom:
     views: Mapping[str, ViewRoom]
     """Bytes of each view, by its name."""
     fit_bytes: int
-    """Greatest size of fits and report, and of the copy of samples that is made when they are replaced."""
+    """Greatest size of fits and report, and of the copy of samples that exists while samples are replaced."""
     reserve_bytes: int
     """Bytes that must stay free."""
 
     def peak_bytes(self, space: Occupied, unfinished_views: Collection[str]) -> int:
-        """Most bytes that the run needs at a time beyond those that its views occupy, if frames of the
-        `unfinished_views` ones are left to take; the others wait to be discarded, or are settled. The reserve is
-        not counted."""
+        """Return the most bytes that the run needs at any time beyond those that its views occupy. Frames of the
+        `unfinished_views` are still to be taken. The other views wait to be discarded, or are settled. The reserve
+        is not counted."""
         other_views = [name for name in self.views if name in unfinished_views]
         waiting_views = [name for name in self.views if name not in {*other_views, *space.settled_views}]
         samples = sum(self.views[name].sample_bytes for name in waiting_views)
@@ -78,11 +80,12 @@ class DiscardRoom:
 
     @property
     def staying_bytes(self) -> int:
-        """Most bytes that the whole run leaves: what is kept of its frames, samples and fits."""
+        """Most bytes that the whole run leaves on the disk: the kept part of its frames, its samples and fits."""
         return sum(view.kept_bytes + view.sample_bytes for view in self.views.values()) + self.fit_bytes
 
     def needed_bytes(self, view: str, waiting: Collection[str]) -> int:
-        """Bytes that must be free when a view begins, while samples of the `waiting` ones are to come."""
+        """Return the bytes that must be free when a view begins, while samples of the `waiting` views are still to
+        be written."""
         samples = sum(self.views[name].sample_bytes for name in waiting if name in self.views)
         view_room = self.views[view]
         return view_room.frame_bytes + view_room.sample_bytes + samples + self.reserve_bytes
@@ -153,7 +156,7 @@ def _view_room(
 
 
 def _most_seen(corners_mm: NDArray[np.float64], rig: Rig, view: ViewPose) -> int:
-    """Most triangles [n, 3, 3] (support frame) that a view can see."""
+    """Return the largest number of triangles [n, 3, 3] (support frame) that a view can see."""
     pixels = rig.sensor.width_px * rig.sensor.height_px
     pose = view.support_from_camera
     if pose is None:

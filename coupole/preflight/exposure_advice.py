@@ -1,10 +1,10 @@
-"""Exposure advice for a plan, from pictures under a few lights at a few exposures, each taken twice.
+"""Exposure advice for a plan, from pictures under a few lights at a few exposures. Each picture is taken twice.
 
 Two criteria bound the exposure. Upper bound: in each picture at most a given share of the pixels is saturated.
 Lower bound: a given share of the object's pixels reaches a signal-to-noise ratio under their most favourable
 light. Noise is measured, not assumed: differences of pairs give the photon transfer line, variance = read^2 + gain
 * signal (Janesick, "Photon Transfer", 2007, eq. 3.5, in DN). If one exposure meets both criteria, the shortest
-such exposure is proposed, because it gives the least dose; otherwise a bracket.
+such exposure is proposed, because it gives the least dose. Otherwise a bracket is proposed.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from coupole.plan.yamlfile import Document
 
 METERING_LIGHTS = 12
 SHORTER = (16, 4, 1)
-"""Metering exposures are the plan's shortest divided by these."""
+"""The metering exposures are the plan's shortest exposure divided by these numbers."""
 _REPEATS = 2
 _CELL_STEP = 4
 """Every n-th Bayer cell in both directions is sampled."""
 _BRACKET_STEP = 4.0
 _FULL = 0.95
-"""Share of the range above black that counts as full, so that noise does not reach saturation."""
+"""Share of the range above black that counts as full. It is below 1, so that noise does not reach saturation."""
 _UNSEEN_LIGHTS = 0.8
 """Factor by which lights that were not metered may be brighter."""
 _NOISE_MARGIN = 1.25
@@ -46,7 +46,7 @@ this factor."""
 _LEVELS = 48
 _ROUNDING_DN = math.sqrt(1.0 / 12.0)
 _SHORTEST_US = 10
-"""The plan's own limit."""
+"""The shortest exposure that a plan may have."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Request:
     snr: float = 30.0
     """Signal-to-noise ratio of a single pixel in a single picture."""
     object_share: float = 0.9
-    """Share of the object's pixels that must reach it."""
+    """Share of the object's pixels that must reach this ratio."""
 
 
 @dataclass(frozen=True)
@@ -81,13 +81,14 @@ class ViewAdvice:
 
     view: str
     longest_us: float
-    """Beyond it more than the allowed share of some picture is saturated."""
+    """Longest exposure. Above it, more than the allowed share of some picture is saturated."""
     shortest_us: float
-    """Below it too few of the object's pixels reach the required signal-to-noise ratio."""
+    """Shortest exposure. Below it, too few of the object's pixels reach the required signal-to-noise ratio."""
     object_share: float
     """Share of the pixels that show the object."""
     saturated_at_shortest: bool
-    """Even the shortest metering exposure saturated more than allowed: `longest_us` may be too long."""
+    """True if even the shortest metering exposure saturated more than allowed. `longest_us` may then be too
+    long."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ class Advice:
     remarks: tuple[str, ...]
 
     def figures(self) -> dict[str, Any]:
-        """JSON's values only."""
+        """Return the figures, with values of JSON only."""
         return {
             "exposure": self.exposure.model_dump(mode="json"),
             "remarks": self.remarks,
@@ -110,7 +111,8 @@ class Advice:
 
 
 def metering_plan(plan: Plan, leds: LedTable, rows: NDArray[np.int64]) -> Plan:
-    """The plan with a few of its lights (`rows` of the table) spread over the dome, each twice at a few exposures.
+    """Return the plan with a few of its lights (`rows` of the table) spread over the dome. Each light is taken
+    twice at a few exposures.
 
     Plans without LEDs (panels, darks) keep their lights.
     """
@@ -144,7 +146,7 @@ def sample_of(pixels: NDArray[np.uint16], cell_step: int = _CELL_STEP) -> NDArra
 
 
 def noise_of(views: Iterable[Metered]) -> Noise:
-    """Noise by all pairs of frames that are alike."""
+    """Compute the noise from all pairs of frames of the same light and exposure."""
     return noise_of_pairs(
         (a, b, view.frame_format.white_dn - view.frame_format.black_dn)
         for view in views
@@ -155,9 +157,10 @@ def noise_of(views: Iterable[Metered]) -> Noise:
 
 
 def noise_of_pairs(pairs: Iterable[tuple[NDArray[np.int32], NDArray[np.int32], int]]) -> Noise:
-    """Photon transfer line through pairs of frames (signals [n] of both above black, and the top of their range,
-    DN): mean squared difference / 2 against mean signal, in levels with as many pixels each, weighted by the
-    uncertainty of a level's variance; rounding noise only if everything is saturated."""
+    """Fit the photon transfer line to pairs of frames: signals [n] of both above black, and the top of their
+    range, DN. The line is half of the mean squared difference against the mean signal, in levels with equally many
+    pixels. Levels are weighted by the uncertainty of their variance. If everything is saturated, the result is
+    rounding noise only."""
     signal, half_squares = [np.zeros(0)], [np.zeros(0)]
     for a, b, white in pairs:
         below_white = np.maximum(a, b) < white
@@ -177,7 +180,7 @@ def noise_of_pairs(pairs: Iterable[tuple[NDArray[np.int32], NDArray[np.int32], i
 
 
 def advise_view(view: str, metering: Metered, request: Request, noise: Noise) -> ViewAdvice:
-    """Bounds of a view's exposure."""
+    """Return the bounds of a view's exposure."""
     white = metering.frame_format.white_dn - metering.frame_format.black_dn
     rates = []
     for by_exposure in metering.samples.values():
@@ -204,7 +207,7 @@ def advise_view(view: str, metering: Metered, request: Request, noise: Noise) ->
 
 
 def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -> Advice:
-    """The exposure or bracket for all views; LEDs can be on for an exposure of at most `longest_us`."""
+    """Return the exposure or bracket for all views. LEDs can be on for an exposure of at most `longest_us`."""
     noise = noise_of(views.values())
     advices = tuple(advise_view(view, metered_view, request, noise) for view, metered_view in views.items())
     remarks = [
@@ -243,7 +246,7 @@ def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -
 
 def write_plan(plan: Document, out: Path, exposure: FixedExposure | BracketExposure) -> None:
     """Copy a plan as it was read, including comments, with another exposure. `out` must be in the plan's folder,
-    because the paths in a plan are relative to it; raises InputError if it is not, or exists already."""
+    because the paths in a plan are relative to it. Raises InputError if `out` is elsewhere, or exists already."""
     from ruamel.yaml import YAML
     from ruamel.yaml.comments import CommentedMap
 
@@ -264,6 +267,6 @@ def write_plan(plan: Document, out: Path, exposure: FixedExposure | BracketExpos
 
 
 def _rounded_us(exposure_us: float, *, up: bool) -> int:
-    """Two digits: 8137 becomes 8200 or 8100."""
+    """Round to two digits: 8137 becomes 8200 or 8100."""
     step = 10.0 ** max(0, math.floor(math.log10(max(exposure_us, 1.0))) - 1)
     return max(10, int((math.ceil if up else math.floor)(round(exposure_us / step, 6)) * step))

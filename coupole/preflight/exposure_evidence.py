@@ -1,4 +1,4 @@
-"""The exposures that the LEDs of a view need, by its proven frames."""
+"""The exposures that the LEDs of a view need, as its proven frames show."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ Floats = NDArray[np.float32]
 Booleans = NDArray[np.bool_]
 
 FULL = 0.95
-"""Share of the range above black that counts as full, so that noise does not reach saturation."""
+"""Share of the range above black that counts as full. It is below 1, so that noise does not reach saturation."""
 QUANTILES = 48
-"""Number of rates that stand for the rates of all pixels in an LED's light."""
+"""Number of rates that represent the rates of all pixels in an LED's light."""
 _JUDGED_MARGIN, _HELP_MARGIN = 1.03, 1.05
-"""Ratio over that which is asked for, by which frames are judged: a pixel's ratio is known from noisy pixels."""
+"""Factors on the required ratio, by which frames are judged: a pixel's ratio is computed from noisy pixels."""
 _SOME_PIXELS = 1000
 _LIT = 0.1
-"""A pixel is lit by an LED where its rate is at least so much of its reference."""
+"""A pixel is lit by an LED if its rate is at least this share of its reference."""
 _REFERENCE_QUANTILE = 0.75
 _SEEN_SIGMA = 4.0
 _LEAST_DN = 1.0
-"""Signal that the object has at least: black is not known better."""
+"""Least signal of the object. The black level is not known more exactly."""
 _CLIPPED_FACTOR = 4.0
-"""Brightness, over that which fills the range, of pixels that clip in all exposures: a guess."""
+"""Assumed brightness of pixels that clip in all exposures, relative to the brightness that fills the range."""
 
 
 @dataclass(frozen=True)
 class Merged:
-    """The frames of one LED together, pixel by pixel of the samples; clipped ones do not count."""
+    """The frames of one LED together, pixel by pixel of the samples. Clipped pixels do not count."""
 
     rate: Floats
-    """[n] signal, DN per us, weighted by the inverse of its variance; infinite where all frames clip."""
+    """[n] signal, DN per us, weighted by the inverse of its variance; it is infinite where all frames clip."""
     snr: Floats
     """[n] signal over noise; 0 where all frames clip."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """An LED's frames beside what the plan asks for."""
+    """An LED's frames compared with the plan's demands."""
 
     clipped_share: float
     """Share of all pixels that clip in the shortest of its frames."""
@@ -85,12 +85,12 @@ class Evidence:
 
     @cached_property
     def full_dn(self) -> int:
-        """The top of the range above black; 1 if nothing is proven."""
+        """Top of the range above black; 1 if nothing is proven."""
         return next((self._samples[label].full_dn for label in self._samples), 1)
 
     @cached_property
     def noise(self) -> Noise:
-        """The noise of frames that were taken twice."""
+        """Noise, from frames that were taken twice."""
         pairs = []
         for label in self._samples:
             first = ShotLabel(label.light, label.exposure)
@@ -100,7 +100,7 @@ class Evidence:
         return noise_of_pairs(pairs)
 
     def merge(self, led: int) -> Merged:
-        """An LED's frames together. Raises KeyError if none is proven."""
+        """Return an LED's frames together. Raises KeyError if none is proven."""
         noise, shape = self.noise, self.sample(led, self.taken[led][0]).signal_dn.shape
         total, weights = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         for place in self.taken[led]:
@@ -118,8 +118,8 @@ class Evidence:
 
     @cached_property
     def reference(self) -> tuple[Floats, Booleans]:
-        """[n] rate over the illuminance that a pixel has under the first LEDs, at their upper quartile; and where
-        the object is seen."""
+        """Upper quartile [n] of a pixel's rate over illuminance under the first LEDs, and where the object is
+        seen."""
         rates = np.stack([self.merge(led).rate / np.float32(self._lux_of_led[led]) for led in self.first_leds])
         place = math.floor(_REFERENCE_QUANTILE * (len(rates) - 1))
         reference = np.partition(rates, place, axis=0)[place]
@@ -129,7 +129,7 @@ class Evidence:
         return reference, bright * time_us > least_dn
 
     def judge(self, led: int) -> Judgement:
-        """Compare an LED's frames with what the plan asks for. Raises KeyError if none is proven."""
+        """Compare an LED's frames with the plan's demands. Raises KeyError if none is proven."""
         frames, exposure = self.merge(led), self._exposure
         is_lit = self._is_lit(led, frames)
         shortest = self.taken[led][0]
@@ -145,9 +145,9 @@ class Evidence:
         return Judgement(clipped_share, reached_share, full_rate, np.sort(rates)[places])
 
     def place_that_helps(self, led: int) -> int | None:
-        """The first exposure that an LED does not have yet and that lets enough of its pixels reach the ratio. If
-        no
-        exposure is enough, the last one that the LED does not have; None if the LED has all exposures."""
+        """Return the first exposure that an LED does not have yet and that lets enough of its pixels reach the
+        ratio. If no exposure is enough, return the last one that the LED does not have; None if the LED has all
+        exposures."""
         frames, exposure = self.merge(led), self._exposure
         lit_pixels = np.flatnonzero(self._is_lit(led, frames))
         some_pixels = lit_pixels[:: max(1, len(lit_pixels) // _SOME_PIXELS)]
@@ -162,7 +162,8 @@ class Evidence:
         return other_places[-1] if other_places else None
 
     def precisions(self, rates: Floats) -> Floats:
-        """[places, ...] inverse variances of `rates` [...] in one frame of each exposure; 0 where it clips."""
+        """Return [places, ...] inverse variances of `rates` [...] in one frame of each exposure; 0 where the frame
+        clips."""
         times_us = self.times_us.astype(np.float32).reshape(-1, *(1,) * rates.ndim)
         signal = rates * times_us
         variance = self.noise.read_dn**2 + self.noise.gain_dn * np.maximum(signal, 0.0)
@@ -175,6 +176,6 @@ class Evidence:
 
 
 def _upper(values: Floats, share: float) -> float:
-    """The value that a share of the values exceeds."""
+    """Return the value that this share of the values exceeds."""
     place = min(max(len(values) - 1 - math.floor(share * len(values)), 0), len(values) - 1)
     return float(np.partition(values, place)[place])

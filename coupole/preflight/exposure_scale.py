@@ -1,8 +1,8 @@
-"""Values that a white surface gives in this cell's pictures, by what is known of its lamps, lens and sensor.
+"""Values that a white surface gives in this cell's pictures, as far as lamps, lens and sensor are known.
 
-The simulated world scales its light to the plan (but with `world.settings.white_at_us`), so its frames say nothing
-about a cell's exposure. The scale is known from a record of the LEDs' power that is in force, or from the rig's
-`white_response`; without either it is not known, and nothing is assumed.
+The simulated world scales its light to the plan (unless `world.settings.white_at_us` is set), so its frames say
+nothing about a cell's exposure. The scale is known from a record of the LEDs' power that is in force, or from the
+rig's `white_response`. Without both it is not known, and nothing is assumed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class ExposureScale:
     dn_per_s: NDArray[np.float64]
     """[leds] above black, at gain 0 dB, under each LED of the dome's table; 0 for a dead one."""
     source: str
-    """Record or rig setting from which the scale is known."""
+    """Record or rig setting that the scale comes from."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class ExposedWhite:
 
     exposure_us: int
     brightest: float
-    """Share of full scale above black under the LED of the plan that gives most; above 1 it saturates."""
+    """Share of full scale above black under the plan's brightest LED. Above 1 the white saturates."""
     median: float
     """Share of full scale above black under the median LED of the plan."""
 
@@ -57,7 +57,7 @@ class ExposedWhite:
 
 
 def exposure_scale(job: Job) -> ExposureScale | None:
-    """The cell's scale of exposure; None if it is not known. Raises InputError for a damaged record."""
+    """Return the cell's scale of exposure; None if it is not known. Raises InputError for a damaged record."""
     rig, leds = job.cell.rig, job.cell.leds
     base_from_support = rig.support.base_from_support.matrix()
     per_flux = irradiance_per_flux(
@@ -97,14 +97,15 @@ def exposed_white(job: Job, scale: ExposureScale) -> list[ExposedWhite]:
 
 
 def white_share(job: Job, scale: ExposureScale, exposure_us: int) -> float:
-    """Share of full scale that white reaches in an exposure at gain 0 dB under the median LED of the dome."""
+    """Return the share of full scale that white reaches in an exposure at gain 0 dB under the median LED of the
+    dome."""
     sensor = job.cell.rig.sensor
     return float(np.median(scale.dn_per_s)) * exposure_us * 1e-6 / (sensor.white_dn - sensor.black_dn)
 
 
 def _power(path: Path, record: Record, files: InputFiles, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-    """[ids] power in the channel with the highest power, DN s^-1 m^2 sr; 0 for LEDs that are dead or not in the
-    record.
+    """Return [ids] power in the channel with the highest power, DN s^-1 m^2 sr; 0 for LEDs that are dead or not in
+    the record.
     """
     table = path.parent / record.files[0].name
     try:

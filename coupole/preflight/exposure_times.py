@@ -1,4 +1,5 @@
-"""The exposure times of a view, and which of them each LED gets, so that all limits are met in the least time."""
+"""Chooses the exposure times of a view, and the times of each LED, so that all limits are met in the least
+time."""
 
 from __future__ import annotations
 
@@ -14,44 +15,45 @@ Floats = NDArray[np.float32]
 
 _TIMES_OF_A_VIEW = 3
 _CLIPPED_STEP_S = 4.0
-"""Time that one step of one LED beyond its longest exposure is worth."""
+"""Penalty, as a time, for each step by which an LED's shortest exposure is above its longest allowed one."""
 _NOISY_S, _NOISY_SHARE_S = 0.3, 5.0
-"""Time that an LED is worth that is noisier than asked for, and the whole share of its pixels."""
+"""Penalties, as times: for an LED that is noisier than required, and for a lack of all of its share of pixels."""
 _SUBSETS_AT_ONCE = 256
 
 
 @dataclass(frozen=True)
 class LightLimits:
-    """Groups of LEDs that need the same exposures, in places among the plan's."""
+    """Groups of LEDs that need the same exposures. Exposures are places among the plan's exposures."""
 
     longest: Integers
-    """[groups] last place at which not too much is clipped; -1: none."""
+    """[groups] last place at which few enough pixels are clipped; -1: none."""
     rates: Floats
     """[groups, quantiles] rates of the object's pixels in their light, DN per us."""
     counts: Integers
-    """[groups] LEDs."""
+    """[groups] number of LEDs."""
 
 
 @dataclass(frozen=True)
 class Wish:
-    """Noise that is asked for, and what exposures cost."""
+    """Required noise, and the cost of exposures."""
 
     precisions: Floats
     """[places, groups, quantiles] inverse variances of the rates in one frame; 0 where it clips."""
     snr: float
     share: float
-    """Share of the pixels that reach the ratio."""
+    """Share of the pixels that must reach the ratio."""
     most: int
-    """Exposures of one LED."""
+    """Largest number of exposures of one LED."""
     step_s: NDArray[np.float64]
     """[places] time of a step."""
     burst_s: NDArray[np.float64]
-    """[places] time of a burst beside the steps of its LEDs."""
+    """[places] time of a burst in addition to the steps of its LEDs."""
 
 
 def chosen_times(limits: LightLimits, wish: Wish) -> list[tuple[int, ...]]:
-    """[groups] places of the exposures of each LED: at most three for the view, such that all LEDs together take
-    least time; of times that cost the same, the shortest, which give the least light."""
+    """Return [groups] places of the exposures of each LED. The view has at most three exposures, chosen so that
+    all LEDs together take the least time. If several choices cost the same, the shortest exposures are used, which
+    give the least light."""
     first = max(0, int(limits.longest.min()))
     places = range(first, len(wish.step_s))
     sizes = range(1, _TIMES_OF_A_VIEW + 1)
@@ -72,7 +74,8 @@ def _parts(times: tuple[int, ...], most: int) -> list[tuple[int, ...]]:
 
 
 def _costs_s(subsets: Sequence[tuple[int, ...]], limits: LightLimits, wish: Wish) -> NDArray[np.float64]:
-    """[subsets, groups] time of these exposures of one LED, and what they lack is worth."""
+    """Return [subsets, groups], the time of these exposures of one LED, with penalties for limits that they
+    miss."""
     square = (limits.rates / np.float32(wish.snr)) ** 2
     reached_shares = np.empty((len(subsets), len(limits.longest)))
     for begin in range(0, len(subsets), _SUBSETS_AT_ONCE):

@@ -1,4 +1,4 @@
-"""Files, read and checked: what `coupole check` says of a plan, or of what is left of a run."""
+"""Files, read and checked: the answer of `coupole check` for a plan, or for the rest of a run."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Files:
 
     plan: Path
     rig: Path | None = None
-    """None: the plan's."""
+    """None: the plan's rig."""
     resume: Path | None = None
     """The run whose remaining part is checked."""
     output: Path | None = None
-    """Parent folder of the run; None: the rig's."""
+    """Parent folder of the run; None: the rig's folder for runs."""
 
 
 def check_files(
@@ -32,11 +32,11 @@ def check_files(
     measure: bool = True,
     say: Callable[[str], object] = lambda _: None,
 ) -> tuple[Job, Report]:
-    """The job at the pace that LEDs and disk allow, and preflight's report on it.
+    """Return the job at the pace that LEDs and disk allow, and preflight's report on it.
 
-    Without `paths` collisions are not checked; the disk's speed is not known unless it is to `measure`; `say` is
-    called with each step in words. Raises InputError: a file is wrong, or not what the run began with;
-    StorageError.
+    Without `paths`, collisions are not checked. The disk's speed is known only with `measure`. `say` is called
+    with each step in words. Raises InputError if a file is wrong, or differs from the file that the run began
+    with; StorageError.
     """
     from coupole.preflight.checking import preflight_of
     from coupole.preflight.job import read_job, without_hidden

@@ -1,8 +1,8 @@
-"""The object in the cell and in the pictures: its size, where it rests, how much of it each view sees, how sharp.
+"""The object in the cell and in the pictures: its size, its place, how much of it each view sees, and how sharply.
 
-Sharp is what a thin lens blurs over at most `SHARP_PX` pixels. A point at distance d from a lens of focal length f
-and f-number N, focused at s, has a circle of confusion of (f / N) v |1/s - 1/d| with v the image distance (Ray,
-Applied Photographic Optics, 2002, chapter 22); diffraction is not counted.
+A point is sharp if a thin lens blurs it over at most `SHARP_PX` pixels. A point at distance d from a lens of focal
+length f and f-number N, focused at s, has a circle of confusion of (f / N) v |1/s - 1/d|, where v is the image
+distance (Ray, Applied Photographic Optics, 2002, chapter 22). Diffraction is not counted.
 """
 
 from __future__ import annotations
@@ -24,18 +24,19 @@ from coupole.plan.schedule import Schedule, ViewPose
 SHARP_PX = 2.0
 """One cell of the Bayer pattern."""
 RESTS_MM = 2.0
-"""Distance from the disk, above or below, within which an object counts as resting on it: meshes and poses are
-known no better before they are calibrated."""
+"""An object counts as resting on the disk if its distance from the disk, above or below, is at most this. Meshes
+and poses are not known better before they are calibrated."""
 _COLUMNS = 64
-"""Rays through the picture, per row."""
+"""Number of rays in each row of the picture."""
 _SAMPLES = 2000
-"""Points on the object's surface."""
+"""Number of points on the object's surface."""
 _R2 = (0.7548776662466927, 0.5698402909980532)
 """Steps of an even sequence in the unit square (Roberts, The unreasonable effectiveness of quasirandom sequences,
 2018)."""
 _NO_HIT_MM = 1e30
 _ALL, _MOST = 0.995, 0.9
-"""Shares of the object in the field, and of what is seen in focus, below which views are warned of."""
+"""Least shares: of the object in the field, and of its visible part in focus. A view below one of them gets a
+warning."""
 
 
 @dataclass(frozen=True)
@@ -56,15 +57,16 @@ class Framing:
 
     view: str
     in_field: float
-    """Share of the surface that is visible from the camera's place which is inside the picture."""
+    """Share of the surface inside the picture, as a part of the surface that is visible from the camera's
+    place."""
     fills: float
     """Share of the picture that shows the object."""
     nearest_mm: float
     farthest_mm: float
-    """Nearest and farthest depth along the optical axis of what the picture shows; NaN if it shows nothing of the
-    object."""
+    """Nearest and farthest depth along the optical axis of the object's part in the picture; NaN if the picture
+    does not show the object."""
     in_focus: float
-    """Share of what the picture shows of the object that is within the depth of field."""
+    """Share of the object's part in the picture that is within the depth of field."""
     px_per_mm: tuple[float, float]
     """Scale of the picture at the farthest and at the nearest point shown; NaN if nothing is shown."""
 
@@ -168,8 +170,8 @@ def framing_of(
 
 
 def seen_depths_mm(sight: Sight, mesh: Any) -> NDArray[np.float64]:
-    """[rows, columns] depth along the axis of the first surface met through the middles of a coarse raster of the
-    picture; infinite where none is."""
+    """Return [rows, columns], the depth along the axis of the first surface behind each middle of a coarse raster
+    of the picture; infinite where there is no surface."""
     columns = min(_COLUMNS, sight.width_px)
     rows = max(1, round(columns * sight.height_px / sight.width_px))
     x = ((np.arange(columns) + 0.5) / columns - 0.5) * sight.width_px / sight.focal_px
@@ -197,7 +199,7 @@ def points_shown(
 
 
 def _camera_pose(view: ViewPose, number: int, rig: Rig, itinerary: Itinerary) -> Transform:
-    """`support_from_camera` of a view."""
+    """Return `support_from_camera` of a view."""
     if view.support_from_camera is not None:
         return view.support_from_camera
     visit = itinerary.visits[number]
@@ -205,7 +207,7 @@ def _camera_pose(view: ViewPose, number: int, rig: Rig, itinerary: Itinerary) ->
 
 
 def camera_at(joints_deg: NDArray[np.float64], rig: Rig) -> Transform:
-    """`support_from_camera` at these angles of the arm."""
+    """Return `support_from_camera` at these angles of the arm."""
     base_from_camera = forward(arm_of(rig), joints_deg) @ rig.flange_from_camera.matrix()
     pose: Transform = inverse(rig.support.base_from_support.matrix()) @ base_from_camera
     return pose
@@ -237,7 +239,8 @@ def _judged_placement(name: str, placement: Placement, disk_radius_mm: float) ->
 def _judged_views(
     name: str, framings: Sequence[Framing], are_aimed: Sequence[bool], sharp_mm: tuple[float, float]
 ) -> tuple[list[str], list[str]]:
-    """Refusals and warnings about what views see. Views that light nothing, or take no aim, are only warned of."""
+    """Return refusals and warnings about what the views see. Views that light nothing, or that have no target, get
+    only warnings."""
     refusals: list[str] = []
     warnings: list[str] = []
     partly, blurred_framings = [], []

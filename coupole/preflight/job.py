@@ -43,13 +43,14 @@ class Job:
     schedule: Schedule
     motion: CellMotion
     calibrations: tuple[InForce, ...] | None = None
-    """The records that the plan names, or else its rig; None for `none`."""
+    """The records that the plan names, or else its rig's; None if the plan says `none`."""
     hidden_leds: Mapping[str, Sequence[int]] = field(default_factory=dict)
     """LEDs left out of views, by name of view."""
     pace: Pace = FASTEST
     """Limits of the schedule's step periods in addition to camera and LEDs."""
     choices: Mapping[str, Sequence[Choice]] = field(default_factory=dict)
-    """Choices that a run has made for its views so far, by name of view, where its bursts are chosen."""
+    """Choices that a run has made for its views so far, by name of view. Only a run that chooses its bursts has
+    them."""
 
     @property
     def inputs(self) -> Inputs:
@@ -63,8 +64,8 @@ class Job:
 
 
 def read_job(plan_path: Path, rig_path: Path | None = None, *, text: str | None = None) -> Job:
-    """Read a plan and all files that it names; `text` is read in place of the plan's file. Raises InputError with
-    all problems of all files."""
+    """Read a plan and all files that it names. With `text`, the text is read instead of the plan's file. Raises
+    InputError with all problems of all files."""
     files = read_plan(plan_path, rig_path, text=text)
     shape = read_object(files)
     calibrations = None
@@ -78,13 +79,13 @@ def read_job(plan_path: Path, rig_path: Path | None = None, *, text: str | None 
 
 
 def motion_of(plan: Plan, cell: Cell, shape: ObjectShape, schedule: Schedule) -> CellMotion:
-    """The arm's motion in this cell."""
+    """Return the arm's motion in this cell."""
     targets = [view.target_mm for view in schedule.views if view.target_mm is not None]
     return CellMotion(cell, shape.corners_mm, targets, plan.order)
 
 
 def schedule_of(plan: Plan, cell: Cell, pace: Pace = FASTEST) -> Schedule:
-    """All bursts of all views of a plan, with the periods that camera, LEDs and pace allow."""
+    """Return all bursts of all views of a plan, with the periods that camera, LEDs and pace allow."""
     return build_schedule(
         plan,
         cell.leds,
@@ -98,7 +99,7 @@ def schedule_of(plan: Plan, cell: Cell, pace: Pace = FASTEST) -> Schedule:
 
 
 def at_pace(job: Job, pace: Pace) -> Job:
-    """The same job at another pace."""
+    """Return the same job at another pace."""
     if pace == job.pace:
         return job
     schedule = schedule_of(job.plan, job.cell, pace).without(job.hidden_leds)
@@ -106,8 +107,8 @@ def at_pace(job: Job, pace: Pace) -> Job:
 
 
 def with_choices(job: Job, choices: Mapping[str, Sequence[Choice]]) -> Job:
-    """The same job, for a run that has made these choices. Raises StorageError for one that the plan does not
-    allow: the journal was changed."""
+    """Return the same job for a run that has made these choices. Raises StorageError for a choice that the plan
+    does not allow, because the journal was then changed."""
     if not job.schedule.is_open:
         return job
     try:
@@ -120,8 +121,8 @@ def with_choices(job: Job, choices: Mapping[str, Sequence[Choice]]) -> Job:
 
 def without_hidden(job: Job, known_leds: Mapping[str, Sequence[int]] | None = None) -> Job:
     """Return the same job without the LEDs that light nothing that a view sees, if the plan has `hidden_lights:
-    skip` or chooses LEDs. These LEDs are the `known_leds`, if a run began without them, otherwise those for the
-    postures of the paths from home. Raises InputError if a view has no LED left to choose."""
+    skip` or chooses LEDs. If a run began without the `known_leds`, these are left out. Otherwise the LEDs are
+    computed for the postures of the paths from home. Raises InputError if a view has no LED left to choose."""
     if not job.plan.skips_hidden_lights:
         return job
     hidden_leds = dict(known_leds) if known_leds is not None else _hidden_from_home(job)

@@ -15,8 +15,8 @@ from coupole.plan.rig import BoardThermal, LedLimits
 
 
 def refuse_on_times(bursts_of_views: Sequence[Sequence[Burst]], limits: LedLimits) -> list[str]:
-    """A refusal for each exposure of each view with an LED on for too long or too short; views with the same
-    table of steps share one."""
+    """Return a refusal for each exposure of each view in which an LED is on for too long or too short. Views with
+    the same table of steps share one refusal."""
     low_us, high_us = limits.on_us
     first_of: dict[tuple[int, int], tuple[Burst, int]] = {}
     views_of: dict[tuple[int, int], list[str]] = {}
@@ -45,7 +45,7 @@ class Heat:
 
     peak_c: float
     too_hot: bool
-    """Boards beyond their limit, or LEDs with too short dark times."""
+    """True if boards exceed their limit, or LEDs have too short dark times."""
     refusals: tuple[str, ...]
 
 
@@ -88,7 +88,7 @@ class BoardHeat:
             self._t_s += burst.duration_s
 
     def heat(self) -> Heat:
-        """The highest temperature so far, and what was beyond the limits."""
+        """Return the highest temperature so far, and the violations of the limits."""
         model = self._limits.board
         peak_c = model.ambient_c + self._peak
         refusals = [self._short_rest] if self._short_rest else []
@@ -102,7 +102,8 @@ class BoardHeat:
 def heat_of(
     bursts_of_views: Sequence[Sequence[Burst]], moves_s: Sequence[float], limits: LedLimits, leds: LedTable
 ) -> Heat:
-    """Heat of a whole schedule: bursts in the order of the visits, with the arm's move before each view."""
+    """Return the heat of a whole schedule: bursts in the order of the visits, with the arm's move before each
+    view."""
     boards = BoardHeat(limits, leds)
     for bursts, move_s in zip(bursts_of_views, moves_s, strict=True):
         boards.light(bursts, move_s)
@@ -117,7 +118,8 @@ def _warm(
     on_s: NDArray[np.float64],
     model: BoardThermal,
 ) -> float:
-    """Warm `rise` [boards] by lit LEDs in order of time, all boards at once; returns the highest rise."""
+    """Add the heat of lit LEDs to `rise` [boards] in order of time, for all boards at once; return the highest
+    rise."""
     peak = 0.0
     turn = np.zeros(len(boards), np.int64)
     order = np.argsort(boards, kind="stable")

@@ -1,4 +1,4 @@
-"""Needs of a cell of the machine that runs it, found without its devices (`coupole doctor`)."""
+"""The cell's needs of the machine that runs it. They are found without the cell's devices (`coupole doctor`)."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from coupole.plan.cell import Cell
 from coupole.plan.rig_devices import host_needs
 
 ROOM_BYTES = 20_400_000_000
-"""One view under 1080 LEDs: frames of 12 megapixels, 12 bits packed."""
+"""Size of one view under 1080 LEDs: frames of 12 megapixels, 12 bits packed."""
 
 
 def machine_needs(cell: Cell) -> list[tuple[str, HostNeed]]:
-    """Return the needs of the rig's drivers and of its storage, each with the part of the rig that has it."""
+    """Return the needs of the rig's drivers and of its storage, each with the part of the rig that needs it."""
     return [*host_needs(cell.rig), *(("storage", need) for need in storage_needs(cell.storage_folder))]
 
 
 def storage_needs(folder: Path) -> list[HostNeed]:
-    """Return the needs of a folder of runs: it can be written, and has room."""
+    """Return the needs of a folder of runs: it must be writable and have room."""
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     need_name = f"folder of runs {folder}"
     if not there.is_dir():

@@ -1,13 +1,13 @@
-"""The lights that tell most beside those that were taken, by what these have shown.
+"""The lights that add most to the lights taken so far, as the pictures under those show.
 
-Pictures between lights are made of the pictures taken, by radial basis functions with a linear tail (seed 003,
-5.2). Each light taken is left out in turn and predicted from the others; Rippa (1999) gives all these errors from
-one inverse. Where such an error is large, a highlight or an edge of shadow passes the object. So the errors of
-pictures are modelled over the directions of light as a random field of exponential covariance, as strong in each
-place as the errors found near it. The next light is the one whose picture is expected to be off the most (MacKay
-1992). It counts as taken while the one after it is chosen.
+Pictures between lights are interpolated from the pictures taken, by radial basis functions with a linear tail
+(seed 003, 5.2). Each light taken is left out in turn and predicted from the others; Rippa (1999) gives all these
+errors from one inverse. A large error shows that a highlight or an edge of shadow passes over the object. So the
+errors of pictures are modelled over the directions of light as a random field of exponential covariance. Its
+strength in each direction follows the errors found near this direction. The next light is the one with the largest
+expected error of its picture (MacKay 1992). It counts as taken while the next one is chosen.
 
-Everything is a function of its arguments, without a draw: a resumed run chooses the same.
+Nothing is drawn at random, so a resumed run chooses the same lights.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from coupole.geometry import farthest_first
 Floats = NDArray[np.float64]
 
 FEWEST_TAKEN = 6
-"""Lights from which errors of left-out ones say anything: the linear tail alone has four unknowns."""
+"""Fewest lights for which the errors of left-out lights mean anything: the linear tail alone has four unknowns."""
 _RANGE_RAD = np.radians(60.0)
-"""Angle over which errors are alike; 25 degrees choose about the same."""
+"""Angle over which errors are similar. An angle of 25 degrees gives about the same choices."""
 _NUGGET = 1e-6
 _LEAST_SPACING_RAD = 1e-3
 _LEAST_SHARE = 1e-6
-"""Least error of a light, as a share of the largest: nothing is known for certain."""
+"""Least error of a light, as a share of the largest error, because no light is known exactly."""
 _ALTERNATIVES = 3
 _BRIGHT_QUANTILE = 0.999
 
@@ -39,27 +39,27 @@ class NextLights:
     """The choice after some lights."""
 
     lights: NDArray[np.int64]
-    """Indices of the next lights, the one that tells most first."""
+    """Indices of the next lights. The light that adds most is first."""
     expected_rms: float
-    """Root mean square error that pictures interpolated for the lights not yet taken are expected to have, as a
+    """Expected root mean square error of pictures that are interpolated for the lights not yet taken. It is a
     share of the bright level of the values (their 99.9 % quantile)."""
     expected_rms_after: float
-    """The same after the next lights."""
+    """The same error after the next lights are taken."""
     alternatives: tuple[int, ...]
-    """Indices of the lights that were weighed next best to the first."""
+    """Indices of the lights that were rated next after the first."""
 
 
 def spread_lights(directions: Floats, allowed_lights: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Indices of `count` lights among `allowed_lights` to begin with: the one nearest to the middle of them, then
-    each as far as possible from those before it. `directions` [n, 3] are unit vectors."""
+    """Return indices of the first `count` lights among `allowed_lights`. The first is nearest to their middle;
+    each further light is as far as possible from those before it. `directions` [n, 3] are unit vectors."""
     candidates = directions[allowed_lights]
     middle = int(np.argmax(candidates @ candidates.mean(axis=0)))
     return allowed_lights[[row for row, _ in islice(farthest_first(candidates, middle), count)]]
 
 
 def left_out_squares(values: Floats, directions: Floats) -> Floats:
-    """[n] mean squared errors of each light's picture, predicted from the others: values [n, sites] under lights
-    from `directions` [n, 3]."""
+    """Return [n] mean squared errors of each light's picture, predicted from the others. `values` [n, sites] are
+    the values under lights from `directions` [n, 3]."""
     count = len(directions)
     tail = np.hstack([np.ones((count, 1)), directions])
     apart = np.sqrt(np.maximum(2.0 - 2.0 * directions @ directions.T, 0.0))
@@ -81,11 +81,11 @@ def next_lights(
     allowed_lights: NDArray[np.int64],
     count: int,
 ) -> NextLights:
-    """The next `count` lights among `allowed_lights`, fewer if there are no more.
+    """Return the next `count` lights among `allowed_lights`, or fewer if there are no more.
 
-    `values` [taken, sites] are what the lights `taken_lights` have shown, in their order, of places all over the
-    picture; `directions` [n, 3] are unit vectors to all lights. A picture is wanted of each of `allowed_lights`.
-    Raises ValueError for fewer than `FEWEST_TAKEN` lights.
+    `values` [taken, sites] are the values under `taken_lights`, in their order, at places all over the picture.
+    `directions` [n, 3] are unit vectors to all lights. A picture is wanted for each of `allowed_lights`. Raises
+    ValueError for fewer than `FEWEST_TAKEN` lights.
     """
     if len(taken_lights) < FEWEST_TAKEN:
         raise ValueError(f"expected at least {FEWEST_TAKEN} lights that were taken, got {len(taken_lights)}")
@@ -112,7 +112,7 @@ def next_lights(
 
 
 def _error_covariance(values: Floats, directions: Floats, taken_lights: NDArray[np.int64]) -> Floats:
-    """[n, n] covariance of the errors of pictures, given those that were taken."""
+    """Return the covariance [n, n] of the errors of pictures, given the pictures that were taken."""
     angle = np.arccos(np.clip(directions @ directions.T, -1.0, 1.0))
     plain = np.exp(-angle / _RANGE_RAD)
     among_taken = np.linalg.inv(plain[np.ix_(taken_lights, taken_lights)] + _NUGGET * np.eye(len(taken_lights)))

@@ -20,9 +20,9 @@ _LARGEST = 2.0
 """Largest side of an object, in diameters of the support."""
 _SMALLEST_MM = 1.0
 _DOUBTFUL_MM = 10.0
-"""Objects below it are measured, but wrong units are likelier."""
+"""Objects smaller than this are measured, but wrong units are more likely."""
 _LARGEST_AREA_MM2 = 1e8
-"""Area of all triangles together beyond which they are not the surface of an object."""
+"""Largest area of all triangles together. Above it, they cannot be the surface of an object."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class ObjectShape:
 
     mesh_path: Path | None
     corners_mm: NDArray[np.float64]
-    """[triangles, 3, 3]; none of them without a mesh."""
+    """[triangles, 3, 3]; no triangles without a mesh."""
     dose_points_mm: NDArray[np.float64]
     """[n, 3] corners and centre of the bounding box; without a mesh, the views' targets."""
     remarks: tuple[str, ...] = ()
@@ -39,8 +39,8 @@ class ObjectShape:
 
 
 def read_object(files: PlanFiles) -> ObjectShape:
-    """Raises InputError with the line in the plan if its mesh cannot be read, or if its size cannot be that of an
-    object on this support."""
+    """Read the object. Raises InputError with the line in the plan if its mesh cannot be read, or if an object on
+    this support cannot have its size."""
     corners, remarks = np.zeros((0, 3, 3)), []
     if files.mesh_path is not None:
         assert files.plan.object is not None
@@ -60,7 +60,8 @@ def read_object(files: PlanFiles) -> ObjectShape:
 
 
 def load_corners(mesh_path: Path, measured_object: MeasuredObject, files: InputFiles) -> NDArray[np.float64]:
-    """Triangles [n, 3, 3] of a mesh file in the support frame, mm. Raises InputError with the place in it."""
+    """Return triangles [n, 3, 3] of a mesh file in the support frame, mm. Raises InputError with the place in the
+    file."""
     try:
         data = files.read_bytes(mesh_path)
     except OSError as error:
@@ -87,7 +88,8 @@ def _impossible_size(corners: NDArray[np.float64], size_mm: float, unit: str, di
 
 
 def _other_unit(size_mm: float, unit: str, diameter_mm: float) -> str:
-    """The units in which the object would have an ordinary size, as a sentence; empty if there is none."""
+    """Return a sentence with the units in which the object would have an ordinary size; empty if there are
+    none."""
     raw = size_mm / MM_PER_UNIT[unit]
     fitting = {
         other_unit: raw * mm

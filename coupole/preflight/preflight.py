@@ -1,4 +1,4 @@
-"""All checks before the robot moves, in one report, without opening a device.
+"""All checks before the robot moves, in one report. No device is opened.
 
 Pure functions: data from disk and ledger are arguments. A refusal names the view, shot or
 LED, the limit and the value.
@@ -29,7 +29,7 @@ from coupole.preflight.led_limits import heat_of, refuse_on_times
 from coupole.storage.run import Occupied
 
 BURST_OVERHEAD_S = 0.14
-"""Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell)."""
+"""Time to arm the camera, read the table's CRC back, start, wait for the last frame, and sync (simulated cell)."""
 CHOICE_S = 2.0
 """Time of a choice of bursts in the run, for 1080 LEDs on a busy machine (`tools/prove_auto_exposure.py`)."""
 SETTLE_CHECK_S = 0.1
@@ -41,7 +41,7 @@ PAGE_BYTES = 4096
 
 @dataclass(frozen=True)
 class StorageFacts:
-    """State of the disk that the run would be on."""
+    """State of the disk on which the run would be."""
 
     free_bytes: int
     write_bytes_s: float = 0.0
@@ -49,11 +49,12 @@ class StorageFacts:
     folder: Path | None = None
     """Folder in which the run would be, or is; None: the rig's."""
     occupied_space: Occupied = field(default_factory=Occupied)
-    """Space that the views of a resumed run already occupy: their files are allocated as a whole."""
+    """Disk space that the views of a resumed run already occupy. Their files are allocated completely at their
+    begin."""
     trouble: str = ""
-    """Reason why nothing can be written there."""
+    """Reason why nothing can be written to the disk."""
     no_holes: str = ""
-    """Reason why parts of files cannot be given back there, where that is asked for."""
+    """Reason why the disk cannot give back parts of files, if this is required."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class ViewReport:
 
 @dataclass(frozen=True)
 class Whole:
-    """The same figures for a whole run, of which a part is done."""
+    """The same figures for a whole run that is partly done."""
 
     views: int
     shots: int
@@ -82,10 +83,10 @@ class Whole:
 
 @dataclass
 class Report:
-    """The expected course of a plan, or of what is left of a run, and the refusals."""
+    """The expected course of a plan or of the rest of a run, and the refusals."""
 
     is_bound: bool = False
-    """True if figures are the most that the plan may cost, as bursts are chosen in the run."""
+    """True if the figures are upper bounds, because bursts are chosen in the run."""
     whole: Whole | None = None
     """Figures of the whole run, if it is resumed; None otherwise."""
     views: list[ViewReport] = field(default_factory=list)
@@ -97,15 +98,15 @@ class Report:
     bytes: int = 0
     """Size of all frames on the disk."""
     peak_bytes: int | None = None
-    """Most that the run needs on the disk at a time, samples and fits included, if frames are discarded; None if
-    all are kept."""
+    """Most bytes that the run needs on the disk at any time, with samples and fits, if frames are discarded; None
+    if all are kept."""
     staying_bytes: int | None = None
-    """Most that the whole run leaves on the disk, samples and fits included, if frames are discarded; None if all
-    are kept."""
+    """Most bytes that the whole run leaves on the disk, with samples and fits, if frames are discarded; None if
+    all are kept."""
     duration_s: float = 0.0
     """Expected duration, s."""
     ideal_s: float = 0.0
-    """Duration of the tables plus motion and settling: a lower bound for any controller."""
+    """Duration of the tables with motion and settling: a lower bound for any controller."""
     dose_lux_h: float = 0.0
     """Light at the object's point that receives most, lux h."""
     dose_before_lux_h: float = 0.0
@@ -115,7 +116,7 @@ class Report:
     peak_board_c: float = 0.0
     """Temperature of the hottest LED board, C."""
     too_hot: bool = False
-    """Boards beyond their limit, or LEDs with too short dark times: a slower pace may help."""
+    """True if boards exceed their limit, or LEDs have too short dark times. A slower pace may help."""
     timings: tuple[BurstTiming, ...] = ()
     """Timing of each exposure, with the limit that determines its period."""
     asked_bytes_s: float = 0.0
@@ -123,7 +124,7 @@ class Report:
     disk_bytes_s: float = 0.0
     """Measured speed of the disk, bytes per second; 0 if it was not measured."""
     exposure_scale: str | None = None
-    """Record or rig setting from which it is known how bright white will be; None: it is not known."""
+    """Record or rig setting that gives the expected brightness of white; None: it is not known."""
     white: tuple[ExposedWhite, ...] = ()
     """Brightness of white in each exposure, if that is known."""
     object_check: ObjectCheck | None = None
@@ -147,8 +148,9 @@ def check(
     dose_budget_lux_h: float | None = None,
     whole: Whole | None = None,
 ) -> Report:
-    """Check a whole plan, or what is left of the run `whole`. The dose is computed at `object_points_support_mm`
-    [n, 3]; the highest counts. `dose_budget_lux_h`: the object's own, by its ledger; a plan's can be stricter."""
+    """Check a whole plan, or the rest of the run `whole`. The dose is computed at `object_points_support_mm` [n,
+    3]; the highest counts. `dose_budget_lux_h` is the object's own budget, by its ledger; a plan's budget can be
+    stricter."""
     report = Report(schedule.is_open, whole, shots=schedule.shots, frames=schedule.frames)
     report.timings = tuple(dict.fromkeys(burst.timing for bursts in schedule.bursts for burst in bursts))
     report.dose_before_lux_h = dose_before_lux_h
@@ -248,7 +250,8 @@ def _time_and_dose(
 
 
 def _most_dose(view: OpenView, lux: NDArray[np.float64], row_of_id: Mapping[int, int]) -> NDArray[np.float64]:
-    """[points] light of a view whose LEDs are chosen: at each point the brightest there may be among them."""
+    """Return [points] the most light of a view whose LEDs are chosen. At each point the brightest of the LEDs get
+    the longest on-times."""
     if not view.bound:
         return np.zeros(len(lux))
     on_us = np.concatenate([burst.table["on_us"][burst.is_light()] for burst in view.bound])

@@ -1,6 +1,6 @@
 """Archives a run: the file of each view is replaced by a compressed one with the same frames.
 
-Views are archived one after the other, so that each frees its space before the next one needs some.
+Views are archived one after the other, so that each view frees its space before the next one needs space.
 `storage.archive_view` archives one view without risk of data loss. Only the view's file shows that it is archived;
 the journal records how frames were taken, and is not changed.
 """
@@ -64,9 +64,9 @@ def archive_run(
     With `keep` the original files are kept in `RUN/unarchived`. With `partial` the complete views of an incomplete
     run are archived; incomplete views never are, so that the run can be resumed.
 
-    Raises InputError if another process has locked the run, UnprovenError if frames are missing (without
-    `partial`), ChecksumMismatch if a frame is not what was proven, before or after, and DiskFull; the current view
-    is then unchanged.
+    Raises InputError if another process has locked the run, and UnprovenError if frames are missing (without
+    `partial`). Raises ChecksumMismatch if a frame differs from the proven one, before or after, and DiskFull.
+    After an error the current view is unchanged.
     """
     with run.hold_lock():
         proven = run.proven()

@@ -1,11 +1,11 @@
 """Compresses the file of one view without loss, reads it back, and only then replaces the original.
 
-The frames of `NAME.h5` are compressed into `NAME.archive`, which is synced, read back from the disk through HDF5
-as any reader would, and compared with the frame table and the journal. Then it is renamed to `NAME.h5`. So at
-every moment a complete file has the view's name, and after a crash archiving can be repeated.
+The frames of `NAME.h5` are compressed into `NAME.archive`. This file is synced, read back from the disk through
+HDF5 as any reader would, and compared with the frame table and the journal. Then it is renamed to `NAME.h5`. So at
+every moment a complete file has the view's name, and archiving can be repeated after a crash.
 
-Only proven frames are kept. Any other slot is free in the archive, or that of a frame that was discarded before,
-and has no stored pixels; they read as 65535.
+Only proven frames are kept. Any other slot is free in the archive, or belongs to a frame that was discarded
+before. It has no stored pixels; they read as 65535.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from coupole.storage.journal_events import FrameProven
 from coupole.storage.line_file import utc_now
 
 _METADATA_BYTES = 2**20
-"""Space that HDF5 may need for metadata beside the frames of one step."""
+"""Space that HDF5 may need for metadata in addition to the frames of one step."""
 
 Progress = Callable[[str, int, int], None]
 """Takes the current work (`top: compress`), the number of frames done, and their total."""
@@ -63,7 +63,7 @@ class ArchivedView:
         return self.pixel_bytes / self.stored_bytes
 
     def figures(self) -> dict[str, Any]:
-        """Its part of `--json`: sizes in bytes, speeds in MB/s of uncompressed frames."""
+        """Return the view's part of `--json`: sizes in bytes, speeds in MB/s of uncompressed frames."""
         return {
             "view": self.view,
             "frames": self.frames,
@@ -141,7 +141,7 @@ def _check_records(path: Path, table: NDArray[np.void], frames: list[FrameProven
 
 
 def _write(path: Path, partial: Path, frames: list[FrameProven], codec: Codec, progress: Progress) -> int:
-    """Compress the frames of `path` into a new file `partial`, synced; returns the bytes that they need there."""
+    """Compress the frames of `path` into a new synced file `partial`; return the bytes that they need there."""
     layout, workers = (
         frame_file.read_layout(path),
         (os.cpu_count() or 1) + 1,
@@ -193,7 +193,8 @@ def _copy_all_but_frames(
     codec: Codec,
     proven_slots: set[int],
 ) -> h5py.Dataset:
-    """Copy groups, tables, values, links and attributes unchanged; returns the frames' dataset, still empty."""
+    """Copy groups, tables, values, links and attributes unchanged. Return the dataset of the frames, which is
+    still empty."""
     frames = before[frame_file.DATA]
     pending = [(before["/"], after["/"])]
     while pending:
@@ -231,7 +232,8 @@ def _copy_attributes(old: h5py.HLObject, new: h5py.HLObject) -> None:
 def _in_order(
     pool: ThreadPoolExecutor, work: Callable[[FrameProven], Tiles], frames: list[FrameProven], ahead: int
 ) -> Iterator[tuple[FrameProven, Tiles]]:
-    """Each frame with the result of `work`; the pool is at most `ahead` frames ahead, which bounds memory."""
+    """Yield each frame with the result of `work`. The pool is at most `ahead` frames ahead, which limits the
+    memory."""
     pending: deque[tuple[FrameProven, Future[Tiles]]] = deque()
     for frame in frames:
         pending.append((frame, pool.submit(work, frame)))
@@ -243,8 +245,8 @@ def _in_order(
 
 
 class _Source:
-    """Stored frames of a view's file, read into separate memory, without the page cache if possible (which takes a
-    tenth of the processor's time)."""
+    """Stored frames of a view's file, read into separate memory. If possible, the page cache is not used: this
+    takes a tenth of the processor's time."""
 
     def __init__(self, path: Path, layout: frame_file.Layout, threads: int) -> None:
         self._path, self._layout = path, layout
@@ -256,7 +258,8 @@ class _Source:
 
     @contextmanager
     def frame(self, frame: FrameProven) -> Iterator[NDArray[np.uint16]]:
-        """Pixels [H, W] while the context lasts. Raises ChecksumMismatch if they are not what was proven."""
+        """Give the pixels [H, W] while the context lasts. Raises ChecksumMismatch if they differ from the proven
+        ones."""
         memory = self._spare.get()
         try:
             offset = self._layout.data_offset + frame.index * self._layout.frame_bytes
@@ -291,7 +294,7 @@ def _open_direct(path: Path) -> int:
 
 
 def _read_back(path: Path, partial: Path, frames: list[FrameProven], progress: Progress) -> None:
-    """Compare each frame and record of the new file, read from the disk as any reader does, through HDF5."""
+    """Compare each frame and record of the new file, read from the disk through HDF5, as any reader does."""
     import hdf5plugin  # noqa: F401  # registers the filter
 
     with partial.open("rb") as on_disk:

@@ -1,10 +1,11 @@
-"""Faults of a cell's arm, and the words of those who have been there: `arm.jsonl`, in each place of that arm.
+"""Faults of a cell's arm, and confirmations of persons who have been at the cell: `arm.jsonl`, in each place of
+that arm.
 
-A fault belongs to the arm, not to the run in which it happened, nor to the rig: until a named person confirms that
-the cause is found and the cell is clear, no session of any run may move that arm. So it is noted by the address
-and the serial number of the arm's controller and in the rig's state folder (`coupole.plan.controller_places`), and
-holds as long as it is in one of them. A confirmation names the faults that it is about: it counts for these
-wherever else they are noted.
+A fault belongs to the arm, not to the run in which it happened, nor to the rig. A named person must confirm that
+the cause is found and the cell is clear; until then no session of any run may move that arm. So the fault is noted
+under the address and the serial number of the arm's controller, and in the rig's state folder
+(`coupole.plan.controller_places`). It holds as long as it is in one of these places. A confirmation names its
+faults, and counts for them in all places.
 """
 
 from __future__ import annotations
@@ -36,21 +37,21 @@ class ArmFault(_Line):
     message: str
     run: str = ""
     id: str = ""
-    """The same in each place; empty in version 0.1, and for a line that cannot be read."""
+    """The id is the same in each place. It is empty in version 0.1, and for a line that cannot be read."""
 
 
 class Confirmation(_Line):
-    """A person's word that the cause of all faults so far is found and that the arm may move again."""
+    """A person's statement that the cause of all faults so far is found and that the arm may move again."""
 
     event: Literal["confirmed"] = "confirmed"
     name: str
     note: str = ""
     faults: tuple[str, ...] = ()
-    """Ids of those that it is about, beside all before it in its file."""
+    """Ids of the faults that it is about, in addition to all earlier faults in its file."""
 
 
 class SessionOfArm(_Line):
-    """The first session after a confirmation has begun."""
+    """The begin of the first session after a confirmation."""
 
     event: Literal["session"] = "session"
     run: str = ""
@@ -64,12 +65,12 @@ class ArmFaults:
     """The faults of one cell's arm."""
 
     def __init__(self, *folders: Path) -> None:
-        """`folders`: all places of the arm."""
+        """`folders` are all places of the arm."""
         self._paths = tuple(folder / "arm.jsonl" for folder in folders)
 
     @property
     def where(self) -> str:
-        """Its files, to be named when their disk does not answer."""
+        """The files' paths, for messages when their disk does not answer."""
         return ", ".join(map(str, self._paths))
 
     def standing(self) -> list[ArmFault]:
@@ -101,17 +102,18 @@ class ArmFaults:
             )
 
     def note(self, message: str, run: str = "") -> None:
-        """A fault, synced when this returns. Raises StorageError if one of the places does not take it."""
+        """Note a fault; it is synced when this returns. Raises StorageError if one of the places does not take
+        it."""
         self._append(ArmFault(message=message, run=run, id=uuid.uuid4().hex))
 
     def confirm(self, name: str, note: str = "") -> None:
-        """Confirm all faults that stand."""
+        """Confirm all standing faults."""
         fault_ids = tuple(fault.id for fault in self.standing() if fault.id)
         self._append(Confirmation(name=name, note=note, faults=fault_ids))
 
     def begin_session(self, run: str) -> str:
-        """A session of this run begins; returns the words that no earlier session has begun with, empty if there
-        are none."""
+        """Note that a session of this run begins. Return the newest confirmation if no earlier session has begun
+        with it, otherwise an empty text."""
         files = [_lines(path) for path in self._paths]
         words = next((confirmation for lines in files if (confirmation := _new_words(lines)) is not None), None)
         if words is None:
@@ -122,19 +124,19 @@ class ArmFaults:
         return f"{last} (confirmed by {words.name}, {words.t})"
 
     def _append(self, line: _Line) -> None:
-        """Append it in all places, also if one of them does not take it."""
+        """Append the line in all places, even if one of them does not take it."""
         failures = [error for path in self._paths if (error := _append_to(path, line)) is not None]
         if failures:
             raise failures[0]
 
 
 def faults_of(cell: Cell, identity: Identity | None = None) -> ArmFaults:
-    """Faults of a cell's arm; give its `identity` if the arm is opened."""
+    """Return the faults of a cell's arm. Give its `identity` if the arm is opened."""
     return ArmFaults(*places_of_arm(cell, identity))
 
 
 def _unconfirmed_faults(lines: list[Line]) -> list[ArmFault]:
-    """Faults after the last confirmation in the same file."""
+    """Return the faults after the last confirmation in the same file."""
     faults: list[ArmFault] = []
     for line in lines:
         if isinstance(line, ArmFault):
@@ -145,7 +147,7 @@ def _unconfirmed_faults(lines: list[Line]) -> list[ArmFault]:
 
 
 def _new_words(lines: list[Line]) -> Confirmation | None:
-    """The last with which no session has begun yet."""
+    """Return the newest confirmation with which no session has begun yet."""
     since = max((i for i, line in enumerate(lines) if isinstance(line, SessionOfArm)), default=-1) + 1
     return next((line for line in reversed(lines[since:]) if isinstance(line, Confirmation)), None)
 
@@ -167,7 +169,8 @@ def _append_to(path: Path, line: _Line) -> StorageError | None:
 
 
 def _lines(path: Path) -> list[Line]:
-    """All lines, oldest first. A line that cannot be read counts as a fault: it may have been one."""
+    """Return all lines, oldest first. A line that cannot be read counts as a fault, because it may have been
+    one."""
     try:
         texts = path.read_bytes().splitlines()
     except FileNotFoundError:

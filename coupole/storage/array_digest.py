@@ -1,7 +1,7 @@
 """Digest of the arrays of an HDF5 file: taken as they are written, and again from the disk.
 
-The digest does not depend on where HDF5 puts what, but on each array's type, shape and bytes, chunk by chunk where
-an array is written in chunks, and on the attributes of the file.
+The digest depends on each array's type, shape and bytes, and on the attributes of the file. An array that is
+written in chunks counts chunk by chunk. The places of the arrays in the file do not matter.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from coupole.storage.frame_file import open_view
 
 
 class ArrayDigest:
-    """Collects what is written."""
+    """Collects the arrays and attributes that are written."""
 
     def __init__(self) -> None:
         self._lines: dict[str, str] = {}
@@ -39,19 +39,19 @@ class ArrayDigest:
 
     @property
     def sha256(self) -> str:
-        """The digest of all that was added, in any order."""
+        """Return the digest of everything that was added, in any order."""
         lines = (f"{name}: {content}\n" for name, content in sorted(self._lines.items()))
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def is_in_chunks(data: h5py.Dataset) -> bool:
-    """Tell whether an array counts chunk by chunk; one that HDF5 compresses counts as a whole."""
+    """Tell whether an array counts chunk by chunk. An array that HDF5 compresses counts as a whole."""
     return data.chunks is not None and data.compression is None
 
 
 def digest_on_disk(path: Path, on_read: Callable[[], None] = lambda: None) -> str:
-    """The digest of a file, synced and then read from the disk, not from memory, where the system can do that;
-    `on_read` is called after each piece. Raises StorageError for a file that cannot be read, OSError."""
+    """Return the digest of a file. The file is synced, and read from the disk instead of memory if the system can
+    do that. `on_read` is called after each piece. Raises StorageError if the file cannot be read, and OSError."""
     with path.open("rb") as on_disk:
         os.fsync(on_disk.fileno())
         os.posix_fadvise(on_disk.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)

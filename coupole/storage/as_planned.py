@@ -1,8 +1,8 @@
-"""Comparison of frames with what the run's own plan asked for: light, exposure and pose, by the plan and the rig
-that the run keeps in `inputs/`.
+"""Compares frames with the run's own plan: light, exposure and pose, by the plan and the rig in the run's
+`inputs/`.
 
-A frame's LED is as the box logged it, its exposure as it was commanded, its pose by the arm's joints as they were
-measured. The object's mesh is not needed for it.
+A frame's LED comes from the box's log, its exposure from the command, and its pose from the measured joints of the
+arm. The object's mesh is not needed.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from coupole.storage.run import Run
 from coupole.storage.step_fields import STORED_NO_LED
 
 _SETTLED_DEG = 0.1
-"""Angle of each axis from where it was sent, deg, beside what an arm may move in a burst (the rig's
+"""Allowed angle of each axis from its goal, deg, in addition to the motion that is allowed in a burst (the rig's
 `still_deg`)."""
 _REACH_MM = 2000.0
-"""Reach of an arm: an axis that is off by an angle moves the camera by this radius at most."""
+"""Reach of an arm. An error of an axis moves the camera by at most the error's angle times this radius."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +45,10 @@ class AsPlanned:
     rig: Rig
     schedule: Schedule
     arm: Arm | None
-    """None if nothing describes it; then poses are not compared."""
+    """None if nothing describes the arm; poses are then not compared."""
 
     def problems_of_the_list(self, run: Run) -> Iterator[str]:
-        """Shots under a light that are in `run.json` but not in the plan, and the other way round."""
+        """Find shots under a light that are in `run.json` but not in the plan, and the reverse."""
         planned_shots = {
             ShotId(view.name, label)
             for view, labels in zip(self.schedule.views, self.schedule.labels, strict=True)
@@ -67,7 +67,8 @@ class AsPlanned:
                 yield f"{len(shots)} shots of the run's {have} are not in its {lack}, the first {first}"
 
     def problems_of_choices(self, run: Run) -> Iterator[str]:
-        """Choices of the journal that the plan does not allow, or that name another time than it has."""
+        """Find choices of the journal that the plan does not allow, or whose exposure time differs from the
+        plan's."""
         choices = run.choices()
         for number, view in enumerate(self.schedule.views if self.schedule.is_open else ()):
             open_view, view_choices = self.schedule.open_view(number), choices.get(view.name, ())
@@ -95,7 +96,7 @@ class AsPlanned:
 
     @lru_cache(maxsize=1)  # noqa: B019  an object of one `verify`
     def _planned_exposures(self, view: str) -> dict[ShotLabel, tuple[int, int]]:
-        """LED and exposure, us, of each frame of a view."""
+        """Return LED and exposure, us, of each frame of a view."""
         light_of_label: dict[ShotLabel, tuple[int, int]] = {}
         for pose, bursts in zip(self.schedule.views, self.schedule.planned_bursts(), strict=True):
             for burst in bursts if pose.name == view else ():
@@ -127,7 +128,8 @@ class AsPlanned:
 
 
 def as_planned(run: Run) -> AsPlanned:
-    """The plan that the run keeps. Raises InputError if it keeps none, or it is not understood any more."""
+    """Return the plan that the run keeps. Raises InputError if the run keeps no plan, or if it is not understood
+    any more."""
     if "stored" not in run.about["plan"] or "stored" not in run.about["rig"]:
         raise InputError("the run keeps no copy of its plan and rig")
     files = InputFiles()

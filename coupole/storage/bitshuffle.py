@@ -1,7 +1,7 @@
-"""Compression of a frame in tiles, in the format of HDF5's bitshuffle filter (32008), but on any thread.
+"""Compresses a frame in tiles, in the format of HDF5's bitshuffle filter (32008), but on any thread.
 
-HDF5 compresses one chunk at a time under one lock. So tiles are compressed here, by the functions of the filter
-that hdf5plugin ships (ctypes releases the interpreter's lock), and written into the file directly.
+HDF5 compresses one chunk at a time under one lock. So the tiles are compressed here, by the functions of the
+filter that comes with hdf5plugin (ctypes releases the interpreter's lock), and are written directly into the file.
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ from coupole.errors import InputError, StorageError
 FILL_DN = 65535
 """Value of pixels that are not stored; it does not occur in 12-bit frames."""
 BLOCK_PIXELS = 16384
-"""Pixels that are shuffled together: at the filter's own 4096, zstd takes twice the time and saves nothing."""
+"""Number of pixels that are shuffled together. With the filter's own 4096, zstd takes twice the time and saves
+nothing."""
 _PIXEL_BYTES = 2
 
 
 @dataclass(frozen=True)
 class Codec:
-    """Method by which tiles are compressed."""
+    """Method for the compression of tiles."""
 
     name: Literal["lz4", "zstd"]
     level: int | None
@@ -47,18 +48,19 @@ CODECS = {"lz4": Codec("lz4", None), "zstd": Codec("zstd", 1)}
 
 
 def codec_of(name: str) -> Codec:
-    """The codec of this name. Raises InputError if there is none."""
+    """Return the codec of this name. Raises InputError if there is none."""
     if name not in CODECS:
         raise InputError(f"--codec: expected one of {', '.join(CODECS)}; found {name}")
     return CODECS[name]
 
 
 def tile_shape(height_px: int, width_px: int) -> tuple[int, int]:
-    """Rows and columns of a tile: at most 256 x 512, all of one size, with the least excess beyond the frame's
-    edges.
+    """Return rows and columns of a tile. It has at most 256 x 512 pixels. All tiles have one size, with the least
+    excess beyond the frame's edges.
 
     Measured on frames of 4096 x 3072, from the disk: a window of 256 x 256 through all frames is read four times
-    faster than from tiles as wide as the frame (twice, if it lies across edges), a whole frame as fast.
+    faster than from tiles as wide as the frame (twice as fast if it lies across edges). A whole frame is read
+    equally fast.
     """
 
     def share(size_px: int, most_px: int) -> int:
@@ -70,7 +72,7 @@ def tile_shape(height_px: int, width_px: int) -> tuple[int, int]:
 def compressed_tiles(
     pixels: NDArray[np.uint16], tile: tuple[int, int], codec: Codec
 ) -> Iterator[tuple[tuple[int, int], bytes]]:
-    """Each tile of a frame [H, W]: row and column of its corner, and its bytes in the file."""
+    """Yield each tile of a frame [H, W]: row and column of its corner, and its bytes in the file."""
     rows, columns = tile
     block = np.full(tile, FILL_DN, np.dtype("<u2"))
     out = np.empty(12 + _bound(block.size, codec), np.uint8)
@@ -84,7 +86,8 @@ def compressed_tiles(
 
 
 def _compress(block: NDArray[np.uint16], out: NDArray[np.uint8], codec: Codec) -> bytes:
-    """The filter's format: bytes uncompressed (u64), bytes of a block (u32), both big-endian, then the blocks."""
+    """Compress into the filter's format: bytes uncompressed (u64), bytes of a block (u32), both big-endian, then
+    the blocks."""
     struct.pack_into(">QI", out.data, 0, block.nbytes, BLOCK_PIXELS * _PIXEL_BYTES)
     to, level = out.ctypes.data + 12, () if codec.level is None else (codec.level,)
     count = getattr(_library(), f"bshuf_compress_{codec.name}")(

@@ -1,9 +1,9 @@
 """Discards frames whose samples are safe, if the run's plan says so (`discard: after_fit`).
 
-A frame is the only copy of a measurement, so the order is: the samples of a view are written and synced; read back
-and compared with what was written (`coupole.storage.sample_proofs`); the journal's line is synced; the frames are
-marked in the view's file; their space is given back, in place. After a crash between two of these steps the frames
-are there, or their samples are safe and the journal says so; `finish` then does what is left.
+A frame is the only copy of a measurement. So the order is: the samples of a view are written and synced, then read
+back and compared with the written ones (`coupole.storage.sample_proofs`). Then the journal's line is synced, the
+frames are marked in the view's file, and their space is given back in place. After a crash between two of these
+steps, either the frames are there, or their samples are safe and the journal says so. `finish` then does the rest.
 """
 
 from __future__ import annotations
@@ -39,27 +39,28 @@ NOT_YET = "the session has not finished it yet"
 
 
 def is_needed(shot: ShotId, held_out: Iterable[int]) -> bool:
-    """Tell whether a frame is kept: all but those under single LEDs that are not held out for the check."""
+    """Tell whether a frame is kept. All frames are kept except those under single LEDs that are not held out for
+    the check."""
     return not isinstance(shot.light, Led) or shot.light.id in held_out
 
 
 def discarded_views(run: Run) -> dict[str, FramesDiscarded]:
-    """Return what was discarded, by name of view, as the journal has it."""
+    """Return the discarded frames by name of view, from the journal."""
     events = journal.read_events(run.journal_path) if run.discards else ()
     return {event.view: event for event in events if isinstance(event, FramesDiscarded)}
 
 
 def place_of_result(run: Run, event: FramesDiscarded) -> Path:
-    """The folder of the result that stands for discarded frames: beside the run, where both may have been moved,
-    or where the journal has it."""
+    """Return the folder of the result that replaces discarded frames. It is beside the run, if both were moved, or
+    at the place in the journal."""
     path = Path(event.result)
     beside = run.folder.with_name(path.name)
     return beside if has_proofs(beside) else path
 
 
 def reason_to_keep(run: Run, view: str) -> str:
-    """Return why the frames of a view must not be discarded, or not yet, though its samples may be safe; empty if
-    they may be."""
+    """Return why the frames of a view must not be discarded, or not yet, even if its samples are safe; empty if
+    they may be discarded."""
     if not run.discards:
         return "the plan does not say `discard: after_fit`"
     events = list(journal.read_events(run.journal_path))
@@ -75,8 +76,8 @@ def reason_to_keep(run: Run, view: str) -> str:
 
 
 def incomplete_until(run: Run, view: str) -> str:
-    """The first view that is not complete, of those begun before a view, whose dark frames count in its samples,
-    and itself; empty if all are: its samples will not change any more."""
+    """Return the first incomplete view among this view and the views begun before it, whose dark frames count in
+    its samples. It is empty if all are complete; the view's samples will then not change any more."""
     complete_views = set(run.complete_views())
     for begun_view in dict.fromkeys(
         shot.view for shot in run.proven() if not isinstance(shot.light, PanelMark | Sentinel)
@@ -89,7 +90,7 @@ def incomplete_until(run: Run, view: str) -> str:
 
 
 def _is_finished(events: Sequence[Event], view: str) -> bool:
-    """Tell whether the session is done with a view whose frames are all there, or has ended."""
+    """Tell whether the session has finished a view whose frames are all there, or has ended."""
     places = [n for n, event in enumerate(events) if isinstance(event, FrameProven) and event.shot.view == view]
     if not places:
         return False
@@ -102,8 +103,8 @@ def _is_finished(events: Sequence[Event], view: str) -> bool:
 
 
 def to_discard(run: Run, view: str, result: Path, digest: str) -> FramesDiscarded | None:
-    """Return what the journal will say of a view whose samples in a result are safe, with this digest; None if it
-    has no frame to discard. The caller has asked for a `reason_to_keep`."""
+    """Return the journal's event for a view whose samples in a result are safe, with this digest; None if the view
+    has no frame to discard. The caller has checked `reason_to_keep` before."""
     expected_shots = list(run.expected_shots())
     held_out = set(held_out_leds({shot.light.id for shot in expected_shots if isinstance(shot.light, Led)}))
     frames = tuple(
@@ -119,10 +120,9 @@ def to_discard(run: Run, view: str, result: Path, digest: str) -> FramesDiscarde
 
 
 def discard(run: Run, event: FramesDiscarded, note: Callable[[FramesDiscarded], None]) -> None:
-    """Discard the frames of an event, which `note` first writes to the journal on the disk. For the process that
-    holds
-    the run's lock. Raises ChecksumMismatch, before anything is done, if the view's file does not have these
-    frames; StorageError."""
+    """Discard the frames of an event. First `note` writes the event to the journal on the disk. Only the process
+    that holds the run's lock may call this. Raises ChecksumMismatch, before anything is done, if the view's file
+    does not have these frames; StorageError."""
     path = run.view_path(event.view)
     layout = _layout(path)
     slots = _slots(path, event)
@@ -131,8 +131,9 @@ def discard(run: Run, event: FramesDiscarded, note: Callable[[FramesDiscarded], 
 
 
 def finish(run: Run) -> None:
-    """Give back what the journal says is discarded, and a crash has left. A file that changes by that is taken out
-    of the manifest first. For whoever holds the run's lock. Raises StorageError."""
+    """Give back the space of frames that the journal lists as discarded, if a crash has left it. A file that
+    changes by this is taken out of the manifest first. Only the process that holds the run's lock may call this.
+    Raises StorageError."""
     for event in discarded_views(run).values():
         path = run.view_path(event.view)
         if path.exists() and not frame_file.read_layout(path).is_archived:
@@ -155,7 +156,7 @@ def _layout(path: Path) -> Layout:
 
 
 def _slots(path: Path, event: FramesDiscarded) -> NDArray[np.int64]:
-    """[n] slots of the frames, rising."""
+    """Return [n] slots of the frames, in rising order."""
     table = frame_file.read_frames(path)
     states = np.isin(table["state"], (PROVEN, DISCARDED))
     slot_of = {(bytes(table[slot]["shot"]), int(table[slot]["xxh3"])): slot for slot in np.flatnonzero(states)}
@@ -171,7 +172,7 @@ def _slots(path: Path, event: FramesDiscarded) -> NDArray[np.int64]:
 
 
 def _is_given_back(path: Path, layout: Layout, slots: NDArray[np.int64]) -> bool:
-    """Tell whether `_give_back` would leave each byte of a file as it is."""
+    """Tell whether `_give_back` would leave every byte of a file unchanged."""
     table = frame_file.read_frames(path)
     if not (table["state"][slots] == DISCARDED).all():
         return False
@@ -183,7 +184,8 @@ def _is_given_back(path: Path, layout: Layout, slots: NDArray[np.int64]) -> bool
 
 
 def _give_back(path: Path, layout: Layout, slots: NDArray[np.int64]) -> None:
-    """Mark the slots first: a reader never takes a hole for a frame. Slots without a frame are given back too."""
+    """Mark the slots, then give back their space. The marks come first, so that a reader never takes a hole for a
+    frame. Slots without a frame are given back too."""
     table = frame_file.read_frames(path)
     table["state"][slots] = DISCARDED
     try:
@@ -200,7 +202,7 @@ def _give_back(path: Path, layout: Layout, slots: NDArray[np.int64]) -> None:
 
 
 def _empty_parts(layout: Layout, table: NDArray[np.void]) -> Iterator[tuple[int, int]]:
-    """Offset and length in bytes of each stretch of slots that have no frame, or not any more."""
+    """Yield offset and length in bytes of each stretch of slots that have no frame, or no longer have one."""
     empty_slots = np.flatnonzero(np.isin(table["state"], (DISCARDED, FREE)))
     size = layout.frame_bytes
     for first, end in _stretches(empty_slots):
@@ -208,7 +210,7 @@ def _empty_parts(layout: Layout, table: NDArray[np.void]) -> Iterator[tuple[int,
 
 
 def _stretches(slots: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """First and end of each stretch of slots, which rise."""
+    """Return first and end of each stretch of slots. The slots are in rising order."""
     stretches = np.split(slots, np.flatnonzero(np.diff(slots) > 1) + 1)
     return [(int(stretch[0]), int(stretch[-1]) + 1) for stretch in stretches if len(stretch)]
 

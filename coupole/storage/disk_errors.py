@@ -1,4 +1,4 @@
-"""Errors of the operating system on a run's disk, in the operator's words."""
+"""Errors of the operating system on a run's disk, in words for the operator."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from coupole.errors import DiskFull, StorageError
 
 
 def disk_error(path: Path, error: OSError) -> StorageError:
-    """The error to raise when a run's file cannot be written: DiskFull if there is no space or quota left."""
+    """Return the error to raise when a run's file cannot be written. It is DiskFull if there is no space or quota
+    left."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DiskFull(f"{path}: the disk is full. Free space on it, then resume the run.")
     if error.errno == errno.EFBIG:

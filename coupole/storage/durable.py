@@ -1,4 +1,4 @@
-"""Files and folders that are on the disk when a call returns, and their SHA-256.
+"""Files and folders that are on the disk when a call returns; SHA-256 of files.
 
 A file's own sync does not promise that its folder knows the file's name: the folder is synced too.
 """
@@ -34,7 +34,8 @@ def make_folder(folder: Path) -> None:
 
 
 def write_synced(path: Path, content: str | bytes) -> None:
-    """Write a whole file: at every moment, also after a crash, the name has the old content or the new one."""
+    """Write a whole file. At every moment, and after a crash, the file has either the old content or the new
+    one."""
     partial = path.with_name(f".{path.name}.part")
     try:
         with partial.open("wb") as file:

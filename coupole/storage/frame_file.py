@@ -1,10 +1,10 @@
-"""The file of one view's frames: its layout, and how it is read.
+"""The file of one view's frames: its layout, and functions to read it.
 
-It is a NeXus HDF5 file: frames `[n, H, W]` uint16 and a table of fixed records, both contiguous, which
-`coupole.storage.frame_file_creation` allocates once. `coupole.storage.view_writer` then writes bytes straight to
-their offsets, so the file is valid HDF5 at every moment and a crash cannot break it. The record of a slot is its
-state: free, a frame not yet proven, a proven shot with its checksum, or one whose pixels were discarded
-(`coupole.storage.discarding`).
+It is a NeXus HDF5 file with frames `[n, H, W]` uint16 and a table of fixed records. Both are contiguous, and
+`coupole.storage.frame_file_creation` allocates them once. `coupole.storage.view_writer` then writes bytes directly
+to their offsets. So the file is valid HDF5 at every moment, and a crash cannot break it. The record of a slot has
+its state: free, a frame not yet proven, a proven shot with its checksum, or a proven shot whose pixels were
+discarded (`coupole.storage.discarding`).
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ FRAME_DTYPE = np.dtype(
         ("pose", "<u2"),
     ]
 )
-"""Frame table: content of each slot (state 0 free, 1 stored but not proven, 2 proven, 3 proven and discarded)."""
+"""Frame table: content of each slot. The states are 0 free, 1 stored but not proven, 2 proven, 3 proven and
+discarded."""
 
 POSE_DTYPE = np.dtype(
     [
@@ -56,7 +57,7 @@ POSE_DTYPE = np.dtype(
         ("base_from_camera", "<f8", (4, 4)),
     ]
 )
-"""Measured poses; a frame's `pose` is the number of its pose in this table."""
+"""Measured poses. The `pose` of a frame is a row number in this table."""
 
 SPARE_SLOTS = 32
 """Slots of a view's file for surplus frames, until their burst has been evaluated."""
@@ -64,7 +65,7 @@ PAGE = mmap.PAGESIZE
 MAX_POSES = 256
 PATTERNS = ("MONO", "RGGB", "BGGR", "GRBG", "GBRG")
 _WRONG = (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, ArithmeticError, MemoryError)
-"""Errors that h5py and NumPy raise for a file that is damaged, or another one."""
+"""Errors that h5py and NumPy raise for a damaged file, or for a file of another kind."""
 DATA, FRAMES, POSES = (
     "entry/instrument/detector/data",
     "entry/instrument/detector/frames",
@@ -85,7 +86,7 @@ class Layout:
     height_px: int
     width_px: int
     data_offset: int
-    """0 if the file is archived."""
+    """Offset of the frames; 0 if the file is archived."""
     table_offset: int
     poses_offset: int
     is_archived: bool
@@ -104,7 +105,7 @@ class Layout:
 
 @contextmanager
 def open_view(path: Path) -> Iterator[h5py.File]:
-    """A view's file, to be read. If h5py or the caller then finds a fault in it, StorageError is raised."""
+    """Open a view's file for reading. Raises StorageError if h5py or the caller then finds a fault in it."""
     try:
         with h5py.File(path, "r") as file:
             yield file
@@ -113,7 +114,7 @@ def open_view(path: Path) -> Iterator[h5py.File]:
 
 
 def read_layout(path: Path) -> Layout:
-    """Layout of a view's file. Raises StorageError if it is not such a file."""
+    """Return the layout of a view's file. Raises StorageError if the file is of another kind."""
     with open_view(path) as file:
         inode = os.fstat(file.id.get_vfd_handle()).st_ino
         data, frames, poses = file[DATA], file[FRAMES], file[POSES]
@@ -137,7 +138,7 @@ def read_layout(path: Path) -> Layout:
 
 
 def read_facts(path: Path) -> dict[str, Any]:
-    """`pattern`, `black_dn` and `white_dn` of a view's frames. Raises StorageError."""
+    """Return `pattern`, `black_dn` and `white_dn` of a view's frames. Raises StorageError."""
     with open_view(path) as file:
         detector = file["entry/instrument/detector"]
         facts = {
@@ -151,14 +152,14 @@ def read_facts(path: Path) -> dict[str, Any]:
 
 
 def read_poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
-    """The table of poses, POSE_DTYPE, and the attributes of a view's file. Raises StorageError."""
+    """Return the table of poses, POSE_DTYPE, and the attributes of a view's file. Raises StorageError."""
     read_layout(path)
     with open_view(path) as file:
         return file[POSES][:], dict(file["entry"].attrs)
 
 
 def read_frames(path: Path) -> NDArray[np.void]:
-    """The frame table [slots], FRAME_DTYPE. Raises StorageError."""
+    """Return the frame table [slots], FRAME_DTYPE. Raises StorageError."""
     layout = read_layout(path)
     with path.open("rb") as file:
         file.seek(layout.table_offset)
@@ -169,7 +170,7 @@ def read_frames(path: Path) -> NDArray[np.void]:
 
 
 def read_frame(path: Path, layout: Layout, slot: int) -> NDArray[np.uint16]:
-    """Pixels [H, W] of one slot, DN, also if the file was archived since its layout was read.
+    """Return the pixels [H, W] of one slot, DN, even if the file was archived after its layout was read.
 
     Raises StorageError if the frame cannot be read.
     """
@@ -186,15 +187,16 @@ def read_frame(path: Path, layout: Layout, slot: int) -> NDArray[np.uint16]:
 
 
 def read_frame_into(path: Path, layout: Layout, slot: int, pixels: NDArray[np.uint16]) -> None:
-    """Read a frame as `read_frame` does, into `pixels` [H, W], C order, of the caller: past the page cache
-    where the file system, the size of the frames and the memory's alignment (512 bytes) allow it. Raises
+    """Read a frame as `read_frame` does, into the caller's `pixels` [H, W], C order. The page cache is not used if
+    the file system, the size of the frames and the memory's alignment (512 bytes) allow this. Raises
     StorageError."""
     if layout.is_archived or layout.is_packed or not _read_direct(path, layout, slot, pixels):
         pixels[:] = read_frame(path, layout, slot)
 
 
 def _read_direct(path: Path, layout: Layout, slot: int, pixels: NDArray[np.uint16]) -> bool:
-    """Tell whether the frame was read; not if the file is another one by now, ends early, or cannot be read so."""
+    """Tell whether the frame was read. It was not read if the file has been replaced, ends early, or cannot be
+    read directly."""
     if layout.frame_bytes % PAGE or layout.data_offset % PAGE:
         return False
     try:
@@ -217,8 +219,8 @@ def _read_direct(path: Path, layout: Layout, slot: int, pixels: NDArray[np.uint1
 
 
 def pixels_of(frame_bytes: bytes | mmap.mmap, layout: Layout) -> NDArray[np.uint16]:
-    """Pixels [H, W] of a frame from its bytes in a file that is not archived, DN; not copied unless it is
-    packed."""
+    """Return the pixels [H, W] of a frame, DN, from its bytes in a file that is not archived. They are copied only
+    if the frame is packed."""
     if layout.is_packed:
         from coupole.storage.packing import unpack12
 

@@ -1,4 +1,4 @@
-"""Lays out the file of one view's frames as NeXus HDF5, with all its space allocated."""
+"""Lays out the file of one view's frames as NeXus HDF5, and allocates all its space."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from coupole.storage.line_file import utc_now
 
 @dataclass(frozen=True)
 class Quantity:
-    """An array, or one value, with what its attributes say."""
+    """An array or one value, with the attributes that describe it."""
 
     values: NDArray[np.generic] | float | str
     units: str = ""
     frame: str = ""
-    """The frame of reference of positions and directions."""
+    """The coordinate frame of positions and directions."""
 
 
 Collections = Mapping[str, Mapping[str, Quantity | NDArray[np.generic]]]
@@ -66,8 +66,8 @@ def create(
     *,
     is_packed: bool = False,
 ) -> None:
-    """Create a view's file with `slots` free slots, and allocate its space; frames of up to 12 bits may be
-    `is_packed`.
+    """Create a view's file with `slots` free slots, and allocate its space; with `is_packed`, frames of up to 12
+    bits are packed.
 
     `metadata`: `title`, `sample`, `simulated`, `pixel_pitch_um` and any further attributes of the entry. Raises
     DiskFull if the disk has not enough space.
@@ -151,7 +151,7 @@ def _store(group: h5py.Group, name: str, value: Quantity | NDArray[np.generic]) 
 def _contiguous(
     group: h5py.Group, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], *, fill: bool
 ) -> h5py.Dataset:
-    """A contiguous dataset that is allocated immediately, so that its offset in the file is known."""
+    """Return a contiguous dataset that is allocated immediately, so that its offset in the file is known."""
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     properties.set_layout(h5py.h5d.CONTIGUOUS)
     properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)

@@ -1,4 +1,5 @@
-"""Gives the disk space of parts of a file back, in place: its size and all other bytes stay (fallocate(2))."""
+"""Gives the disk space of parts of a file back, in place (fallocate(2)). The file's size and all other bytes
+stay."""
 
 from __future__ import annotations
 
@@ -15,9 +16,9 @@ _TRIAL_BYTES = 2**20
 
 
 def give_back(fd: int, parts: Iterable[tuple[int, int]]) -> None:
-    """Give back parts of an open file, (offset, length) in bytes each; they read as zeros afterwards. Blocks of
-    the file system that a part fills in part alone are overwritten by zeros there. Done again, nothing changes.
-    On the disk when this returns. Raises OSError."""
+    """Give back parts of an open file, (offset, length) in bytes each; they read as zeros afterwards. A block of
+    the file system that is only partly covered is overwritten by zeros in the covered part. A second call changes
+    nothing. The change is on the disk when this returns. Raises OSError."""
     libc = ctypes.CDLL(None, use_errno=True)
     for offset, length in parts:
         mode = _KEEP_SIZE | _PUNCH_HOLE
@@ -28,8 +29,8 @@ def give_back(fd: int, parts: Iterable[tuple[int, int]]) -> None:
 
 
 def is_blank(fd: int, parts: Iterable[tuple[int, int]]) -> bool:
-    """Tell whether parts of an open file, (offset, length) in bytes each, read as zeros. Holes are passed over.
-    Raises OSError."""
+    """Tell whether parts of an open file, (offset, length) in bytes each, read as zeros. Holes are skipped. Raises
+    OSError."""
     for start, length in parts:
         offset, end = start, start + length
         while (offset := _next_data(fd, offset)) < end:
@@ -42,7 +43,8 @@ def is_blank(fd: int, parts: Iterable[tuple[int, int]]) -> bool:
 
 
 def _next_data(fd: int, offset: int) -> int:
-    """Place of the next byte of a file that is not in a hole; beyond every file if there is none."""
+    """Return the place of the next byte of a file that is not in a hole. If there is none, the place is beyond
+    every file."""
     try:
         return os.lseek(fd, offset, os.SEEK_DATA)
     except OSError as error:
@@ -52,7 +54,7 @@ def _next_data(fd: int, offset: int) -> int:
 
 
 def why_not(folder: Path) -> str:
-    """Try it in a folder that exists. Return why nothing can be given back there; empty if it can."""
+    """Return why space cannot be given back in this existing folder, found by a test; empty if it can."""
     if sys.platform != "linux":
         return "this system cannot give back a part of a file"
     try:

@@ -1,7 +1,8 @@
-"""The run's journal: one JSON object per line, appended, never changed. Only this module reads or writes it.
+"""The run's journal: one JSON object per line. Lines are appended and never changed. Only this module reads or
+writes them.
 
-A `frame` line means that a shot is proven and its bytes are on disk. So lines are held back until `commit()`,
-which the caller calls after it has synced the frames; lines are then written and synced too.
+A `frame` line means that a shot is proven and its bytes are on disk. So lines are held back until `commit()`. The
+caller calls it after it has synced the frames; then the lines are written and synced too.
 """
 
 from __future__ import annotations
@@ -38,16 +39,16 @@ class Journal:
         self._lines.append(event_line(event))
 
     def take(self) -> list[str]:
-        """The lines added since the last call; the caller must pass them to `append`."""
+        """Return the lines that were added since the last call. The caller must pass them to `append`."""
         lines, self._lines = self._lines, []
         return lines
 
     def commit(self) -> None:
-        """Write and sync the added events. Raises DiskFull or StorageError; none of them is then valid."""
+        """Write and sync the added events. Raises DiskFull or StorageError; then none of these events is valid."""
         self.append(self.take())
 
     def append(self, lines: list[str]) -> None:
-        """Write and sync lines from `take`, or of `event_line`; may run on several threads."""
+        """Write and sync lines from `take` or from `event_line`. Several threads may call this."""
         if not lines:
             return
         with self._writing:
@@ -61,7 +62,7 @@ class Journal:
 
     @property
     def place(self) -> Path | None:
-        """Path where the file is now; None if it was removed, or that is not told."""
+        """Path where the file is now; None if it was removed, or if the path cannot be found."""
         return self._file.place
 
     def close(self) -> None:
@@ -69,7 +70,7 @@ class Journal:
 
 
 def append_lines(path: Path, lines: list[str]) -> None:
-    """Write and sync lines of `Journal.take` after whatever the journal has; raises DiskFull or StorageError."""
+    """Append lines of `Journal.take` to the journal, and sync them. Raises DiskFull or StorageError."""
     file = LineFile(path)
     try:
         head = [event_line(JournalBegun(t=json_of(lines[0].encode(), str(path))["t"]))] if file.was_empty else []
@@ -86,7 +87,7 @@ def event_line(event: Event) -> str:
 
 
 def read_events(path: Path) -> Iterator[Event]:
-    """Events of a journal, also of one by version 0.1; none if there is no journal yet.
+    """Yield the events of a journal, also of a journal by version 0.1; none if there is no journal yet.
 
     A line truncated by a crash is skipped: its event was not committed. Raises StorageError for a complete line
     that is not an event, and for a journal of a later version.
@@ -101,7 +102,7 @@ def read_events(path: Path) -> Iterator[Event]:
 
 
 def tail(path: Path, most_bytes: int) -> list[Event]:
-    """The events in the last `most_bytes` of a journal; none if there is no journal."""
+    """Return the events in the last `most_bytes` of a journal; none if there is no journal."""
     try:
         with path.open("rb") as file:
             offset = max(0, path.stat().st_size - most_bytes)
@@ -115,13 +116,13 @@ def tail(path: Path, most_bytes: int) -> list[Event]:
 
 
 class Follower:
-    """Reads what a journal gains, while another process writes it."""
+    """Reads new events of a journal while another process writes it."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._read = path, 0
 
     def news(self) -> list[Event]:
-        """The events since the last call; at first all. Raises StorageError."""
+        """Return the events since the last call; the first call returns all events. Raises StorageError."""
         try:
             with self._path.open("rb") as file:
                 file.seek(self._read)
@@ -135,7 +136,7 @@ class Follower:
 
 
 def version(path: Path) -> int:
-    """Version of a journal; the current one if it does not exist yet."""
+    """Return the version of a journal; the current one if the journal does not exist yet."""
     first = next(read_events(path), None)
     if first is None:
         return JOURNAL_VERSION
@@ -168,7 +169,8 @@ def _events(path: Path, lines: Iterable[bytes]) -> Iterator[Event]:
 
 
 def _of_today(fields: Any) -> Any:
-    """A line's fields in the current version: in version 1 `resume` with `after` meant the end of a pause."""
+    """Return a line's fields in the current version. In version 1, `resume` with `after` meant the end of a
+    pause."""
     if isinstance(fields, dict) and fields.get("event") == "resume" and fields.get("after") == "pause":
         return {"event": "continue", "t": fields.get("t", "")}
     return fields

@@ -62,7 +62,7 @@ class SessionStarted(JournalEvent):
     acknowledged: str = ""
     """The fault of the arm that the operator confirmed to be repaired."""
     dose_budget_lux_h: float | None = None
-    """Light that the object may receive in its life, by its ledger and the plan, as the session begins; None: no
+    """Light that the object may receive in its life, by its ledger and the plan, at the session's begin; None: no
     budget."""
     trusted: tuple[str, ...] = ()
     """Permissions that a person gives by name in the rig (`any_controller_by`, `without_realtime_by`), in
@@ -80,18 +80,18 @@ class SessionResumed(JournalEvent):
     acknowledged: str = ""
     """The fault of the arm that the operator confirmed to be repaired."""
     dose_budget_lux_h: float | None = None
-    """Light that the object may receive in its life, by its ledger and the plan, as the session begins; None: no
+    """Light that the object may receive in its life, by its ledger and the plan, at the session's begin; None: no
     budget."""
     trusted: tuple[str, ...] = ()
     """Permissions that a person gives by name in the rig, in words."""
 
 
 class ProcessingAsked(JournalEvent):
-    """The session shall end with a result: views are processed beside the acquisition, in a process of its own."""
+    """The session shall end with a result. Views are processed beside the acquisition, in another process."""
 
     event: Literal["processing"] = "processing"
     result: str
-    """Folder of the result, a whole path."""
+    """Folder of the result, an absolute path."""
 
 
 class ViewBegun(JournalEvent):
@@ -101,7 +101,7 @@ class ViewBegun(JournalEvent):
     view: str
     """Name of the view."""
     hidden_leds: tuple[int, ...] = ()
-    """LEDs that are occluded from everything that this view sees."""
+    """LEDs that are occluded from everything that this view shows."""
 
 
 class MoveBegun(JournalEvent):
@@ -111,7 +111,7 @@ class MoveBegun(JournalEvent):
     view: str
     """Name of the view."""
     joints_deg: tuple[Joints, ...]
-    """[waypoints, 6] angles of the axes, degrees; the last are the view's."""
+    """[waypoints, 6] angles of the axes, degrees. The last waypoint is the view's posture."""
 
 
 class ArmSettled(JournalEvent):
@@ -123,7 +123,7 @@ class ArmSettled(JournalEvent):
     joints_deg: Joints
     """[6] measured angles of the axes, degrees."""
     base_from_camera: tuple[tuple[float, ...], ...]
-    """[4, 4] pose of the camera by these angles, mm: from camera to base coordinates."""
+    """[4, 4] pose of the camera by these angles, mm. It maps camera to base coordinates."""
 
 
 class FrameProven(JournalEvent):
@@ -143,22 +143,22 @@ class FrameProven(JournalEvent):
 
 
 class BurstsChosen(JournalEvent):
-    """The next bursts of a view were chosen; synced before the first of them gives light. A resumed run repeats
-    them."""
+    """The next bursts of a view were chosen. The line is synced before the first of them gives light. A resumed
+    run repeats these bursts."""
 
     event: Literal["chosen"] = "chosen"
     view: str
     """Name of the view."""
     bursts: tuple[ChosenBurst, ...]
-    """The bursts, in their order; none: the view has enough."""
+    """The bursts in their order. An empty list means that the view has enough."""
     reason: str
-    """The reason for these, or for no more."""
+    """The reason for these bursts, or for no more bursts."""
     figures: dict[str, Any] = Field(default_factory=dict)
-    """Numbers behind the reason, and what else was weighed."""
+    """Numbers behind the reason, and the alternatives that were weighed."""
 
 
 class BurstBegun(JournalEvent):
-    """A burst is about to give light; synced before it does."""
+    """A burst is about to give light. The line is synced before the light."""
 
     event: Literal["begin"] = "begin"
     view: str
@@ -168,7 +168,7 @@ class BurstBegun(JournalEvent):
 
 
 class BurstEnded(JournalEvent):
-    """A burst has ended, complete or not; the light that it gave."""
+    """A burst has ended, complete or not. The line has the light that it gave."""
 
     event: Literal["burst"] = "burst"
     view: str
@@ -192,7 +192,7 @@ class BurstEnded(JournalEvent):
     hottest_board_c: float | None = None
     """Highest temperature of a board in the burst, C; None if the box knows none."""
     given_lux_h: tuple[float, ...] | None = None
-    """Light at each of the object's dose points, lux h, in place of what was planned; None in version 0.1."""
+    """Light at each of the object's dose points, lux h. It replaces the planned light; None in version 0.1."""
 
 
 class GapFound(JournalEvent):
@@ -206,13 +206,13 @@ class GapFound(JournalEvent):
     missing: int
     """Number of steps that sent an edge and have no frame."""
     lost_in_transfer: int
-    """Number of those whose frames the camera exposed, and which did not arrive."""
+    """Number of these frames that the camera exposed, but that did not arrive."""
     surplus: int
     """Number of frames that no step has triggered."""
     dead_leds: tuple[Shot, ...] = ()
     """Shots whose LED drew no current."""
     reason: str = ""
-    """Reason why nothing, or not everything, could be proven; empty if everything that came was."""
+    """Reason why nothing, or not everything, could be proven. It is empty if all frames that came were proven."""
 
 
 class ReshootBegun(JournalEvent):
@@ -228,12 +228,13 @@ class ReshootBegun(JournalEvent):
 
 
 class FindingNoted(JournalEvent):
-    """Something changed in a burst that should not; the shots are marked by this line, and may be taken again."""
+    """Something changed in a burst but should not have changed. This line marks the shots; they may be taken
+    again."""
 
     event: Literal["finding"] = "finding"
     kind: str
-    """Name of what was found: `ambient light`, `LED`, `drift`, `moved`, `smudge`, `exposure step` or
-    `thing in the field`; `not watched` if the watching itself has failed, and has ended."""
+    """Name of the finding: `ambient light`, `LED`, `drift`, `moved`, `smudge`, `exposure step` or `thing in the
+    field`. It is `not watched` if the watching itself has failed and ended."""
     view: str
     """Name of the view."""
     shots: tuple[Shot, ...]
@@ -241,18 +242,18 @@ class FindingNoted(JournalEvent):
     figure: float
     """Size of the change."""
     limit: float
-    """Limit that the figure is beyond, from the rig's figures of noise."""
+    """Limit that the figure exceeds, from the rig's figures of noise."""
     unit: str
-    """Unit of both."""
+    """Unit of figure and limit."""
     message: str
-    """Description of what was seen, in a sentence."""
+    """Description of the finding, in a sentence."""
     picture: InnerPath | Literal[""] = ""
     """A PNG file with the light before, after, and their difference, relative to the run's folder."""
 
 
 class FramesDiscarded(JournalEvent):
-    """Frames of a view are discarded, as its plan says, because their samples are safe; synced before the first of
-    them is touched."""
+    """Frames of a view are discarded, as its plan says, because their samples are safe. The line is synced before
+    the first frame is changed."""
 
     event: Literal["discard"] = "discard"
     view: str
@@ -260,11 +261,12 @@ class FramesDiscarded(JournalEvent):
     frames: tuple[tuple[Shot, str], ...]
     """Each frame with the checksum of its bytes, 16 hexadecimal digits, as in its `frame` line."""
     result: str
-    """Folder of the result that has their samples, a whole path."""
+    """Folder of the result that has their samples, an absolute path."""
     samples: InnerPath
     """The file with the samples, relative to that folder."""
     digest: str
-    """Digest of the arrays in that file, as they were written and read back: SHA-256."""
+    """SHA-256 digest of the arrays in that file. It was the same when they were written and when they were read
+    back."""
 
 
 class FaultNoted(JournalEvent):
@@ -272,24 +274,26 @@ class FaultNoted(JournalEvent):
 
     event: Literal["fault"] = "fault"
     kind: str
-    """Name of the error, such as `DeviceTimeout`, or `unsafe`: a device could not be made safe."""
+    """Name of the error, such as `DeviceTimeout`. `unsafe` means that a device could not be made safe."""
     message: str
     """Message of the error."""
     device: str = ""
-    """The device that failed, by its kind in the rig; empty if none did."""
+    """The failed device, by its kind in the rig; empty if no device failed."""
 
     @property
     def is_hold(self) -> bool:
-        """Tell whether nothing failed: the session was held until a person's word, after Ctrl-Z or a freeze."""
+        """Tell whether nothing failed: the session was only held until a person let it go on, after Ctrl-Z or a
+        freeze."""
         return self.kind == "Held"
 
 
 class InputsChanged(JournalEvent):
-    """Files of the run were changed on the disk after they were read; the run goes on with what was read."""
+    """Files of the run were changed on the disk after they were read; the run goes on with the content that was
+    read."""
 
     event: Literal["changed"] = "changed"
     files: tuple[str, ...]
-    """Path and what happened, a sentence each."""
+    """Path and change of each file, a sentence each."""
 
 
 class Paused(JournalEvent):
@@ -305,7 +309,7 @@ class Continued(JournalEvent):
 
 
 class TextUnread(JournalEvent):
-    """The reader of the session's text (a terminal, a pipe) did not take it; the session did not wait for it."""
+    """The reader of the session's text (a terminal, a pipe) did not take it. The session did not wait for it."""
 
     event: Literal["unread"] = "unread"
     lost_lines: int
@@ -315,7 +319,7 @@ class TextUnread(JournalEvent):
     waiting_bytes: int
     """Bytes that were kept for the reader when this was written."""
     stalled_s: float
-    """Time for which nothing had been taken, s."""
+    """Time for which no text had been taken, s."""
 
 
 class ViewSealed(JournalEvent):
@@ -333,7 +337,8 @@ class SessionStopped(JournalEvent):
     outcome: Literal["done", "interrupted", "failed"]
     """End of the session, in one word."""
     reason: str = ""
-    """Reason why not all was done: who stopped it, or what failed; empty if all was done."""
+    """Reason why not all was done: the person or signal that stopped it, or the failure. It is empty if all was
+    done."""
     robot: dict[str, Any] = Field(default_factory=dict)
     """Figures of the robot's link."""
 

@@ -1,11 +1,12 @@
 """The dose ledger of each object: all light that it has received, `<ledger folder>/<object id>.jsonl`.
 
 A caller that gives light enters the planned light first (`Ledger.plan`), and afterwards the light that was given
-(`Ledger.correct`); both are on disk when the call returns. So a process that is killed, or a power cut, can only
-leave too high a figure: that of the last plan. Writers hold a lock on the object's file.
+(`Ledger.correct`); both are on disk when the call returns. So after a kill of the process, or a power cut, the
+figure can only be too high: it is then that of the last plan. Writers hold a lock on the object's file.
 
-The object's budget stands in the same file. A plan is entered only if the budget allows it after all that stands
-there at that moment, under the same lock: however many give light at once, their sum never exceeds it.
+The object's budget is in the same file. A plan is entered only if the budget allows it, with all entries of the
+file at that moment, under the same lock. So even if several processes give light at once, the sum of their light
+never exceeds the budget.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from coupole.storage.ledger_lines import (
 from coupole.storage.line_file import LineFile
 
 LOCK_S = 10.0
-"""Other writers hold the lock for one line each."""
+"""Longest wait for the lock. Other writers hold it for one line each."""
 _NAP_S = 0.01
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 
@@ -55,7 +56,7 @@ class Ledger:
         self, folder: Path, object_id: str, former_folder: Path | None = None, *, only_grows: bool = False
     ) -> None:
         """`only_grows`: `newest`, `plan` and `ask_again` raise StorageError if lines that were read are gone, or
-        if it is no text. Raises InputError for an id that no plan can have."""
+        if the file is not text. Raises InputError for an id that no plan can have."""
         try:
             self.object_id = _NAME.validate_python(object_id)
         except ValidationError as error:
@@ -68,12 +69,13 @@ class Ledger:
         self._reading = Reading(only_grows=only_grows)
 
     def read_history(self) -> History:
-        """Raises StorageError if a file cannot be read."""
+        """Return all light and budgets of the object. Raises StorageError if a file cannot be read."""
         texts = read_lines(self.path)
         return history_of([*self._former_lines(texts), *texts])
 
     def newest(self) -> History:
-        """The same as `read_history`, for who asks often: only lines that are new are read. Not to be changed."""
+        """Return the same as `read_history`, but read only new lines, for callers that ask often. The caller must
+        not change the history."""
         self._reading = self._reading.with_new_lines(self.path)
         if self._former_folder is not None and (self._former_folder / self.path.name).exists():
             return self.read_history()
@@ -82,10 +84,10 @@ class Ledger:
     def plan(
         self, run: str, dose_lux_h: float, damage_wh_m2: float | None, budget_request: Asked | None = None
     ) -> str:
-        """Light that is about to be given, at most; returns the id for `correct`.
+        """Enter the most light that is about to be given; return the id for `correct`.
 
-        The budget is asked for what is `budget_request`; a plan's budget becomes the object's if that has none.
-        Raises DoseBudgetReached, and StorageError if earlier lines are missing: nothing is entered then.
+        The budget is checked for `budget_request`. A plan's budget becomes the object's if the object has none.
+        Raises DoseBudgetReached, and StorageError if earlier lines are missing; nothing is entered then.
         """
         line = LightPlanned(id=uuid.uuid4().hex, run=run, dose_lux_h=dose_lux_h, damage_wh_m2=damage_wh_m2)
         lines: list[Line] = [line]
@@ -109,7 +111,7 @@ class Ledger:
             )
 
     def ask_again(self, budget_request: Asked, plan_id: str) -> None:
-        """Ask the budget once more for light whose plan has this id. Raises DoseBudgetReached."""
+        """Check the budget once more, for light whose plan has this id. Raises DoseBudgetReached."""
         with self._open_locked():
             history = self.newest()
             budget_request.refuse_beyond(self.object_id, history, -history.planned_lux_h(plan_id))
@@ -119,19 +121,21 @@ class Ledger:
         self._append(LightGiven(id=plan_id, dose_lux_h=dose_lux_h, damage_wh_m2=damage_wh_m2))
 
     def enter(self, dose_lux_h: float, note: str) -> None:
-        """Light that others have given, in a photographer's studio for example. Raises InputError: no figure."""
+        """Enter light that was given elsewhere, for example in a photographer's studio. Raises InputError if the
+        dose is not a valid figure."""
         self._refuse_no_figure("light", dose_lux_h)
         self._append(LightEntered(dose_lux_h=dose_lux_h, note=note))
 
     def set_budget(self, dose_lux_h: float, name: str, reason: str = "") -> None:
-        """The object may receive so much in its life, by this person's word. Raises InputError without a name."""
+        """Set the light that the object may receive in its life, on the responsibility of this person. Raises
+        InputError without a name."""
         if not name.strip():
             raise InputError(f"object {self.object_id}: expected the name of the person who sets its light budget")
         self._refuse_no_figure("a budget", dose_lux_h)
         self._append(BudgetSet(dose_lux_h=dose_lux_h, name=name.strip(), reason=reason.strip()))
 
     def warn_above(self, dose_lux_h: float | None) -> None:
-        """Raises InputError: no figure."""
+        """Set the dose above which there is a warning. Raises InputError if the dose is not a valid figure."""
         if dose_lux_h is not None:
             self._refuse_no_figure("a limit", dose_lux_h)
         self._append(WarningSet(dose_lux_h=dose_lux_h))
@@ -148,7 +152,7 @@ class Ledger:
             pass
 
     def _former_lines(self, texts: list[bytes]) -> list[bytes]:
-        """Lines of the former place that are not in the present one too."""
+        """Return lines of the former place that are not also in the present one."""
         if self._former_folder is None:
             return []
         known_texts = set(texts)
@@ -181,7 +185,7 @@ class Ledger:
             os.close(lock)
 
     def _take(self, lock: int) -> None:
-        """Wait for the lock on the open file `lock`, which is released when that is closed."""
+        """Wait for the lock on the open file `lock`. The lock is released when the file is closed."""
         end_s = time.monotonic() + LOCK_S
         while True:
             try:
@@ -200,12 +204,13 @@ class Ledger:
 
 
 def ledger_of(cell: Cell, object_id: str, *, only_grows: bool = False) -> Ledger:
-    """The ledger of an object in the place that the cell's rig names."""
+    """Return the ledger of an object in the place that the cell's rig names."""
     return Ledger(cell.ledger_folder, object_id, cell.former_ledger_folder, only_grows=only_grows)
 
 
 def similar_ids(folder: Path, object_id: str) -> list[str]:
-    """Ids of other objects in a folder of ledgers that differ only in case, blanks, dots, hyphens, underscores."""
+    """Return ids of other objects in a folder of ledgers that differ only in case, blanks, dots, hyphens or
+    underscores."""
     try:
         ids = sorted(path.stem for path in folder.glob("*.jsonl"))
     except OSError as error:

@@ -1,4 +1,5 @@
-"""The lines of an object's dose ledger, and what they say together: all light on it, and its budget."""
+"""The lines of an object's dose ledger, and the history that follows from them: all light on it, and its
+budget."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from coupole.errors import DoseBudgetReached, StorageError
 from coupole.storage.line_file import utc_now
 
 BY_HAND = "by hand"
-"""Name in place of a run's, for light that was entered with `coupole dose --add`."""
+"""Name instead of a run's name, for light that was entered with `coupole dose --add`."""
 _ROUNDING = 1e-9
 _TAIL_BYTES = 256
 NO_FILE = "a pipe or a device, expected a file"
@@ -53,21 +54,21 @@ class LightPlanned(_Light):
 
 
 class LightGiven(_Light):
-    """Light that was given of the plan with this id."""
+    """Light that was given under the plan with this id."""
 
     event: Literal["given"] = "given"
     id: str
 
 
 class WarningSet(_Line):
-    """Total above which a warning is given from now on; None: no warning."""
+    """There is a warning above this total from now on; None: no warning."""
 
     event: Literal["warn_above"] = "warn_above"
     dose_lux_h: Amount | None
 
 
 class BudgetSet(_Line):
-    """Light that the object may receive in its life from now on, by this person's word."""
+    """Light that the object may receive in its life from now on, on the responsibility of this person."""
 
     event: Literal["budget"] = "budget"
     dose_lux_h: Amount
@@ -89,7 +90,7 @@ class Entry:
     damage_wh_m2: float | None
     note: str = ""
     is_settled: bool = True
-    """False while only the plan is known: what was given is at most this."""
+    """False while only the plan is known; the light that was given is at most this."""
 
 
 @dataclass
@@ -101,20 +102,21 @@ class History:
     """Entries of planned light, by their id."""
     warn_above_lux_h: float | None = None
     budgets: list[BudgetSet] = field(default_factory=list)
-    """Budgets in the order in which they were set; the last one holds."""
+    """Budgets in the order in which they were set. The last one counts."""
     without_plan: int = 0
-    """Lines of light that was given of a plan which is not here, since light was last entered by hand."""
+    """Number of lines with given light whose plan is missing, since light was last entered by hand."""
     unreadable: int = 0
-    """Lines that are no entries: torn by a crash before their light was given, or damaged later."""
+    """Number of lines that are not entries: a crash cut them before their light was given, or they were damaged
+    later."""
 
     @property
     def lacks_lines(self) -> bool:
-        """True if earlier lines are missing: more plans than damaged lines explain."""
+        """True if earlier lines are missing: more plans are missing than damaged lines explain."""
         return self.without_plan > self.unreadable
 
     @property
     def is_empty(self) -> bool:
-        """True if nothing was ever entered, as of an object that is new, or whose file was moved away."""
+        """True if nothing was ever entered. The object is then new, or its file was moved away."""
         return not self.entries and not self.budgets and self.warn_above_lux_h is None and not self.unreadable
 
     @property
@@ -123,7 +125,7 @@ class History:
 
     @property
     def budget_lux_h(self) -> float | None:
-        """The object's own; None if nobody has set one."""
+        """The object's own budget; None if nobody has set one."""
         return self.budgets[-1].dose_lux_h if self.budgets else None
 
     def allowed_lux_h(self, plans_lux_h: float | None) -> float | None:
@@ -145,11 +147,11 @@ class History:
 
     @property
     def unsettled_lux_h(self) -> float:
-        """Planned, with nobody left who could say what was given."""
+        """Planned light, if nobody can say any more how much of it was given."""
         return sum(entry.dose_lux_h for entry in self.entries if not entry.is_settled)
 
     def planned_lux_h(self, plan_id: str) -> float:
-        """Return the light that counts of the plan with this id; 0 if it is not known."""
+        """Return the light that counts for the plan with this id; 0 if the plan is not known."""
         return self.of_plan[plan_id].dose_lux_h if plan_id in self.of_plan else 0.0
 
     def of_run(self, run: str) -> History:
@@ -157,23 +159,23 @@ class History:
 
     @property
     def runs(self) -> list[str]:
-        """Runs in the order of their first light."""
+        """Return the runs in the order of their first light."""
         return list(dict.fromkeys(entry.run for entry in self.entries))
 
 
 @dataclass(frozen=True)
 class Asked:
-    """Light that somebody wants to give under a plan."""
+    """Light that is requested under a plan."""
 
     lux_h: float
     budget_lux_h: float | None
-    """The plan's own, which can only be stricter than the object's."""
+    """The plan's own budget. It can only make the object's budget stricter."""
     plan: str = ""
     name: str = ""
-    """Person who runs it."""
+    """Person who runs the plan."""
 
     def refuse_beyond(self, object_id: str, history: History, more_lux_h: float = 0.0) -> None:
-        """Raise DoseBudgetReached if this light, after what the ledger has and `more_lux_h`, is too much."""
+        """Raise DoseBudgetReached if this light is too much, together with the ledger's light and `more_lux_h`."""
         total_lux_h, allowed_lux_h = history.total_lux_h + more_lux_h, history.allowed_lux_h(self.budget_lux_h)
         if allowed_lux_h is None or total_lux_h + self.lux_h <= allowed_lux_h * (1.0 + _ROUNDING):
             return
@@ -186,7 +188,7 @@ class Asked:
         )
 
     def as_the_objects(self) -> BudgetSet:
-        """The plan's budget, as that of an object that has none."""
+        """Return the plan's budget as the budget of an object that has none."""
         assert self.budget_lux_h is not None
         return BudgetSet(
             dose_lux_h=self.budget_lux_h, name=self.name, reason=f"the first budget, by the plan {self.plan}"
@@ -194,7 +196,7 @@ class Asked:
 
 
 def read_lines(path: Path) -> list[bytes]:
-    """Lines of a file; none if there is no file. Raises StorageError."""
+    """Return the lines of a file; none if there is no file. Raises StorageError."""
     try:
         with _open_regular(path) as file:
             return file.read().split(b"\n")
@@ -205,7 +207,7 @@ def read_lines(path: Path) -> list[bytes]:
 
 
 def _open_regular(path: Path) -> BinaryIO:
-    """A file for reading. Raises OSError, also for a pipe or a device, which is not waited for."""
+    """Open a file for reading. Raises OSError, also for a pipe or a device, without waiting for it."""
     file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
@@ -214,7 +216,7 @@ def _open_regular(path: Path) -> BinaryIO:
 
 
 def history_of(texts: list[bytes]) -> History:
-    """Build the history that these lines tell."""
+    """Build the history from these lines."""
     reading = Reading()
     for text in texts:
         reading.take(text)
@@ -222,17 +224,17 @@ def history_of(texts: list[bytes]) -> History:
 
 
 class Reading:
-    """Part of a ledger that has been read; others go on writing it."""
+    """Part of a ledger that has been read, while others go on writing the ledger."""
 
     def __init__(self, *, only_grows: bool = False) -> None:
-        """`only_grows`: once lines were read, the file must keep them, and must be text; `with_new_lines` raises
-        StorageError otherwise."""
+        """`only_grows`: the file must keep lines that were read, and must be text; otherwise `with_new_lines`
+        raises StorageError."""
         self.history = History()
         self._only_grows = only_grows
         self._inode, self._read_bytes, self._tail = 0, 0, b""
 
     def with_new_lines(self, path: Path) -> Reading:
-        """Add the complete lines that came since; read all of them anew if the file is another one now. Raises
+        """Add the complete lines that are new. If the file was replaced, read all its lines again. Raises
         StorageError."""
         try:
             with _open_regular(path) as file:
@@ -276,7 +278,7 @@ class Reading:
         return reading
 
     def take(self, text: bytes) -> None:
-        """One more line."""
+        """Take one more line."""
         try:
             line = _LINE.validate_json(text)
         except ValidationError:
@@ -290,7 +292,7 @@ def _unreadable(path: Path, error: OSError) -> StorageError:
 
 
 def _add(history: History, line: Line) -> None:
-    """A correction counts in place of its plan; one whose plan cannot be read counts by itself."""
+    """Add a line. A correction replaces its plan. A correction whose plan cannot be read counts by itself."""
     if isinstance(line, WarningSet):
         history.warn_above_lux_h = line.dose_lux_h
         return

@@ -14,17 +14,17 @@ from coupole.storage.durable import sync_folder
 
 
 def utc_now() -> str:
-    """Now, ISO 8601 with milliseconds, UTC."""
+    """Return the present time, ISO 8601 with milliseconds, UTC."""
     return utc_text(datetime.now(UTC))
 
 
 def utc_text(time: datetime) -> str:
-    """A time in UTC, ISO 8601 with milliseconds."""
+    """Return a time in UTC, ISO 8601 with milliseconds."""
     return time.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 class LineFile:
-    """A file opened for appending. Raises DiskFull or StorageError; none of the lines is then appended."""
+    """A file opened for appending. After DiskFull or StorageError, none of the lines is appended."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -39,7 +39,7 @@ class LineFile:
             raise disk_error(path, error) from error
 
     def _end_torn_line(self) -> None:
-        """End the last line, which may be truncated after a crash, so that the next one is separate."""
+        """End the last line, which a crash may have cut, so that the next line is separate."""
         size = os.fstat(self._fd).st_size
         if size and os.pread(self._fd, 1, size - 1) != b"\n":
             os.write(self._fd, b"\n")
@@ -76,8 +76,8 @@ class LineFile:
 
     @property
     def place(self) -> Path | None:
-        """Path where the file is now, as the kernel has it (proc(5)); None if it was removed, or that is not
-        told."""
+        """Path where the file is now, from the kernel (proc(5)); None if it was removed, or if the path cannot be
+        found."""
         try:
             path = Path(f"/proc/self/fd/{self._fd}").readlink()
             return path if os.path.samestat(os.fstat(self._fd), path.stat()) else None

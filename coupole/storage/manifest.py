@@ -1,8 +1,8 @@
 """`manifest.sha256`: SHA-256 of a run's files; in the run's folder `sha256sum -c manifest.sha256` checks it.
 
-At every moment, also after a crash, all that it lists is on the disk and unchanged: files that a session writes
-(journal, views, report) are taken out of the list before the session begins, and entered when they are complete.
-`verify --manifest` enters files that are not listed yet.
+At every moment, and after a crash, all files that it lists are on the disk and unchanged. A session writes
+journal, views and report. So these files are taken out of the list before the session begins, and entered when
+they are complete. `verify --manifest` enters files that are not listed yet.
 """
 
 from __future__ import annotations
@@ -29,13 +29,14 @@ _UNFINISHED = (".part", ".archive")
 _CHUNK_BYTES = 4 * 2**20
 
 Progress = Callable[[int, int], None]
-"""Files hashed so far, and all."""
+"""Called with the number of files hashed so far, and the number of all files."""
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 def read_checksums(run: Path) -> dict[str, str]:
-    """SHA-256 by path in the run; empty without a manifest. Raises StorageError for another kind of line."""
+    """Return the SHA-256 by path in the run; empty without a manifest. Raises StorageError for a line of another
+    kind."""
     path = run / NAME
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -56,7 +57,8 @@ def read_checksums(run: Path) -> dict[str, str]:
 
 
 def files(run: Path) -> list[str]:
-    """Every file that a manifest can list, sorted; unfinished ones and the manifest itself are left out."""
+    """Return every file that a manifest can list, sorted. Unfinished files and the manifest itself are left
+    out."""
     names = [str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()]
     return sorted(name for name in names if name != NAME and not name.endswith(_UNFINISHED))
 
@@ -67,8 +69,8 @@ def begin(run: Path) -> None:
 
 
 def open_for_session(run: Path, complete_views: Iterable[str]) -> None:
-    """Take out what a session may write, before it begins. `complete_views` are files of views that it will not
-    open."""
+    """Take out the files that a session may write, before it begins. `complete_views` are files of views that it
+    will not open."""
     kept_names = set(complete_views)
     forget(run, [name for name in read_checksums(run) if _written_by_sessions(name) and name not in kept_names])
 
@@ -107,13 +109,13 @@ def enter(
 
 
 def _yield_to_others() -> None:
-    """Lowest priority, for the calling thread only, as Linux has it."""
+    """Give the calling thread the lowest priority; on Linux a thread has its own priority."""
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
 
 
 def _synced_sha256(path: Path, stop: threading.Event, on_read: Callable[[], None]) -> str:
-    """Hash a file that is on the disk first: the manifest must not know of more than the disk."""
+    """Sync a file, then hash it: the manifest must not list more than the disk has."""
     digest = hashlib.sha256()
     try:
         with path.open("rb") as file:
@@ -129,7 +131,8 @@ def _synced_sha256(path: Path, stop: threading.Event, on_read: Callable[[], None
 def problems(
     run: Path, progress: Progress = lambda done, total: None, *, only: AbstractSet[str] | None = None
 ) -> dict[str, str]:
-    """Say what is wrong with each listed file (of `only` these) that is missing or has changed, by its name."""
+    """Return the faults of listed files by name: a file is missing or has changed. With `only`, check only these
+    files."""
     digests, messages = read_checksums(run), {}
     digests = {name: digest for name, digest in digests.items() if only is None or name in only}
     for count, (name, digest) in enumerate(digests.items()):
@@ -145,7 +148,7 @@ def problems(
 
 
 def unlisted_files(run: Path) -> list[str]:
-    """Files that the manifest does not cover (yet)."""
+    """Return files that the manifest does not cover yet."""
     digests = read_checksums(run)
     return [name for name in files(run) if name not in digests]
 

@@ -7,9 +7,9 @@ lsb    a[7:0]    b[3:0] and a[11:8]  b[11:4]
 msb    a[11:4]   a[3:0] and b[11:8]  b[7:0]
 =====  ========  ==================  =======
 
-(The middle byte's high half is named first.) `lsb` is GenICam's `Mono12p` and `BayerGB12p` (PFNC: least
-significant bit first, no gaps), `msb` is TIFF's and DNG's (FillOrder 1). GigE Vision's older `Mono12Packed` is
-neither. Rows follow each other without a gap, as TIFF requires for an even width.
+(The middle byte's high half is named first.) `lsb` is the order of GenICam's `Mono12p` and `BayerGB12p` (PFNC:
+least significant bit first, no gaps). `msb` is the order of TIFF and DNG (FillOrder 1). GigE Vision's older
+`Mono12Packed` is neither. Rows follow each other without a gap, as TIFF requires for an even width.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ Order = Literal["lsb", "msb"]
 def pack12(
     pixels: NDArray[np.uint16], order: Order = "lsb", *, out: NDArray[np.uint8] | None = None
 ) -> NDArray[np.uint8]:
-    """Bytes [3 n / 2] of n pixels (any shape, C order, n even) below 4096, in `out` if given.
+    """Return the bytes [3 n / 2] of n pixels (any shape, C order, n even) below 4096, in `out` if given.
 
-    Raises ValueError for an odd number of pixels, and for one that has more than 12 bits.
+    Raises ValueError for an odd number of pixels, and for a pixel that has more than 12 bits.
     """
     if pixels.size % 2:
         raise ValueError(f"expected an even number of pixels, found {pixels.size}")
@@ -40,7 +40,8 @@ def pack12(
 
 
 def unpack12(packed_bytes: NDArray[np.uint8], order: Order = "lsb") -> NDArray[np.uint16]:
-    """Pixels [2 n / 3] of n bytes that `pack12` or a camera made. Raises ValueError unless 3 divides n."""
+    """Return the pixels [2 n / 3] of n bytes that `pack12` or a camera made. Raises ValueError unless n is a
+    multiple of 3."""
     if packed_bytes.size % 3:
         raise ValueError(f"expected a multiple of 3 bytes, found {packed_bytes.size}")
     pixels = np.empty(packed_bytes.size // 3 * 2, np.uint16)
@@ -50,7 +51,7 @@ def unpack12(packed_bytes: NDArray[np.uint8], order: Order = "lsb") -> NDArray[n
 
 @numba.njit(cache=True, nogil=True)
 def _pack(pixels, packed_bytes, msb_first):  # type: ignore[no-untyped-def]
-    """Returns the bitwise or of all pixels."""
+    """Pack the pixels; return the bitwise or of all of them."""
     all_bits = np.uint16(0)
     for pair in range(len(packed_bytes) // 3):
         a, b = pixels[2 * pair], pixels[2 * pair + 1]

@@ -32,7 +32,7 @@ from coupole.storage.stopped_process import holder_of, is_stopped
 
 FOLDER = "beside"
 RESULT = "result.json"
-"""File of a result that is whole."""
+"""File that a complete result has."""
 PICTURE = f"{FOLDER}/normals.png"
 _LOCK, _PROGRESS = f"{FOLDER}/lock", f"{FOLDER}/progress.json"
 _SUFFIX = "-reflectance"
@@ -52,13 +52,13 @@ class Progress(BaseModel):
     views: Annotated[int, Field(ge=0)] = 0
     """Views of the plan."""
     detail: str = ""
-    """Name of the step within the step, such as a fit."""
+    """Name of the present part of a step, such as a fit."""
     done_count: Annotated[int, Field(ge=0)] = 0
-    """Parts of `detail` that are done."""
+    """Number of parts of `detail` that are done."""
     of: Annotated[int, Field(ge=0)] = 0
-    """Parts of `detail`."""
+    """Number of parts of `detail`."""
     fitted_views: Annotated[int, Field(ge=0)] = 0
-    """Views of the result so far; 0 while there is none."""
+    """Number of views in the result so far; 0 while there is no result."""
     why: str = ""
     """Reason of a failure."""
 
@@ -70,20 +70,21 @@ class Processing:
     result: str
     """Folder of the result."""
     state: Literal["waiting", "extracting", "growing", "fitting", "done", "failed", "ended"]
-    """`waiting` for a complete view, `extracting` samples of one, `growing`: fitting what is there so far,
-    `fitting` after the last; `done`; `failed`, or `ended` before the result was whole."""
+    """`waiting`: for a complete view. `extracting`: samples of a view. `growing`: fitting the views so far.
+    `fitting`: after the last view. `done`. `failed`. `ended`: before the result was complete."""
     views_done: int = 0
     """Views whose samples are there."""
     views: int = 0
     """Views of the plan."""
     fitted_views: int = 0
-    """Views of the result so far, `RESULT/so-far`; 0 while there is none, and when the result is whole."""
+    """Views of the result so far, `RESULT/so-far`. It is 0 while there is no such result, and when the result is
+    complete."""
     detail: str = ""
-    """Fit or other step under way, with its share that is done."""
+    """The present fit or other step, with the share of it that is done."""
     why: str = ""
-    """Reason why it failed or ended, or stands still."""
+    """Reason why it failed, ended or stands still."""
     remedy: str = ""
-    """The command line that goes on from what is there; empty while nothing is wrong."""
+    """The command line that continues with the present data; empty while nothing is wrong."""
 
     def figures(self) -> dict[str, Any]:
         """Content of `processing` in `--json`."""
@@ -91,7 +92,7 @@ class Processing:
 
     @property
     def words(self) -> str:
-        """Say in a few words how far it is."""
+        """Return the state of the processing in a few words."""
         views = f"{self.views_done} of {self.views} views extracted"
         if self.fitted_views:
             views += f", result so far of {self.fitted_views}"
@@ -107,17 +108,17 @@ class Processing:
 
 
 def default_result(run: Path) -> Path:
-    """The folder of a run's result, if none was named: beside the run's own."""
+    """Return the folder of a run's result if no folder was named. It is beside the run's folder."""
     return run.with_name(run.name + _SUFFIX)
 
 
 def go_on_command(run: Path, result: Path) -> str:
-    """The command line that makes a result of a complete run, from what is there of it."""
+    """Return the command line that makes the result of a complete run, from its present data."""
     return f"coupole reflectance {shlex.quote(str(run))} --out {shlex.quote(str(result))}"
 
 
 def tell(result: Path, progress: Progress) -> None:
-    """Write the progress, for `processing_of`. Not synced: it must cost the acquisition nothing. Raises
+    """Write the progress for `processing_of`. It is not synced, because it must not slow the acquisition. Raises
     OSError."""
     path = result / _PROGRESS
     part = path.with_suffix(".json.part")
@@ -126,8 +127,8 @@ def tell(result: Path, progress: Progress) -> None:
 
 
 def processing_of(run: Path, result: Path, *, frames_left: bool, in_use: bool) -> Processing:
-    """State of the processing of a run into a result. `frames_left`: the run is not complete; `in_use`: a process
-    acquires into it."""
+    """Return the state of the processing of a run into a result. With `frames_left`, the run is not complete; with
+    `in_use`, a process acquires into it."""
     progress = _read_progress(result)
     place = str(result)
     if not frames_left and _is_whole(run, result):
@@ -149,7 +150,7 @@ def processing_of(run: Path, result: Path, *, frames_left: bool, in_use: bool) -
 
 
 def _is_whole(run: Path, result: Path) -> bool:
-    """Tell whether a folder has the whole result of this run, and of no other."""
+    """Tell whether a folder has the complete result of this run, and not of another one."""
     with contextlib.suppress(OSError, InputError):
         about = read_json(result / RESULT, allow_nan=True)
         return isinstance(about, dict) and list(about.get("runs", ())) == [run.name]
@@ -157,7 +158,7 @@ def _is_whole(run: Path, result: Path) -> bool:
 
 
 def _read_progress(result: Path) -> Progress:
-    """Nothing, where nothing was told yet, or what is there is none."""
+    """Return the progress. It is empty if no progress was written yet, or if the file is not valid."""
     try:
         return Progress.model_validate(read_json(result / _PROGRESS))
     except (OSError, InputError, ValidationError):
@@ -166,7 +167,7 @@ def _read_progress(result: Path) -> Progress:
 
 @contextmanager
 def hold_result(result: Path) -> Iterator[None]:
-    """Keep a result for this process: its folder is made, and locked while the context lasts. Raises InputError if
+    """Keep a result for this process: make its folder, and lock it while the context lasts. Raises InputError if
     another process has it, OSError."""
     (result / FOLDER).mkdir(parents=True, exist_ok=True)
     fd = os.open(result / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -183,7 +184,7 @@ def hold_result(result: Path) -> Iterator[None]:
 
 
 def refuse_held(result: Path) -> None:
-    """Raise InputError if another process is at work on a result, beside an acquisition."""
+    """Raise InputError if another process is making a result beside an acquisition."""
     if result.resolve() not in _own_results and _is_held(result / _LOCK):
         raise InputError(_at_work(result))
 

@@ -57,7 +57,7 @@ class Occupied:
     bytes_of_view: Mapping[str, int] = field(default_factory=dict)
     """Bytes by name of view."""
     settled_views: frozenset[str] = frozenset()
-    """Views whose files give nothing back any more: their frames are discarded, or they are archived."""
+    """Views whose files give back no more space, because their frames are discarded or they are archived."""
 
     @property
     def bytes(self) -> int:
@@ -69,15 +69,16 @@ class Run:
     """An open run folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Open an existing run. Raises InputError if there is none, or its run.json is wrong."""
+        """Open an existing run. Raises InputError if there is no run, or if its run.json is wrong."""
         self.folder = folder.resolve()
         self.is_lost = False
-        """Whether its folder or journal was removed or replaced: nothing more is written at its path."""
+        """True if its folder or journal was removed or replaced. Nothing more is then written at its path."""
         self.about = read_description(folder)
 
     @staticmethod
     def create(parent: Path, name: str, inputs: Inputs, about: dict[str, Any]) -> Run:
-        """Make `<UTC time>-<name>` under `parent`, with copies of the inputs; on the disk when this returns."""
+        """Make `<UTC time>-<name>` under `parent`, with copies of the inputs. It is on the disk when this
+        returns."""
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         try:
             make_folder(parent)
@@ -112,15 +113,15 @@ class Run:
         return self.folder / "views" / f"{view}.h5"
 
     def occupied_space(self) -> Occupied:
-        """Disk space that its views already occupy."""
+        """Return the disk space that its views already occupy."""
         events = journal.read_events(self.journal_path) if self.discards else ()
         gone_views = {event.view for event in events if isinstance(event, FramesDiscarded)}
         archived_views = {path.stem for path in (self.folder / "views").glob("*.h5") if _is_archived(path)}
         return Occupied(self._allocated_bytes(), frozenset(gone_views | archived_views))
 
     def _allocated_bytes(self) -> dict[str, int]:
-        """Disk space that the files of views already occupy, by name of view: files are allocated completely
-        before their first frame; later they may be archived, or frames of theirs discarded."""
+        """Return the disk space that the files of views already occupy, by name of view. Files are allocated
+        completely before their first frame. Later they may be archived, or their frames may be discarded."""
         return {path.stem: _settled_bytes(path) for path in (self.folder / "views").glob("*.h5")}
 
     @property
@@ -129,7 +130,8 @@ class Run:
         return bool(self.about.get("chosen_in_the_run", False))
 
     def choices(self) -> dict[str, list[Choice]]:
-        """The choices that were made for each view, by the journal; empty where the plan says all."""
+        """The choices that were made for each view, from the journal; empty if the plan itself gives all
+        bursts."""
         choices: dict[str, list[Choice]] = {}
         for event in journal.read_events(self.journal_path) if self.is_open else ():
             if isinstance(event, BurstsChosen):
@@ -145,8 +147,8 @@ class Run:
         return [view for view in self.about["views"] if not has_enough(choices.get(view, ()))]
 
     def expected_shots(self) -> Iterable[ShotId]:
-        """All shots and dark frames of the plan, without those whose LEDs are occluded in their view; where they
-        are chosen while it runs, all that were chosen so far."""
+        """All shots and dark frames of the plan, without those whose LEDs are occluded in their view. If bursts
+        are chosen while the run goes on, these are all shots that were chosen so far."""
         if self.is_open:
             choices = self.choices()
             for view in self.about["views"]:
@@ -168,7 +170,7 @@ class Run:
 
     @property
     def discards(self) -> bool:
-        """True if its plan has frames discarded when their samples are safe (`discard: after_fit`)."""
+        """True if its plan discards frames when their samples are safe (`discard: after_fit`)."""
         return self.about.get("discard") == "after_fit"
 
     @property
@@ -178,19 +180,19 @@ class Run:
 
     @property
     def proof(self) -> str:
-        """Basis of the identity of the run's frames, in the words of run.json."""
+        """Kind of proof of the run's frames, in the words of run.json."""
         proof: str = self.about.get("proof", "not recorded")
         return proof
 
     def proven(self) -> dict[ShotId, FrameProven]:
-        """Proven shots, by the journal."""
+        """Return the proven shots, from the journal."""
         return {
             event.shot: event for event in journal.read_events(self.journal_path) if isinstance(event, FrameProven)
         }
 
     def complete_views(self) -> list[str]:
-        """Views whose frames are all proven and on the disk, and of which no more are chosen, in the plan's order:
-        nothing writes into their files any more."""
+        """Views whose frames are all proven and on the disk, and for which no more are chosen, in the plan's
+        order. Nothing writes into their files any more."""
         proven = self.proven()
         incomplete_views = {shot.view for shot in self.expected_shots() if shot not in proven}
         incomplete_views |= set(self.open_views())
@@ -199,8 +201,8 @@ class Run:
 
     @property
     def asked_result(self) -> Path | None:
-        """The folder of the result that is made beside the acquisition, as the newest session says; None if none
-        is."""
+        """The folder of the result that is made beside the acquisition, from the newest session; None if there is
+        none."""
         events = [e for e in journal.read_events(self.journal_path) if isinstance(e, ProcessingAsked)]
         return Path(events[-1].result) if events else None
 
@@ -220,7 +222,7 @@ class Run:
 
     @contextmanager
     def hold_lock(self) -> Iterator[None]:
-        """The lock while the context lasts."""
+        """Hold the lock while the context lasts."""
         fd = self.lock()
         try:
             yield
@@ -241,22 +243,23 @@ class Run:
 
     @property
     def holder(self) -> int | None:
-        """The process that acquires into the run, or archives it; None if there is none, or it cannot be told."""
+        """The process that acquires into the run, or archives it; None if there is none, or if it cannot be
+        found."""
         return holder_of(self.folder / RUN_JSON)
 
     @property
     def report_path(self) -> Path:
-        """The page that its conclusion writes; it may be missing."""
+        """The page that the end of a session writes; it may be missing."""
         return self.folder / "report.html"
 
     @property
     def plan_path(self) -> Path:
-        """The plan to go on with: the run's own copy, or in runs without copies the file that was named."""
+        """The plan to continue with: the run's own copy, or in runs without copies the original file."""
         return self._input("plan")
 
     @property
     def rig_path(self) -> Path:
-        """The rig, likewise."""
+        """The rig to continue with: the run's own copy, or in runs without copies the original file."""
         return self._input("rig")
 
     def _input(self, kind: str) -> Path:
@@ -265,7 +268,7 @@ class Run:
 
     @property
     def go_on_command(self) -> str:
-        """The whole command line that resumes the run."""
+        """The complete command line that resumes the run."""
         plan = "" if "stored" in self.about["plan"] else f"{shlex.quote(self.about['plan']['path'])} "
         return f"coupole acquire {plan}--resume {shlex.quote(str(self.folder))}"
 
@@ -279,8 +282,8 @@ class Run:
             )
 
     def refuse_changes(self, inputs: Inputs) -> None:
-        """Raise InputError unless plan, rig and the files they name mean what those meant that the run began
-        with."""
+        """Raise InputError if plan, rig or the files that they name differ in meaning from those at the run's
+        begin."""
         if changes := changes_since(self.about, self.folder, inputs):
             own_files = {
                 RUN_JSON,
@@ -324,12 +327,13 @@ def _settled_bytes(view_file: Path) -> int:
 
 
 def name_without_time(folder_name: str) -> str:
-    """The name that a run was given, which its folder's name has after the time; other names stay."""
+    """Return the name that the user gave to a run: its folder's name without the time. Other names stay
+    unchanged."""
     return folder_name.partition("Z-")[2] or folder_name
 
 
 def user_name() -> str:
-    """Whoever is logged in."""
+    """Return the name of the user who is logged in."""
     try:
         return getpass.getuser()
     except (OSError, KeyError):

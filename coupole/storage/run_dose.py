@@ -1,6 +1,6 @@
 """The light that a run has given the object in all its sessions, from its journal.
 
-A burst whose end was not recorded (its process was killed) counts as planned.
+If the end of a burst was not recorded (its process was killed), its planned light counts.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from coupole.storage.journal_events import BurstBegun, BurstEnded, Event
 
 
 def lux_h_of_points(events: Iterable[Event]) -> tuple[float, ...]:
-    """Lux hours at each of the object's dose points; empty if no light is recorded."""
+    """Return lux hours at each of the object's dose points; empty if no light is recorded."""
     total: tuple[float, ...] = ()
     burst_lux_h: tuple[float, ...] = ()
     for event in events:
@@ -24,7 +24,7 @@ def lux_h_of_points(events: Iterable[Event]) -> tuple[float, ...]:
 
 
 def highest_lux_h(events: Iterable[Event]) -> float:
-    """Light at the point with the highest dose, which is the run's."""
+    """Return the light at the point with the highest dose, which is the run's dose."""
     return max(lux_h_of_points(events), default=0.0)
 
 

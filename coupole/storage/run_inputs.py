@@ -8,8 +8,8 @@
            arm/                     description of the arm, meshes of its links
            calibrations/NAME/       a record and its files
 
-Paths that are no files to be read (the storage folder, a joined world) become absolute. `run.json` has hash and
-unchanged text of plan and rig, and the hash of every other file.
+Paths that do not name readable files (the storage folder, a joined world) become absolute. `run.json` has the hash
+and the unchanged text of plan and rig, and the hash of every other file.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from coupole.storage.durable import make_folder, sync_folder, write_synced
 FOLDER = "inputs"
 PLAN, RIG = f"{FOLDER}/plan.yaml", f"{FOLDER}/rig.yaml"
 MOST_COPIED_BYTES = 100_000_000
-"""A larger file is named by its hash, and copied on request."""
+"""A larger file is only named by its hash. It is copied on request."""
 _SLOWEST_BYTES_S = 5e6
 
 
@@ -51,20 +51,21 @@ class Inputs:
     other_files: tuple[Path, ...]
     """LED table, mesh, calibration records."""
     arm: ArmDescription | None = None
-    """The arm in force, whatever names it."""
+    """The arm in force, from wherever it is named."""
     copy_large: bool = False
     """Copy files of more than MOST_COPIED_BYTES, too."""
     files: InputFiles = field(default_factory=InputFiles)
-    """Their bytes, as the job was made of them: these are hashed, compared and kept, whatever the disk has now."""
+    """The files' bytes that the job was made of. These bytes are hashed, compared and kept, even if the disk has
+    others now."""
 
 
 def copied_s(inputs: Inputs) -> float:
-    """Time for the copies of a new run on a disk that is slow."""
+    """Return the time for the copies of a new run on a slow disk."""
     return sum(path.stat().st_size for path in inputs.other_files if path.is_file()) / _SLOWEST_BYTES_S
 
 
 def keep(inputs: Inputs, run: Path) -> dict[str, Any]:
-    """Write the inputs, as they were read, into a run's folder; returns what `run.json` says of them. All is on
+    """Write the inputs, as they were read, into a run's folder; return their description for `run.json`. All is on
     the disk afterwards."""
     keeper = _Keeper(run, inputs.files, inputs.copy_large)
     make_folder(run / FOLDER)
@@ -91,7 +92,7 @@ def keep(inputs: Inputs, run: Path) -> dict[str, Any]:
 
 
 def _arm_sha256(arm: ArmDescription) -> str:
-    """Hash of all that the description says; the meshes of its links are compared as files."""
+    """Return the hash of the whole description. The meshes of its links are compared as files."""
     return hashlib.sha256(arm.model_dump_json(exclude={"link_meshes"}).encode()).hexdigest()
 
 
@@ -104,7 +105,7 @@ def _text(path: Path, files: InputFiles) -> str:
 
 
 def _read_model(path: Path, files: InputFiles, model: type[Plan] | type[Rig]) -> tuple[Document, BaseModel] | None:
-    """A plan or rig and its model; None if it is none."""
+    """Return a plan or rig and its model; None if the file is neither."""
     try:
         document = yamlfile.read_document(path, files)
         return document, document.validate(model)
@@ -114,13 +115,13 @@ def _read_model(path: Path, files: InputFiles, model: type[Plan] | type[Rig]) ->
 
 @dataclass
 class _Keeper:
-    """Writes the bytes that were read into a run, each file's once."""
+    """Writes the bytes that were read into a run, each file once."""
 
     run: Path
     files: InputFiles
     copy_large: bool
     stored_places: dict[Path, str | None] = field(default_factory=dict)
-    """Place in the run, by absolute path; None for a file that is too large."""
+    """Place in the run, by absolute path; None for a file that is too large or missing."""
 
     def plan_text(self, inputs: Inputs) -> str:
         plan_file = _read_model(inputs.plan, self.files, Plan)
@@ -147,7 +148,7 @@ class _Keeper:
         return rewritten(document, document.text, changes)
 
     def _copy(self, at: KeyPath, path: Path) -> str | None:
-        """Place of the copy of what stands at this key path; None if it is not copied."""
+        """Copy the file at this key path; return the place of the copy, None if it is not copied."""
         match at:
             case ("dome", _):
                 return self.file(path, "dome")
@@ -160,7 +161,7 @@ class _Keeper:
         return None
 
     def file(self, path: Path, folder: str) -> str | None:
-        """Copy a file into a folder of `inputs`; None if it is too large, or not there."""
+        """Copy a file into a folder of `inputs`; None if it is too large or missing."""
         path = path.absolute()
         if path not in self.stored_places:
             if not self.files.there(path) or (
@@ -185,7 +186,7 @@ class _Keeper:
         return next(place for place in places if place not in taken_places)
 
     def _record(self, path: Path) -> str | None:
-        """A calibration record, and beside it the files that it names."""
+        """Copy a calibration record, and beside it the files that it names."""
         folder = f"calibrations/{re.sub(r'[^A-Za-z0-9._-]', '_', path.stem)}"
         copy = self.file(path, folder)
         if copy is not None:
@@ -201,7 +202,7 @@ class _Keeper:
         return str(Path(places[0]).parent) if all(places) and places[0] else None
 
     def _arm(self, document: Document, arm: ArmDescription) -> str:
-        """The arm's file, or a new one for the arm that comes with Coupole for the robot's driver."""
+        """Write the arm's file, or a new file for the arm that comes with Coupole for the robot's driver."""
         arm_name = document.data.get("arm")
         place = f"{FOLDER}/arm/{Path(arm_name).name if arm_name else 'arm.yaml'}"
         meshes = self._link_meshes(arm.link_meshes) if arm.link_meshes else None
@@ -237,7 +238,8 @@ def _files_of_record(path: Path, files: InputFiles) -> Iterator[str]:
 def changes_since(about: Mapping[str, Any], run: Path, now: Inputs) -> list[str]:
     """List how plan, rig and the files that they name differ in meaning from those that a run began with.
 
-    Comments, the order of keys, and the place of a file are no change; any other byte of a mesh or a record is.
+    Comments, the order of keys, and the place of a file do not count as changes. Any changed byte of a mesh or a
+    record counts.
     """
     arm_known = now.arm is not None and "arm_sha256" in about
     changes = [
@@ -287,7 +289,8 @@ def _plain(text: str) -> str:
 
 
 def _meaning(path: Path, files: InputFiles) -> str:
-    """Hash of what counts in a file: of a table's lines without comments, and of all bytes of another file."""
+    """Return the hash of the content that counts: for a table, its lines without comments; for another file, all
+    bytes."""
     if path.suffix.lower() != ".csv":
         return files.sha256(path)
     lines = [line.strip() for line in files.read_bytes(path).splitlines()]

@@ -1,4 +1,4 @@
-"""Model of run.json: what the program needs to go on with the run; more may stand there."""
+"""Model of run.json: the fields that the program needs to continue the run. The file may have more fields."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class _Description(_Part):
     labels: list[Label] | dict[str, list[Label]]
     """One list for all views, or one for each."""
     chosen_in_the_run: bool = False
-    """True: which frames there are stands in the journal, not in `labels`."""
+    """True: the frames are listed in the journal, not in `labels`."""
     hidden_leds: dict[str, list[int]] = Field(default_factory=dict)
     plan: _File
     rig: _File
@@ -88,7 +88,8 @@ class _Description(_Part):
 
 
 def read_description(folder: Path) -> dict[str, Any]:
-    """The content of a run's run.json. Raises InputError if the folder is no run, or something in it is wrong."""
+    """Return the content of a run's run.json. Raises InputError if the folder is not a run, or if run.json is
+    wrong."""
     path = folder / RUN_JSON
     try:
         content = read_json(path, allow_nan=True)

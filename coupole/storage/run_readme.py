@@ -1,4 +1,4 @@
-"""`README.txt` of a run: for whoever finds the folder in ten years, without Coupole."""
+"""`README.txt` of a run, for a person who finds the folder in ten years and does not have Coupole."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ with the folder of the samples, which is not this one.
 
 
 def readme(folder_name: str, about: dict[str, Any]) -> str:
-    """Its text, by the content of run.json."""
+    """Return the text, from the content of run.json."""
     views = about.get("views") or ["NAME"]
     return _TEXT.format(
         name=folder_name,

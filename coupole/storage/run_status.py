@@ -1,4 +1,4 @@
-"""Progress of a run and the story of its sessions, by its journal and its lock."""
+"""Progress of a run and the history of its sessions, from its journal and its lock."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from coupole.storage.stopped_process import is_stopped
 RUNNING, PAUSED, CREATED = "running", "paused", "created"
 KILLED = "its last session has no end: it was killed, or the power failed"
 _STOPPED_IN_0_1 = "Interrupted"
-"""Kind of fault as which version 0.1 noted that the operator had stopped the session."""
+"""Kind of fault with which version 0.1 noted that the operator had stopped the session."""
 
 
 @dataclass
@@ -58,9 +58,9 @@ class Session:
     ended: str = ""
     """Time of its last event so far."""
     outcome: str = ""
-    """`done`, `interrupted` or `failed`; empty while it runs, and for one that was killed."""
+    """`done`, `interrupted` or `failed`; empty while it runs, and for a killed session."""
     reason: str = ""
-    """Reason why it ended, if not because all was done."""
+    """Reason why it ended before all was done."""
     pauses: int = 0
     paused_s: float = 0.0
     light_s: float = 0.0
@@ -68,7 +68,7 @@ class Session:
 
     @property
     def duration_s(self) -> float:
-        """Time from its begin to its last event, s, pauses included, by this machine's clock."""
+        """Time from its begin to its last event, s, by this machine's clock. Pauses are included."""
         return _seconds(self.begun, self.ended)
 
 
@@ -81,38 +81,39 @@ class Status:
     reason: str = ""
     """Reason why it is interrupted or failed."""
     proof: str = ""
-    """Basis of the identity of its frames."""
+    """Kind of proof of its frames."""
     shots: int = 0
     proven: int = 0
     darks_proven: int = 0
     reshot: int = 0
     faults: list[str] = field(default_factory=list)
-    """Failures of the run. That somebody stopped the run is none."""
+    """Failures of the run. A stop by a person is not a failure."""
     holds: list[str] = field(default_factory=list)
-    """Reason of each hold until a person's word: Ctrl-Z, a freeze."""
+    """Reason of each hold until a person let the session go on, such as Ctrl-Z or a freeze."""
     findings: list[str] = field(default_factory=list)
-    """Findings of watching the measurement: view, name, what was seen, and the picture's path in the run."""
+    """Findings of watching the measurement: view, name, description, and the picture's path in the run."""
     sessions: list[Session] = field(default_factory=list)
     views: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Proven and expected frames of each view; where they are chosen in the run, expected as far as chosen."""
+    """Proven and expected frames of each view. If frames are chosen in the run, the expected ones are those chosen
+    so far."""
     open_views: list[str] = field(default_factory=list)
-    """Views of which it is not yet decided what else they need, where that is chosen in the run."""
+    """Views for which more frames may still be chosen, if frames are chosen in the run."""
     last_event: str = ""
     dose_lux_h: float = 0.0
     """Light on the object in all sessions."""
     dose_budget_lux_h: float | None = None
-    """Light that the object may receive in its life, as it was when the last session began; None: no budget, or
-    not known."""
+    """Light that the object may receive in its life, at the begin of the last session; None: no budget, or not
+    known."""
     stopped_pid: int | None = None
-    """The process that has the run, where that is stopped (Ctrl-Z, SIGSTOP)."""
+    """The process that has the run, if that process is stopped (Ctrl-Z, SIGSTOP)."""
     go_on: str = ""
-    """The command line that takes what is left; empty if nothing is, or while the run is in use."""
+    """The command line that takes the remaining frames; empty if there are none, or while the run is in use."""
     before_that: str = ""
-    """The command line by which a person first confirms a fault of the arm; empty if none stands."""
+    """The command line with which a person first confirms a fault of the arm; empty if there is no fault."""
     frames_discarded: int = 0
     """Frames that were discarded when their samples were safe, as the plan said."""
     processing: Processing | None = None
-    """Processing beside the acquisition; None if it was not asked for."""
+    """Processing beside the acquisition; None if it was not requested."""
 
     @property
     def missing(self) -> int:
@@ -125,7 +126,7 @@ class Status:
 
     @property
     def left_in_words(self) -> str:
-        """Say in words what is left to take; where bursts are chosen in the run, nobody knows how much more."""
+        """Return in words how much is left to take. If bursts are chosen in the run, the rest is not known."""
         frames = "1 frame" if self.frames_left == 1 else f"{self.frames_left} frames"
         return f"{frames} and frames that are not chosen yet" if self.open_views else frames
 
@@ -138,8 +139,8 @@ class Status:
 
 
 def status(run: Run, *, in_use: bool | None = None) -> Status:
-    """Progress of a run, also of one that is running. The caller that knows about its lock states whether it is
-    `in_use`.
+    """Return the progress of a run, even while it is running. A caller that knows about its lock may say whether
+    it is `in_use`.
     """
     status = Status(proof=run.proof)
     shots = list(run.expected_shots())
@@ -185,7 +186,7 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
 
 
 def _place_of_samples(run: Run, discards: Sequence[FramesDiscarded]) -> Path | None:
-    """Return the folder of the result whose samples stand for frames that were discarded; None if none were."""
+    """Return the folder of the result whose samples replace discarded frames; None if no frames were discarded."""
     if not discards:
         return None
     from coupole.storage.discarding import place_of_result
@@ -194,7 +195,7 @@ def _place_of_samples(run: Run, discards: Sequence[FramesDiscarded]) -> Path | N
 
 
 def _with_samples(processing: Processing, place: Path, discards: Sequence[FramesDiscarded]) -> Processing:
-    """The processing, failed if samples that stand for discarded frames are not where they were."""
+    """Return the processing. It is failed if samples that replace discarded frames are missing."""
     missing = [place / event.samples for event in discards if not (place / event.samples).exists()]
     if not missing:
         return processing
@@ -203,8 +204,8 @@ def _with_samples(processing: Processing, place: Path, discards: Sequence[Frames
 
 
 def _confirmation(run: Run) -> str:
-    """Return the command that confirms the standing faults of the arm of the run's rig; empty without any, and if
-    the rig is not where the run was begun."""
+    """Return the command that confirms the standing faults of the rig's arm. It is empty if there are none, or if
+    the rig's file is not where it was at the run's begin."""
     from coupole.plan.cell import read_cell
     from coupole.storage.arm_faults import faults_of
 
@@ -270,8 +271,8 @@ def _seconds(begin_time: str, end_time: str) -> float:
 
 
 def newest_run(parent: Path, name: str, plan: Path, say: Callable[[str], object]) -> Path | None:
-    """The newest run in `parent` of the plan with this name; None if there is none, or if the plan's file was
-    changed since it began, which is said."""
+    """Return the newest run in `parent` of the plan with this name. None if there is none, or if the plan's file
+    has changed since the run began; `say` is told this."""
     folders = [folder for folder in sorted(parent.glob(f"*-{name}")) if (folder / RUN_JSON).is_file()]
     if not folders:
         return None
@@ -282,6 +283,6 @@ def newest_run(parent: Path, name: str, plan: Path, say: Callable[[str], object]
 
 
 def is_complete(folder: Path) -> bool:
-    """Tell whether all frames of a run are proven, and none are left to choose."""
+    """Tell whether all frames of a run are proven, and no more are to be chosen."""
     found = status(Run(folder))
     return not found.missing and not found.open_views

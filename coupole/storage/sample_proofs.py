@@ -1,8 +1,8 @@
-"""Proofs of the samples that stand for discarded frames: `proofs.jsonl` in the folder of their result.
+"""Proofs of the samples that replace discarded frames: `proofs.jsonl` in the folder of their result.
 
-Each line has the digest of a view's file of samples, taken from what was written, and found again when the file
-was read back. A line more is added, before the file is replaced, when light from surface to surface is taken off
-the samples, and when those that contradict others are left out.
+Each line has the digest of a view's file of samples. The digest was taken from the written data, and was the same
+when the file was read back. Another line is added before the file is replaced. This happens when light from
+surface to surface is subtracted from the samples, and when samples that contradict others are left out.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ class Proof:
     view: str
     digest: str
     is_first: bool
-    """True for samples that were taken from frames, whose file may have replaced an earlier one."""
+    """True for samples that were taken from frames. Their file may have replaced an earlier one."""
 
 
 def has_proofs(result: Path) -> bool:
-    """Tell whether samples of a result stand, or may come to stand, for frames that are discarded."""
+    """Tell whether samples of a result replace discarded frames, or may do so later."""
     return (result / NAME).exists()
 
 
 def proofs_of(result: Path, view: str) -> list[str]:
-    """Digests that the samples of a view have had since they were taken, the first first. A line that a crash has
-    cut is no proof. Raises StorageError for what is no proof."""
+    """Return the digests that the samples of a view have had, in the order of time. A line that a crash has cut is
+    ignored. Raises StorageError for a line that is not a proof."""
     digests: list[str] = []
     for proof in _read_proofs(result / NAME):
         if proof.view == view:
@@ -46,8 +46,8 @@ def proofs_of(result: Path, view: str) -> list[str]:
 
 
 def prove(result: Path, view: str, digest: str) -> None:
-    """Read the samples of a view back, compare them with what was written, whose `digest` is given, and note it.
-    Raises ChecksumMismatch if they differ, StorageError."""
+    """Read the samples of a view back, compare them with the written data, whose `digest` is given, and note the
+    digest. Raises ChecksumMismatch if they differ, StorageError."""
     path = samples_path(result, view)
     if digest_on_disk(path) != digest:
         raise ChecksumMismatch(
@@ -58,7 +58,8 @@ def prove(result: Path, view: str, digest: str) -> None:
 
 
 def note(result: Path, view: str, digest: str, *, is_first: bool = False) -> None:
-    """Note a digest that was found again; on the disk when this returns. Raises StorageError."""
+    """Note a digest that was confirmed by reading back. It is on the disk when this returns. Raises
+    StorageError."""
     about = {"t": utc_now(), "view": view, "digest": digest, "is_first": is_first}
     file = LineFile(result / NAME)
     try:
@@ -68,8 +69,8 @@ def note(result: Path, view: str, digest: str, *, is_first: bool = False) -> Non
 
 
 def problem_of(result: Path, view: str, first: str) -> str:
-    """Return what is wrong with the samples of a view, read from the disk, that were proven with the digest
-    `first`; empty if nothing is."""
+    """Return the fault of a view's samples on the disk, which were proven with the digest `first`; empty if there
+    is none."""
     path = samples_path(result, view)
     if not path.is_file():
         return f"{path} is missing: put it back from a copy; nothing else has these samples"

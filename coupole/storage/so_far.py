@@ -5,8 +5,8 @@
     RESULT/so-far           link to the newest of them, until the result is whole
     RESULT/beside/RUN-2-of-3-views-1a2b3c4d/
 
-Each is a whole result, which any command opens. It is put in its place when it is whole; the one before it stays
-for those who read it, the one before that is removed.
+Each is a complete result, which any command opens. It is put in its place when it is complete. The one before it
+stays, because somebody may be reading it; older ones are removed.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ _KEPT, _FOLDERS = 2, "*-of-*-views-*/"
 
 
 def new_folder(result: Path, run: str, views: int, of: int) -> Path:
-    """Folder in which the result of some views of a run is made; another one each time, because the link may lead
-    to an earlier one of the same views."""
+    """Return a new folder for the result of some views of a run. It is another folder each time, because the link
+    may lead to an earlier result of the same views."""
     return result / FOLDER / f"{run}-{views}-of-{of}-views-{uuid4().hex[:8]}"
 
 
 def remove_halves(result: Path) -> None:
-    """Remove what a process that was killed left half made."""
+    """Remove results that a killed process left incomplete."""
     for folder in (result / FOLDER).glob(_FOLDERS):
         if not (folder / RESULT).exists():
             shutil.rmtree(folder, ignore_errors=True)
 
 
 def put_in_place(result: Path, new_folder: Path) -> None:
-    """Let the link lead to a result of the views so far that was just made; remove what nobody reads any more.
-    Raises OSError."""
+    """Let the link lead to the new result of the views so far. Remove results that nobody reads any more. Raises
+    OSError."""
     link = result / f"{LINK}.part"
     link.unlink(missing_ok=True)
     link.symlink_to(new_folder.relative_to(result))
@@ -55,14 +55,14 @@ def put_in_place(result: Path, new_folder: Path) -> None:
 
 
 def remove(result: Path) -> None:
-    """Remove the link, when the result is whole."""
+    """Remove the link when the result is complete."""
     with contextlib.suppress(FileNotFoundError):
         (result / LINK).unlink()
 
 
 def as_it_is_now(result: Path) -> Path:
-    """Return the folder that a reader opens, which no later view replaces: that of the views so far while the
-    result itself is not whole; else the same."""
+    """Return the folder that a reader opens; no later view replaces it. It is the result of the views so far until
+    the result itself is complete, then the result itself."""
     link = result if result.is_symlink() and result.name == LINK else result / LINK
     if (result / RESULT).exists() and link != result:
         return result
@@ -71,8 +71,8 @@ def as_it_is_now(result: Path) -> Path:
 
 @contextmanager
 def reading(result: Path) -> Iterator[Path]:
-    """Give the folder that a reader opens (`as_it_is_now`). Whatever fails inside because a result of more views
-    has replaced it meanwhile is raised as InputError."""
+    """Give the folder that a reader opens (`as_it_is_now`). An error is raised as InputError if a result of more
+    views has replaced the folder meanwhile."""
     folder = as_it_is_now(result)
     try:
         yield folder
@@ -89,12 +89,12 @@ def _is_replaced(folder: Path) -> bool:
 
 
 def figures(about: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what `--json` says of it: empty for a result that is whole."""
+    """Return the figures for `--json`; empty for a complete result."""
     return {KEY: about[KEY]} if KEY in about else {}
 
 
 def words(about: Mapping[str, Any]) -> str:
-    """Say from how many views of how many a result is; empty for one that is whole."""
+    """Say how many of the views a result has; empty for a complete result."""
     if KEY not in about:
         return ""
     views, of = about[KEY]["views"], about[KEY]["of"]

@@ -1,4 +1,5 @@
-"""Fields of a step's record that a frame table keeps: the columns of a view's file, in the file's own terms."""
+"""Fields of a step's record that a frame table keeps: the columns of a view's file, in the file's units and
+codes."""
 
 from __future__ import annotations
 
@@ -14,11 +15,11 @@ STORED_NO_LED = 0xFFFF
 _LED_OPEN, _OVER_TEMPERATURE, _NO_EDGE, _WAITED = 1, 2, 4, 8
 """Bits of `status`."""
 _UNKNOWN = 0
-"""`board_temperature_dc` and `led_current_ma` where the box could not tell."""
+"""Value of `board_temperature_dc` and `led_current_ma` if the box did not measure them."""
 
 
 def step_fields(record: StepRecord, t_trigger_ns: int) -> dict[str, int]:
-    """Columns of the frame that a step made, which was triggered at `t_trigger_ns`."""
+    """Return the columns of the frame that a step made. The step was triggered at `t_trigger_ns`."""
     return {
         "t_trigger_ns": t_trigger_ns,
         "led": STORED_NO_LED if record.led == NO_LED else record.led,
@@ -33,14 +34,14 @@ def step_fields(record: StepRecord, t_trigger_ns: int) -> dict[str, int]:
 
 
 def board_temperature_c(record: np.void) -> float | None:
-    """Temperature of the LED's board, as a frame's record (FRAME_DTYPE) has it, C; None if the box could not
-    tell."""
+    """Return the temperature of the LED's board from a frame's record (FRAME_DTYPE), C; None if the box did not
+    measure it."""
     decicelsius = int(record["board_temperature_dc"])
     return None if decicelsius == _UNKNOWN else decicelsius / 10
 
 
 def temperature_range_c(records: Iterable[np.void]) -> tuple[float, float] | None:
-    """Lowest and highest of the boards' temperatures; None if none is known."""
+    """Return the lowest and the highest temperature of the boards; None if none is known."""
     temperatures_c = [celsius for record in records if (celsius := board_temperature_c(record)) is not None]
     return (min(temperatures_c), max(temperatures_c)) if temperatures_c else None
 

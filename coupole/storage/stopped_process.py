@@ -1,4 +1,5 @@
-"""Processes of this machine, by Linux's `/proc`: which one has locked a file, and whether one is stopped."""
+"""Processes of this machine, from Linux's `/proc`: the process that has locked a file, and whether a process is
+stopped."""
 
 from __future__ import annotations
 
@@ -19,8 +20,8 @@ def is_stopped(pid: int) -> bool:
 
 
 def holder_of(file: Path) -> int | None:
-    """The process that holds the exclusive lock of a file (flock), found without taking a lock; None if there is
-    none, or if it cannot be determined.
+    """Return the process that holds the exclusive lock of a file (flock), without taking a lock. None if there is
+    none, or if it cannot be found.
     """
     try:
         inode = file.stat().st_ino

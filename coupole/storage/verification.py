@@ -1,4 +1,4 @@
-"""Reads a run back: every proven frame, and every file that its manifest lists."""
+"""Reads every proven frame of a run back, and every file that its manifest lists."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class Verification:
     """One line for each error."""
     missing: list[str] = field(default_factory=list)
     listed_count: int = 0
-    """Files of the manifest, each read and compared."""
+    """Number of files in the manifest; each was read and compared."""
     discarded_counts: dict[str, int] = field(default_factory=dict)
-    """Number of discarded frames by view, as the plan said. The samples that stand for them were read and
+    """Number of discarded frames by view, as the plan said. The samples that replace them were read and
     compared."""
     results: list[str] = field(default_factory=list)
     """Folders of the results that have these samples."""
@@ -47,8 +47,8 @@ class Verification:
 
 def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: None) -> Verification:
     """Read every proven frame back: each shot of the plan exactly once, each record and checksum right. Compare
-    its light, exposure and pose with the plan that the run keeps, and every file that the manifest lists. In the
-    place of frames that were discarded, their samples are read."""
+    its light, exposure and pose with the plan that the run keeps, and every file that the manifest lists. For
+    discarded frames, their samples are read instead."""
     result = Verification()
     proven = run.proven()
     result.missing = [str(shot) for shot in run.expected_shots() if shot not in proven]
@@ -95,7 +95,7 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
 
 
 def _check_discarded(run: Run, result: Verification, proven: Mapping[ShotId, FrameProven]) -> set[ShotId]:
-    """Frames that were discarded; what is wrong with the samples that stand for them is noted."""
+    """Return the frames that were discarded. Faults of the samples that replace them are noted."""
     frames: set[ShotId] = set()
     for view, event in discarded_views(run).items():
         if event.view != view or any(
@@ -115,7 +115,7 @@ def _check_discarded(run: Run, result: Verification, proven: Mapping[ShotId, Fra
 
 
 def _unchosen(run: Run) -> list[str]:
-    """Frames that the journal has before it has the choice that they belong to, where frames are chosen."""
+    """Find frames that come before their choice in the journal, if frames are chosen."""
     chosen_shots: set[ShotId] = set()
     problems = []
     for event in journal.read_events(run.journal_path) if run.is_open else ():

@@ -1,4 +1,5 @@
-"""One view's file as readers of proven frames need it: pixels, records and poses, checked against each other."""
+"""One view's file for readers of proven frames: pixels, records and poses, which are checked against each
+other."""
 
 from __future__ import annotations
 
@@ -34,17 +35,17 @@ class View:
     white_dn: int
 
     def pixels(self, slot: int) -> NDArray[np.uint16]:
-        """[H, W], DN. Raises StorageError, FrameDiscarded."""
+        """Return [H, W], DN. Raises StorageError, FrameDiscarded."""
         self._refuse_discarded(slot)
         return frame_file.read_frame(self.path, self.layout, slot)
 
     def proven_pixels(self, frame: FrameProven) -> NDArray[np.uint16]:
-        """[H, W], DN, of a frame of this file. Raises StorageError, FrameDiscarded; ChecksumMismatch if not what
-        was proven."""
+        """Return [H, W], DN, of a frame of this file. Raises StorageError, FrameDiscarded, and ChecksumMismatch if
+        the pixels differ from the proven ones."""
         return self._proven(frame, self.pixels(frame.index))
 
     def read_proven_pixels(self, frame: FrameProven, pixels: NDArray[np.uint16]) -> None:
-        """The same into memory [H, W] of the caller, as `frame_file.read_frame_into`."""
+        """Read the same into the caller's memory [H, W], as `frame_file.read_frame_into` does."""
         self._refuse_discarded(frame.index)
         frame_file.read_frame_into(self.path, self.layout, frame.index, pixels)
         self._proven(frame, pixels)
@@ -68,7 +69,7 @@ class View:
         return pixels
 
     def number(self, name: str) -> float | None:
-        """An attribute that is a number; None if the file lacks it. Raises StorageError."""
+        """Return an attribute that is a number; None if the file lacks it. Raises StorageError."""
         if (value := self.attributes.get(name)) is None:
             return None
         try:
@@ -81,8 +82,8 @@ class View:
 
 
 def refuse_lost(folder: Path, frames: Iterable[FrameProven]) -> None:
-    """Raise StorageError if the file of one of these frames is missing, is none of a view, or ends before it.
-    Checksums are not compared (`coupole verify` does)."""
+    """Raise StorageError if the file of one of these frames is missing, is not a view's file, or ends before the
+    frame. Checksums are not compared (`coupole verify` compares them)."""
     last_slots: dict[str, int] = {}
     for frame in frames:
         last_slots[frame.file] = max(frame.index, last_slots.get(frame.file, -1))
@@ -109,7 +110,7 @@ def refuse_lost(folder: Path, frames: Iterable[FrameProven]) -> None:
 
 
 def read_view(path: Path, frames: Iterable[FrameProven]) -> View:
-    """The file that holds these frames. Raises StorageError if it is damaged, or does not hold one of them."""
+    """Return the file that holds these frames. Raises StorageError if it is damaged, or lacks one of them."""
     layout, records = frame_file.read_layout(path), frame_file.read_frames(path)
     poses, attributes = frame_file.read_poses_and_attributes(path)
     for frame in frames:

@@ -1,5 +1,5 @@
-"""Writes frames into the file of one view at the speed of the disk: O_DIRECT where the file system and the size of
-the frames allow it."""
+"""Writes frames into the file of one view at the speed of the disk. It uses O_DIRECT if the file system and the
+size of the frames allow this."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ WRITERS = 3
 
 
 class ViewWriter:
-    """Writes one view's file. `store` may be called from several threads; all other methods from one thread,
-    `sync` possibly from another one."""
+    """Writes one view's file. Several threads may call `store`. One thread calls all other methods; `sync` may be
+    called from another one."""
 
     def __init__(self, path: Path, proven_slots: dict[str, int]) -> None:
         """Open a file that `create` made. `proven_slots` (shot id to slot) are kept; all other slots are free.
@@ -57,14 +57,14 @@ class ViewWriter:
         taken_slots = set(proven_slots.values())
         self._free = deque(slot for slot in range(self._layout.frames) if slot not in taken_slots)
         self._packed: queue.SimpleQueue[mmap.mmap] = queue.SimpleQueue()
-        """Memory to pack frames in, page-aligned as direct writing requires."""
+        """Memory for packing frames, page-aligned as direct writing requires."""
         if self._layout.is_packed:
             from coupole.storage.packing import pack12
 
             self._pack12 = pack12
             pack12(np.zeros(2, np.uint16))  # compiled now, not in the first burst
         self._changed: set[int] = set()
-        """Slots whose record in the file is not up to date."""
+        """Slots whose record in the file is not up to date yet."""
         self._poses = 0
         self.direct = False
         try:
@@ -93,7 +93,7 @@ class ViewWriter:
         return np.frombuffer(data, POSE_DTYPE)
 
     def add_pose(self, arm: ArmState, base_from_camera: Transform) -> int:
-        """Store a measured pose; returns its number, by which frames refer to it."""
+        """Store a measured pose; return its number, with which frames refer to it."""
         if self._poses == MAX_POSES:
             raise StorageError(f"{self.path}: more than {MAX_POSES} measured poses in one view")
         record = np.zeros(1, POSE_DTYPE)
@@ -124,7 +124,7 @@ class ViewWriter:
 
     @contextlib.contextmanager
     def _as_stored(self, pixels: NDArray[np.uint16]) -> Iterator[memoryview]:
-        """A frame's bytes in the file's format, valid within the context."""
+        """Give a frame's bytes in the file's format. They are valid within the context."""
         if not self._layout.is_packed:
             yield pixels.data.cast("B")
             return
@@ -146,7 +146,7 @@ class ViewWriter:
         return int(self._table[slot]["frame_id"])
 
     def prove(self, slot: int, shot: str, **fields: Any) -> int:
-        """Record that a slot holds a proven shot; returns the frame's checksum. Durable after `sync()`."""
+        """Record that a slot holds a proven shot; returns the frame's checksum. It is durable after `sync()`."""
         record = self._table[slot].copy()
         record["shot"] = shot.encode()
         for name, value in fields.items():
@@ -163,8 +163,9 @@ class ViewWriter:
                 self._free.append(slot)
 
     def _note(self, slot: int, record: NDArray[np.void] | np.void) -> None:
-        """Change a slot's record in memory. The next `sync()` writes it with others: a small write beside each
-        large one would cost a tenth of the disk's speed (they wait for each other in the file system)."""
+        """Change a slot's record in memory. The next `sync()` writes it together with others. A small write beside
+        each large one would cost a tenth of the disk's speed, because they wait for each other in the file
+        system."""
         with self._lock:
             self._table[slot] = record
             self._changed.add(slot)
@@ -188,7 +189,7 @@ class ViewWriter:
             raise disk_error(self.path, error) from error
 
     def sync(self) -> None:
-        """Bring everything that was put, proven and freed to the disk before it returns."""
+        """Bring everything that was stored, proven and freed to the disk before this returns."""
         self._write_table()
         try:
             os.fdatasync(self._plain_fd)
@@ -196,8 +197,8 @@ class ViewWriter:
             raise disk_error(self.path, error) from error
 
     def refuse_lost(self, path: Path) -> None:
-        """Raise StorageError if the file was removed, replaced or cut since it was opened; `path` is where it is
-        now, if its folder was moved."""
+        """Raise StorageError if the file was removed, replaced or cut since it was opened. If its folder was
+        moved, `path` is the present place."""
         try:
             is_there = os.path.samestat(os.fstat(self._plain_fd), path.stat())
         except OSError:
@@ -210,7 +211,7 @@ class ViewWriter:
             )
 
     def close(self) -> None:
-        """Close the file; records that were not synced are written, but not durable."""
+        """Close the file. Records that were not synced are written, but are not durable."""
         with contextlib.suppress(StorageError):
             self._write_table()
         if self._fd != self._plain_fd:

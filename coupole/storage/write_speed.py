@@ -13,16 +13,17 @@ from coupole.storage.disk_errors import disk_error
 from coupole.storage.view_writer import WRITERS
 
 _BLOCK_BYTES, _RANDOM_BYTES = 8 * 2**20, 2**20
-"""A block consists of random bytes, repeated: no file system compresses more than those at once."""
+"""A block repeats the same random bytes. File systems compress less than this length at once, so they gain
+nothing."""
 _LEAST_BLOCKS, _MOST_BLOCKS, _FRAMES = 8, 16, 20
 
 
 def measure_write_speed(folder: Path, *, frame_bytes: int = 0, room_bytes: int) -> float:
-    """Write speed of a folder's disk, bytes per second, measured as frames are written: O_DIRECT if possible,
-    several at a time, into allocated space, synced.
+    """Measure the write speed of a folder's disk, bytes per second, in the way frames are written: with O_DIRECT
+    if possible, several at a time, into allocated space, synced.
 
-    It writes 64 MiB, or 128 MiB for large frames, into a file without a name, which does not outlast this
-    process. Returns 0 if that is more than the room there is. Raises StorageError if nothing can be written.
+    It writes 64 MiB, or 128 MiB for large frames, into a file without a name, which disappears with this process.
+    Returns 0 if there is not enough room. Raises StorageError if nothing can be written.
     """
     blocks = min(max(_LEAST_BLOCKS, _FRAMES * frame_bytes // _BLOCK_BYTES), _MOST_BLOCKS)
     total_bytes = blocks * _BLOCK_BYTES

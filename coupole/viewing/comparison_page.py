@@ -1,5 +1,4 @@
-"""`report.html` and `maps.ply` of a comparison: where shape and colour changed, by how much, and how
-surely."""
+"""`report.html` and `maps.ply` of a comparison: places, size and certainty of changes of shape and colour."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ from coupole.viewing.view_solids import Points, Solid
 
 REPORT, MAPS = "report.html", "maps.ply"
 _ENDS = np.array(ANCHORS["signed"])
-"""Colours of distances inwards, of none, and outwards."""
+"""Colours of distances: inwards, zero, and outwards."""
 _UNKNOWN = np.array([0.55, 0.55, 0.58])
 _REGIONS_SHOWN = 20
 _SHOWN_QUANTILE = 0.999
@@ -91,7 +90,7 @@ def _next_step(comparison: Comparison) -> Inline:
 
 
 def remarks(comparison: Comparison) -> Iterator[str]:
-    """Yield what the reader of the report must know, one sentence each."""
+    """Yield facts that the reader of the report must know, one sentence each."""
     is_finite = np.isfinite(comparison.distance_mm)
     yield (
         f"shape: {int(comparison.moved_points.sum()):,} of {int(is_finite.sum()):,} points changed significantly, "
@@ -123,7 +122,8 @@ def remarks(comparison: Comparison) -> Iterator[str]:
 
 
 def _in_regions(regions: Sequence[Region], is_changed: NDArray[np.bool_]) -> str:
-    """Say how many of the changed points are connected, and in how many regions; the others are single points."""
+    """Return a sentence about the changed points: how many are connected, and in how many regions. The others are
+    single points."""
     points_in_regions = sum(region.points for region in regions)
     single = int(is_changed.sum()) - points_in_regions
     if not regions:
@@ -142,7 +142,7 @@ def _largest(comparison: Comparison, region: Region) -> str:
 
 
 def _frames(comparison: Comparison) -> str:
-    """Say in sentences which frames places and pictures have."""
+    """Return sentences that name the coordinate frames of places and pictures."""
     before, after = comparison.before, comparison.after
     words = f"Places are in the frames of {before.name} and of {after.name}."
     sides = sides_in_words(comparison.upright_axes)
@@ -158,7 +158,7 @@ def _scale(distance_mm: Points, u_mm: Points) -> float:
 
 
 def distance_colours(distance_mm: Points, scale_mm: float) -> Points:
-    """[n, 3] of distances, full at `scale_mm`; grey where there is none."""
+    """Return [n, 3] colours of distances, with full colour at `scale_mm`; grey where there is no distance."""
     colours = colours_of(0.5 + 0.5 * np.nan_to_num(distance_mm / scale_mm), "signed")
     return np.where(np.isfinite(distance_mm)[:, None], colours, _UNKNOWN)
 
@@ -192,8 +192,8 @@ def _colour(comparison: Comparison) -> Section:
 def _map(
     comparison: Comparison, values: Points, colours: Points, scale: tuple[str, str, float, float, str]
 ) -> Figure:
-    """Values of the points [n] on the surface; points without triangles are drawn in `colours`. `scale`: title,
-    unit, lowest and highest value, palette."""
+    """Draw values of the points [n] on the surface. Points without triangles are drawn in `colours`. `scale` has
+    title, unit, lowest and highest value, and palette."""
     title, unit, low, high, palette = scale
     state = comparison.before
     if not len(state.triangles):
@@ -208,7 +208,7 @@ def _marks(is_marked: NDArray[np.bool_]) -> Points:
 
 
 def _drawing_of_changed(comparison: Comparison, is_changed: NDArray[np.bool_], quantity: str) -> list[Figure]:
-    """A drawing of the points that changed; none if there are none."""
+    """Draw the points that changed; none if there are none."""
     if not is_changed.any():
         return []
     return [_image(comparison, _marks(is_changed), f"Points whose {quantity} changed significantly are orange")]

@@ -17,8 +17,8 @@ NO_BUDGET = "  it has no light budget: `coupole dose {} --budget LUX_H --name NA
 
 
 def show_dose(console: Console, ledger: Ledger, history: History, similar_ids: list[str], *, is_new: bool) -> None:
-    """Light of each run, the total, and remarks. `similar_ids`: objects with nearly the same id; `is_new`: nothing
-    was entered before this command."""
+    """Show the light of each run, the total, and remarks. `similar_ids` are objects with nearly the same id.
+    `is_new` is true if nothing was entered before this command."""
     title = f"{ledger.object_id}: light received"
     table = Table("run", "first", "lux.h", "damage, mW.h/m2", "", box=None, title=title, title_justify="left")
     for run in history.runs:
@@ -101,7 +101,7 @@ def _sums(history: History) -> dict[str, float]:
 
 
 def _damage(history: History) -> str:
-    """Radiant exposure weighted by damage, and the light for which it is not known."""
+    """Return the radiant exposure weighted by damage, and the light for which it is not known."""
     unknown_lux_h = history.of_unknown_spectrum_lux_h
     if unknown_lux_h and unknown_lux_h == history.total_lux_h:
         return NOT_KNOWN

@@ -18,12 +18,12 @@ _MOST_BYTES, _NAP_S = 64, 0.5
 
 @contextmanager
 def key_actions(actions: Mapping[str, Callable[[], object]]) -> Iterator[bool]:
-    """Call what belongs to a key when it is pressed alone (or with Enter), in another thread; True if any is
-    read.
+    """Call the action of a key when the key is pressed alone (or with Enter), in another thread. Gives True if
+    keys are read.
 
-    They are where standard input is a terminal and this process in its foreground; in the background nothing is
-    read, and the process is not stopped for it. Several characters at once, as of function keys and of text that
-    is pasted, do nothing. Ctrl-C and its like stay signals; the terminal's modes are as before when this ends.
+    Keys are read if standard input is a terminal and this process is in its foreground. In the background nothing
+    is read, and the process is not stopped because of it. Several characters at once, from function keys or pasted
+    text, do nothing. Ctrl-C and similar keys stay signals. The terminal's former modes are restored at the end.
     """
     if not _is_ours() or threading.current_thread() is not threading.main_thread():
         yield False
@@ -68,7 +68,7 @@ def _read_keys(terminal: int, end_fd: int, actions: Mapping[str, Callable[[], ob
 
 
 def _is_ours() -> bool:
-    """Tell whether standard input is a terminal, and this process in its foreground."""
+    """Tell whether standard input is a terminal with this process in its foreground."""
     try:
         terminal = sys.stdin.fileno()
         return os.isatty(terminal) and os.tcgetpgrp(terminal) == os.getpgrp()

@@ -1,4 +1,4 @@
-"""Live view: the newest frame of a cell or of a run in progress, to focus, to aim and to watch.
+"""Live view: the newest frame of a cell or of a run in progress, for focusing, aiming and watching.
 
 A *source* gives frames, and `Studio` holds the newest one for viewers. Viewers poll it at any time, and nothing
 waits for them. For a run only its folder is read, so viewers cannot slow it.
@@ -30,10 +30,11 @@ from coupole.viewing.raw_preview import Coding, Figures, figures
 
 _POLL_S = 0.2
 _STATUS_S, _STATUS_REST = 1.0, 20.0
-"""A run's status is read at most so often, and rests so many times as long as it takes to read."""
+"""Least time between two readings of a run's status; and the pause after a reading, as a multiple of the time that
+it took."""
 UNWATCHED_S = 5.0
-"""A source of light stops when no page has asked for so long; an open page asks five times a second, one in the
-background once."""
+"""A source of light stops when no page has asked for this time. An open page asks five times a second; a page in
+the background asks once a second."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Shown:
     frames_per_s: float
     dose_lux_h: float
     run: str = ""
-    """State and progress of the run that the frame is of; empty for a camera's frame."""
+    """State and progress of the frame's run; empty for a camera's frame."""
 
 
 class Source(Protocol):
@@ -87,11 +88,11 @@ class Studio:
 
     @property
     def is_watched(self) -> bool:
-        """False if no page has asked for some seconds (at the beginning: none has come)."""
+        """False if no page has asked for some seconds, or if no page has come yet."""
         return time.monotonic() - self._asked_s < UNWATCHED_S
 
     def note_request(self) -> None:
-        """A page asks, so that somebody may be watching."""
+        """Note that a page asks, so that somebody may be watching."""
         self._asked_s = time.monotonic()
 
     @property
@@ -114,7 +115,7 @@ class Studio:
 
 
 class FrameRate:
-    """Frames a second, over the last ones."""
+    """Frames per second, over the last frames."""
 
     def __init__(self) -> None:
         self._times_s: list[float] = []
@@ -155,7 +156,8 @@ class RunSource:
             studio.closing.wait(_POLL_S)
 
     def _ask_status(self, studio: Studio) -> bool:
-        """Read how far the run is, from time to time: a small part of this thread's time. True if it is news."""
+        """Read the run's progress from time to time, in a small part of this thread's time. True if it has
+        changed."""
         begun_s = time.monotonic()
         if begun_s < self._next_status_s:
             return False
@@ -174,8 +176,8 @@ class RunSource:
         return replace(frame, run=progress, dose_lux_h=now.dose_lux_h)
 
     def _newest_kept(self) -> FrameProven | None:
-        """The newest frame whose pixels were not discarded; None if none is proven yet. Raises FrameDiscarded with
-        what to look at instead if none is kept."""
+        """Return the newest frame whose pixels were not discarded; None if no frame is proven yet. If no frame is
+        kept, raises FrameDiscarded, which names the pictures to look at instead."""
         proven_frames = [frame for shot, frame in self._run.proven().items() if isinstance(shot.light, Led)]
         discards = discarded_views(self._run)
         gone_shots = {shot for event in discards.values() for shot, _ in event.frames}
@@ -209,8 +211,8 @@ class RunSource:
 
 
 class Wanted(BaseModel):
-    """A viewer's choice as it comes: numbers are whole numbers, nothing is converted. Fields that are left out do
-    not change.
+    """A viewer's choice as it was sent. Numbers must be whole, and nothing is converted. Omitted fields do not
+    change.
     """
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
@@ -232,7 +234,8 @@ def read_wanted(body: bytes) -> Wanted:
 
 
 def choice_from(request: Wanted, before: Choice, leds: tuple[int, ...], longest_us: int) -> Choice:
-    """A viewer's choice, checked. Raises InputError for an LED or an exposure that the cell does not have."""
+    """Return a viewer's choice after checking it. Raises InputError for an LED or an exposure that the cell does
+    not have."""
     led = request.led if "led" in request.model_fields_set else before.led
     exposure_us = request.exposure_us if "exposure_us" in request.model_fields_set else before.exposure_us
     if led is not None and led not in leds:

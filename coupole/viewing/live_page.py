@@ -1,8 +1,8 @@
-"""The live view's web page, served to this machine only, to those who know its address.
+"""The live view's web page. It is served only on this machine, and only to users who know its address.
 
-The address contains a token that is new each time. Requests by another host name (DNS rebinding), from pages of
-other sites, or that are not exactly what the page sends are refused. Each connection has one request, a bounded
-time and one of a few threads, so that clients which are slow or hang hold nobody up.
+The address contains a token that is new each time. A request is refused if it uses another host name (DNS
+rebinding), comes from a page of another site, or is not exactly as the page sends it. Each connection has one
+request, a bounded time and one of a few threads. So clients that are slow or hang delay nobody.
 """
 
 from __future__ import annotations
@@ -32,9 +32,10 @@ from coupole.viewing.raw_preview import look
 
 _WIDTH_PX = 960
 _REQUEST_S = 10.0
-"""A connection is closed after this time, whatever it is doing."""
+"""A connection is closed after this time, whatever its state."""
 MOST_CONNECTIONS = 16
-"""Most connections at the same time; one more closes the oldest. A page has two, for some milliseconds each."""
+"""Greatest number of connections at the same time. One more connection closes the oldest. A page has two, for some
+milliseconds each."""
 _MOST_POSTED = 4096
 _OURS = "X-Coupole-Live"
 """Browsers send this header only for pages of this server, so no other site can switch LEDs."""
@@ -44,7 +45,7 @@ _LENGTH = re.compile(r"[0-9]{1,4}", re.ASCII)
 
 
 class Refused(Exception):
-    """A request that is not answered with what it asks for."""
+    """Raised when the server refuses a request."""
 
     def __init__(self, status: HTTPStatus, message: str) -> None:
         super().__init__(message)
@@ -71,7 +72,7 @@ class _Page:
     token: str
 
     def get(self, target: str) -> Answer:
-        """Page, figures or picture, by a path with its query. Raises Refused."""
+        """Return page, figures or picture for a path with its query. Raises Refused."""
         path, query = self._place(target)
         if path == "":
             return Answer("text/html; charset=utf-8", self.html)
@@ -98,7 +99,7 @@ class _Page:
         return Answer("application/json", self._figures())
 
     def _place(self, target: str) -> tuple[str, str]:
-        """Path below the token, and query. Raises Refused without the right token."""
+        """Return the path after the token, and the query. Raises Refused if the token is wrong."""
         try:
             url = urlsplit(target)
         except ValueError as error:
@@ -114,7 +115,7 @@ class _Page:
 
 
 class LiveServer(ThreadingHTTPServer):
-    """Serves the page on 127.0.0.1; call `serve_forever` on a thread, `shutdown` to end."""
+    """Serves the page on 127.0.0.1. Call `serve_forever` on a thread, and `shutdown` to end it."""
 
     daemon_threads = True
     request_queue_size = 2 * MOST_CONNECTIONS
@@ -136,7 +137,7 @@ class LiveServer(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_port}/{self._page.token}/"
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Take a connection; beyond `MOST_CONNECTIONS` the oldest is closed."""
+        """Take a connection. If there are more than `MOST_CONNECTIONS`, the oldest is closed."""
         with self._lock:
             if len(self._since_s) >= MOST_CONNECTIONS:
                 oldest = next(iter(self._since_s))
@@ -158,7 +159,7 @@ class LiveServer(ThreadingHTTPServer):
                     _hang_up(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A broken connection is not an error of this server. Any other exception is, and is printed."""
+        """Ignore a broken connection, which is not an error of this server. Print any other exception."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
 
@@ -171,11 +172,11 @@ class _Viewer(BaseHTTPRequestHandler):
     timeout = _REQUEST_S
 
     def do_GET(self) -> None:
-        """Page, picture or figures."""
+        """Answer with page, picture or figures."""
         self._answer_with(lambda: self.server.page.get(self.path))
 
     def do_POST(self) -> None:
-        """A viewer's choice: {"led": 417, "exposure_us": 8000}, led null for none."""
+        """Take a viewer's choice: {"led": 417, "exposure_us": 8000}; led is null for none."""
         self._answer_with(lambda: self.server.page.choose(self.path, self._read_body()))
 
     def _answer_with(self, work: Callable[[], Answer]) -> None:
@@ -190,7 +191,7 @@ class _Viewer(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, answer)
 
     def _refuse_others(self) -> None:
-        """Refuse a request to another name than this machine's own: another site may have sent it."""
+        """Refuse a request with a host name that is not this machine's, because another site may have sent it."""
         hosts, origins = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
         if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]):
             raise Refused(HTTPStatus.FORBIDDEN, "ask 127.0.0.1")
@@ -211,7 +212,7 @@ class _Viewer(BaseHTTPRequestHandler):
         return self.rfile.read(size)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Send plain text in place of the base class's page, for requests that it cannot read and for other
+        """Send plain text instead of the base class's page, for requests that it cannot read and for other
         methods."""
         self._send(HTTPStatus(code), Answer("text/plain; charset=utf-8", HTTPStatus(code).phrase.encode()))
 
@@ -235,18 +236,19 @@ class _Viewer(BaseHTTPRequestHandler):
             self.wfile.write(answer.body)
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002  the base class names it so
-        """Requests are not logged."""
+        """Do not log requests."""
 
 
 def serve(studio: Studio, leds: tuple[int, ...], longest_us: int, port: int) -> LiveServer:
-    """A server whose page is at its `url`. `leds` are the ids that a viewer may choose, `longest_us` the longest
-    exposure. Raises OSError if the port cannot be taken."""
+    """Return a server; its page is at its `url`. `leds` are the ids that a viewer may choose, `longest_us` the
+    longest exposure. Raises OSError if the port cannot be taken."""
     html = resources.files("coupole.viewing").joinpath("live.html").read_bytes()
     return LiveServer(_Page(html, studio, leds, longest_us, secrets.token_urlsafe(16)), port)
 
 
 def _policy(html: bytes) -> str:
-    """Nothing runs but the page's own script and style, known by their hashes; nobody may frame the page."""
+    """Return a policy that allows only the page's own script and style, by their hashes, and that forbids frames
+    around the page."""
     hashes = {
         tag: base64.b64encode(hashlib.sha256(_content(html, tag)).digest()).decode() for tag in ("script", "style")
     }
@@ -263,7 +265,7 @@ def _content(html: bytes, tag: str) -> bytes:
 
 
 def _hang_up(connection: socket.socket) -> None:
-    """Its thread then finds the connection closed."""
+    """Close the connection, so that its thread ends."""
     with contextlib.suppress(OSError):  # it is closed already
         connection.shutdown(socket.SHUT_RDWR)
 

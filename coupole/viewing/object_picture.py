@@ -1,4 +1,4 @@
-"""The object as it lies on the support, with its measures: is it this one, and where it should be?"""
+"""The object on the support, with its measures, so that an operator can check the object and its place."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from coupole.viewing.view_solids import Solid, disk
 _WIDTH_PX, _HEIGHT_PX, _STRIP_PX = 560, 520, 26
 _THICKNESS_MM = 15.0
 _AROUND = 1.15
-"""Shown beside the object, as a factor of its size."""
+"""Size of the picture as a factor of the object's size, so that its surroundings are shown."""
 _SCALE_BARS_MM = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 
 
 def write_object_picture(job: Job, path: Path) -> None:
-    """Write the PNG. Raises InputError: the plan names no mesh."""
+    """Write the PNG. Raises InputError if the plan names no mesh."""
     from PIL import Image, ImageDraw
 
     if not len(job.shape.corners_mm):

@@ -19,8 +19,8 @@ _ON_THE_DISK_MM = 0.05
 
 
 def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> None:
-    """Print the summary of a preflight. For a resumed run the figures are those of the rest, beside those of the
-    whole run.
+    """Print the summary of a preflight. For a resumed run the figures are for the rest of the run, beside those
+    for the whole run.
     """
     whole = report.whole
     table = Table(title=f"{name} on {rig}", title_justify="left", box=None, show_header=False)
@@ -54,7 +54,7 @@ def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> 
 
 
 def show_views(console: Console, report: Report) -> None:
-    """A line for each view: motion, time and light; and one for what it sees of the object."""
+    """Print a line for each view with motion, time and light, and one with the view of the object."""
     table = Table("view", "joints (deg)", "move", "bursts", "lux.h", box=None)
     for view in report.views:
         joints = "-" if view.joints_deg is None else " ".join(f"{j:.0f}" for j in view.joints_deg)
@@ -106,7 +106,7 @@ def _object_figures(report: Report) -> dict[str, Any] | None:
 
 
 def _finite(value: Any) -> Any:
-    """JSON has no NaN and no infinity: both become null."""
+    """Return the value for JSON. NaN and infinity, which JSON does not have, become null."""
     if isinstance(value, tuple):
         return [_finite(inner) for inner in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

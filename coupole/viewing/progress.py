@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from coupole.plan.shot_id import ShotId
 
 OVER_EXPOSED, UNDER_EXPOSED = 1e-3, 0.05
-"""Share of a frame's pixels that may saturate; share of full scale that the bright pixels of most frames reach."""
+"""Limits of exposure: the share of a frame's pixels that may saturate; and the share of full scale that the bright
+pixels of most frames must reach."""
 
 
 @dataclass(frozen=True)
@@ -21,13 +22,13 @@ class Progress:
     view_number: int
     views: int
     proven: int
-    """Proven frames of the whole run, darks included."""
+    """Proven frames of the whole run, with dark frames."""
     frames: int
     light: str
     dose_lux_h: float
-    """Light on the object in all sessions of the run, the burst under way as far as it has come."""
+    """Light on the object in all sessions of the run. The present burst counts as far as it has run."""
     left_s: float
-    """Expected until the last frame is proven, on the cell's clock, if nothing is taken again."""
+    """Expected time until the last frame is proven, on the cell's clock, if no frame is taken again."""
 
 
 @dataclass
@@ -38,13 +39,13 @@ class Outcome:
     proven: int = 0
     reshot: int = 0
     bad: set[ShotId] = field(default_factory=set)
-    """Shots whose LED drew no current: proven to be dark, so not stored as shots."""
+    """Shots whose LED drew no current. They are proven to be dark, so they are not stored as shots."""
     missing: list[ShotId] = field(default_factory=list)
     missing_darks: list[ShotId] = field(default_factory=list)
     """Dark frames and marks that are not proven."""
     duration_s: float = 0.0
     ideal_s: float = 0.0
-    """Time of this session's motions and settling at the arm's limits, plus that of its burst tables."""
+    """Time of this session's motions and settling at the arm's limits, plus the time of its burst tables."""
     dose_lux_h: float = 0.0
     over_triggers: int = 0
     lost_transfers: int = 0

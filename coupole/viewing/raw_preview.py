@@ -14,13 +14,14 @@ _GAMMA = 1 / 2.2
 BINS = 128
 _SATURATED, _SHARP = (255, 0, 0), (0, 255, 60)
 _SHARP_GRADIENT = 0.25
-"""Relative change of brightness from one cell to the next, above which an edge is in focus."""
+"""Relative change of brightness from one cell to the next. Above it an edge is in focus."""
 _BEYOND_NOISE = 5.0
-"""Multiple of the standard error of a frame's mean product of gradients, below which noise may have made it."""
+"""Multiple of the standard error of a frame's mean product of gradients. Below it, noise may have caused the
+value."""
 _CLIPPED = 0.001
-"""Share of a region's pixels at full scale, above which it says nothing about the white point."""
+"""Share of a region's pixels at full scale. Above it, the region says nothing about the white point."""
 _DARK = 0.02
-"""Share of full scale below which an edge is noise."""
+"""Share of full scale. Below it, an edge is noise."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Coding:
     """Pattern and levels of a frame."""
 
     pattern: str
-    """2x2 Bayer pattern from the top left, or MONO."""
+    """Bayer pattern 2 x 2 from the top left, or MONO."""
     black_dn: int
     white_dn: int
 
@@ -38,16 +39,15 @@ class Figures:
     """Figures of a RAW frame."""
 
     histograms: dict[str, list[int]]
-    """Pixels by channel (R, G1, G2, B; Y for MONO), in `BINS` equal steps from 0 to full scale."""
+    """Numbers of pixels by channel (R, G1, G2, B; Y for MONO), in `BINS` equal steps from 0 to full scale."""
     saturated: dict[str, float]
     """Share of pixels at full scale, by channel."""
     brightest: float
     """99.9 % quantile, share of the range above black."""
     sharpness: float
     """Mean squared gradient over mean square. Both squares are products of the two green pixels of each cell,
-    whose
-    noise is independent, so noise adds nothing in the mean. A value that noise alone may have caused counts as 0.
-    Comparable only for the same scene under the same light."""
+    whose noise is independent. So noise adds nothing in the mean. A value that noise alone may have caused counts
+    as 0. Values can be compared only for the same scene under the same light."""
 
 
 def develop(
@@ -58,8 +58,8 @@ def develop(
     white_dn: int,
     gains: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> NDArray[np.uint8]:
-    """A preview [h/2, w/2, 3] of a RAW frame: one pixel for each Bayer cell, times `gains` of R, G, B; gamma
-    2.2."""
+    """Return a preview [h/2, w/2, 3] of a RAW frame: one pixel for each Bayer cell, times `gains` of R, G, B, with
+    a gamma of 2.2."""
     shares = np.clip((raw.astype(np.float32) - black_dn) / (white_dn - black_dn), 0, 1)
     cell = [shares[0::2, 0::2], shares[0::2, 1::2], shares[1::2, 0::2], shares[1::2, 1::2]]
     letters = pattern if pattern != "MONO" else "GGGG"
@@ -126,8 +126,8 @@ def _sharpness(plane: NDArray[np.float32], other_plane: NDArray[np.float32]) -> 
 
 
 def white_point(raw: NDArray[np.uint16], coding: Coding) -> tuple[float, float, float] | None:
-    """Gains of R, G, B that make the mean of a region neutral, green unchanged. None if the region is saturated,
-    too dark, or has no colours.
+    """Return gains of R, G, B that make the mean of a region neutral, with green unchanged. None if the region is
+    saturated, too dark, or has no colours.
     """
     planes = channels(raw, coding.pattern)
     span = coding.white_dn - coding.black_dn
@@ -140,8 +140,8 @@ def white_point(raw: NDArray[np.uint16], coding: Coding) -> tuple[float, float, 
 
 
 def loupe(raw: NDArray[np.uint16], coding: Coding, gains: Sequence[float] = (1.0, 1.0, 1.0)) -> bytes:
-    """A region of a RAW frame that begins on a Bayer cell, as PNG with one pixel for each of the sensor's: each
-    has its own value, the other two colours are those of its cell."""
+    """Return a region of a RAW frame as PNG, with one pixel for each of the sensor's. The region begins on a Bayer
+    cell. Each pixel has its own value; its two other colours are those of its cell."""
     cells = develop(raw, pattern=coding.pattern, black_dn=coding.black_dn, white_dn=coding.white_dn, gains=gains)
     picture = np.repeat(np.repeat(cells, 2, axis=0), 2, axis=1)
     letters = coding.pattern if coding.pattern != "MONO" else "GGGG"
@@ -164,8 +164,8 @@ def look(
     focus: bool,
     gains: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> bytes:
-    """A JPEG of a RAW frame, at most `width_px` wide; on request with saturated cells in red and edges in focus in
-    green."""
+    """Return a JPEG of a RAW frame, at most `width_px` wide. On request, saturated cells are red, and edges in
+    focus are green."""
     from PIL import Image
 
     stride = max(1, -(-raw.shape[1] // 2 // width_px))
@@ -184,7 +184,8 @@ def look(
 
 
 def _two_greens(raw: NDArray[np.uint16], coding: Coding) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """[h/2, w/2] both greens of each cell (of MONO the pixels of a diagonal) above black, share of the range."""
+    """Return [h/2, w/2], both greens of each cell (for MONO the pixels of a diagonal) above black, as a share of
+    the range."""
     planes = channels(raw, coding.pattern)
     first, second = (planes["G1"], planes["G2"]) if "G1" in planes else (raw[::2, ::2], raw[1::2, 1::2])
     span = np.float32(coding.white_dn - coding.black_dn)
@@ -204,7 +205,7 @@ def _in_focus(green: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _any_of(mask: NDArray[np.bool_], stride: int) -> NDArray[np.bool_]:
-    """Blocks of `stride` x `stride` in which any is True."""
+    """Return blocks of `stride` x `stride`, True where any pixel is True."""
     height, width = (size // stride * stride for size in mask.shape)
     blocks = mask[:height, :width].reshape(height // stride, stride, width // stride, stride)
     return np.asarray(blocks.any(axis=(1, 3)))

@@ -1,4 +1,5 @@
-"""`report.html` of a registration: the scans in their places, the mesh, how well loops close, uncertainties."""
+"""`report.html` of a registration: the scans in their places, the mesh, the closing errors of loops,
+uncertainties."""
 
 from __future__ import annotations
 
@@ -29,7 +30,7 @@ _UNKNOWN_SIDES = (
     ("from the other side", 15.0, 120.0),
     ("along its width", 75.0, -60.0),
 )
-"""Sides of an object of which nobody knows what is up: the shortest extent is taken for depth."""
+"""Views of an object for which the upward direction is not known. The shortest extent is taken for depth."""
 _WIDTH_PX, _HEIGHT_PX = 560, 520
 _DRAWN_FACES, _DRAWN_POINTS = 300_000, 40_000
 _STONE = (0.75, 0.72, 0.66)
@@ -37,7 +38,8 @@ _LOOPS_SHOWN, _TARGETS_SHOWN = 12, 60
 
 
 def write(registration: Registration, merged_mesh: Merged | None, folder: Path, name: str) -> None:
-    """Write the report beside what was merged. The folder gets its `name` when all is written. Raises OSError."""
+    """Write the report beside the merged scans. The folder gets its `name` when everything is written. Raises
+    OSError."""
     placed_count = len(registration.placed_numbers)
     page = Page(
         title=f"{name}: {placed_count} of {len(registration.names)} scans registered",
@@ -94,15 +96,15 @@ def _pictures(registration: Registration, merged_mesh: Merged | None, folder: Pa
 
 
 def picture_of(sheet: Any, title: str) -> Picture:
-    """A PIL image as a picture as wide as the page."""
+    """Return a PIL image as a picture as wide as the page."""
     buffer = io.BytesIO()
     sheet.save(buffer, "PNG", optimize=True)
     return Picture(title, buffer.getvalue(), is_broad=True)
 
 
 def _scan_points(registration: Registration, merged_mesh: Merged | None) -> tuple[Points, Points]:
-    """The scans' coarse points [n, 3], mm, in the frame of the mesh, else of the first scan, and their colours,
-    one for each scan."""
+    """Return the scans' coarse points [n, 3], mm, and their colours, one for each scan. They are in the frame of
+    the mesh, or otherwise of the first scan."""
     if merged_mesh is None:
         poses = [registration.first_from_scan[k] for k in registration.placed_numbers]
     else:
@@ -127,9 +129,9 @@ def solid_drawn(solid: Solid, colours: Any, axes: Points | None) -> Any:
 
 
 def sheet_of_sides(points: Points, draw: Callable[[Canvas], None], axes: Points | None) -> Any:
-    """A PIL image from three sides, each of which shows all of the points; `draw` draws on a canvas.
+    """Return a PIL image from three sides. Each side shows all of the points; `draw` draws on a canvas.
 
-    `axes`: [3, 3] x, y and z of the frame in which z is up, as columns; None where nobody knows it."""
+    `axes` [3, 3] are x, y and z of the frame in which z is up, as columns; None if this frame is not known."""
     from PIL import Image, ImageDraw
 
     sheet = Image.new("RGB", (len(_SIDES) * _WIDTH_PX, _HEIGHT_PX), "white")
@@ -142,7 +144,8 @@ def sheet_of_sides(points: Points, draw: Callable[[Canvas], None], axes: Points 
 
 
 def values_from_sides(solid: Solid, values: Points, axes: Points | None) -> tuple[Points, Points]:
-    """Values [faces] of a solid as seen from three sides, and its brightness, both [h, w]; NaN beside it.
+    """Return values [faces] of a solid as seen from three sides, and its brightness, both [h, w]; NaN beside the
+    solid.
 
     `axes` as for `sheet_of_sides`."""
     sheets, shades = [], []
@@ -159,7 +162,7 @@ def sides_in_words(axes: Points | None) -> str:
 
 
 def _lookouts(points: Points, axes: Points | None) -> Iterator[tuple[str, Lookout]]:
-    """Three sides, and where from each is looked at all of the points."""
+    """Yield three sides, with a viewpoint for each from which all points can be seen."""
     low, high = points.min(axis=0), points.max(axis=0)
     size_mm = float(np.linalg.norm(high - low))
     turn = _axes_by_extent(points) if axes is None else axes
@@ -171,7 +174,8 @@ def _lookouts(points: Points, axes: Points | None) -> Iterator[tuple[str, Lookou
 
 
 def _axes_by_extent(points: Points) -> NDArray[np.float64]:
-    """[3, 3] axes as columns: the longest extent, the shortest, which is taken for depth, and the third."""
+    """Return [3, 3], axes as columns: the longest extent; the shortest, which is taken for depth; and the
+    third."""
     _, _, axes = np.linalg.svd(points[:: max(1, len(points) // 5000)] - points.mean(axis=0), full_matrices=False)
     turn = axes[[0, 2, 1]].T
     return np.asarray(turn * np.sign(np.linalg.det(turn)))

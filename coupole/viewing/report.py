@@ -1,6 +1,7 @@
-"""`report.html` of a run: a picture, what was measured and how well, light and time, then trouble; tables last.
+"""`report.html` of a run: a picture, the measured views and their quality, light and time, then trouble, and
+tables last.
 
-It is made from the run's folder alone, at any time, also while the run goes on and after a crash.
+It is made only from the run's folder. It can be made at any time, even while the run goes on, and after a crash.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ from coupole.viewing.run_sample import SampledView, sampled_views
 
 
 def write(run: Run, path: Path | None = None, *, in_use: bool | None = None) -> Path:
-    """Write the run's report into its folder, or to another file; also of an incomplete run. The caller that knows
-    about the run's lock states whether it is `in_use`. Raises StorageError.
+    """Write the run's report into its folder, or to another file; also of an incomplete run. A caller that knows
+    about the run's lock may say whether it is `in_use`. Raises StorageError.
     """
     path = path or run.report_path
     write_page(path, _page(run, status(run, in_use=in_use)))
@@ -40,7 +41,7 @@ def write(run: Run, path: Path | None = None, *, in_use: bool | None = None) -> 
 
 
 _MOST_ENDS = 2
-"""Reasons for which views had enough that are said at the top."""
+"""Number of reasons, for which views have enough, that are shown at the top."""
 
 
 def _page(run: Run, run_status: Status) -> Page:
@@ -117,7 +118,7 @@ def _things(lines: Sequence[Inline]) -> str:
 
 
 def _coverage(run: Run, views: Sequence[SampledView]) -> Coverage | str:
-    """The object's coverage, or why it is not known."""
+    """Return the object's coverage, or the reason why it is not known."""
     try:
         return coverage_of(run, views) or "not known: the object has no mesh, or no view a measured pose"
     except (InputError, StorageError, OSError, ValueError) as error:
@@ -167,7 +168,7 @@ def _plans_budget_lux_h(run: Run) -> float | None:
 
 
 def _measured_views(run: Run, events: Sequence[Event], views: Sequence[SampledView]) -> Section:
-    """Views, their lights and what of them is proven."""
+    """Return views, their lights and the proven part of them."""
     hidden_counts = {event.view: len(event.hidden_leds) for event in events if isinstance(event, ViewBegun)}
     rows: list[Sequence[Inline]] = []
     for view in views:

@@ -27,7 +27,7 @@ from coupole.viewing.run_sample import SampledView
 from coupole.viewing.terminal import bytes_text, duration_text
 
 _MOST_LINES = 30
-"""Most lines of trouble; the rest is only counted."""
+"""Greatest number of lines of trouble. The other lines are only counted."""
 _STOPPED_IN_0_1 = "Interrupted"
 
 
@@ -37,14 +37,14 @@ def sign_of(state: str) -> Literal["ok", "stopped", "bad"]:
 
 
 def light_in_words(run_status: Status, budget_lux_h: float | None) -> str:
-    """Return the light of all sessions; a burst whose end was not recorded counts as planned."""
+    """Return the light of all sessions; for a burst whose end was not recorded, the planned light counts."""
     light_s = sum(session.light_s for session in run_status.sessions)
     budget = f" (the object may receive {budget_lux_h:g} in its life)" if budget_lux_h else ""
     return f"{run_status.dose_lux_h:.3f} lux h{budget}, LEDs on for {light_s:.1f} s"
 
 
 def light(events: Sequence[Event], views: Iterable[SampledView], run_status: Status) -> Section:
-    """The dose by view, at the point of the object that received most."""
+    """Return the dose by view, at the point of the object that received most."""
     total = run_dose.lux_h_of_points(events)
     if not total:
         words = "The journal has no entry of light: it was not recorded, or no light was given."
@@ -67,7 +67,7 @@ def light(events: Sequence[Event], views: Iterable[SampledView], run_status: Sta
 
 
 def choices(events: Iterable[Event]) -> list[Section]:
-    """Choices that were made in the run, with their reasons; none where the plan says all."""
+    """Return the choices that were made in the run, with their reasons; none if the plan gives all bursts."""
     rows: list[Sequence[Inline]] = []
     for event in events:
         if isinstance(event, BurstsChosen):
@@ -107,13 +107,13 @@ def _end_of(session: Session, run_status: Status, *, last: bool) -> tuple[str, s
 
 
 def calibrations_in_words(run: Run) -> str:
-    """The kinds that were in force."""
+    """Return the kinds of records that were in force."""
     stamps = run.about.get("calibrations", "none")
     return ", ".join(stamps) if isinstance(stamps, dict) and stamps else "none in force"
 
 
 def calibrations(run: Run) -> Section:
-    """The records that were in force: when they were made, until when they hold, and the run's copies."""
+    """Return the records that were in force: their dates, their validity, and the run's copies."""
     stamps = run.about.get("calibrations", "none")
     rows: list[Sequence[Inline]] = []
     records = _records(run)
@@ -127,7 +127,7 @@ def calibrations(run: Run) -> Section:
 
 
 def _records(run: Run) -> dict[str, tuple[Any, str]]:
-    """Records among the run's copies, and their places, by their checksum."""
+    """Return the records among the run's copies with their places, by their checksum."""
     records = {}
     for entry in run.about.get("files", []):
         path = entry.get("stored") or ""
@@ -145,7 +145,7 @@ def _records(run: Run) -> dict[str, tuple[Any, str]]:
 
 
 def troubles(events: Iterable[Event], views: Iterable[SampledView], run_status: Status) -> list[Inline]:
-    """Return what went wrong, a line each."""
+    """Return the things that went wrong, a line each."""
     lines: list[Inline] = []
     for event in events:
         if isinstance(event, FaultNoted) and event.kind != _STOPPED_IN_0_1:
@@ -172,7 +172,7 @@ def troubles(events: Iterable[Event], views: Iterable[SampledView], run_status: 
 
 
 def trouble(lines: Sequence[Inline]) -> Section:
-    """The list, cut off where it is long."""
+    """Return the list, shortened if it is long."""
     more = len(lines) - _MOST_LINES
     rest: list[Inline] = [[f"and {more} more, in ", Link("journal.jsonl")]] if more > 0 else []
     words = [] if lines else ["Nothing went wrong."]

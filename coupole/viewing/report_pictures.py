@@ -1,4 +1,4 @@
-"""Sections of a run's report about what its pictures show: exposure, coverage of the mesh, the pictures."""
+"""Sections of a run's report about its pictures: exposure, coverage of the mesh, and the pictures."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from coupole.viewing.view_colours import css, of_share
 _WIDTH, _HEIGHT = 192, 56
 _SPOKEN = {"R": "red", "G": "green", "B": "blue", "Y": "grey"}
 _MOST_FIRST = 3
-"""Views that the top of the page shows."""
+"""Number of views at the top of the page."""
 
 
 def first_pictures(views: Iterable[SampledView]) -> list[Picture]:
-    """The first views, each as the mean of its pictures: as if many lights were on together."""
+    """Return the first views. Each is the mean of its pictures, as if many lights were on together."""
     with_pictures = [view for view in views if view.pictures][:_MOST_FIRST]
     return [
         Picture(f"{view.name}: mean of {len(view.pictures)} pictures, each under one LED", _mean(view), "jpeg")
@@ -33,7 +33,7 @@ def first_pictures(views: Iterable[SampledView]) -> list[Picture]:
 
 
 def _mean(view: SampledView) -> bytes:
-    """The mean of a view's pictures as a JPEG, with the brightest two hundredth white."""
+    """Return the mean of a view's pictures as a JPEG. The brightest two hundredth of the pixels are white."""
     from PIL import Image
 
     total: NDArray[np.float64] | None = None
@@ -57,7 +57,8 @@ def exposure_in_words(views: Sequence[SampledView]) -> str:
 
 
 def exposures(views: Sequence[SampledView], scaling: str) -> Section:
-    """A row for each exposure of each view. `scaling`: how a simulated cell chose its light; else empty."""
+    """Return a row for each exposure of each view. `scaling` says how a simulated cell chose its light; it is
+    empty for a real cell."""
     rows: list[Sequence[Inline]] = [
         (
             Link(f"#view-{anchor(view.name)}", view.name),
@@ -107,12 +108,12 @@ def _histogram(view: str, exposure: SampledExposure) -> Drawing:
 
 
 def coverage_in_words(coverage: Coverage) -> str:
-    """The share of the surface that is in the pictures at all."""
+    """Return the share of the surface that is in at least one picture."""
     return f"{coverage.shares[0]:.0%} of the surface that can be seen from above the disk is in a view"
 
 
 def coverages(coverage: Coverage) -> Section:
-    """Shares of the surface by number of views, drawings, and what each view has of the object."""
+    """Return shares of the surface by number of views, drawings, and each view's share of the object."""
     size = " x ".join(
         f"{high - low:.0f}"
         for low, high in zip(coverage.placement.low_mm, coverage.placement.high_mm, strict=True)
@@ -163,7 +164,8 @@ def _legend() -> Legend:
 
 
 def pictures(views: Iterable[SampledView]) -> Section:
-    """The sampled pictures of each view; a view whose file cannot be read says so."""
+    """Return the sampled pictures of each view. If a view's file cannot be read, its picture is replaced by a
+    sentence."""
     parts = [
         Section(
             f"view-{anchor(view.name)}",

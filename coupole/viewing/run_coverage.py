@@ -1,4 +1,4 @@
-"""Coverage: how much of an object's surface the views of a run show, by its mesh and the measured poses."""
+"""Coverage: how much of an object's surface the views of a run show, from its mesh and the measured poses."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from coupole.viewing.run_sample import SampledView
 from coupole.viewing.view_colours import of_share
 
 MOST = 4
-"""Views of a point that the pictures tell apart; more look like these."""
+"""Largest number of views of a point that the pictures distinguish. A point in more views has the same colour."""
 FROM = {"from above": (-90.0, 90.0), "from azimuth -60": (-60.0, 25.0), "from azimuth 120": (120.0, 25.0)}
-"""The drawings: azimuth and elevation from which the object is seen, degrees."""
+"""Directions of the drawings: azimuth and elevation from which the object is seen, degrees."""
 _DIRECTIONS = 128
 _LOWEST_DEG = 5.0
 _DRAWN_PX = 150
@@ -41,15 +41,16 @@ _BACKGROUND = 255
 
 @dataclass(frozen=True)
 class Coverage:
-    """Coverage of the reachable part of the surface: what can be seen from anywhere above the disk."""
+    """Coverage of the reachable part of the surface, which is the part that can be seen from some place above the
+    disk."""
 
     placement: Placement
     sharp_mm: tuple[float, float]
     views: tuple[Framing, ...]
     """Framings of the views that have proven shots."""
     shares: tuple[float, ...]
-    """[n]: share of the reachable part that at least n + 1 views show, up to `MOST` views or as many as there
-    are."""
+    """[n] share of the reachable part that at least n + 1 views show. It ends at `MOST` views or at the number of
+    views."""
     reachable: float
     """Reachable part, as a share of the whole surface."""
     drawings: dict[str, bytes]
@@ -99,7 +100,7 @@ def coverage(rig: Rig, corners_mm: NDArray[np.float64], poses: dict[str, Transfo
 
 
 def _seen_from_above(mesh: Any, points_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """[n] True where some direction above the disk leads from the point past the object."""
+    """Return [n], True if the line of sight from the point is free in some direction above the disk."""
     number = np.arange(_DIRECTIONS) + 0.5
     lowest = np.sin(np.deg2rad(_LOWEST_DEG))
     z = lowest + (1 - lowest) * number / _DIRECTIONS
@@ -117,7 +118,7 @@ def _seen_from_above(mesh: Any, points_mm: NDArray[np.float64]) -> NDArray[np.bo
 def _drawing_png(
     mesh: Any, corners_mm: NDArray[np.float64], views_of: Any, azimuth_deg: float, elevation_deg: float
 ) -> bytes:
-    """A parallel projection as PNG: the colour tells the number of views, the shade the slope."""
+    """Return a parallel projection as PNG. The colour shows the number of views, the shade shows the slope."""
     from PIL import Image
 
     azimuth, elevation = np.deg2rad((azimuth_deg, elevation_deg))

@@ -1,4 +1,4 @@
-"""Sample of a run's proven frames, and what it shows of each view: exposure, histograms, small pictures."""
+"""Sample of a run's proven frames, with exposure, histograms and small pictures of each view."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ _PICTURE_WIDTH_PX = 320
 
 @dataclass
 class SampledExposure:
-    """One exposure time of a view, by some of its frames, which are spread evenly over its lights."""
+    """One exposure time of a view, from some of its frames, which are spread evenly over its lights."""
 
     exposure_us: int
     frames: int
-    """Proven shots; the sample is `sample.pictures` of them."""
+    """Number of proven shots. The sample has `sample.pictures` of them."""
     sample: ViewExposure = field(default_factory=ViewExposure)
     worst: str = ""
-    """The sampled shot with the largest share of saturated pixels; empty if none has any."""
+    """The sampled shot with the largest share of saturated pixels; empty if no pixel is saturated."""
     histograms: dict[str, NDArray[np.int64]] = field(default_factory=dict)
-    """Pixels of all sampled frames by colour (R, G, B; Y for MONO), in `BINS` equal steps from 0 to full scale."""
+    """Numbers of pixels of all sampled frames by colour (R, G, B; Y for MONO), in `BINS` equal steps from 0 to
+    full scale."""
     black_share: float = 0.0
     """The black level as a share of full scale."""
 
@@ -52,11 +53,11 @@ class SampledExposure:
 
 @dataclass
 class SampledView:
-    """A view's proven frames, and what a sample of them shows."""
+    """A view's proven frames, and the results of a sample of them."""
 
     name: str
     expected_frames: int = 0
-    """Frames that the plan asks for, dark ones included."""
+    """Frames that the plan asks for, with dark frames."""
     proven: int = 0
     darks: int = 0
     leds: int = 0
@@ -66,13 +67,13 @@ class SampledView:
     pictures: list[tuple[str, bytes]] = field(default_factory=list)
     """Name of the shot, and a JPEG with saturated pixels in red."""
     base_from_camera: Transform | None = None
-    """Measured; None if the view has no frame, or its file no pose."""
+    """Measured pose; None if the view has no frame, or if its file has no pose."""
     trouble: str = ""
     """Reason why the view's file cannot be read; empty if it can."""
 
     def verdict(self) -> str:
         """`over-exposed` if even the shortest exposure saturates, `under-exposed` if even the longest is dark,
-        else `well exposed`; empty without pictures."""
+        otherwise `well exposed`; empty without pictures."""
         figures = [exposure.sample for exposure in self.exposures if exposure.sample.pictures]
         if not figures:
             return ""

@@ -54,7 +54,8 @@ def import_scan(
 
 
 def picture(scan: Scan) -> Any:
-    """The mesh from three sides, its targets as red dots, and the distances between these; a PIL image."""
+    """Return a PIL image with the mesh from three sides, its targets as red dots, and the distances between
+    these."""
     from PIL import Image, ImageDraw
 
     mesh = scan.mesh

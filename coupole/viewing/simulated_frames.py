@@ -1,6 +1,6 @@
-"""Preview of a plan: some of its frames, rendered without devices.
+"""Preview of a plan: some of its frames are rendered without devices.
 
-Each is developed to a PNG that is marked as simulated, and all are on one sheet.
+Each frame is developed to a PNG that is marked as simulated, and one sheet shows all of them.
 """
 
 from __future__ import annotations
@@ -92,14 +92,15 @@ def simulate(job: Job, folder: Path, count: int, *, width_px: int | None, progre
 
 
 def flange_at(view: ViewPose, job: Job) -> Transform:
-    """Nominal pose of the flange at a view, by its camera pose or its joints, without errors of the arm."""
+    """Return the nominal pose of the flange at a view, from its camera pose or its joints, without errors of the
+    arm."""
     if view.joints_deg is not None:
         return forward(arm_of(job.cell.rig), np.asarray(view.joints_deg, dtype=np.float64))
     return base_from_flange(view, job.cell.rig)
 
 
 def _spread_shots(job: Job, count: int) -> Iterator[tuple[ViewPose, Burst, int]]:
-    """Shots of all views in turn, in each spread evenly over its bursts and lights."""
+    """Yield shots of all views in turn, spread evenly over the bursts and lights of each view."""
     views = job.schedule.views
     for number, view in enumerate(views):
         share = count // len(views) + (number < count % len(views))

@@ -35,17 +35,17 @@ if TYPE_CHECKING:
 
 _PLAIN_LINE_EVERY_S = 5.0
 _WIDE = 110
-"""Columns of a terminal that has room for rates beside the bars."""
+"""Number of a terminal's columns from which rates are shown beside the bars."""
 
 
 def make_console(*, quiet: bool) -> Console:
-    """The console for text: standard error, so that standard output is free for `--json`."""
+    """Return the console for text. It is standard error, so that standard output is free for `--json`."""
     stream: Any = _Terminal(sys.stderr)
     return _Console(file=stream, quiet=quiet, highlight=False, soft_wrap=not sys.stderr.isatty())
 
 
 class _Console(Console):
-    """Console as wide as the terminal that reads it, also if a queue is between them."""
+    """Console as wide as the terminal that reads it, even if there is a queue between them."""
 
     @property
     def size(self) -> ConsoleDimensions:
@@ -58,8 +58,8 @@ class _Console(Console):
 
 
 class _Terminal:
-    """A stream that may go away (a closed window, a broken pipe): what it does not take is dropped, so that the
-    session ends in order."""
+    """A stream that may go away (a closed window, a broken pipe). Text that it does not take is dropped, so that
+    the session ends normally."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -79,9 +79,9 @@ class _Terminal:
 
 @contextmanager
 def step_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """Bars, one for each step of a job, with the time left; call what this gives with a step, how much of it is
-    done, and of how much. A step is over when the next one begins. Where there is no terminal, which shows no bars
-    before the end, each step has a line when it begins."""
+    """Show a bar for each step of a job, with the time left. Call the given function with a step, the number that
+    is done, and the number in all. A step is over when the next one begins. Without a terminal there are no bars;
+    each step gets a line when it begins."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as bars:
         tasks: dict[str, TaskID] = {}
@@ -101,7 +101,7 @@ def step_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
 
 
 def alarm(message: str) -> None:
-    """A message that a person must see: on standard error, even with `--json`."""
+    """Show a message that a person must see: on standard error, even with `--json`."""
     print(message, file=_Terminal(sys.stderr), flush=True)
 
 
@@ -115,7 +115,7 @@ def ask(question: str) -> bool:
 
 
 def ask_number(question: str) -> float | None:
-    """Ask for a number on standard error, again if what was typed is none; None for an empty answer."""
+    """Ask for a number on standard error, again if the answer is not a number; None for an empty answer."""
     while True:
         print(f"{question} ", end="", file=sys.stderr, flush=True)
         try:
@@ -131,14 +131,14 @@ def ask_number(question: str) -> float | None:
 
 
 def duration_text(seconds: float) -> str:
-    """`2 h 05 min`, `3 min 20 s`, `12.3 s`."""
+    """Return a duration as `2 h 05 min`, `3 min 20 s` or `12.3 s`."""
     if seconds >= 3600:
         return f"{int(seconds // 3600)} h {int(seconds % 3600 // 60):02d} min"
     return f"{int(seconds // 60)} min {seconds % 60:02.0f} s" if seconds >= 60 else f"{seconds:.1f} s"
 
 
 def bytes_text(count: float) -> str:
-    """`1.25 GB`, `39.3 MB`, `12 kB`."""
+    """Return a size as `1.25 GB`, `39.3 MB` or `12 kB`."""
     if count < 1e5:
         return f"{count / 1e3:.0f} kB"
     return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
@@ -148,7 +148,7 @@ class RunObserver:
     """Watches a run: bars on a terminal, a line every few seconds elsewhere."""
 
     def __init__(self, console: Console, frame_bytes: int, proven_before: int, *, speed: float = 1.0) -> None:
-        """`speed`: of the cell's clock, in seconds of it a second."""
+        """`speed` is that of the cell's clock, in its seconds per second."""
         self._console, self._frame_bytes, self._speed = console, frame_bytes, speed
         self._started_s = time.monotonic()
         self._printed_s = 0.0
@@ -205,7 +205,7 @@ class RunObserver:
 
 
 def show_status(console: Console, status: Status) -> None:
-    """Progress of a run; only what failed is red."""
+    """Show the progress of a run. Only failures are red."""
     colour = {"done": "green", "failed": "red"}.get(status.state, "yellow")
     note = ", but stopped" if status.stopped_pid else ""
     console.print(
@@ -300,7 +300,8 @@ def show_advice(console: Console, advice: Advice) -> None:
 
 
 class LiveFigures:
-    """The live view's figures: updated in place on a terminal, a line from time to time elsewhere."""
+    """The live view's figures. They are updated in place on a terminal; elsewhere a line is printed from time to
+    time."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -340,7 +341,7 @@ class LiveFigures:
 
 
 def _bars(name: str, bins: list[int]) -> str:
-    """A histogram as one line of blocks, logarithmic."""
+    """Return a histogram as one line of blocks, logarithmic."""
     blocks = " ▁▂▃▄▅▆▇█"
     top = math.log1p(max(bins)) or 1.0
     pairs = [max(bins[i : i + 2]) for i in range(0, len(bins), 2)]

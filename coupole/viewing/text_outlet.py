@@ -1,10 +1,10 @@
 """Standard output and standard error of a command that holds a cell: nothing in it waits for a reader of text.
 
-A terminal that stands still (Ctrl-S, a half-dead ssh), a full pipe, a disk that hangs: a write to them may block
-for ever, and with it whoever supervises. `install` puts a queue between. What Python writes goes into it at once;
-file descriptors 1 and 2 become pipes into it, for libraries and for children that inherit them. A thread alone
-writes to the reader, and may wait for him. When the queue is full the oldest text is dropped, which is said when
-somebody reads again. `finish` gives the reader a bounded time at the end.
+A terminal may stand still (Ctrl-S, a half-dead ssh), a pipe may be full, or a disk may hang. A write to them may
+block for ever, and would block the supervising thread too. `install` puts a queue in between. Text of Python goes
+into it at once. File descriptors 1 and 2 become pipes into it, for libraries and for children that inherit them.
+Only one thread writes to the reader and may wait. When the queue is full the oldest text is dropped; a message
+says so when somebody reads again. `finish` gives the reader a bounded time at the end.
 """
 
 from __future__ import annotations
@@ -21,22 +21,23 @@ import threading
 from coupole.viewing.text_queue import TextQueue, Unread
 
 PATIENCE_S = 1.0
-"""Time for which a command waits at its end for a reader who takes nothing."""
+"""A command at its end waits this long for a reader who takes nothing."""
 AT_MOST_S = 10.0
-"""Time for which it waits at most for a reader who is slow."""
+"""A command at its end waits at most this long for a slow reader."""
 DOCUMENT_PATIENCE_S = 10.0
-"""Time for which it waits for a reader of standard output who takes nothing: half a document is worth nothing."""
+"""A command at its end waits this long for a reader of standard output who takes nothing, because half a document
+is useless."""
 _DOCUMENT_BYTES = 1 << 24
 _WRITE_BYTES = 4096
 _FIRST_KEPT_FD = 10
 
 
 class Outlet:
-    """The way of one of the standard streams from this process, its libraries and children to its reader."""
+    """The way of a standard stream from this process, its libraries and children to its reader."""
 
     def __init__(self, fd: int, queue: TextQueue) -> None:
-        """Lead descriptor `fd` into the queue from now on; only a thread of this outlet writes to what it was
-        before."""
+        """Lead descriptor `fd` into the queue from now on. Only a thread of this outlet writes to its former
+        target."""
         self.fd, self.queue = fd, queue
         self.reader_fd = fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, _FIRST_KEPT_FD)
         read_fd, write_fd = os.pipe()
@@ -50,14 +51,13 @@ class Outlet:
         threading.Thread(target=self._listen, name=f"text into {fd}", daemon=True).start()
 
     def append(self, text: bytes) -> None:
-        """Append text to what libraries and children have written so far. Never waits."""
+        """Append text after the text of libraries and children so far. Never waits."""
         with self._order:
             self.collect()
             self.queue.append(text)
 
     def collect(self) -> bool:
-        """Put what libraries and children have written into the queue. Return whether any of them can write
-        more."""
+        """Put the text of libraries and children into the queue. Return whether any of them can write more."""
         with self._order, contextlib.suppress(BlockingIOError):
             while text := os.read(self._pipe, 65536):
                 self.queue.append(text)
@@ -112,8 +112,9 @@ _outlets: dict[str, Outlet] = {}
 
 
 def keep_standard_places() -> None:
-    """Standard streams that are closed lead nowhere: a device or a pipe that is opened must not take their place
-    and be given text, and who writes need not ask whether there is one. To be called before anything is opened.
+    """Replace closed standard streams by ones that lead nowhere. Otherwise a device or pipe that is opened could
+    take their place and receive text, and writers would have to check for them. Call this before anything is
+    opened.
 
     Standard output keeps what it could not write (PYTHONUNBUFFERED would drop it): see `full_stdout`."""
     for fd, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
@@ -125,8 +126,8 @@ def keep_standard_places() -> None:
 
 
 def install() -> None:
-    """Make nothing that this process prints wait for a reader, from now to its end. Streams that somebody has
-    replaced (tests) stay as they are."""
+    """Let no output of this process wait for a reader, from now to its end. Streams that somebody has replaced
+    (tests) stay as they are."""
     keep_standard_places()
     for fd, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
@@ -148,8 +149,8 @@ def install() -> None:
 
 
 def full_stdout() -> str:
-    """Return why standard output does not take what was written to it; empty if it does, or if its reader has
-    gone. Text that it did not take is dropped.
+    """Return why standard output does not take text; empty if it takes text, or if its reader has gone. Text that
+    it did not take is dropped.
     """
     try:
         sys.stdout.flush()
@@ -164,15 +165,16 @@ def full_stdout() -> str:
 
 
 def unread() -> Unread | None:
-    """Return what of standard error was not taken so far; None if all was, or its reader is only a little late."""
+    """Return the text of standard error that was not taken so far. None if all was taken, or if its reader is only
+    a little late."""
     outlet = _outlets.get("stderr")
     text = outlet.queue.unread() if outlet else None
     return text if text and (text.lost_bytes or text.stalled_s >= PATIENCE_S) else None
 
 
 def terminal_size() -> os.terminal_size | None:
-    """Return the size of the terminal that reads standard error; None if none does, or text does not go there by a
-    queue."""
+    """Return the size of the terminal that reads standard error. None if there is no terminal, or if text does not
+    go there through a queue."""
     outlet = _outlets.get("stderr")
     with contextlib.suppress(OSError):
         return os.get_terminal_size(outlet.reader_fd) if outlet else None
@@ -190,8 +192,8 @@ def say_now(text: str, patience_s: float) -> None:
 
 
 def lead_blocked_nowhere(patience_s: float) -> None:
-    """Drop from now on the text of a standard stream whose reader takes nothing for this time: after a signal
-    nothing may wait for him. Streams with a queue drop by themselves."""
+    """Drop the text of a standard stream from now on, if its reader takes nothing for this time. After a signal
+    nothing may wait for the reader. Streams with a queue drop text by themselves."""
     for fd, name in ((1, "stdout"), (2, "stderr")):
         with contextlib.suppress(OSError):
             if name not in _outlets and not select.select([], [fd], [], patience_s)[1]:
@@ -201,7 +203,8 @@ def lead_blocked_nowhere(patience_s: float) -> None:
 
 
 def finish(patience_s: float = PATIENCE_S, document_s: float = DOCUMENT_PATIENCE_S) -> None:
-    """Wait a bounded time until the readers have taken everything; `document_s`: for that of standard output."""
+    """Wait a bounded time until the readers have taken everything. `document_s` is the time for standard
+    output."""
     for name, outlet in _outlets.items():
         with contextlib.suppress(OSError, ValueError):
             getattr(sys, name).flush()

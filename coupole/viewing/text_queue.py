@@ -1,4 +1,4 @@
-"""Text on its way to a reader who may not read: in order, in bounded memory, and nobody waits to put it in."""
+"""Text on its way to a reader who may not read. It stays in order and in bounded memory, and no writer waits."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ class Unread:
 
 
 class TextQueue:
-    """Bytes in the order in which they were put in. When it is full the oldest go, and what is taken next says how
-    many lines are gone. From any thread."""
+    """Bytes in the order in which they were put in. When the queue is full the oldest bytes are dropped, and the
+    next text that is taken says how many lines were lost. Any thread may use it."""
 
     def __init__(self, most_bytes: int = MOST_BYTES, *, tells: bool = True) -> None:
-        """Make an empty queue. `tells`: it reports what was dropped, in its place; false for a document."""
+        """Make an empty queue. With `tells`, it reports dropped text in its place; a document has `tells`
+        false."""
         self._most_bytes, self._tells = most_bytes, tells
         self._pieces: deque[bytes] = deque()
         self._waiting_bytes = self._taken_bytes = 0  # taken: handed out, not yet with the reader
@@ -54,8 +55,8 @@ class TextQueue:
             self._changed.notify_all()
 
     def take(self, wait_s: float | None = None) -> bytes:
-        """The oldest piece, to be given to the reader, which `gave` or `note_refused` then tells of; empty if none
-        comes within a time."""
+        """Take the oldest piece, to be given to the reader; empty if none comes within a time. Report the result
+        by `gave` or `note_refused`."""
         with self._changed:
             self._changed.wait_for(lambda: self._pieces or (self._tells and self._untold_bytes), wait_s)
             if self._tells and self._untold_bytes:
@@ -67,14 +68,14 @@ class TextQueue:
             return self._handed_out(piece)
 
     def gave(self, count: int) -> None:
-        """The reader has taken so many bytes of what was handed out."""
+        """Note that the reader has taken this number of bytes of the piece."""
         with self._changed:
             self._taken_bytes -= count
             self._moved_s = time.monotonic()
             self._changed.notify_all()
 
     def note_refused(self, rest: bytes) -> None:
-        """The reader refused this rest of what was handed out."""
+        """Note that the reader refused this rest of the piece."""
         with self._changed:
             self._taken_bytes -= len(rest)
             self._lost_lines, self._lost_bytes = self._lost_lines + rest.count(b"\n"), self._lost_bytes + len(rest)
@@ -87,7 +88,7 @@ class TextQueue:
             return Unread(self._lost_lines, self._lost_bytes, waiting, stalled_s)
 
     def wait_until_drained(self, patience_s: float, at_most_s: float) -> bool:
-        """Wait until the reader has all, or takes nothing for `patience_s`, or `at_most_s` have passed."""
+        """Wait until the reader has everything, takes nothing for `patience_s`, or `at_most_s` have passed."""
         begun_s = time.monotonic()
         with self._changed:
             while self._waiting_bytes or self._taken_bytes:

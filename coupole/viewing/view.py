@@ -1,4 +1,4 @@
-"""`coupole view`: a plan's picture and page, also of a plan that preflight refuses."""
+"""`coupole view`: a plan's picture and page, even if preflight refuses the plan."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from coupole.viewing.view_scene import Scene, scene_of
 
 
 def look_at_plan(job: Job, folder: Path, console: Console, *, paths: bool) -> tuple[Path, Path]:
-    """Write `<plan>.png` and `<plan>.html` into a folder, and say where.
+    """Write `<plan>.png` and `<plan>.html` into a folder, and print their paths.
 
     Raises InputError if they cannot be written there. Without `paths` all motions are straight and collisions are
     not checked.
@@ -43,7 +43,7 @@ def look_at_plan(job: Job, folder: Path, console: Console, *, paths: bool) -> tu
 
 
 def look(job: Job, console: Console, *, paths: bool) -> Scene:
-    """The scene, and the refusals that `check` would give, except those that concern the disk."""
+    """Return the scene, and the refusals that `check` would give, except those that concern the disk."""
     rig, views = job.cell.rig, job.schedule.views
     with _doing(console, f"planning paths to {len(views)} views" if paths else "finding postures"):
         job = without_hidden(job) if paths else job
@@ -59,7 +59,7 @@ def look(job: Job, console: Console, *, paths: bool) -> Scene:
 
 @contextmanager
 def _doing(console: Console, action: str) -> Iterator[None]:
-    """Report slow work: by a temporary line on a terminal, by a plain one elsewhere."""
+    """Report slow work: by a temporary line on a terminal, by a plain line elsewhere."""
     if console.is_terminal:
         with console.status(action):
             yield

@@ -23,7 +23,7 @@ _TO_LIGHT = np.array((-0.35, -0.55, -0.76))
 """Direction to the light in the viewer's frame: from above, from the left, from behind."""
 _AMBIENT = 0.45
 _OUTLINE = 0.55
-"""Pixels at the outline of a body in front of another one are darkened by this factor."""
+"""Factor by which pixels at the outline of a body are darkened, if it is in front of another body."""
 _LINE_BIAS, _LINE_BIAS_MM = 2e-3, 10.0
 """Depth tolerance for lines on surfaces: as a share of the depth (perspective), or in mm."""
 _NEARNESS_PER_MM = 1e-5
@@ -32,8 +32,8 @@ _NEARNESS_PER_MM = 1e-5
 
 @dataclass(frozen=True)
 class Lookout:
-    """Viewpoint of a picture, x to the right, y down, z forward. `scale` is the focal length in pixels with
-    perspective, else pixels per mm."""
+    """Viewpoint of a picture, x to the right, y down, z forward. With perspective, `scale` is the focal length in
+    pixels; otherwise it is pixels per mm."""
 
     world_from_eye: Transform
     scale: float
@@ -42,8 +42,8 @@ class Lookout:
     perspective: bool
 
     def project(self, points_mm: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pixels [..., 2] and nearness [...] of points [..., 3]: it is larger for nearer points, and linear in the
-        picture. NaN for points behind the viewpoint."""
+        """Return pixels [..., 2] and nearness [...] of points [..., 3]. Nearness is larger for nearer points, and
+        linear in the picture. It is NaN for points behind the viewpoint."""
         points_eye = apply(inverse(self.world_from_eye), points_mm)
         depth_mm = points_eye[..., 2]
         middle = np.array((self.width_px, self.height_px)) / 2
@@ -70,8 +70,8 @@ class Canvas:
         opacity: float = 1.0,
         has_outline: bool = True,
     ) -> None:
-        """Draw solids, each in one colour [3] or one per face [faces, 3]. Transparent ones are drawn as one layer:
-        only the nearest of them is visible, and solids drawn later shine through."""
+        """Draw solids, each in one colour [3] or one per face [faces, 3]. Transparent solids are drawn as one
+        layer: only the nearest of them is visible, and solids that are drawn later shine through."""
         if not solids:
             return
         corners_mm = np.concatenate([solid.corners_mm for solid in solids])
@@ -95,7 +95,7 @@ class Canvas:
             self._near = layer
 
     def line(self, points_mm: Points, colour: Colour, width_px: float, *, hidden_opacity: float = 0.15) -> None:
-        """Draw a line through points [n, 3]; where it is hidden, with `hidden_opacity`."""
+        """Draw a line through points [n, 3]. Hidden parts have the opacity `hidden_opacity`."""
         for a, b in pairwise(points_mm):
             (start, end), near = self._project(np.array((a, b)))
             if not np.isfinite(near).all():
@@ -167,7 +167,7 @@ def _brightness(lookout: Lookout, corners_mm: Points) -> NDArray[np.float32]:
 
 
 def seen_faces(lookout: Lookout, solid: Solid) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """The face that each pixel [h, w] sees, -1 where it sees none, and the brightness of all faces [faces]."""
+    """Return the face at each pixel [h, w], -1 if there is none, and the brightness of all faces [faces]."""
     pixels, near = lookout.project(solid.corners_mm)
     nearest = np.full((lookout.height_px, lookout.width_px), -np.inf)
     face = np.full(nearest.shape, -1, np.int32)
@@ -176,7 +176,7 @@ def seen_faces(lookout: Lookout, solid: Solid) -> tuple[NDArray[np.int32], NDArr
 
 
 def _edges(body: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """[height, width] True beside a pixel of another body."""
+    """Return [height, width], True beside a pixel of another body."""
     edge = np.zeros(body.shape, np.bool_)
     across, down = body[:, 1:] != body[:, :-1], body[1:] != body[:-1]
     edge[:, 1:] |= across

@@ -25,11 +25,11 @@ INK: Colour = (0.13, 0.15, 0.18)
 
 
 def of_share(share: ArrayLike) -> NDArray[np.float64]:
-    """Colours [..., 3] of shares [...] from 0 to 1: those of amounts on all pages."""
+    """Return colours [..., 3] of shares [...] from 0 to 1, the same as those of amounts on all pages."""
     return colours_of(share)
 
 
 def css(colour: ArrayLike) -> str:
-    """`rgb(12,34,56)`."""
+    """Return `rgb(12,34,56)`."""
     red, green, blue = (round(255 * float(part)) for part in np.asarray(colour, np.float64))
     return f"rgb({red},{green},{blue})"

@@ -1,4 +1,4 @@
-"""The interactive page of a plan: the cell in 3D, view by view. One file that needs no network."""
+"""The interactive page of a plan: the cell in 3D, view by view. It is one file that needs no network."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from coupole.viewing.view_solids import Points, Solid, disk, join_solids, with_f
 _OBJECT_FACES = 30_000
 _ROUND = 12
 _MANY = 8
-"""Number of views beyond which the arm is shown in one view at a time only."""
+"""Largest number of views for which the arm is shown in several views at a time."""
 _SUPPORT_THICKNESS_MM = 15.0
 _OVERVIEW, _ALWAYS = 0, -1
-"""Steps of the slider, beside the views' numbers, at which a part of the drawing is shown."""
+"""Steps of the slider in addition to the views' numbers: the overview, and all steps."""
 
 _SCRIPT = """
 const steps = %s, slider = document.getElementById("step");
@@ -40,13 +40,13 @@ function show() {
 slider.addEventListener("input", show);
 show();
 """
-"""`{plot_id}` is Plotly's."""
+"""Script of the slider; `{plot_id}` is replaced by Plotly."""
 _BUTTONS = [["toImage"], ["orbitRotation", "tableRotation", "pan3d", "zoom3d"], ["resetCameraDefault3d"]]
-"""Buttons that would send the drawing to a server are left out."""
+"""Buttons of the drawing. Buttons that would send the drawing to a server are left out."""
 
 
 def write_page(scene: Scene, path: Path) -> None:
-    """Write the HTML page, plotly.js in it. Raises OSError."""
+    """Write the HTML page, with plotly.js in it. Raises OSError."""
     figure, steps = _figure(scene)
     drawing = figure.to_html(
         full_html=False,
@@ -81,7 +81,7 @@ def _words_of(scene: Scene) -> Page:
 
 
 def _figure(scene: Scene) -> tuple[Any, list[dict[str, Any]]]:
-    """The drawing, and for each step of the slider what is visible, its name and words in HTML."""
+    """Return the drawing, and for each step of the slider its visible parts, name and words in HTML."""
     import plotly.graph_objects as go
 
     step_traces: list[tuple[int, Any]] = [(_ALWAYS, trace) for trace in _cell(scene)]
@@ -158,7 +158,7 @@ def _cell(scene: Scene) -> list[Any]:
 
 
 def _arm(scene: Scene, stop: Stop, *, opacity: float) -> list[Any]:
-    """The arm at a view, and in red where it would collide."""
+    """Draw the arm at a view, red where it would collide."""
     traces = []
     if stop.joints_deg is not None:
         arm = scene.arm(stop.joints_deg, _ROUND)
@@ -207,7 +207,8 @@ def _camera(scene: Scene, stop: Stop) -> list[Any]:
 
 
 def _leds(scene: Scene, share: NDArray[np.float64], stop: Stop | None) -> Any:
-    """LEDs of the plan, coloured by the share that they reach; in a view with the causes of occlusion."""
+    """Draw the LEDs of the plan, coloured by the share that they reach. In a view, they have the causes of
+    occlusion."""
     columns = [scene.led_ids, share]
     hover = "LED %{customdata[0]:.0f}: reaches %{customdata[1]:.0%} of the visible surface"
     if stop is not None and stop.shadow is not None:

@@ -1,4 +1,4 @@
-"""The picture of a plan: the cell from three sides, what the camera sees of the object, and what is refused."""
+"""The picture of a plan: the cell from three sides, the camera's view of the object, and the refusals."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ WIDTH_PX, HEIGHT_PX = 1800, 1300
 _MARGIN, _HEADER, _STRIP = 16, 76, 316
 _LEFT = 1120
 _CAMERAS, _CAMERA_WIDTH = 4, 306
-"""Largest number of views that are shown through the camera, and their width: refused ones first, then others at
-even intervals."""
+"""Largest number of views that are shown through the camera, and their width. Refused views are first, then others
+at even intervals."""
 _GHOST, _GHOST_TOOL, _MANY = 0.38, 0.8, 8
-"""Opacity of arm and tool at a view; with more views than this only the tool is drawn."""
+"""Opacity of arm and tool at a view, and the largest number of views with an arm. With more views only the tool is
+drawn."""
 _SUPPORT_THICKNESS_MM = 15.0
 _ROUND = 36
 _ROWS = 14
-"""Lines of text beside the pictures."""
+"""Number of lines of text beside the pictures."""
 
 
 def write_picture(scene: Scene, path: Path) -> None:
@@ -116,7 +117,7 @@ def _cell_from(scene: Scene, lookout: Lookout) -> Any:
 
 
 def _standing(scene: Scene) -> tuple[list[Solid], list[Solid], list[Solid]]:
-    """The arm at the views: its links without the base, the tool, and bodies that would collide."""
+    """Return the arm at the views: its links without the base, the tool, and bodies that would collide."""
     arms: list[Solid] = []
     tools: list[Solid] = []
     touching: list[Solid] = []
@@ -133,7 +134,7 @@ def _standing(scene: Scene) -> tuple[list[Solid], list[Solid], list[Solid]]:
 
 
 def _dots_of_leds(canvas: Canvas, scene: Scene, lookout: Lookout) -> None:
-    """LEDs, those on the near side of the dome faint, so that the inside is visible."""
+    """Draw the LEDs. Those on the near side of the dome are faint, so that the inside is visible."""
     towards_eye = -lookout.world_from_eye[:3, 2]
     near_side = scene.leds_mm @ towards_eye > 0
     colour = np.where(scene.is_used[:, None], colours.of_share(scene.led_share), colours.UNUSED)
@@ -174,7 +175,7 @@ def _write_with_halo(pen: Any, at: Any, words: str, width: int) -> None:
 
 
 def _through_the_camera(sheet: Any, pen: Any, scene: Scene, stop: Stop, left_px: int, top_px: int) -> None:
-    """The camera's picture in a view, the object coloured by the share of LEDs that reach it."""
+    """Draw the camera's picture in a view, with the object coloured by the share of LEDs that reach it."""
     assert stop.sight is not None
     width = min(_CAMERA_WIDTH, (_STRIP - 84) * stop.sight.width_px // stop.sight.height_px)
     height = width * stop.sight.height_px // stop.sight.width_px
@@ -186,7 +187,7 @@ def _through_the_camera(sheet: Any, pen: Any, scene: Scene, stop: Stop, left_px:
 
 
 def _chosen_stops(stops: list[Stop]) -> list[Stop]:
-    """Refused views first, then others at even intervals, in the order of visiting."""
+    """Return refused views first, then others at even intervals, in the order of visiting."""
     refusals = [stop for stop in stops if stop.refusal][:_CAMERAS]
     clear = [stop for stop in stops if not stop.refusal]
     room = min(len(clear), _CAMERAS - len(refusals))
@@ -210,7 +211,7 @@ def _seen_by(scene: Scene, stop: Stop, width: int, height: int) -> Any:
 
 
 def _lit(scene: Scene, stop: Stop) -> Any:
-    """Colours of the object's faces: the share of the plan's LEDs that reach them."""
+    """Return colours of the object's faces, by the share of the plan's LEDs that reach them."""
     if stop.shadow is None or not scene.is_used.any():
         return np.array(colours.OBJECT)
     share = (stop.shadow.codes[:, scene.is_used] == REACHED).mean(axis=1)
@@ -243,7 +244,8 @@ def _header(pen: Any, scene: Scene) -> None:
 
 
 def _column(pen: Any, scene: Scene, x: int, top: int) -> None:
-    """Text beside the pictures: why the plan is refused, else the views and the durations of their legs."""
+    """Write text beside the pictures: the reasons of a refusal, or otherwise the views and the durations of their
+    legs."""
     rows = [
         line
         for refusal in scene.refusals
@@ -261,7 +263,7 @@ def _column(pen: Any, scene: Scene, x: int, top: int) -> None:
 
 
 def _legend(pen: Any, bottom_left: tuple[int, int]) -> None:
-    """Legend of the colours, upwards from a corner."""
+    """Draw the legend of the colours, upwards from a corner."""
     x, y = bottom_left
     for k in range(120):
         pen.line((x + k, y - 10, x + k, y), colours.css(colours.of_share(k / 119)))

@@ -1,6 +1,6 @@
 """Scene of a plan: the cell, the arm at each view, its paths, and its collisions.
 
-Everything is in the support frame, in mm, and independent of how it is drawn.
+Everything is in the support frame, in mm, and independent of the drawing.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ class Stop:
     leg_s: float | None
     """Duration of the leg; None if there is none."""
     camera_way_mm: Points
-    """[n, 3] path of the projection centre on the leg; without a leg, of the straight motion to the collision."""
+    """[n, 3] path of the projection centre on the leg. Without a leg, it is that of the straight motion to the
+    collision."""
     flange_way_mm: Points
     vias_mm: Points
     """[k, 3] projection centre at the leg's via points."""
@@ -94,7 +95,7 @@ class Scene:
     leds_mm: Points
     led_ids: NDArray[np.int64]
     is_used: NDArray[np.bool_]
-    """[leds] True for those that the plan lights."""
+    """[leds] True for LEDs that the plan lights."""
     paths_checked: bool
     links: tuple[Capsule, ...]
     """The arm's own bodies, without the tool."""
@@ -105,12 +106,13 @@ class Scene:
 
     @property
     def tool_names(self) -> frozenset[str]:
-        """Names of the bodies that the flange carries."""
+        """Names of the bodies on the flange."""
         return frozenset(body.name for body in self.rig.tool)
 
     @property
     def led_share(self) -> NDArray[np.float64]:
-        """[leds] share of the visible surface that each LED reaches, mean of the views that can be taken."""
+        """[leds] share of the visible surface that each LED reaches, as the mean over the views that can be
+        taken."""
         shares = [stop.shadow.share() for stop in self.stops if stop.shadow is not None]
         return np.mean(shares, axis=0) if shares else np.zeros(len(self.leds_mm))
 
@@ -128,7 +130,7 @@ class Scene:
         ]
 
     def arm(self, joints_deg: Joints, around: int = 24) -> list[Solid]:
-        """The arm's and the tool's bodies, each a solid, at joint angles [6]."""
+        """Return the arm's and the tool's bodies, each as a solid, at joint angles [6]."""
         capsules = [
             *self.links,
             *(Capsule(b.name, FLANGE, b.from_mm, b.to_mm, b.radius_mm) for b in self.rig.tool),
@@ -141,7 +143,7 @@ class Scene:
 
 
 def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals: Sequence[str]) -> Scene:
-    """The scene of a job; without `bodies` collisions are not checked."""
+    """Return the scene of a job. Without `bodies`, collisions are not checked."""
     rig, views = job.cell.rig, job.schedule.views
     shadows, corners_mm = job.motion.occlusions, job.shape.corners_mm
     refused_indices = [index for index in range(len(views)) if index not in itinerary.order]
@@ -274,7 +276,7 @@ def _along(way_deg: Sequence[Joints]) -> Joints:
 def _clash(
     view: ViewPose, starts_deg: Sequence[Joints], rig: Rig, bodies: CellBodies
 ) -> tuple[Clash | None, Joints]:
-    """Collision of a refused view, or of the straight motion to it, and the start of that motion.
+    """Return the collision of a refused view, or of the straight motion to it, and the start of that motion.
 
     If all postures of the view collide, the one with the least penetration is used.
     """

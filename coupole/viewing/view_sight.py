@@ -12,13 +12,13 @@ from coupole.motion.occlusion import Sight
 from coupole.viewing.view_solids import Points
 
 _BORDER_POINTS = 16
-"""Points on each side of the picture whose rays make up its footprint."""
+"""Number of points on each side of the picture; their rays give the footprint."""
 _FAR_MM = 1e4
 
 
 def picture_border(sight: Sight) -> Points:
-    """Points [4 n, 3] in the camera's frame, 1 mm in front of it, along the border of its picture; every n-th is a
-    corner."""
+    """Return points [4 n, 3] in the camera frame, 1 mm in front of it, along the border of its picture. Every n-th
+    point is a corner."""
     half = np.array((sight.width_px, sight.height_px)) / 2 / sight.focal_px
     corners = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
     share = np.arange(_BORDER_POINTS)[:, None] / _BORDER_POINTS
@@ -35,8 +35,8 @@ def sight_lines(sight: Sight, length_mm: float = 120.0) -> list[Points]:
 
 
 def footprint(sight: Sight, mesh: Any, support_radius_mm: float) -> Points:
-    """Closed line [n, 3]: the border of a camera's picture projected onto the object, else onto the support;
-    without points that are on neither."""
+    """Return a closed line [n, 3]: the border of a camera's picture, projected onto the object, or otherwise onto
+    the support. Points that are on neither are left out."""
     eye_mm = sight.support_from_camera[:3, 3]
     rays = picture_border(sight) @ sight.support_from_camera[:3, :3].T
     with np.errstate(divide="ignore"):

@@ -16,7 +16,7 @@ Points = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Solid:
-    """A named body: vertices [n, 3] in mm and faces [m, 3], counter-clockwise seen from outside."""
+    """A named body: vertices [n, 3] in mm and faces [m, 3], which run counter-clockwise as seen from outside."""
 
     name: str
     vertices_mm: Points
@@ -39,7 +39,7 @@ def join_solids(name: str, solids: Sequence[Solid]) -> Solid:
 
 
 def capsule(name: str, start_mm: ArrayLike, end_mm: ArrayLike, radius_mm: float, around: int = 24) -> Solid:
-    """All points within a radius of a segment; `around` edges make its circles."""
+    """Return the body of all points within a radius of a segment. Its circles have `around` edges."""
     start, end = np.asarray(start_mm, np.float64), np.asarray(end_mm, np.float64)
     length = float(np.linalg.norm(end - start))
     z = (end - start) / length if length > 0 else np.array((0.0, 0.0, 1.0))
@@ -55,7 +55,7 @@ def sphere(name: str, center_mm: ArrayLike, radius_mm: float, around: int = 24) 
 
 
 def box(name: str, low_mm: ArrayLike, high_mm: ArrayLike) -> Solid:
-    """Parallel to the axes."""
+    """Return a box parallel to the axes."""
     corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
     low, high = np.asarray(low_mm, np.float64), np.asarray(high_mm, np.float64)
     faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -89,8 +89,8 @@ def with_fewer_faces(solid: Solid, faces_at_most: int) -> Solid:
 
 @lru_cache(maxsize=8)
 def _ball(around: int) -> tuple[Points, NDArray[np.int64], NDArray[np.bool_]]:
-    """Unit sphere with two equators, so that its halves can be moved apart to make a capsule: vertices, faces, and
-    for each vertex whether it belongs to the upper half."""
+    """Return a unit sphere with two equators, so that its halves can be moved apart to make a capsule. It has
+    vertices, faces, and for each vertex whether it belongs to the upper half."""
     rings = max(2, around // 4)
     below = np.linspace(-np.pi / 2, 0, rings + 1)
     latitude = np.concatenate([below, -below[::-1]])

@@ -1,7 +1,7 @@
 """Page-aligned memory for the frames of cameras whose library delivers images one by one.
 
-A slot is free until it is taken for a frame, and again when that frame is released. A frame of an earlier
-acquisition may be released late without effect on the slots of the present one.
+A slot is free until it is taken for a frame, and again after that frame is released. A frame of an earlier
+acquisition may be released late; this has no effect on the slots of the present acquisition.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ class FramePool:
         self._freed = threading.Condition()
 
     def begin(self) -> None:
-        """Begin a new acquisition: all slots become free, also those not yet released."""
+        """Begin a new acquisition. All slots become free, even those not yet released."""
         with self._freed:
             self._acquisition += 1
             self._free = list(range(self.slots))
 
     def take(self, timeout_s: float) -> Slot | None:
-        """A free slot, or None if none was released in time."""
+        """Return a free slot, or None if no slot was released in time."""
         with self._freed:
             if not self._freed.wait_for(lambda: self._free, timeout_s):
                 return None
@@ -42,7 +42,7 @@ class FramePool:
             return Slot(self, index, self._acquisition, self._memory[start : start + self.slot_bytes])
 
     def give_back(self, index: int, acquisition: int) -> None:
-        """Called by `Slot.release`."""
+        """Take a slot back; `Slot.release` calls this."""
         with self._freed:
             if acquisition == self._acquisition and index not in self._free:
                 self._free.append(index)

@@ -1,4 +1,4 @@
-"""Access to a camera's GenICam features, as the shared functions of the GenICam drivers need it."""
+"""Access to a camera's GenICam features, for the functions that the GenICam drivers share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Protocol
 from drivers.camera.genicam_settings import Value
 
 _READBACK_TOLERANCE = 0.01
-"""Relative. Cameras round values: an exposure to the line time, a gain to the converter's steps."""
+"""Relative tolerance of values that are read back. Cameras round values: an exposure to the line time, a gain to
+the converter's steps."""
 
 
 class Features(Protocol):
@@ -35,7 +36,7 @@ class Features(Protocol):
 
 
 def alike(readback: Value, setting: Value) -> bool:
-    """True if `readback`, read back, is the value that was set, within the rounding of cameras."""
+    """True if `readback` is the value that was set, within the rounding of cameras."""
     if isinstance(readback, bool) != isinstance(setting, bool):
         return False
     if isinstance(readback, float) and not isinstance(setting, str):

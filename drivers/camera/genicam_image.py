@@ -1,6 +1,6 @@
-"""Image format of a GenICam camera: sets and reads it through features.
+"""Image format of a GenICam camera, which is set and read through features.
 
-Used by all GenICam drivers, whatever their library.
+All GenICam drivers use it, whatever their library.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ from drivers.camera.pixel_formats import FORMATS, PixelFormat, pixels_in_a_group
 
 
 def set_up(features: Features, settings: GenICamSettings, *, is_triggered: bool) -> dict[str, str]:
-    """Bring a camera that was just opened into its state, whatever it was left in; returns what was read back.
+    """Bring a camera that was just opened into its state, whatever its former state was. Return the values that
+    were read back.
 
-    First the driver's table, then the rig's features in their order, the region, the pixel format and, if frames
-    are `is_triggered`, the trigger. Raises DeviceRefused, naming the feature that does not take its value.
+    The order is: the driver's table, the rig's features in their order, the region, the pixel format and, if
+    frames are `is_triggered`, the trigger. Raises DeviceRefused, which names the feature that does not take its
+    value.
     """
     state = State(features, settings)
     state.apply(AT_OPENING)
@@ -40,7 +42,7 @@ def set_up(features: Features, settings: GenICamSettings, *, is_triggered: bool)
 
 
 def _set_region(features: Features, region: Region) -> None:
-    """Offsets are set to zero first, because offset and size limit each other."""
+    """Set the region. Offsets are set to zero first, because offset and size limit each other."""
     for name, value in (
         ("OffsetX", 0),
         ("OffsetY", 0),
@@ -54,7 +56,8 @@ def _set_region(features: Features, region: Region) -> None:
 
 
 def pixel_format(features: Features, device: str) -> PixelFormat:
-    """The camera's present pixel format. Raises DeviceRefused for one that the driver does not support."""
+    """Return the camera's present pixel format. Raises DeviceRefused for a format that the driver does not
+    support."""
     name = str(features.read_value("PixelFormat"))
     if name not in FORMATS:
         raise DeviceRefused(
@@ -67,7 +70,8 @@ def pixel_format(features: Features, device: str) -> PixelFormat:
 
 
 def frame_format(features: Features, device: str, black_dn: int | None) -> FrameFormat:
-    """Format of the camera's frames; with `black_dn` None, black is `BlackLevel`. Raises DeviceRefused."""
+    """Return the format of the camera's frames. If `black_dn` is None, black is `BlackLevel`. Raises
+    DeviceRefused."""
     pixel_type = pixel_format(features, device)
     width_px, height_px = int(features.number("Width")), int(features.number("Height"))
     if width_px * height_px % pixels_in_a_group(pixel_type):
@@ -84,7 +88,8 @@ def frame_format(features: Features, device: str, black_dn: int | None) -> Frame
 
 
 def readout_us(features: Features, device: str, given_us: int | None) -> int:
-    """Least time between two frames, us: `given_us`, else the camera's readout time or highest frame rate."""
+    """Return the least time between two frames, us: `given_us`, or otherwise from the camera's readout time or
+    highest frame rate."""
     if given_us is not None:
         return given_us
     if features.has("SensorReadoutTime"):

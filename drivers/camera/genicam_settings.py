@@ -7,7 +7,7 @@ from typing import Annotated, Protocol
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt, StrictStr
 
 Value = StrictBool | StrictInt | StrictFloat | StrictStr
-"""Value of a feature; of an enumeration, the name of its entry."""
+"""Value of a feature. For an enumeration it is the name of its entry."""
 
 
 class Region(BaseModel):
@@ -31,7 +31,7 @@ class Counter(BaseModel):
 
 
 class GenICamSettings(Protocol):
-    """Settings used by `genicam_image` and `genicam_trigger`; each driver's own class documents them."""
+    """Settings that `genicam_image` and `genicam_trigger` use. Each driver's own class documents them."""
 
     @property
     def region(self) -> Region | None: ...

@@ -1,10 +1,11 @@
-"""The state that a GenICam camera must be in, whatever it was left in: one table for all GenICam drivers.
+"""The state that a GenICam camera must have, whatever its former state was. There is one table for all GenICam
+drivers.
 
-A camera keeps what the last program set, and some keep it over power-off. So each feature that decides when, for
-how long and how a frame is exposed, or what happens to its pixels, is set and read back when the camera is opened.
-Names and entries are those of the GenICam Standard Features Naming Convention (SFNC) 2.7. A feature that the
-camera lacks is left out; one that it has and that does not take the value is an error. Features named in the rig
-(`features`, or `leave`) are the rig's: their lines of the table are not used.
+A camera keeps the settings of the last program, and some cameras keep them over power-off. So each feature that
+affects the exposure of a frame or its pixels is set and read back when the camera is opened. Names and entries are
+those of the GenICam Standard Features Naming Convention (SFNC) 2.7. A feature that the camera lacks is left out.
+If the camera has a feature that does not take the value, this is an error. Features named in the rig (`features`,
+or `leave`) belong to the rig, and their lines of the table are not used.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ from drivers.camera.genicam_settings import GenICamSettings, Value
 
 @dataclass(frozen=True)
 class Line:
-    """The first of `names` that the camera has gets the first of `values` that it offers."""
+    """The first of `names` that the camera has is set to the first of `values` that the camera offers."""
 
     names: tuple[str, ...]
     values: tuple[Value, ...]
     selector: str = ""
-    """The feature is set for each entry of this one, if the camera has it."""
+    """Selector feature: the feature is set for each of its entries, if the camera has the selector."""
     if_offered: bool = False
-    """An enumeration without any of the values stays as it is."""
+    """True: an enumeration without any of the values stays unchanged."""
 
 
 def _line(name: str, value: Value, selector: str = "") -> Line:
@@ -77,7 +78,8 @@ FRAME_TRIGGER = (
     _line("TriggerDivider", 1),
     _line("TriggerMultiplier", 1),
 )
-"""Features of the trigger that starts frames, set once it is on: some cameras lock them before."""
+"""Features of the trigger that starts frames. They are set after it is on, because some cameras lock them
+before."""
 TRIGGER_LINE = (
     Line(("LineMode",), ("Input",)),
     _line("LineInverter", False),
@@ -87,7 +89,7 @@ _ONE_OF_SEVERAL = (
     ("RegionSelector", "RegionMode", "Region0"),
     ("ComponentSelector", "ComponentEnable", "Intensity"),
 )
-"""Selector, what switches the selected one on, and the only one that is to be on."""
+"""A selector, the feature that switches the selected entry on, and the only entry that is to be on."""
 _WHOLE_GAINS = ("All", "AnalogAll")
 _ALSO_READ = (
     "PixelFormat",
@@ -105,7 +107,7 @@ _ALSO_READ = (
 
 
 class State:
-    """Sets features of an open camera and keeps what was read back.
+    """Sets features of an open camera, and keeps the values that were read back.
 
     Each method raises DeviceRefused if the camera has the feature and does not take the value, DeviceLost.
     """
@@ -114,7 +116,7 @@ class State:
         self._features = features
         self._rigs = {*settings.features, *settings.leave}
         self.held: dict[str, str] = {}
-        """Values as read back, by feature or feature[entry of its selector]."""
+        """Values that were read back, by feature or feature[entry of its selector]."""
 
     def apply(self, lines: Collection[Line]) -> None:
         """Set the features of these lines, in their order."""
@@ -122,7 +124,7 @@ class State:
             self._apply(line)
 
     def set(self, name: str, value: Value, entry: str = "") -> None:
-        """Set a feature, unless it holds the value already, and keep what it then holds."""
+        """Set a feature, unless it has the value already, and keep the value that it then has."""
         read_back = self._features.read_value(name)
         if not alike(read_back, value):
             self._features.write(name, value)
@@ -135,13 +137,13 @@ class State:
             self._features.write(selector, entry)
 
     def note(self, *names: str) -> None:
-        """Keep what these features hold, where the camera has them."""
+        """Keep the values of these features, if the camera has them."""
         for name in names:
             if self._features.has(name):
                 self.held[name] = str(self._features.read_value(name))
 
     def note_all(self) -> None:
-        """Keep what is worth knowing beside what was set."""
+        """Keep other values that are worth knowing."""
         self.note(*_ALSO_READ)
 
     def use_one_region_and_component(self) -> None:
@@ -176,7 +178,7 @@ class State:
         features.write("GainSelector", whole)
 
     def use_whole_sensor(self) -> None:
-        """Read out all that the sensor has, with the present binning."""
+        """Read out the whole sensor, with the present binning."""
         for offset, size in (("OffsetX", "Width"), ("OffsetY", "Height")):
             if self._features.has(offset) and offset not in self._rigs:
                 self.set(offset, 0)
@@ -196,11 +198,12 @@ class State:
                 self._set_first(line, name, entry)
 
     def _has(self, name: str, selector: str) -> bool:
-        """True if the camera has the feature, perhaps for some entries of its selector only."""
+        """True if the camera has the feature, if only for some entries of its selector."""
         return self._features.has(name) or any(self._features.has(name) for _ in self._entries_of(selector))
 
     def _entries_of(self, selector: str) -> Iterator[str]:
-        """Each entry of the selector, selected in turn; once the empty text without selector."""
+        """Yield each entry of the selector, which is selected in turn. Without a selector, yield the empty text
+        once."""
         if not selector or selector in self._rigs or not self._features.has(selector):
             yield ""
             return
@@ -209,7 +212,7 @@ class State:
             yield entry
 
     def _set_first(self, line: Line, name: str, entry: str) -> None:
-        """Set the feature to the first value of the line that suits it."""
+        """Set the feature to the first suitable value of the line."""
         value = line.values[min(line.names.index(name), len(line.values) - 1)]
         if isinstance(value, str):
             entries = self._features.entries(name)
@@ -222,7 +225,7 @@ class State:
 
 
 def _in_type_of(value: Value, readback: Value) -> Value:
-    """A number in the type in which the camera has the feature."""
+    """Return a number in the type of the camera's feature."""
     if isinstance(value, float) and isinstance(readback, int) and math.isfinite(value):
         return int(value)
     if isinstance(value, bool) and not isinstance(readback, bool) and isinstance(readback, int | str):

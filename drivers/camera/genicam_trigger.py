@@ -12,7 +12,8 @@ _LAST_WIDE_ID = 2**62
 
 
 def set_exposure(features: Features, settings: GenICamSettings, exposure: Exposure) -> None:
-    """Each frame starts at an edge of the box or at a software trigger, and is exposed for the time given."""
+    """Set exposure and trigger: each frame starts at an edge of the box or at a software trigger, and has the
+    given exposure time."""
     set_trigger(State(features, settings), features, settings, by_edges=exposure.hardware_trigger)
     features.write(features.first_of("ExposureTimeAbs") or "ExposureTime", float(exposure.exposure_us))
     if exposure.gain_db or features.has("Gain"):
@@ -20,7 +21,7 @@ def set_exposure(features: Features, settings: GenICamSettings, exposure: Exposu
 
 
 def set_trigger(state: State, features: Features, settings: GenICamSettings, *, by_edges: bool) -> None:
-    """Have each edge of the trigger line, or each software trigger, start one frame, at once."""
+    """Let each edge of the trigger line, or each software trigger, start one frame at once."""
     state.select("TriggerSelector", "FrameStart")
     state.set("TriggerMode", "On", "FrameStart")
     state.set("TriggerSource", settings.trigger_line if by_edges else settings.software_trigger, "FrameStart")
@@ -33,8 +34,8 @@ def set_trigger(state: State, features: Features, settings: GenICamSettings, *, 
 
 
 def frame_id_range(features: Features, *, gige: bool) -> tuple[int, int]:
-    """First and last frame id of the transport: 16 bits on GigE Vision, unless the camera reports the extended ids
-    of version 2; else 64."""
+    """Return the first and last frame id of the transport. They have 16 bits on GigE Vision, unless the camera
+    reports the extended ids of version 2; otherwise 64 bits."""
     if not gige:
         return (0, _LAST_WIDE_ID)
     extended_id_feature = "GevGVSPExtendedIDMode"
@@ -43,7 +44,8 @@ def frame_id_range(features: Features, *, gige: bool) -> tuple[int, int]:
 
 
 def counts(features: Features, settings: GenICamSettings) -> tuple[int, int]:
-    """Numbers of exposures and of edges that came too early, from the camera's counters; -1 without counter."""
+    """Return the numbers of exposures and of edges that came too early, from the camera's counters; -1 without a
+    counter."""
     return (_count(features, settings.exposed_counter), _count(features, settings.over_trigger_counter))
 
 
@@ -55,5 +57,5 @@ def _count(features: Features, counter: Counter | None) -> int:
 
 
 def since(count: int, before: int) -> int:
-    """Increase of a 32-bit counter since it was `before`; -1 without counter."""
+    """Return the increase of a 32-bit counter since it was `before`; -1 without a counter."""
     return count if count < 0 else (count - before) % 2**32

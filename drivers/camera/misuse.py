@@ -1,4 +1,4 @@
-"""The error for methods of a camera called in an order that its contract does not allow."""
+"""The error for methods of a camera that are called in a wrong order."""
 
 from __future__ import annotations
 

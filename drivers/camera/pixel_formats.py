@@ -1,6 +1,6 @@
 """Pixel formats of GenICam cameras (PFNC), and the unpacking of packed pixels to 16-bit numbers.
 
-Formats of 10 to 16 bits in two bytes are used as received. Formats of one byte, and packed formats, are widened to
+Formats of 10 to 16 bits in two bytes are used as received. Formats of one byte and packed formats are widened to
 16-bit frames.
 """
 
@@ -62,7 +62,7 @@ FORMATS = {
     for code, (suffix, depth, size, packing) in zip(codes, _COLUMNS, strict=True)
     if code
 }
-"""Formats by name, as the feature `PixelFormat` holds it."""
+"""Formats by the name that the feature `PixelFormat` has."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -97,7 +97,8 @@ def _widen_10p(out, data):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _widen_10_packed(out, data):  # type: ignore[no-untyped-def]
-    """Two pixels in three bytes: the middle byte holds the lower two bits, those of the second from bit 4 on."""
+    """Two pixels in three bytes: the middle byte holds the lower two bits of each; those of the second pixel begin
+    at bit 4."""
     for pair in range(len(out) // 2):
         first, middle, last = data[3 * pair], data[3 * pair + 1], data[3 * pair + 2]
         out[2 * pair] = np.uint16(first) << np.uint16(2) | np.uint16(middle & 3)
@@ -121,7 +122,7 @@ _GROUP = {"one byte": 1, "two bytes": 1, "10p": 4, "12p": 2, "10Packed": 2, "12P
 
 
 def pixels_in_a_group(pixel_format: PixelFormat) -> int:
-    """Number of pixels that share bytes; the pixels of an image must be a multiple of it."""
+    """Return the number of pixels that share bytes. The number of pixels of an image must be a multiple of it."""
     return _GROUP[pixel_format.packing]
 
 

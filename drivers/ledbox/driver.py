@@ -1,8 +1,8 @@
 """The LED control box, by SCPI over a serial line or USBTMC (docs/reference/ledbox-protocol.md).
 
-Every message ends in `SYSTem:ERRor?`, so every command is confirmed and costs one round trip. The box's two
-table banks are used alternately: while one runs, the next table is uploaded into the other, in blocks between
-which other messages pass. `lights_off` waits for none of them: it begins with a device clear.
+Every message ends in `SYSTem:ERRor?`, so every command is confirmed and costs one round trip. The box's two table
+banks are used alternately. While one runs, the next table is uploaded into the other, in blocks; other messages
+pass between the blocks. `lights_off` waits for no message, because it begins with a device clear.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ _POLL_S, _POLL_OVERHEAD_BYTES = 0.055, 130
 _MAX_RECORDS_PER_POLL = 512
 _UNDEFINED_HEADER, _HARDWARE_MISSING, _FIRST_PROTOCOL = "-113", "-241", "1.0"
 _CLEARS_AT_ONCE = 5
-"""Threads that may switch the lights off at the same time; each clears the box, and ends the others' messages."""
+"""Number of threads that may switch the lights off at the same time. Each clears the box, and ends the messages of
+the others."""
 _SHORTEST_PERIOD_US = 100
 _FLASH_MARGIN_S = 5.0
-"""A flash that lasts this much longer than requested counts as not ended."""
+"""A flash that lasts longer than requested by this time counts as not ended."""
 
 
 class LedBox:
@@ -96,7 +97,8 @@ class LedBox:
             self._upload(bank, payload)
 
     def start(self, table: NDArray[np.void]) -> None:
-        """Run a loaded table. A bank with a wrong CRC-32 is uploaded once more; if still wrong, it is refused."""
+        """Run a loaded table. If a bank has a wrong CRC-32, it is uploaded once more; if it is still wrong, it is
+        refused."""
         payload = self._payload(table)
         with self._scpi.call():
             self._start(payload, table)
@@ -120,7 +122,8 @@ class LedBox:
         return int(self._scpi.number(count))
 
     def flash(self, led: int, on_us: int) -> None:
-        """Run a table of one step without edge: the box times the flash, and runs as long as the LED is lit."""
+        """Run a table of one step without an edge. The box times the flash, and the table runs as long as the LED
+        is lit."""
         step = Step(led, on_us, 0, max(on_us, _SHORTEST_PERIOD_US), sends_edge=False)
         table = np.array([astuple(step)], STEP_DTYPE)
         with self._scpi.call():
@@ -153,11 +156,11 @@ class LedBox:
         return StepRecord(*records[0].tolist())
 
     def lights_off(self) -> None:
-        """Device clear, at which the box goes dark whatever it is being sent; then abort, and wait for the
-        confirmation. Calls of other threads end with DeviceError and light nothing any more.
+        """Send a device clear, which makes the box dark whatever it is being sent. Then abort, and wait for the
+        confirmation. Calls of other threads end with DeviceError, and give no more light.
 
-        A box without device clear first gets the rest of the message that is being sent. Raises only if a second
-        try fails too: by then such a box has discarded an incomplete upload. Takes about 5 s at most.
+        A box without a device clear first gets the rest of the message that is being sent. Raises only if a second
+        try fails too; by then such a box has discarded an incomplete upload. It takes about 5 s at most.
         """
         self._running_bank = None
         if self._clears:
@@ -172,7 +175,7 @@ class LedBox:
             self._abort()
 
     def acknowledge(self) -> None:
-        """The box forgets its tables with its faults."""
+        """Clear the box's faults. The box forgets its tables too."""
         self._running_bank, self._banks = None, [None, None]
         self._scpi.ask("*RST;*CLS", 0)
         self._set_up()
@@ -193,7 +196,7 @@ class LedBox:
         return switch_state == "1"
 
     def close(self) -> None:
-        """Lights off if the box still answers; never raises for a lost link."""
+        """Switch the lights off if the box still answers. Never raises for a lost link."""
         with contextlib.suppress(DeviceError):
             self.lights_off()
         self._scpi.close()
@@ -218,8 +221,8 @@ class LedBox:
             raise no_port(settings.name, settings.port, error) from error
 
     def _greet(self) -> Identity:
-        """Clear what an earlier program left in box and line, and read the box's identity: once more if the answer
-        to an earlier message comes late, in its place."""
+        """Discard the rest of an earlier program's messages in box and line, and read the box's identity. Read it
+        once more if a late answer to an earlier message comes in its place."""
         try:
             self._scpi.ask("*CLS", 0)
         except DeviceTimeout:
@@ -238,7 +241,7 @@ class LedBox:
         return Identity(vendor, model, serial, firmware, simulated=serial.startswith("SIM"))
 
     def _ask_protocol(self) -> str:
-        """Version of the protocol that the box speaks; the first one could not be asked."""
+        """Return the version of the box's protocol. A box of the first version cannot be asked."""
         try:
             (version,) = self._scpi.ask("SYST:PROT?", 1)
         except DeviceRefused as refused:
@@ -248,7 +251,7 @@ class LedBox:
         return str(version)
 
     def _ask_enabling_switch(self) -> bool:
-        """Ask whether the box has an input for an enabling switch: older firmware does not know the question."""
+        """Ask whether the box has an input for an enabling switch. Older firmware does not know the question."""
         try:
             self._scpi.ask("INP:ENAB?", 1)
         except DeviceRefused as refused:
@@ -259,7 +262,7 @@ class LedBox:
 
     @property
     def _clears(self) -> bool:
-        """True if the box's protocol has a device clear, and takes tables in blocks."""
+        """True if the box's protocol has a device clear, and accepts tables in blocks."""
         return self._protocol != _FIRST_PROTOCOL
 
     def _set_up(self) -> int:
@@ -319,7 +322,7 @@ class LedBox:
         return int(self._scpi.number(crc))
 
     def _poll(self) -> tuple[bool, NDArray[np.void]]:
-        """Return whether there are more records of finished steps to fetch, and the next ones."""
+        """Return whether there are more records of finished steps to fetch, and the next records."""
         bytes_wanted = self._scpi.bytes_per_s * _POLL_S - _POLL_OVERHEAD_BYTES
         limit = max(1, min(_MAX_RECORDS_PER_POLL, int(bytes_wanted / RECORD_BYTES)))
         command = f"SEQ:STAT?;INDex?;LOG? {self._next_record},{limit}"

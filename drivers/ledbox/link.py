@@ -1,4 +1,4 @@
-"""Links that carry bytes to a box and back, with a device clear that waits for no exchange."""
+"""Links that carry bytes to a box and back. Their device clear waits for no exchange."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from coupole.errors import DeviceError
 
 
 class Cleared(Exception):
-    """A device clear ended the exchange; nothing more of it is sent."""
+    """A device clear ended the exchange. Nothing more of the exchange is sent."""
 
 
 class CallEnded(DeviceError):
-    """`lights_off`, called in another thread, ended the call. Nothing more of it was sent."""
+    """Another thread called `lights_off`, which ended the call. Nothing more of the call was sent."""
 
     def __init__(self, device: str, doing: str) -> None:
         super().__init__(
@@ -25,27 +25,28 @@ class CallEnded(DeviceError):
 
 
 class Link(Protocol):
-    """Transports bytes. `write` and `read_bytes` belong to one thread at a time, `device_clear` to any at any
-    moment.
+    """Transports bytes. Only one thread at a time may call `write` and `read_bytes`. Any thread may call
+    `device_clear` at any moment.
 
-    Both raise TimeoutError when the deadline passes, ConnectionError when the link is lost, and Cleared if
-    `clears` is no longer the link's own: then a device clear came after the exchange had begun.
+    `write` and `read_bytes` raise TimeoutError when the deadline passes, and ConnectionError when the link is
+    lost. They raise Cleared if `clears` is no longer the link's own number, because a device clear came after the
+    exchange had begun.
     """
 
     bytes_per_s: float
     clears: int
-    """Device clears begun so far."""
+    """Number of device clears begun so far."""
 
     def write(self, data: bytes, deadline: Deadline, clears: int) -> None: ...
     def read_bytes(self, deadline: Deadline, clears: int) -> bytes: ...
 
     def device_clear(self) -> None:
-        """Tell the box out of band to go dark and to forget what it was sent; returns at once. Unsent bytes are
-        discarded, and running exchanges end with Cleared. Raises ConnectionError."""
+        """Tell the box out of band to go dark and to forget all that was sent to it. Returns at once. Unsent bytes
+        are discarded, and running exchanges end with Cleared. Raises ConnectionError."""
         ...
 
     def clear(self) -> None:
-        """Bring both ends in step, also after a device clear: discard what is still on its way. Raises
+        """Bring both ends in step, also after a device clear: discard bytes that are still on their way. Raises
         ConnectionError."""
         ...
 

@@ -1,6 +1,7 @@
 """SCPI, host side: each message is followed by a query of the device's error queue, in the same line.
 
-Responses follow IEEE 488.2, chapter 8: units separated by `;`, ended by LF; a unit is text or a block.
+Responses follow IEEE 488.2, chapter 8. Their units are separated by `;`, and the last one ends in LF. A unit is
+text or a block.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from drivers.fair_lock import FairLock
 from drivers.ledbox.link import CallEnded, Cleared, Link
 
 REPLY_MARGIN_S = 2.0
-"""Time that a device may take to answer, without the transmission of the bytes."""
+"""Time that a device may take to answer, not counting the transmission of the bytes."""
 _SHORT_REPLY_BYTES = 200
 _ERROR = re.compile(r'([+-]?[0-9]+),"(.*)"')
 _MAX_TEXT_BYTES = 4096
 _MOST_ERRORS = 64
-"""A queue that is not empty after so many errors never will be."""
+"""A queue that is not empty after this many errors will never be empty."""
 
 Unit = str | bytes
 """Text as received, or the content of a definite-length block."""
@@ -39,7 +40,7 @@ class ScpiSession:
         self.bytes_per_s = link.bytes_per_s
         self._lock = FairLock()
         self._in_step: int | None = None
-        """Device clears so far when both ends were last in step; None if an exchange has gone wrong since."""
+        """Number of device clears when both ends were last in step; None if an exchange has gone wrong since."""
         self._calls = threading.local()
         self._ends = 0
         """Number of times that all calls in progress were ended."""
@@ -66,8 +67,8 @@ class ScpiSession:
 
     @contextlib.contextmanager
     def call(self) -> Iterator[int]:
-        """The messages in this context belong to one call of the driver: after `end_calls` no more of them are
-        sent. Gives how often calls had been ended when the outermost call of this thread began."""
+        """Treat the messages in this context as one call of the driver: after `end_calls` no more of them are
+        sent. Gives the number of times that calls had been ended when the outermost call of this thread began."""
         outer = getattr(self._calls, "ends", None)
         self._calls.ends = self._ends if outer is None else outer
         try:
@@ -76,12 +77,13 @@ class ScpiSession:
             self._calls.ends = outer
 
     def end_calls(self) -> None:
-        """Calls in progress, but for the message that is being sent, end with CallEnded. From any thread."""
+        """End calls in progress with CallEnded, except for the message that is being sent. Any thread may call
+        this."""
         self._ends += 1
 
     def device_clear(self) -> None:
-        """Clear the device out of band, from any thread: it waits for no message that is being sent, and ends all
-        calls in progress with CallEnded. Raises DeviceLost."""
+        """Clear the device out of band, from any thread. It does not wait for a message that is being sent, and it
+        ends all calls in progress with CallEnded. Raises DeviceLost."""
         self.end_calls()
         try:
             self._link.device_clear()
@@ -96,7 +98,7 @@ class ScpiSession:
             self.raise_unexpected("a number", f"{unit!r} came")
 
     def raise_unexpected(self, expectation: str, observation: str) -> NoReturn:
-        """Raise DeviceError for an invalid reply; before the next message the line is cleared."""
+        """Raise DeviceError for an invalid reply. The line is cleared before the next message."""
         self._in_step = None
         raise DeviceError(
             self._name,
@@ -215,7 +217,8 @@ def _error_of(unit: Unit) -> tuple[int, str]:
 
 
 def _text_end(data: bytearray) -> int | None:
-    """Index of the end of the text unit at the start of `data`: `;` or LF outside quotes; None if not there."""
+    """Return the index of the end of the text unit at the start of `data`: `;` or LF outside quotes. None if the
+    end has not come yet."""
     in_quotes = False
     for index, byte in enumerate(data):
         if byte == ord('"'):

@@ -1,10 +1,10 @@
-"""Bytes to and from a device on a serial line, by any URL that pyserial accepts.
+"""Carries bytes to and from a device on a serial line, with any URL that pyserial accepts.
 
 Time-outs are counted on the rig's clock, so that they hold in a simulated world that runs faster or slower.
-pyserial's own time-outs, in machine time, only set how often the rig's clock is read.
+pyserial's own time-outs, in machine time, determine only how often the rig's clock is read.
 
-Device clear is a BREAK on a serial line, RFC 2217's on an `rfc2217://` port, and the end of the connection on a
-`socket://`, which carries bytes only.
+A device clear is a BREAK on a serial line, and RFC 2217's BREAK on an `rfc2217://` port. On a `socket://`, which
+carries only bytes, it is the end of the connection.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _LOOK_S = 0.02
 _BITS_PER_BYTE = 10
 _QUIET_S, _DRAIN_S = 0.05, 2.0
 _BREAK_BITS, _SHORTEST_BREAK_S = 25, 0.002
-"""A BREAK is longer than any character: 10 bits, 12 with parity and a second stop bit."""
+"""A BREAK is longer than any character, which has 10 bits, or 12 with parity and a second stop bit."""
 _RECONNECT_S = 2.0
-"""A server may need a while until it takes the next connection."""
+"""Time that a server may need until it accepts the next connection."""
 
 
 class SerialLink:
@@ -47,7 +47,8 @@ class SerialLink:
         self.bytes_per_s = baud / _BITS_PER_BYTE
         self.clears = 0
         self._gate = threading.Lock()
-        """Held for the moment of one write, and to begin a device clear: no byte of an exchange follows it."""
+        """Held for the moment of one write, and at the begin of a device clear. So no byte of an exchange follows
+        the clear."""
         self._is_socket, self._hung_up = url.startswith("socket://"), False
         self._port: Any = self._open_port()
 
@@ -83,7 +84,7 @@ class SerialLink:
                 raise TimeoutError("nothing came")
 
     def waiting(self) -> bytes:
-        """Bytes that have already arrived, possibly none; does not wait."""
+        """Return bytes that have already arrived, possibly none. Does not wait."""
         self._refuse_closed(self.clears)
         try:
             data: bytes = self._port.read(count) if (count := self._port.in_waiting) else b""
@@ -92,12 +93,12 @@ class SerialLink:
         return data
 
     def end_exchanges(self) -> None:
-        """A device clear on this side only: nothing is sent, and running exchanges end with Cleared."""
+        """Make a device clear only on this side: nothing is sent, and running exchanges end with Cleared."""
         with self._gate:
             self.clears += 1
 
     def device_clear(self) -> None:
-        """Discard unsent bytes, then BREAK; on a socket, end the connection with what it still holds."""
+        """Discard unsent bytes, then send BREAK. On a socket, end the connection and drop its bytes."""
         self.end_exchanges()
         with self._gate:
             if not self._port.is_open:
@@ -115,7 +116,7 @@ class SerialLink:
                 self._port.break_condition = False
 
     def clear(self) -> None:
-        """Discard input until the line is quiet; connect again where a device clear has ended the connection."""
+        """Discard input until the line is quiet. Connect again if a device clear has ended the connection."""
         if self._hung_up:
             self._connect_again()
         deadline, clears = Deadline(self._clock, _DRAIN_S), self.clears
@@ -152,8 +153,8 @@ class SerialLink:
         return port
 
     def _hang_up(self) -> None:
-        """Reset the connection: bytes that are still on their way are thrown away, here and at the box. The port
-        is left open, since another thread may be reading from it; its socket is closed."""
+        """Reset the connection: bytes that are still on their way are discarded, here and at the box. The port
+        stays open, because another thread may be reading from it; its socket is closed."""
         connection: socket.socket = self._port._socket
         with contextlib.suppress(OSError):  # it is closed already
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))

@@ -11,7 +11,8 @@ from drivers.host_checks import serial_port
 from drivers.ledbox.wire import STEP_BYTES
 
 BLOCK_BYTES = 512
-"""Largest part of a table in one message: what a box that lacks the device clear lets another command wait for."""
+"""Largest part of a table in one message. With a box that has no device clear, another command may have to wait
+for one such part."""
 _BLOCK_OVERHEAD_BYTES, _BLOCK_OVERHEAD_S = 70, 0.003
 _UPLOAD_OVERHEAD_S, _BITS_PER_BYTE = 0.1, 10
 
@@ -32,7 +33,8 @@ class Settings(BaseModel):
     edge_width_us: int = Field(default=50, ge=10, le=10_000)
     edge_polarity: Literal["normal", "inverted"] = "normal"
     wait_for_ready: bool = False
-    """Delay each step until the camera's exposure-ready line is high; needs that cable."""
+    """True: each step is delayed until the camera's exposure-ready line is high. This needs the cable of that
+    line."""
     name: str = "led box"
 
     def upload_s(self, steps: int) -> float:

@@ -1,9 +1,9 @@
-"""An LED box controlled by lines of text only, such as a dome built with a microcontroller.
+"""An LED box that is controlled only by lines of text, such as a dome with a microcontroller.
 
-Each command is a line made from a template in the rig; the box answers each with one line. A box of this kind has
-no table, log, clock or watchdog. Therefore this driver limits the light: a thread ends each flash in time,
-whatever the caller does, and all LEDs are switched off at opening, at closing and after any failure. It has no
-device clear either: `lights_off` waits for the rest of a line, but for no answer.
+Each command is a line made from a template in the rig, and the box answers each command with one line. A box of
+this kind has no table, log, clock or watchdog. Therefore this driver limits the light. A thread ends each flash in
+time, whatever the caller does. All LEDs are switched off at opening, at closing and after any failure. The box has
+no device clear either: `lights_off` waits for the rest of a line, but not for an answer.
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ from drivers.ledbox.link import CallEnded, Cleared
 from drivers.ledbox.serial_link import SerialLink, open_serial
 
 _REPLY_MARGIN_S = 2.0
-"""Time that a box may take to answer, without the transmission of the bytes."""
+"""Time that a box may take to answer, not counting the transmission of the bytes."""
 _SHORT_REPLY_BYTES, _LONGEST_REPLY_BYTES = 100, 1000
 _CONFIRMS_S = 0.5
-"""A box that takes longer to confirm a light gets less of it: its own bound must not come before ours."""
+"""Time to confirm a light. If a box takes longer, its light is shorter, because the box's own limit must not come
+before the driver's."""
 _BOX_PATIENCE = 1.5
-"""The box's own bound on a light over the driver's, its clock being a cheap one."""
+"""The box's own limit of a light, divided by the driver's limit. It allows for the box's cheap clock."""
 _LOOK_S = 0.001
 """Machine time between two readings of the rig's clock during a flash."""
 _ENDED_AT_ONCE = 5
-"""Threads that may switch the lights off at the same time; each ends the others' exchanges."""
+"""Number of threads that may switch the lights off at the same time. Each ends the exchanges of the others."""
 _ENDINGS = {"lf": "\n", "crlf": "\r\n", "cr": "\r"}
 _FIELDS: dict[str, tuple[frozenset[str], frozenset[str]]] = {
     "on": (frozenset({"led"}), frozenset({"led", "on_ms"})),
@@ -43,7 +44,7 @@ _FIELDS: dict[str, tuple[frozenset[str], frozenset[str]]] = {
     "all_off": (frozenset(), frozenset()),
     "identify": (frozenset(), frozenset()),
 }
-"""Fields of each template: those that it must have, and those that it may have."""
+"""Fields of each template: required fields, and allowed fields."""
 
 
 class Settings(BaseModel):
@@ -57,17 +58,17 @@ class Settings(BaseModel):
     led_count: int = Field(ge=1, le=65535)
     """Number of LEDs of the box; Coupole numbers them from 0."""
     first_led: int = Field(default=0, ge=0)
-    """The box's number for LED 0: 1 for a box that counts from 1."""
+    """The box's number for LED 0. It is 1 for a box that counts from 1."""
     on: str = "LED {led} ON"
     """Switches one LED on. It may contain `{on_ms}`: a time after which the box itself switches the LED off."""
     off: str | None = "LED {led} OFF"
-    """Switches one LED off; null for a box that has `all_off` only."""
+    """Switches one LED off; null for a box that has only `all_off`."""
     all_off: str = "ALL OFF"
     identify: str | None = None
-    """Asks the box for its identity, answered in one line; null for a box without such a command."""
+    """Asks the box for its identity, which it answers in one line; null for a box without this command."""
     expected_reply: str = Field(default="OK", min_length=1)
-    """The whole line by which the box confirms a command. A box that never answers is not supported: nothing would
-    prove which LED shone during an exposure."""
+    """The whole line with which the box confirms a command. A box that never answers is not supported, because
+    nothing would prove which LED was lit during an exposure."""
     line_ending: Literal["lf", "crlf", "cr"] = "lf"
     """Ending of commands. A reply ends in LF, or in CR if commands do."""
     settle_ms: float = Field(default=2000, ge=0, le=60_000)
@@ -75,8 +76,8 @@ class Settings(BaseModel):
     name: str = "led box"
 
     def longest_light_s(self, on_us: int) -> float:
-        """Longest time that the box leaves a light of `on_us` on if the host dies: its own bound. (If `on` has no
-        `{on_ms}`, the box has none: it then leaves the light on until it is told otherwise.)"""
+        """Longest time for which the box leaves a light of `on_us` on if the host dies, which is its own limit.
+        (If `on` has no `{on_ms}`, the box has no limit. It then leaves the light on until the next command.)"""
         return _box_bound_ms(on_us) * 1e-3
 
     def host_needs(self) -> list[HostNeed]:
@@ -112,7 +113,7 @@ def _check_template(name: str, template: str) -> None:
 
 
 def _box_bound_ms(on_us: int) -> int:
-    """The box's own bound on a light of `on_us`."""
+    """Return the box's own limit for a light of `on_us`."""
     return math.ceil(_BOX_PATIENCE * (on_us * 1e-6 + _CONFIRMS_S) * 1e3)
 
 
@@ -122,14 +123,14 @@ class _Flash:
 
     led: int
     sent_ns: int
-    """Rig time at which its command was sent: it cannot have begun earlier."""
+    """Rig time at which its command was sent. The flash cannot have begun earlier."""
     deadline: Deadline
     end_event: threading.Event = field(default_factory=threading.Event)
     """Set before the command that ends the light is sent."""
     off_ns: int | None = None
     """Rig time at which the box confirmed that command; None until then."""
     failure: DeviceError | None = None
-    """Error because of which the driver's thread could not end the flash."""
+    """Error that prevented the driver's thread from ending the flash."""
 
 
 class TextLineBox:
@@ -147,7 +148,7 @@ class TextLineBox:
         self.led_count = settings.led_count
         self._lock = threading.RLock()
         self._ends = 0
-        """Number of times that `lights_off` has ended the calls in progress."""
+        """Number of times that `lights_off` has ended calls in progress."""
         self._flash: _Flash | None = None
         self._in_step = False
         """True if the next line from the box is the answer to the next command."""
@@ -199,13 +200,14 @@ class TextLineBox:
                 raise
 
     def lit(self) -> bool:
-        """False once the flash's time is over, even if the thread that ends it is late: the box may have ended
-        it by itself."""
+        """False once the flash's time is over, even if the thread that ends it is late, because the box may have
+        ended it by itself."""
         flash = self._flash
         return flash is not None and not flash.end_event.is_set() and not flash.deadline.has_expired
 
     def end_flash(self) -> StepRecord:
-        """End the flash now, if its time has not ended it. `on_us`: from the command to the box's confirmation."""
+        """End the flash now, if its time has not ended it. `on_us` lasts from the command to the box's
+        confirmation."""
         flash = self._flash
         if flash is None:
             self._refuse("a flash to end", "none was begun", "This is a fault of the program that drives the box.")
@@ -232,8 +234,8 @@ class TextLineBox:
         )
 
     def lights_off(self) -> None:
-        """All LEDs off, confirmed by the box. Calls of other threads end with DeviceError. Raises only if a second
-        try fails too: the first may have been appended to an incomplete line that the box had received before."""
+        """Switch all LEDs off; the box confirms it. Calls of other threads end with DeviceError. Raises only if a
+        second try fails too, because the first command may have been appended to an incomplete line in the box."""
         self._ends += 1
         self._link.end_exchanges()
         with self._lock:
@@ -247,7 +249,7 @@ class TextLineBox:
                 self._flash.off_ns = self._clock.now_ns()
 
     def acknowledge(self) -> None:
-        """A box of this kind has no faults that it keeps."""
+        """Do nothing: a box of this kind keeps no faults."""
         self.lights_off()
 
     def panel(self, panel: int, on: bool) -> None:
@@ -257,7 +259,7 @@ class TextLineBox:
         return None
 
     def close(self) -> None:
-        """Lights off if the box still answers; never raises for a lost link."""
+        """Switch the lights off if the box still answers. Never raises for a lost link."""
         self._try_lights_off()
         self._link.close()
 
@@ -298,14 +300,14 @@ class TextLineBox:
             raise
 
     def _try_lights_off(self) -> None:
-        """All LEDs off, if the box still answers."""
+        """Switch all LEDs off if the box still answers."""
         with contextlib.suppress(DeviceError):
             self.lights_off()
 
     # Lines.
 
     def _greet(self) -> Identity:
-        """Identity from a reply `vendor,model,serial,firmware`; any other reply is taken as the model."""
+        """Return the identity from a reply `vendor,model,serial,firmware`. Any other reply counts as the model."""
         if self._settings.identify is None:
             return Identity("unknown", "box of text lines", "unknown", "unknown")
         text = self._exchange(self._settings.identify, self._ends)
@@ -314,7 +316,7 @@ class TextLineBox:
         return Identity(vendor, model, serial, firmware, simulated=serial.startswith("SIM"))
 
     def _command(self, line: str, ends: int) -> None:
-        """Have a command executed. Raises DeviceRefused for any reply but the expected one."""
+        """Let the box execute a command. Raises DeviceRefused for any reply but the expected one."""
         expected_reply = self._settings.expected_reply
         reply = self._exchange(line, ends)
         if reply != expected_reply:
@@ -326,7 +328,8 @@ class TextLineBox:
             )
 
     def _exchange(self, line: str, ends: int) -> str:
-        """Send a line and return the box's answer without its ending; `ends`, from when the call began."""
+        """Send a line, and return the box's answer without its ending. `ends` is the number of ended calls when
+        the call began."""
         settings, link = self._settings, self._link
         data = (line + _ENDINGS[settings.line_ending]).encode("ascii")
         seconds = _REPLY_MARGIN_S + (len(data) + _SHORT_REPLY_BYTES) / link.bytes_per_s

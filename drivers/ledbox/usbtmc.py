@@ -1,7 +1,7 @@
 """Messages to and from a device of the USB Test and Measurement Class, over pyusb.
 
 Source: USB-IF, "USB Test and Measurement Class Specification (USBTMC)", revision 1.0, 2003; the table numbers
-below are from it. Program messages and responses need nothing of the subclass USB488.
+below are from it. The subclass USB488 is not needed for program messages and responses.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ class UsbtmcLink:
         )
 
     def write(self, data: bytes, deadline: Deadline, clears: int) -> None:
-        """Send `data` as one message: DEV_DEP_MSG_OUT transfers, EOM on the last. During a device clear the
-        device halts the endpoint, so that what is sent too late is refused."""
+        """Send `data` as one message: DEV_DEP_MSG_OUT transfers, EOM on the last. During a device clear the device
+        halts the endpoint, so that late data are refused."""
         for start in range(0, len(data), _MAX_OUT_BYTES):
             self._refuse_cleared(clears)
             piece = data[start : start + _MAX_OUT_BYTES]
@@ -79,7 +79,7 @@ class UsbtmcLink:
                 raise self._failure(ConnectionError(str(error)), clears) from error
 
     def read_bytes(self, deadline: Deadline, clears: int) -> bytes:
-        """The payload of one DEV_DEP_MSG_IN transfer; a response may take several."""
+        """Return the payload of one DEV_DEP_MSG_IN transfer. A response may need several transfers."""
         self._refuse_cleared(clears)
         if self._requested_tag is None:
             request = self._header(_REQUEST_DEV_DEP_MSG_IN, _MAX_IN_BYTES, 0)
@@ -106,7 +106,7 @@ class UsbtmcLink:
         return transfer[_HEADER.size : _HEADER.size + size]
 
     def device_clear(self) -> None:
-        """INITIATE_CLEAR, on the control endpoint: it waits for no bulk transfer (section 4.2.1.6)."""
+        """Send INITIATE_CLEAR on the control endpoint, which waits for no bulk transfer (section 4.2.1.6)."""
         with self._counting:
             self.clears += 1
         self._initiate_clear()

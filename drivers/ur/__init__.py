@@ -1,7 +1,7 @@
 """Universal Robots arms over RTDE.
 
-The driver is imported when it is asked for: `worker`, the process that runs ur-rtde, has this package too, and
-begins with little.
+The driver is imported only on use. The process that runs ur-rtde, `worker`, also imports this package, and starts
+with few modules.
 """
 
 from __future__ import annotations

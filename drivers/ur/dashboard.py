@@ -1,6 +1,6 @@
 """UR's dashboard server: one line per question, one per answer (Universal Robots, "Dashboard Server e-Series").
 
-Used to check the controller before ur-rtde connects to it, and to end a program without ur-rtde.
+It is used to check the controller before ur-rtde connects to it, and to end a program without ur-rtde.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _CONDITIONS = (
 
 
 class CannotBegin(Exception):
-    """Carries a `Failure` to the driver."""
+    """Passes a `Failure` to the driver."""
 
     def __init__(
         self, kind: Literal["refused", "fault", "lost"], expectation: str, observation: str, remedy: str
@@ -57,7 +57,7 @@ class Dashboard:
 def ready_controller(config: Config) -> tuple[str, str, str]:
     """Model, serial number and firmware; raises CannotBegin unless the controller is ready to run a program.
 
-    ur-rtde's constructor hangs while another program runs; therefore this is checked first.
+    This is checked first, because ur-rtde's constructor hangs while another program runs.
     """
     wait_until_s = time.monotonic() + 2.0 * config.watchdog_s + 0.5
     try:
@@ -83,7 +83,7 @@ def ready_controller(config: Config) -> tuple[str, str, str]:
 
 
 def why_ended(host: str) -> str:
-    """Name of the fault for a program that ended without being stopped by the driver."""
+    """Return the name of the fault for a program that ended although the driver did not stop it."""
     with contextlib.suppress(OSError), contextlib.closing(Dashboard(host)) as dashboard:
         if dashboard.ask("is in remote control") == "false":
             return "not in remote control: the program was stopped at the pendant"
@@ -91,6 +91,7 @@ def why_ended(host: str) -> str:
 
 
 def end_program(host: str) -> None:
-    """End the program that runs or is paused. A failing link is ignored: the link's time-out detects it."""
+    """End the program that runs or is paused. A failing link is ignored, because the link's time-out detects
+    it."""
     with contextlib.suppress(OSError), contextlib.closing(Dashboard(host)) as dashboard:
         dashboard.ask("stop")

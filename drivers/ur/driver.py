@@ -1,12 +1,12 @@
 """A Universal Robots arm over ur-rtde: `coupole.devices.Robot`.
 
-A separate process (`drivers.ur.worker`) runs the library and talks to the controller; this class queries it and
+A separate process (`drivers.ur.worker`) runs the library and talks to the controller. This class queries it, and
 takes the age of its answers from the controller's timestamp. In the cell: power the arm, release its brakes,
 switch to remote control, then open this driver. The controller shapes the motion (movej: a trapezoidal speed
 profile of the leading joint), so no jerk can be set.
 
-Poses are the controller's own `actual_TCP_pose`, with the tool offset read at opening removed: the controller
-knows the arm's factory calibration, from which nominal DH parameters differ by millimetres.
+Poses are the controller's own `actual_TCP_pose`, without the tool offset that was read at opening. The controller
+knows the arm's factory calibration; nominal DH parameters differ from it by millimetres.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _POLL_S = 0.008
 
 
 class Settings(BaseModel):
-    """Settings of the driver in the rig file. Angles are joint angles; speeds are of the leading joint."""
+    """Settings of the driver in the rig file. Angles are joint angles. Speeds are those of the leading joint."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -57,7 +57,7 @@ class Settings(BaseModel):
     model: str = Field(default="ur10e", pattern=r"^ur\d+e?$")
     """Model of the arm; the controller must report the same, with or without the e."""
     arm_model: Arm | None = None
-    """The arm as described in the rig, used for planning; this driver does not use it to move."""
+    """The arm as described in the rig. It is used for planning; this driver does not use it to move."""
     limits_deg: tuple[tuple[float, float], ...] = Field(default=((-360.0, 360.0),) * 6, min_length=6, max_length=6)
     """Lowest and highest angle of each joint; narrower than the arm's own limits if the cell requires it."""
     joint_speed_deg_s: float = Field(default=120.0, gt=0, le=179.9)
@@ -71,8 +71,8 @@ class Settings(BaseModel):
     watchdog_s: float = Field(default=0.1, ge=0.05)
     """The controller ends all motion after this time without a message from the host's process."""
     attention_s: float = Field(default=ATTENTION_S, gt=0, le=0.5)
-    """A motion that nobody has looked at for this long, machine time, ends (`coupole.supervision`). Longer only
-    for a simulated cell on a machine that is busy with other work."""
+    """A motion ends if nobody has looked at it for this time, machine time (`coupole.supervision`). Use a longer
+    time only for a simulated cell on a machine that is busy with other work."""
     link_timeout_s: float = Field(default=1.0, gt=0)
     """The link counts as lost after this time without a sample from the controller."""
     connect_timeout_s: float = Field(default=20.0, gt=0)
@@ -80,11 +80,11 @@ class Settings(BaseModel):
     settle_deg: float = Field(default=0.02, gt=0)
     settle_deg_s: float = Field(default=0.1, gt=0)
     settle_samples: int = Field(default=10, ge=1)
-    """Settled: within both tolerances for this many samples, and again after the dwell."""
+    """The arm is settled if it is within both tolerances for this many samples, and again after the dwell."""
     dwell_s: float = Field(default=0.1, ge=0)
     follow_deg: float = Field(default=1.0, gt=0)
     follow_samples: int = Field(default=10, ge=1)
-    """The arm does not follow: farther than `follow_deg` from the controller's target joints for this many
+    """The arm does not follow if it is farther than `follow_deg` from the controller's target joints for this many
     samples."""
 
     def host_needs(self) -> list[HostNeed]:
@@ -92,8 +92,8 @@ class Settings(BaseModel):
         return [package("rtde_control", "ur")]
 
     def arm(self) -> Arm | None:
-        """The arm with the limits and speeds that this driver uses; preflight computes durations with it.
-        Speed profiles are trapezoids of the leading joint: the jerk is unlimited."""
+        """The arm with the limits and speeds of this driver. Preflight computes durations with it. Speed profiles
+        are trapezoids of the leading joint, so the jerk is unlimited."""
         if self.arm_model is None:
             return None
         limits_deg = zip(self.limits_deg, self.arm_model.limits_deg, strict=True)
@@ -129,12 +129,12 @@ class UrRobot:
         self._message_time = MessageTime(clock)
         self._number = 0
         self._asking = FairLock()
-        """Held while the process is asked and answers: `stop` may come from any thread."""
+        """Held while the process is asked and answers, because any thread may call `stop`."""
         self._stops = 0
         self._motion_s = 0.0
         self._attention = Attention()
         self._lapses = 0
-        """Lapses that the process had counted when the last motion began."""
+        """Number of lapses that the process had counted when the last motion began."""
         config = {field.name: getattr(settings, field.name) for field in fields(Config)}
         self._process = UrProcess(Config(**config))
         try:
@@ -146,7 +146,7 @@ class UrRobot:
             raise
 
     def _check_model(self, reported_model: str) -> None:
-        """Plans are computed for one arm model; no other must run them. The dashboard calls a UR10e `UR10`."""
+        """Check the arm model, because plans are computed for one model. The dashboard calls a UR10e `UR10`."""
         if reported_model.lower().removesuffix("e") != self.settings.model.removesuffix("e"):
             raise DeviceRefused(
                 "robot",
@@ -216,7 +216,7 @@ class UrRobot:
     def stop(self) -> None:
         """Brake and wait until the arm is at rest; raises DeviceTimeout if it does not come to rest.
 
-        With a lost link it sends nothing: the controller's watchdog has then stopped the arm.
+        If the link is lost, it sends nothing, because the controller's watchdog has then stopped the arm.
         """
         with contextlib.suppress(DeviceLost):
             self._command("stop")
@@ -224,9 +224,9 @@ class UrRobot:
             self._wait(self._is_still, deadline, "the arm at rest", faults=False)
 
     def stopping_deg(self) -> NDArray[np.float64]:
-        """Largest angle that each joint [6] can turn after a stop command: the leading joint's speed, which no
-        joint exceeds, times the delay before stopj and half the braking time. The delay is six samples: three for
-        a library call in progress, three for the answer to stopj.
+        """Largest angle that each joint [6] can turn after a stop command. It is the leading joint's speed, which
+        no joint exceeds, times the sum of the delay before stopj and half the braking time. The delay is six
+        samples: three for a library call in progress, three for the answer to stopj.
         """
         settings = self.settings
         delay_s = 6.0 / settings.frequency_hz
@@ -253,7 +253,7 @@ class UrRobot:
     def _command(
         self, verb: Literal["move", "stop"], target_deg: Six | None = None, stops: int = 0, speed: float = 1.0
     ) -> State:
-        """`stops` is the count of stops when the call of a motion began."""
+        """Send a command and return the state. `stops` is the number of stops when the call of a motion began."""
         with self._asking:
             if verb == "stop":
                 self._stops += 1
@@ -301,7 +301,8 @@ class UrRobot:
 
 
 def _movej_s(settings: Settings, turn_deg: float) -> float:
-    """Duration of a trapezoidal speed profile: d/v + v/a, or 2 sqrt(d/a) if full speed is not reached."""
+    """Return the duration of a trapezoidal speed profile: d/v + v/a, or 2 sqrt(d/a) if full speed is not
+    reached."""
     speed, acceleration = settings.speed_deg_s, settings.acceleration_deg_s2
     if turn_deg < speed**2 / acceleration:
         return 2.0 * math.sqrt(turn_deg / acceleration)
@@ -319,7 +320,7 @@ def _condition(state: State) -> ArmCondition:
 
 
 def _transform(pose_m_rad: Six) -> geometry.Transform:
-    """A UR pose (x, y, z in m and a rotation vector in rad) as 4x4 in mm."""
+    """Return the 4x4 transform in mm for a UR pose (x, y, z in m and a rotation vector in rad)."""
     from scipy.spatial.transform import Rotation
 
     result = np.eye(4)

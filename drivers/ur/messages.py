@@ -1,7 +1,8 @@
-"""Messages between the driver and the process that runs ur-rtde (`drivers.ur.worker`): one JSON object a datagram.
+"""Messages between the driver and the process that runs ur-rtde (`drivers.ur.worker`): one JSON object per
+datagram.
 
-The driver sends an `Ask`, the process answers each with its `State`. Its last message before it ends by itself is
-a `State` too, or a `Failure` if it could not begin.
+The driver sends an `Ask`, and the process answers each with its `State`. If the process ends by itself, its last
+message is a `State` too, or a `Failure` if it could not begin.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Ask:
     speed: float = 1.0
     """Share of the configured speed."""
     looks: bool = False
-    """The supervisor of the motion asks for it: the motion continues."""
+    """True if the supervisor of the motion asks. The motion then continues."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +76,13 @@ class State:
     wanted_deg: Six
     """The controller's present set point of the joints."""
     tcp_pose_m_rad: Six
-    """base from tool centre point: x, y, z and a rotation vector."""
+    """Pose of the tool centre point in the base frame: x, y, z and a rotation vector."""
     tcp_offset_m_rad: Six
-    """flange from tool centre point, read at opening."""
+    """Pose of the tool centre point in the flange frame, read at opening."""
     speed_fraction: float
     """The speed slider at the pendant, 0 to 1."""
     still_samples: int
-    """Samples in a row in which the arm was at rest, and at its target if it has one."""
+    """Number of consecutive samples in which the arm was at rest, and at its target if it has one."""
     samples: int
     max_gap_s: float
     max_call_s: float
@@ -96,9 +97,9 @@ class State:
     fault: str = ""
     """Name and reason of the latched fault; empty when there is none."""
     lapses: int = 0
-    """Motions that ended because nobody watched them (`coupole.supervision`)."""
+    """Number of motions that ended because nobody watched them (`coupole.supervision`)."""
     lost: bool = False
-    """The fault is a lost link; the process has ended."""
+    """True if the fault is a lost link; the process has ended."""
 
 
 @dataclass(frozen=True)

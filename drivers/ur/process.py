@@ -18,17 +18,17 @@ from drivers.ur.messages import Ask, Config, Failure, State
 _LEAVE_S = 4.0
 """Longer than the process takes to bring the arm to rest and end."""
 _WATCHDOG_MARGIN_S = 0.3
-"""Delay of the controller's watchdog: a sign of life reaches it after it was sent."""
+"""Margin for the controller's watchdog: a sign of life reaches the watchdog later than it was sent."""
 _FAILURES: dict[str, type[DeviceError]] = {"refused": DeviceRefused, "fault": DeviceFault, "lost": DeviceLost}
 
 
 class UrProcess:
-    """Every wait is limited: a process that does not answer in time is killed, and the robot counts as lost."""
+    """Every wait is limited. A process that does not answer in time is killed, and the robot counts as lost."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
         self._lost = ""
-        """Reason why no answer can come any more; empty while it can."""
+        """Reason why no answer can come any more; empty while answers can come."""
         self._began = self._rested = False
         self._errors_fd = os.memfd_create("coupole-ur")
         self._link, its_link = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -47,7 +47,8 @@ class UrProcess:
         return self._process.pid
 
     def first_state(self, timeout_s: float) -> State:
-        """The state after opening; raises DeviceTimeout if it does not come, or the reason why it cannot."""
+        """Return the state after opening. Raises DeviceTimeout if it does not come, or the reason why it cannot
+        come."""
         self._link.settimeout(timeout_s)
         state = self._take(DeviceTimeout)
         self._began = True
@@ -55,8 +56,8 @@ class UrProcess:
         return state
 
     def ask(self, ask: Ask) -> State:
-        """The answer. Raises DeviceLost if there is none, or if it reports a lost link; the arm is then at
-        rest."""
+        """Return the answer. Raises DeviceLost if there is no answer, or if it reports a lost link; the arm is
+        then at rest."""
         if not self._lost:
             with contextlib.suppress(OSError):  # the process has ended: its last message may still be readable
                 messages.send(self._link, ask)
@@ -111,8 +112,8 @@ class UrProcess:
             return messages.receive(self._link)
 
     def _end(self) -> None:
-        """End the process. If it did not bring the arm to rest, the controller's watchdog does; this waits for
-        that."""
+        """End the process. If it did not bring the arm to rest, the controller's watchdog does this, and this
+        method waits for it."""
         self._process.kill()
         code = self._process.wait()
         if self._began and code != 0 and not self._rested:
@@ -127,7 +128,7 @@ class UrProcess:
 
 
 def raise_fault(state: State) -> None:
-    """DeviceFault or DeviceLost if the state has a latched fault."""
+    """Raise DeviceFault or DeviceLost if the state has a latched fault."""
     if not state.fault:
         return
     kind = DeviceLost if state.lost else DeviceFault

@@ -7,7 +7,7 @@ its constructor and moveJ can hang for minutes; after a lost link its getters ke
 reconnects and restarts its program by itself. A process can be ended, and this one ends itself when the link is
 lost.
 
-The controller monitors this process (RTDE watchdog): silence ends the program and so all motion.
+The controller monitors this process (RTDE watchdog). Silence ends the program, and so all motion.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ _SAFETY_FAULTS = (
 )
 """Bits of RTDE's safety_status_bits, most serious first."""
 _NAMING_SAMPLES = 10
-"""Samples between the end of a program and its fault: the safety bits that give the cause come after the end."""
+"""Number of samples between the end of a program and its fault. The safety bits with the cause come after the
+end."""
 _CANNOT_BEGIN, _LOST = 1, 2
 """Exit codes."""
 _LEAVE_S = 3
@@ -89,7 +90,8 @@ class Link:
         self._goal_deg: Six | None = None
         self._pending_deg: Six | None = None
         self._pending_speed = 1.0
-        """A target that waits until the arm is at rest: the effect of movej on a moving arm is not documented."""
+        """A target that waits until the arm is at rest, because the effect of movej on a moving arm is not
+        documented."""
         self._quiet_samples = self._astray_samples = self._ended_samples = 0
         self._timestamp_s = -1.0
         self._changed_s = self._kicked_s = self._looked_s = time.monotonic()
@@ -111,7 +113,8 @@ class Link:
         )
 
     def tick(self) -> None:
-        """Read the controller's state, kick its watchdog, start a pending motion; end one that nobody watches."""
+        """Read the controller's state, kick its watchdog, and start a pending motion. End a motion that nobody
+        watches."""
         self._look()
         if self.state.fault:
             return
@@ -124,7 +127,7 @@ class Link:
             self._start(self._pending_deg, self._pending_speed)
 
     def obey(self, ask: Ask) -> None:
-        """Begin a command; after a fault, nothing. The answer is `state`."""
+        """Begin a command. After a fault, do nothing. The answer is `state`."""
         if ask.looks or ask.verb == "move":
             self._looked_s = time.monotonic()
         if ask.verb == "state" or self.state.fault:
@@ -231,7 +234,8 @@ class Link:
             self._latch(why_ended(config.host))
 
     def _latch(self, fault: str, *, is_lost: bool = False) -> None:
-        """Latch a fault: no more commands; the program is ended, so that no acknowledgement resumes a motion."""
+        """Latch a fault: no more commands are taken. The program is ended, so that no acknowledgement resumes a
+        motion."""
         self._goal_deg = self._pending_deg = None
         self.state = replace(self.state, fault=fault, lost=is_lost)
         if not is_lost:
@@ -274,8 +278,8 @@ def serve(driver: socket.socket, link: Link) -> None:
 
 
 def main() -> None:
-    """Serve, then end by os._exit with `link` alive: on a lost link the library's destructors hang, and while
-    they do, the library reconnects and restarts its program."""
+    """Serve, then end by os._exit with `link` alive. The reason is that on a lost link the library's destructors
+    hang, and meanwhile the library reconnects and restarts its program."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     driver = socket.socket(fileno=int(sys.argv[1]))
     try:

@@ -1,1 +1,1 @@
-"""The process that holds a cell's devices for consoles while no run is at work: `coupole bench`."""
+"""The process that holds a cell's devices for consoles while no run uses the cell: `coupole bench`."""

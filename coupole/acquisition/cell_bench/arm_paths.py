@@ -26,18 +26,18 @@ _MOST_SHOWN = 200
 
 @dataclass(frozen=True)
 class ShownPath:
-    """A collision-free path from where the arm stood when it was planned."""
+    """A collision-free path that begins where the arm was when the path was planned."""
 
     id: str
     to: str
     start_deg: Joints
     visit: Visit
     motion: CellMotion
-    """The bodies among which it is clear."""
+    """The bodies that the path does not touch."""
 
 
 class ArmPaths:
-    """Plans paths of the arm of a cell on whose support lies a job's object, or nothing."""
+    """Plans paths of a cell's arm. On the support lies a job's object, or nothing."""
 
     def __init__(self, cell: Cell, job: Job | None) -> None:
         self._cell, self._job = cell, job
@@ -46,8 +46,8 @@ class ArmPaths:
         self._jobs: dict[tuple[str, int], Job] = {}
 
     def plan(self, number: str, to: str | ViewOf | Posture, start_deg: Joints) -> ShownPath:
-        """A path to home, park, a view or joint angles. Raises InputError if there is none, and for a plan of
-        another cell or object."""
+        """Plan a path to home, to park, to a view or to joint angles. Raises InputError if there is no path, or if
+        the plan is for another cell or object."""
         if isinstance(to, ViewOf):
             job = self.job_of(Path(to.plan))
             view = next((pose for pose in job.schedule.views if pose.name == to.view), None)
@@ -78,7 +78,7 @@ class ArmPaths:
         }
 
     def base_from_camera(self, joints_deg: Joints) -> NDArray[np.float64]:
-        """The camera's pose by the rig's drawing."""
+        """Return the camera's pose, computed from the rig."""
         pose: NDArray[np.float64] = link_frames(self.arm, joints_deg)[-1] @ self._flange_from_camera
         return pose
 
@@ -113,7 +113,7 @@ class ArmPaths:
         return Visit(goal_deg, leg)
 
     def job_of(self, plan: Path) -> Job:
-        """The plan's job in this cell. Raises InputError if its object is not the bench's."""
+        """Return the plan's job in this cell. Raises InputError if its object is not the bench's object."""
         if not plan.is_absolute():
             raise InputError(f"{plan}: expected an absolute path")
         try:
@@ -143,6 +143,7 @@ def shown_postures(corners_deg: Sequence[Joints]) -> NDArray[np.float64]:
 
 
 def links_mm(arm: Arm, joints_deg: NDArray[np.float64]) -> list[Any]:
-    """Origins [..., 8, 3] in the base frame of base, six links and flange, for postures [..., 6]."""
+    """Return origins [..., 8, 3] for postures [..., 6], in the base frame: of the base, the six links and the
+    flange."""
     origins_mm: list[Any] = np.round(link_frames(arm, joints_deg)[..., :3, 3], 2).tolist()
     return origins_mm

@@ -33,11 +33,11 @@ _SAME_PLACE_DEG = 0.05
 
 
 class HoldLostError(Exception):
-    """A button was let go, or its renewals have ended."""
+    """Raised when a button was let go, or when its renewals have ended."""
 
 
 class BenchArm:
-    """One arm at a time does one thing: a path, or a motion by hand."""
+    """The arm does one thing at a time: it follows a path, or moves by hand."""
 
     def __init__(
         self, cell: Cell, opened_cell: OpenedCell, job: Job | None, works: Works, control: Control
@@ -75,7 +75,7 @@ class BenchArm:
         }
 
     def plan_path(self, request: PathAsked) -> dict[str, Any]:
-        """A path from where the arm stands. Raises InputError if it moves, or there is none."""
+        """Plan a path from where the arm is. Raises InputError if the arm moves, or if there is no path."""
         state = self._opened.robot.measured()
         if state.moving:
             raise InputError("the arm is moving; a path is planned only from an arm at rest")
@@ -87,8 +87,8 @@ class BenchArm:
         return self._paths.figures(path)
 
     def drive(self, number: str, stops: int) -> dict[str, Any]:
-        """Begin to follow a path that was shown; `stops` of the works when it was asked. Raises InputError if the
-        arm is not where it begins."""
+        """Begin to follow a path that was shown. `stops` is the number of stops when this was requested. Raises
+        InputError if the arm is not at the path's begin."""
         path = self._shown.get(number)
         if path is None:
             raise InputError(f"path: expected one that `plan_path` has shown, found {number!r}")
@@ -106,8 +106,8 @@ class BenchArm:
         return work.figures()
 
     def jog(self, request: JogAsked, stops: int) -> dict[str, Any]:
-        """Begin a motion by hand, or renew it; `stops` of the works when it was asked. Raises
-        InputError if it must not be."""
+        """Begin a motion by hand, or renew it. `stops` is the number of stops when this was requested. Raises
+        InputError if the motion is not allowed."""
         consoles = self._cell.rig.console.at_the_cell
         if request.at not in consoles:
             raise InputError(
@@ -126,7 +126,7 @@ class BenchArm:
         return work.figures()
 
     def job_of(self, plan: Path) -> Job:
-        """The plan's job in this cell. Raises InputError if its object is not the bench's."""
+        """Return the plan's job in this cell. Raises InputError if its object is not the bench's object."""
         return self._paths.job_of(plan)
 
     def _renew(self, request: JogAsked) -> dict[str, Any]:
@@ -159,7 +159,7 @@ class BenchArm:
         return {}
 
     def _go_on(self, hold: _Hold, control: Control) -> dict[str, Any]:
-        """Step after step while the button is held."""
+        """Move step after step while the button is held."""
         rig, bodies = self._cell.rig, self._paths.motion.bodies
         supervisor = ArmSupervisor(rig, self._paths.motion, self._opened, control)
 
@@ -182,7 +182,7 @@ class BenchArm:
 
     @contextmanager
     def _stopped_at_the_end(self) -> Iterator[None]:
-        """Whatever ends it the arm is stopped; its faults stay with the cell."""
+        """Stop the arm however the context ends. Faults of the arm are kept with the cell."""
         try:
             try:
                 yield

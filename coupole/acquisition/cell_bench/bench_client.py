@@ -14,9 +14,9 @@ from coupole.errors import InputError
 from coupole.plan.cell import Cell
 
 _LONG_PATIENCE_S = 120.0
-"""A path among many bodies, or a long exposure, takes a while."""
+"""Longest wait for an answer: a path among many bodies, or a long exposure, takes time."""
 _AT_ONCE = {"state", "stop", "jog", "drive"}
-"""Commands whose answer does not wait for the work that they begin or end."""
+"""Commands that are answered before the work that they begin or end is done."""
 _GIVEN_UP = "given up without an answer: it will not move the arm or light an LED later"
 _STOP_GIVEN_UP = "given up without an answer: the bench obeys the stop as soon as it runs again"
 
@@ -29,8 +29,9 @@ def bench_socket(cell: Cell) -> Path:
 def ask_bench(
     cell: Cell, command: str, *, say: Callable[[str], object] = lambda _: None, **fields: Any
 ) -> dict[str, Any]:
-    """The bench's answer; one that was not obeyed has an `error`. `say` is told within 2 s why it does not answer,
-    and of a command that is given up what becomes of it. Raises InputError: there is no bench, or it is silent."""
+    """Return the bench's answer. It has an `error` if the command was not obeyed. `say` gets a message within 2 s
+    if the bench does not answer, and another if this gives up: it says what becomes of the command. Raises
+    InputError if there is no bench, or if it is silent."""
     patience_s = PATIENCE_S if command in _AT_ONCE else _LONG_PATIENCE_S
     rig, request = cell.document.path, {"version": VERSION, "command": command, **fields}
     try:
@@ -54,7 +55,8 @@ def _why_no_bench(cell: Cell) -> str:
 
 
 def checked_answer(answer: dict[str, Any]) -> dict[str, Any]:
-    """The same answer. Raises InputError, with the exit code of the error that it says, if it was not obeyed."""
+    """Return the same answer. Raises InputError if the command was not obeyed, with the exit code of the error
+    that the answer names."""
     if "error" in answer:
         error = InputError(answer["error"])
         error.exit_code = answer["exit_code"]

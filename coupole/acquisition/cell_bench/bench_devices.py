@@ -34,7 +34,7 @@ class BenchDevices:
         self._asked_s = 0.0
         self._box_c: float | None = None
         self.in_use = threading.Lock()
-        """Held by whoever talks to box and camera."""
+        """Held by the thread that talks to box and camera."""
 
     def state(self, robot_heard_s_ago: float | None) -> dict[str, Any]:
         """Return by kind of device: identity, link, temperature, last error, last self-test. The box is asked for
@@ -57,7 +57,7 @@ class BenchDevices:
         }
 
     def self_test(self, kind: str) -> dict[str, Any]:
-        """Have a device test itself; the report stays in the state. Box and camera must not be at work."""
+        """Have a device test itself; the report stays in the state. Box and camera must not be in use."""
         device = getattr(self._opened, kind)
         test: Callable[[], Mapping[str, str]] = device.self_test
         outcome: dict[str, Any] = {"t": utc_now(), "passed": True, "report": {}}
@@ -72,7 +72,7 @@ class BenchDevices:
         return {"device": kind, **outcome}
 
     def note_answer(self, *kinds: str) -> None:
-        """These devices have just answered."""
+        """Note that these devices have just answered."""
         for kind in kinds:
             self._heard_s[kind] = time.monotonic()
 

@@ -1,4 +1,4 @@
-"""Pictures of a bench: exposed on request, with the figures by which one focuses and exposes."""
+"""Pictures of a bench, exposed on request, with figures for focus and exposure."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MOST_LOUPE_PX = 2048
 
 
 class BenchFrames:
-    """Takes one picture at a time; the last ones lie in a folder that only this user can enter."""
+    """Takes one picture at a time. The newest pictures are in a folder that only this user can enter."""
 
     def __init__(
         self, cell: Cell, opened_cell: OpenedCell, job: Job | None, devices: BenchDevices, works: Works
@@ -48,8 +48,8 @@ class BenchFrames:
         self._folder.mkdir(mode=0o700)
 
     def frame(self, request: FrameAsked, stops: int) -> dict[str, Any]:
-        """Expose under each light in turn, and add up; after a stop nothing more is lit: `stops` of the works when
-        it was asked. Raises InputError, DoseBudgetReached, DeviceError."""
+        """Expose under each light in turn, and add the pictures up. `stops` is the number of stops when this was
+        requested: after another stop no more light is given. Raises InputError, DoseBudgetReached, DeviceError."""
         self._refuse_what_there_is_not(request)
         if request.stops not in (None, stops):
             raise InputError("frame: the bench was stopped while it waited; look at its state, then ask again")
@@ -82,7 +82,7 @@ class BenchFrames:
         }
 
     def loupe(self, request: LoupeAsked) -> dict[str, Any]:
-        """A region of the last picture, pixel by pixel, without another exposure. Raises InputError."""
+        """Return a region of the last picture, pixel by pixel, without another exposure. Raises InputError."""
         shot, number = self._last, self._number
         if shot is None:
             raise InputError("loupe: expected a `frame` before it")
@@ -117,7 +117,7 @@ class BenchFrames:
         self._shots = SingleShots(self._cell, self._opened, self._lux, self._meter)
 
     def release(self) -> None:
-        """The camera is free for others."""
+        """Let others use the camera."""
         self._shots.disarm()
 
     def end(self) -> None:
@@ -178,7 +178,7 @@ class BenchFrames:
 
 
 def _region(shot: Shot, region: Sequence[int]) -> tuple[NDArray[np.uint16], tuple[int, int]]:
-    """[h, w], widened to whole Bayer cells; and x, y of its first pixel."""
+    """Return the region [h, w], widened to whole Bayer cells, and x, y of its first pixel."""
     height_px, width_px = shot.raw.shape
     x, y, width, height = _within(region, width_px, height_px)
     left_px, top_px = x - x % 2, y - y % 2
@@ -187,7 +187,8 @@ def _region(shot: Shot, region: Sequence[int]) -> tuple[NDArray[np.uint16], tupl
 
 
 def _within(region: Sequence[int], width_px: int, height_px: int) -> tuple[int, int, int, int]:
-    """Raises InputError for a region that is not within a picture of this size, or has no two Bayer cells."""
+    """Raises InputError for a region that is not inside a picture of this size, or that does not contain two Bayer
+    cells."""
     x, y, width, height = region
     if min(width, height) < 4 or x + width > width_px or y + height > height_px:
         raise InputError(
@@ -198,8 +199,8 @@ def _within(region: Sequence[int], width_px: int, height_px: int) -> tuple[int, 
 
 
 def _added_up(shots: Sequence[Shot]) -> Shot:
-    """Return what one exposure under all lights at once would give, but for its noise. A pixel is full where one
-    of the shots is."""
+    """Return the picture that one exposure under all lights at once would give, apart from its noise. A pixel is
+    full if it is full in one of the shots."""
     if len(shots) == 1:
         return shots[0]
     coding = shots[0].coding

@@ -1,6 +1,6 @@
 """Requests to a bench: one line of JSON each, `{"version": 1, "command": ..., ...}`.
 
-Nothing is converted and no other field is allowed. docs/reference/bench.md describes the answers.
+Values are not converted, and other fields are not allowed. docs/reference/bench.md describes the answers.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from coupole.errors import InputError
 VERSION = 1
 _MOST_SAID = 6
 Axis = Literal["A1", "A2", "A3", "A4", "A5", "A6", "x", "y", "z", "rx", "ry", "rz"]
-"""An axis of the arm; or one of the robot's base frame, along which the camera moves (`x`) or about which it turns
-(`rx`)."""
+"""An axis of the arm, or an axis of the robot's base frame. The camera moves along a base axis (`x`) or turns
+about it (`rx`)."""
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -74,7 +74,7 @@ class JogAsked(_Request):
     share: Annotated[float, Field(gt=0, le=1)] = 0.4
     """Share of reduced speed, 250 mm/s."""
     hold: int | None = None
-    """The number that the first answer gave; without it a button is pressed anew."""
+    """The number that the first answer gave. A request without it counts as a new press of the button."""
     at: Annotated[str, Field(alias="from")]
     """Origin of the request: an address in the rig's `console: at_the_cell:`."""
 
@@ -88,7 +88,7 @@ _Region = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=4, max_l
 class FrameAsked(_Request):
     command: Literal["frame"]
     lights: Annotated[list[int], Field(max_length=16)] = []
-    """Ids of LEDs; each gives a picture, and these are added up."""
+    """Ids of LEDs. Each LED gives a picture, and the pictures are added up."""
     panels: Annotated[list[int], Field(max_length=4)] = []
     """Numbers of panels, from 1; in the same way."""
     exposure_us: Annotated[int, Field(ge=10)]
@@ -102,7 +102,7 @@ class FrameAsked(_Request):
     gains: _Gains = [1.0, 1.0, 1.0]
     """White point: factors of R, G, B in the JPEG."""
     stops: Annotated[int, Field(ge=0)] | None = None
-    """Number of stops from a state: no LED is lit if a stop came since then."""
+    """Number of stops, from a state. No LED is lit if another stop came since that state."""
 
 
 class LoupeAsked(_Request):
@@ -140,7 +140,7 @@ _REQUEST: TypeAdapter[Request] = TypeAdapter(Annotated[Request, Field(discrimina
 
 
 def read_request(line: bytes) -> Request:
-    """Raises InputError for anything else than a request of this version."""
+    """Raises InputError for anything that is not a request of this version."""
     try:
         return _REQUEST.validate_json(line)
     except ValidationError as error:

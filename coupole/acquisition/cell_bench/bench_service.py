@@ -1,8 +1,7 @@
-"""`coupole bench`: holds a cell's devices while no run is at work, and answers at a socket.
+"""`coupole bench`: holds a cell's devices while no run uses the cell, and answers requests at a socket.
 
-The process that draws a console never touches a device; it asks this one, as any other client of the same user
-can. Whatever becomes of the clients, nothing moves by hand longer than it is held, and no light outlasts its
-picture.
+The process that draws a console never touches a device; it asks this process, as any other client of the same user
+can. Even if a client dies, a motion by hand ends when it is no longer held, and a light ends with its picture.
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ _BEGIN = (SelfTestAsked, DriveAsked, JogAsked, FrameAsked, MeterAsked)
 
 
 class BenchService:
-    """Answers requests; each is called in a thread of its own."""
+    """Answers requests, each in a thread of its own."""
 
     def __init__(self, cell: Cell, opened_cell: OpenedCell, job: Job | None, control: Control) -> None:
         """`control` is that of the bench's session."""
@@ -79,19 +78,19 @@ class BenchService:
 
     @property
     def is_spent(self) -> bool:
-        """A failure has made the cell safe: nothing can be lit or moved any more."""
+        """True after a failure has made the cell safe: nothing can be lit or moved any more."""
         return self._opened.made_safe and self.works.running is None
 
     @property
     def idle_s(self) -> float:
-        """Since the last request, or the end of the last work."""
+        """Return the seconds since the last request, or since the end of the last work."""
         if self.works.running is not None:
             self._asked_s = time.monotonic()
         return time.monotonic() - self._asked_s
 
     def answer(self, line: bytes, is_gone: Gone) -> dict[str, Any]:
-        """The answer to a request; an `error` with its `kind` where it was not obeyed. Nothing moves or shines for
-        who is `is_gone`."""
+        """Return the answer to a request. It has an `error` with its `kind` if the request was not obeyed. Nothing
+        moves or shines for a client that has gone (`is_gone`)."""
         stops = self.works.stops
         try:
             request = read_request(line)
@@ -122,11 +121,11 @@ class BenchService:
             }
 
     def ask(self, command: str, **fields: Any) -> dict[str, Any]:
-        """The same for a caller in this process."""
+        """Answer a request of a caller in this process."""
         return self.answer(json.dumps({"version": VERSION, "command": command, **fields}).encode(), lambda: False)
 
     def _obey(self, request: Request, stops: int) -> dict[str, Any]:
-        """`stops` of the works before the request was read."""
+        """Obey a request. `stops` is the number of stops before the request was read."""
         match request:
             case StateAsked():
                 return self._state()
@@ -177,8 +176,8 @@ class BenchService:
         return work.figures()
 
     def _stop(self) -> list[str]:
-        """Stop everything; return sentences on devices that are not surely safe then. Pictures that are under way
-        have ended, with their light, when this returns.
+        """Stop everything; return sentences on devices that are not surely safe then. When this returns, the
+        picture under way and its light have ended.
         """
         self.works.stop()
         trouble = unsure(self._opened.halt(), _STOPPED_WITHIN_S)
@@ -223,9 +222,10 @@ class BenchService:
 def bench_of(
     job_or_cell: Job | Cell, console: Console, control: Control, *, confirm: bool
 ) -> Iterator[BenchService]:
-    """A bench that holds the cell's devices while the context lasts, and then makes all safe; signals are obeyed.
+    """Give a bench that holds the cell's devices while the context lasts, and then makes all safe. It obeys
+    signals.
 
-    With a job its object lies on the support. Raises InputError if somebody uses the cell already, DeviceError.
+    With a job, its object lies on the support. Raises InputError if the cell is in use already, and DeviceError.
     """
     job = job_or_cell if isinstance(job_or_cell, Job) else None
     cell = job_or_cell.cell if isinstance(job_or_cell, Job) else job_or_cell
@@ -252,7 +252,7 @@ def bench_of(
 def serve_bench(
     job_or_cell: Job | Cell, console: Console, *, confirm: bool, leave_after_s: float, as_json: bool
 ) -> None:
-    """Hold the cell's devices until `close` is asked, a signal comes, or nobody has asked for a while.
+    """Hold the cell's devices until `close` is requested, a signal comes, or no request has come for a while.
 
     Raises InputError, DeviceError, Interrupted (SIGTERM, SIGHUP, or the process did not run for a while).
     """

@@ -1,5 +1,5 @@
-"""Work that takes a bench some time: one piece at a time, in a thread of its own. It can be stopped from any
-thread."""
+"""Work that takes a bench some time. One piece of work runs at a time, in a thread of its own; any thread can stop
+it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ class Work:
     def __init__(
         self, session: Control, kind: str, about: dict[str, Any], act: Callable[[Control], dict[str, Any]]
     ) -> None:
-        """`act` returns what was found; it raises Interrupted after the `stop` of its Control or the session's."""
+        """`act` does the work and returns its results. It raises Interrupted after the `stop` of its Control or of
+        the session's."""
         self.kind, self._about, self._act = kind, about, act
         self.control = Control(session=session)
         self._state, self._found, self._why = "running", {}, ""  # type: tuple[str, dict[str, Any], str]
@@ -32,15 +33,15 @@ class Work:
         self._thread.start()
 
     def stop(self) -> None:
-        """Returns at once; nothing new is moved or lit after this."""
+        """Stop the work. Returns at once; nothing new is moved or lit after this."""
         self.control.stop_by(signal.SIGINT)
 
     def join(self, seconds: float) -> None:
         self._thread.join(seconds)
 
     def figures(self) -> dict[str, Any]:
-        """`kind`, `state` (running, done, stopped, failed), the work's request, its results, and `why` it ended
-        early."""
+        """Return `kind`, `state` (running, done, stopped, failed), the request, the results, and `why` the work
+        ended early."""
         return {"kind": self.kind, "state": self._state, **self._about, **self._found, "why": self._why}
 
     def _run(self) -> None:
@@ -66,11 +67,11 @@ class Works:
         self._lock = threading.Lock()
         self.last: Work | None = None
         self.stops = 0
-        """Number of stops that were asked for."""
+        """Number of stops that were requested."""
 
     def begin(self, work: Work, stops: int) -> None:
-        """`stops` as it was when the work was asked. Raises InputError if a stop came since, or while another is
-        under way."""
+        """Begin the work. `stops` is the number of stops when the work was requested. Raises InputError if a stop
+        came since, or while other work is under way."""
         with self._lock:
             if self.stops != stops:
                 raise InputError(f"{work.kind}: it was stopped before it began")
@@ -80,7 +81,7 @@ class Works:
             work.begin()
 
     def stop(self) -> None:
-        """Returns at once. Work that was requested before and has not begun never begins."""
+        """Stop the work. Returns at once. Work that was requested before and has not begun never begins."""
         with self._lock:
             self.stops += 1
             if self.last is not None:

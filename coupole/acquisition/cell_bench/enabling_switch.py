@@ -1,7 +1,8 @@
 """The enabling switch that a person at the cell holds while the arm is moved from a console (ISO 10218-1, 5.8.3).
 
-It hangs on an input of the LED box. That is no safety function: a box, its line and this program lie in between.
-It tells that somebody is there who wants the motion, which no address of a console can tell.
+The switch is connected to an input of the LED box. It is not a safety function, because the box, its line and this
+program are in between. It shows that a person is at the cell and wants the motion; the address of a console cannot
+show this.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from coupole.supervision import ATTENTION_S
 
 _POLL_S = 0.03
 _NEWS_S = 0.3
-"""A switch that was not heard of for so long counts as released."""
+"""A switch counts as released if there was no news of it for this time."""
 
 
 class ReleasedError(Exception):
@@ -33,8 +34,8 @@ class EnablingSwitch:
         self.exists = box.presence() is not None
 
     def refuse_released(self) -> None:
-        """Raise InputError unless it is held; a cell without one is moved without, unless its rig has one. For an
-        arm at rest: it waits for the box."""
+        """Raise InputError unless the switch is held. A cell without a switch passes, unless its rig has one. Use
+        this for an arm at rest, because it waits for the box."""
         if not self.exists:
             if self._must_exist:
                 raise InputError(
@@ -50,9 +51,9 @@ class EnablingSwitch:
 
     @contextmanager
     def release_check(self) -> Iterator[Callable[[], None]]:
-        """Give a function that raises ReleasedError unless the switch is held, while the context lasts. It is to
-        be called all the time while the arm moves. Another thread asks the box, but not for a caller that hangs:
-        or else the box's watchdog would hear that thread in the caller's place."""
+        """Give a function that raises ReleasedError unless the switch is held, while the context lasts. Call the
+        function again and again while the arm moves. Another thread asks the box. It stops asking if the caller
+        hangs; otherwise it would keep the box's watchdog quiet in the caller's place."""
         if not self.exists:
             yield lambda: None
             return
@@ -72,7 +73,7 @@ class _Watch:
         threading.Thread(target=self._ask, name="enabling switch", daemon=True).start()
 
     def check(self) -> None:
-        """Raises ReleasedError. Once released it stays so: the motion is to be asked for anew."""
+        """Raises ReleasedError. A released switch stays released: the motion must be requested again."""
         now_s = time.monotonic()
         if now_s - self._checked_s > ATTENTION_S:  # the arm rested, and nothing was asked
             self._resumed_s = now_s

@@ -1,7 +1,7 @@
 """Motions by hand, step by step: each step is a straight motion in joint space that touches nothing.
 
-The arm comes to rest at the end of a step by its own speed profile, and earlier on the same line when it is
-stopped; so whatever happens it stays on a line that was checked as a whole.
+The arm comes to rest at the end of a step by its own speed profile. If it is stopped, it comes to rest earlier on
+the same line. So it always stays on a line that was checked as a whole.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ _OFF_LINE_MM, _MOST_TURN_DEG = 1.0, 20.0
 line."""
 _HALVINGS = 10
 _KEPT_MM = 2.0
-"""Length by which a step towards a contact stops short of what could be gone, at any point of arm and tool."""
+"""A step towards a contact ends this length before the last clear posture, at every point of arm and tool."""
 _SAMPLES, _ROUNDING_MM = 65, 1e-6
 
 
 @dataclass(frozen=True)
 class JogStep:
-    """One step, and the share of the arm's speeds at which it is slow enough."""
+    """One step, and the share of the arm's speeds that keeps it slow enough."""
 
     visit: Visit
     speed: float
@@ -50,7 +50,7 @@ def jog_step(
     direction: int,
     share: float,
 ) -> JogStep:
-    """The next step, at most `share` of REDUCED_MM_S at every point of arm and tool.
+    """Return the next step. No point of arm and tool is faster than `share` of REDUCED_MM_S.
 
     Raises InputError that says why there is none: a limit, a contact, or a posture near a singularity.
     """
@@ -65,8 +65,8 @@ def jog_step(
 
 
 def greatest_speed_mm_s(arm: Arm, bodies: CellBodies, from_deg: Joints, to_deg: Joints) -> float:
-    """Bound of the speed of any point of arm and tool in a straight motion in joint space at the arm's full
-    speed: the sum over the axes of their speeds times the greatest distance of any point from the axis."""
+    """Return a bound of the speed of any point of arm and tool in a straight motion in joint space at full speed.
+    The bound is a sum over the axes: the speed of an axis times the greatest distance of any point from it."""
     turn_deg = np.abs(to_deg - from_deg)
     line_s = float((turn_deg / np.array(arm.velocity_deg_s)).max())
     return float(np.radians(turn_deg / line_s) @ bodies.reach_mm)
@@ -83,8 +83,8 @@ def _step_target_deg(arm: Arm, here_deg: Joints, axis: int, direction: int) -> J
 
 
 def _along(arm: Arm, flange_from_camera: Transform, here_deg: Joints, axis: str, direction: int) -> Joints:
-    """Joint angles farther along the line, or the turn, of the camera; as far as a straight motion in joint space
-    keeps to it."""
+    """Return joint angles farther along the camera's line or turn, as far as a straight motion in joint space
+    keeps to the line."""
     start = forward(arm, here_deg) @ flange_from_camera
     part = 1.0
     while part * _STEP_MM >= _LEAST_MM:
@@ -120,7 +120,8 @@ def _posture_at(
 def _off_line_mm(
     points_mm: NDArray[np.float64], from_mm: NDArray[np.float64], to_mm: NDArray[np.float64]
 ) -> float:
-    """Greatest distance of points [n, 3] from a segment's line; from its start if it has no length."""
+    """Return the greatest distance of points [n, 3] from a segment's line. If the segment has no length, it is the
+    distance from its start."""
     along = to_mm - from_mm
     length = float(np.linalg.norm(along))
     off = points_mm - from_mm
@@ -130,8 +131,8 @@ def _off_line_mm(
 
 
 def _clear_part(bodies: CellBodies, here_deg: Joints, there_deg: Joints) -> Joints:
-    """The farthest posture on the way that is found to be reached without contact, less a little, so that the arm
-    can go on from there; out of a place where something is too close already: away from it."""
+    """Return the farthest posture on the way that is reached without contact, less a little, so that the arm can
+    go on from there. If something is too close already, return a posture that leads away from it."""
     if bodies.tightest_mm(here_deg[None])[0] < 0.0:
         return _outwards(bodies, here_deg, there_deg)
     if bodies.is_clear(here_deg, there_deg):
@@ -152,7 +153,8 @@ def _clear_part(bodies: CellBodies, here_deg: Joints, there_deg: Joints) -> Join
 
 
 def _outwards(bodies: CellBodies, here_deg: Joints, there_deg: Joints) -> Joints:
-    """Raises InputError unless on the whole way no pair that is too close comes closer, and none becomes so."""
+    """Return the goal. Raises InputError if, on the way, a pair that is too close comes closer, or another pair
+    becomes too close."""
     along_deg = here_deg + np.linspace(0.0, 1.0, _SAMPLES)[:, None] * (there_deg - here_deg)
     closer = [np.diff(margins).min() < -_ROUNDING_MM for margins in bodies.margins(along_deg, 0.0).values()]
     if any(closer):

@@ -1,2 +1,2 @@
-"""Commissioning of a cell: its safety figures are measured at reduced speed, step by step, with a person's
-word."""
+"""Commissioning of a cell: its safety figures are measured at reduced speed, step by step, while a person
+confirms."""

@@ -14,12 +14,12 @@ from coupole.plan.registry import settings_class
 from coupole.plan.rig_devices import device_for
 
 CYCLES = {"cycle_ms": "packets", "status_ms": "statuses", "frequency_hz": "samples"}
-"""Setting of a driver that says how often its controller reports, and the figure of `Robot.statistics` that counts
-the reports."""
+"""Settings of drivers that say how often the controller reports. Each has the figure of `Robot.statistics` that
+counts the reports."""
 _CYCLE_S = 3.0
 _CYCLE_DEVIATION = 0.05
-"""Greatest deviation of the period of the controller's reports, as a share: more is another cycle, not another
-quartz."""
+"""Greatest deviation of the period of the controller's reports, as a share. A larger deviation shows another
+cycle, not another quartz."""
 _LENS_MM, _LEAST_DEG, _MOST_DEG = 15.0, 3.0, 10.0
 _TURNED_DEG, _OTHERS_DEG = 0.05, 0.05
 _SHARES = (1.0, 0.5, 0.25)
@@ -32,7 +32,7 @@ _LONGEST_STOP_S = 10.0
 
 
 def cycle(bench: Bench) -> None:
-    """Count the controller's reports for some seconds and compare their period with the one that the driver
+    """Count the controller's reports for some seconds, and compare their period with the period that the driver
     expects."""
     findings, robot, clock = bench.findings, bench.opened.robot, bench.opened.clock
     findings.remedy = (
@@ -101,9 +101,9 @@ def axes(bench: Bench) -> None:
 def stopping(bench: Bench) -> None:
     """Stop motions of all axes at several speeds; no axis may turn farther than the driver promises.
 
-    The axes of one motion go at shares of their greatest speeds (`_SHARES`, in turn), so three motions measure
-    each axis at each share. All axes stop together along their path, so the promise for a share is that share of
-    `stopping_deg`.
+    In one motion the axes have different shares of their greatest speeds (`_SHARES`, in turn). So three motions
+    measure each axis at each share. All axes stop together along their path, so the limit for a share is that
+    share of `stopping_deg`.
     """
     findings = bench.findings
     findings.remedy = (
@@ -140,8 +140,8 @@ def stopping(bench: Bench) -> None:
 
 
 def _stopped_once(bench: Bench, shares: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Speeds [6] at the command to stop and angles [6] from it to rest, in a motion at these shares of the
-    greatest speeds. A motion that had ended before this machine came to stop it is repeated."""
+    """Return speeds [6] at the command to stop, and angles [6] from there to rest, in a motion at these shares of
+    the greatest speeds. If the motion ended before the command to stop, it is repeated."""
     robot, clock = bench.opened.robot, bench.opened.clock
     for _ in range(_TRIES):
         begun_deg = bench.joints_deg()
@@ -178,7 +178,8 @@ def _stopped_once(bench: Bench, shares: NDArray[np.float64]) -> tuple[NDArray[np
 
 
 def _at_rest(bench: Bench) -> NDArray[np.float64]:
-    """The axes [6] once they have not turned for a while. Raises StepFailedError if they go on."""
+    """Return the axes [6] once they have been at rest for a while. Raises StepFailedError if they go on
+    turning."""
     deadline = Deadline(bench.opened.clock, _LONGEST_STOP_S)
     last_deg = bench.joints_deg()
     while not deadline.has_expired:
@@ -191,7 +192,7 @@ def _at_rest(bench: Bench) -> NDArray[np.float64]:
 
 
 def _visible_change(bench: Bench, home_deg: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """A turn [6] of one axis that moves the lens by about _LENS_MM, within _LEAST_DEG and _MOST_DEG."""
+    """Return a turn [6] of one axis that moves the lens by about _LENS_MM, between _LEAST_DEG and _MOST_DEG."""
     one_deg = np.zeros(6)
     one_deg[axis] = 1.0
     lens_mm = [_base_from_camera(bench, joints)[:3, 3] for joints in (home_deg, home_deg + one_deg)]

@@ -1,4 +1,4 @@
-"""Bench that every step of a commissioning works with: the opened cell, the person, and the result that grows."""
+"""Common data of all steps of a commissioning: the opened cell, the person, and the result that grows."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from coupole.preflight.commissioned import Answer
 
 
 class Person(Protocol):
-    """Person who stands at the cell."""
+    """Person at the cell."""
 
     def is_ready(self, announcement: str) -> bool:
-        """Ask for the person's word before something moves or is lit."""
+        """Ask the person to confirm before something moves or is lit."""
         ...
 
     def confirms(self, question: str) -> bool:
@@ -32,11 +32,11 @@ class Person(Protocol):
         ...
 
     def measures(self, quantity: str, question: str) -> float | None:
-        """A length by ruler, mm; None if it was not measured. `quantity` is the question's name."""
+        """Ask for a length by ruler, mm; None if it was not measured. `quantity` is the question's name."""
         ...
 
     def tell(self, message: str) -> None:
-        """A message without an answer."""
+        """Show a message that needs no answer."""
         ...
 
     def hold_enabling_switch(self, *, is_held: bool) -> None:
@@ -49,7 +49,7 @@ class Person(Protocol):
 
 
 Say = Callable[[str, int, int], None]
-"""Called with a job's name, how much of it is done, and of how much."""
+"""Called with a job's name, the number that is done, and the number in all."""
 
 
 class StepFailedError(Exception):
@@ -95,12 +95,12 @@ class Bench:
     control: Control
     findings: Findings = field(default_factory=Findings)
     bars: Callable[[], AbstractContextManager[Say]] = lambda: nullcontext(lambda *_: None)
-    """Shows how far a long job is, while the context lasts."""
+    """Shows the progress of a long job while the context lasts."""
     board: Path | None = None
     """The file that describes the board on the support; None: the one of docs/how-to/commission-a-cell.md."""
 
     def iterate(self, label: str, numbers: Iterable[int]) -> Iterator[int]:
-        """One after the other, shown as a bar. Raises Interrupted between two of them after the operator's
+        """Go through the numbers, with a progress bar. Raises Interrupted between two of them after the operator's
         stop."""
         all_numbers = list(numbers)
         with self.bars() as say:
@@ -110,7 +110,7 @@ class Bench:
                 say(label, k + 1, len(all_numbers))
 
     def ask_before(self, announcement: str) -> None:
-        """Raises Interrupted unless the person agrees."""
+        """Ask the person to agree. Raises Interrupted if the person does not."""
         self.control.go_on()
         if not self.person.is_ready(announcement):
             raise Interrupted("the commissioning was not continued; the steps that were done are kept")
@@ -124,7 +124,7 @@ class Bench:
         return yes
 
     def measured_mm(self, quantity: str, question: str) -> float:
-        """A length that the person measures, mm; it is noted. Raises StepFailedError if it was not measured."""
+        """Ask the person to measure a length, mm, and note it. Raises StepFailedError if it was not measured."""
         self.control.go_on()
         found_mm = self.person.measures(quantity, question)
         if found_mm is None:
@@ -139,7 +139,7 @@ class Bench:
         self.control.go_on()
 
     def joints_deg(self) -> NDArray[np.float64]:
-        """The axes [6] as measured now."""
+        """Return the axes [6] as measured now."""
         return np.array(self.opened.robot.measured().joints_deg)
 
     def go_to(self, joints_deg: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -156,10 +156,10 @@ class Bench:
         return measured_deg
 
     def clear_change(self, change_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The change [6] of the axes, or its opposite, whichever touches nothing and stays within the axes'
-        limits.
+        """Return the change [6] of the axes or its opposite: the one that touches nothing and stays within the
+        axes' limits.
 
-        Raises StepFailedError if neither does.
+        Raises StepFailedError if both fail.
         """
         here_deg = self.joints_deg()
         low, high = np.array(self.arm_limits_deg).T

@@ -1,4 +1,4 @@
-"""A motion of the camera in words and an arrow, for a person who stands at the cell."""
+"""Describes a motion of the camera in words and an arrow, for a person at the cell."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ _ARROWS = "→↗↑↖←↙↓↘"
 
 
 def described_motion(base_from_support: Transform, before: Transform, after: Transform) -> str:
-    """The motion from one `base_from_camera` to another.
+    """Describe the motion from one `base_from_camera` to another.
 
-    The way of the lens in the support frame, with an arrow as seen from above (x to the right, y up the page); or,
-    if the lens stays where it is, the sense in which the camera turns, as seen from behind it.
+    If the lens moves, the text gives its way in the support frame, with an arrow as seen from above (x to the
+    right, y up the page). If the lens stays where it is, the text gives the sense in which the camera turns, as
+    seen from behind.
     """
     support_from_base = inverse(base_from_support)
     way_mm = support_from_base[:3, :3] @ (after[:3, 3] - before[:3, 3])

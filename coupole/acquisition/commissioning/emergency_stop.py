@@ -1,4 +1,5 @@
-"""The emergency stop: pressed in motion, the arm stops, its fault is seen here, and nothing moves it on."""
+"""The emergency stop is pressed during a motion. The arm must stop, its fault must be seen here, and nothing may
+move it on."""
 
 from __future__ import annotations
 
@@ -51,7 +52,7 @@ def emergency_stop(bench: Bench) -> None:
 
 
 def _moved_until_pressed(bench: Bench) -> np.ndarray:
-    """Axes [6] when the fault was first seen. Raises StepFailedError if none is."""
+    """Return the axes [6] when the fault was first seen. Raises StepFailedError if no fault is seen."""
     robot, clock = bench.opened.robot, bench.opened.clock
     home_deg = bench.joints_deg()
     change_deg = np.zeros(6)
@@ -83,7 +84,7 @@ def _moved_until_pressed(bench: Bench) -> np.ndarray:
 
 
 def _last_known_deg(bench: Bench, before_deg: np.ndarray) -> np.ndarray:
-    """The axes [6] once they rest; the last ones that were known if the controller has fallen silent."""
+    """Return the axes [6] once they rest. If the controller no longer answers, these are the last known ones."""
     deadline = Deadline(bench.opened.clock, _WATCHED_S)
     last_deg = before_deg
     with contextlib.suppress(DeviceError):

@@ -1,4 +1,5 @@
-"""Pictures under one light at a time: with one edge, or one software trigger, a frame cannot be another's."""
+"""Pictures under one light at a time. There is only one edge or one software trigger, so the frame cannot belong
+to another."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ _TRIES = 8
 
 
 def timing_of(bench: Bench, exposure_us: int) -> BurstTiming:
-    """Times of a flash that covers an exposure."""
+    """Return the times of a flash that covers an exposure."""
     rig = bench.cell.rig
     return burst_timing(
         exposure_us,
@@ -33,7 +34,7 @@ def timing_of(bench: Bench, exposure_us: int) -> BurstTiming:
 
 
 def arm_camera(bench: Bench, exposure_us: int, *, hardware: bool) -> None:
-    """Ready for frames of this exposure."""
+    """Arm the camera for frames of this exposure."""
     camera = bench.opened.camera
     camera.disarm()
     camera.configure(Exposure(exposure_us, hardware_trigger=hardware))
@@ -41,8 +42,8 @@ def arm_camera(bench: Bench, exposure_us: int, *, hardware: bool) -> None:
 
 
 def photograph(bench: Bench, led: int, exposure_us: int) -> tuple[NDArray[np.float64], StepRecord]:
-    """The picture [H, W] in DN under one LED (NO_LED: none), and the box's record of the flash. The camera must be
-    armed for this exposure, with the box's trigger if the box has one."""
+    """Return the picture [H, W] in DN under one LED (NO_LED: none), and the box's record of the flash. The camera
+    must be armed for this exposure. If the box has a trigger, it must be armed for this trigger."""
     timing, rig = timing_of(bench, exposure_us), bench.cell.rig
     rest_us = int(timing.on_us * (1.0 + rig.led_limits.cooldown_ratio))
     step = Step(led, timing.on_us, timing.trigger_delay_us, max(timing.period_us, rest_us))
@@ -57,7 +58,7 @@ def photograph(bench: Bench, led: int, exposure_us: int) -> tuple[NDArray[np.flo
 
 
 def triggered_by_box(bench: Bench, step: Step) -> tuple[NDArray[np.float64], StepRecord]:
-    """The same by a table of this one step."""
+    """Take the picture by a table with this one step; return the same."""
     bench.control.go_on()
     box = table_box(bench.opened.ledbox)
     table = np.array([astuple(step)], STEP_DTYPE)
@@ -70,7 +71,7 @@ def triggered_by_box(bench: Bench, step: Step) -> tuple[NDArray[np.float64], Ste
 
 
 def next_frame(bench: Bench, within_s: float) -> Frame:
-    """The next frame. Raises DeviceTimeout if none comes."""
+    """Return the next frame. Raises DeviceTimeout if no frame comes."""
     seconds = within_s + _FRAME_S
     frame = bench.opened.camera.next_frame(seconds)
     if frame is None:
@@ -84,7 +85,7 @@ def next_frame(bench: Bench, within_s: float) -> Frame:
 
 
 def pixels_of(frame: Frame) -> NDArray[np.float64]:
-    """A copy; the frame's buffer goes back to the camera."""
+    """Return a copy of the pixels. The frame's buffer goes back to the camera."""
     pixels = frame.pixels.astype(np.float64)
     frame.release()
     return pixels
@@ -106,8 +107,8 @@ def wait_for_end(bench: Bench, duration_s: float) -> None:
 
 
 def good_exposure_us(bench: Bench, leds: list[int]) -> tuple[int, int]:
-    """An exposure at which the brightest pixel under these LEDs is well below saturation, and the LED under which
-    it is. Raises StepFailedError if the camera sees too little or too much."""
+    """Return an exposure at which the brightest pixel under these LEDs is well below saturation, and the LED that
+    lights this pixel. Raises StepFailedError if the camera sees too little or too much."""
     limits = bench.cell.rig.led_limits
     longest_us = limits.on_us[1] - limits.rise_us - 2 * LED_GAP_US
     exposure_us, white = _FIRST_EXPOSURE_US, float(bench.cell.rig.sensor.white_dn)

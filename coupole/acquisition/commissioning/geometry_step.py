@@ -1,8 +1,8 @@
-"""The geometry: a board is sighted from several postures, and a person measures with a ruler. Both are compared
-with the rig: its support, its camera, what the flange carries, the dome, and the volumes to keep out of.
+"""The geometry: the camera sees a board from several postures, and a person measures with a ruler. Both results
+are compared with the rig: support, camera, bodies on the flange, dome, and `keep_out` volumes.
 
-Pictures and ruler check each other. The camera tells where the support is, within what a lens by its maker's
-figures allows; the ruler does not trust the camera, and tells whether the bodies that collisions are computed with
+Pictures and ruler check each other. The camera shows where the support is, as exactly as the maker's figures of
+the lens allow. The ruler does not depend on the camera. It shows whether the bodies in the collision checks
 enclose the real ones.
 """
 
@@ -29,20 +29,20 @@ from coupole.motion.itinerary import arm_of
 from coupole.plan.rig import KeepOut, KeepOutBox, Rig
 
 MOST_HEIGHT_MM, MOST_SIDEWAYS_MM, MOST_TILT_DEG, MOST_DISAGREEMENT_MM = 15.0, 20.0, 2.0, 3.0
-"""Greatest deviations of the board as it is seen: a lens is known within 2 % here, 7 mm at 335 mm; a board is laid
-down by hand."""
+"""Greatest deviations of the board as the camera sees it. The lens is known only within 2 % here, which is 7 mm at
+335 mm, and the board is laid down by hand."""
 MOST_TOO_NEAR_MM, MOST_BEYOND_MM, MOST_ROUGH_MM = 5.0, 2.0, 10.0
-"""Greatest deviations by ruler: room that only the rig has; parts that stick out of the rig's bodies; large
-lengths."""
+"""Greatest deviations by ruler: of free room that is less than in the rig; of parts that stick out of the rig's
+bodies; of large lengths."""
 _TILTS_DEG = (12.0, 9.0, 6.0)
-"""Tilts of the camera about the board. The first at which the arm has room for all sights is taken."""
+"""Tilts of the camera about the board. The first tilt at which the arm has room for all sights is used."""
 _MOST_TURN_DEG = 30.0
 _METERED = 5
 Floats = NDArray[np.float64]
 
 
 def geometry(bench: Bench) -> None:
-    """Sight and measure; refuse what lies beyond the limits."""
+    """Take sights and measure; refuse deviations beyond the limits."""
     bench.findings.remedy = (
         "Compare the rig with the cell: `support`, `flange_from_camera`, `lens`, `sensor`, `tool`, `dome`, "
         "`keep_out` and the arm's description. Do not run any plan."
@@ -73,7 +73,7 @@ _BOARD = (
 
 
 def _measure_bodies(bench: Bench) -> None:
-    """The ruler against the bodies of the rig, where they stand now."""
+    """Compare lengths by ruler with the bodies of the rig at their present places."""
     findings, rig = bench.findings, bench.cell.rig
     over_mm = bench.measured_mm(
         "tool_over_support_mm",
@@ -108,7 +108,7 @@ def _measure_bodies(bench: Bench) -> None:
 
 
 def _ask_for_volumes(bench: Bench) -> None:
-    """Ask the person about the volumes: only a person can see what stands in the cell."""
+    """Ask the person about the volumes, because only a person can see what is in the cell."""
     volumes = bench.cell.rig.keep_out
     for volume in volumes:
         bench.ask_whether(
@@ -137,7 +137,7 @@ def _volume_text(volume: KeepOut) -> str:
 
 
 def _lowest_mm(rig: Rig, base_from_flange: Transform) -> float:
-    """Return the least height over the disk of the flange and what it carries, by the rig."""
+    """Return the least height of the flange and its bodies above the disk, by the rig."""
     support_from_flange = inverse(rig.support.base_from_support.matrix()) @ base_from_flange
     ends = [(0.0, 0.0, 0.0, 0.0)]
     ends += [(*end, body.radius_mm) for body in rig.tool for end in (body.from_mm, body.to_mm)]
@@ -147,7 +147,8 @@ def _lowest_mm(rig: Rig, base_from_flange: Transform) -> float:
 
 
 def _extent_mm(rig: Rig) -> tuple[float, float]:
-    """Return the extent of the rig's bodies on the flange: along its axis from its face, and from its axis."""
+    """Return the extent of the rig's bodies on the flange: along the flange's axis from its face, and across from
+    the axis."""
     ends = [(*end, body.radius_mm) for body in rig.tool for end in (body.from_mm, body.to_mm)]
     points = np.array(ends).reshape(-1, 4)
     along, aside = points[:, 2] + points[:, 3], np.hypot(points[:, 0], points[:, 1]) + points[:, 3]
@@ -189,7 +190,7 @@ def _sight(bench: Bench, board: Board, place_mm: Floats) -> None:
 
 
 _AROUND = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
-"""Axes of the camera about which it is turned round the board."""
+"""Axes about which the camera is turned round the board, in the camera frame."""
 
 
 def _motion(rig: Rig, from_deg: Floats, to_deg: Floats) -> str:
@@ -200,7 +201,8 @@ def _motion(rig: Rig, from_deg: Floats, to_deg: Floats) -> str:
 
 
 def _postures_about(bench: Bench, home_deg: Floats, in_camera_mm: Floats) -> list[Floats]:
-    """Postures in which the camera looks at a point of its frame from other sides. Raises StepFailedError."""
+    """Return postures in which the camera looks at a point, given in its present frame, from other sides. Raises
+    StepFailedError."""
     rig, arm = bench.cell.rig, arm_of(bench.cell.rig)
     flange_from_camera = rig.flange_from_camera.matrix()
     base_from_camera = forward(arm, home_deg) @ flange_from_camera
@@ -230,7 +232,7 @@ def _has_room(bench: Bench, home_deg: Floats, posture_deg: Floats) -> bool:
 
 
 def _first_sight(bench: Bench, board: Board, joints_deg: Floats, exposure_us: int, leds: Sequence[int]) -> Sight:
-    """The board under the first LED that shows it. Raises StepFailedError if none does."""
+    """Return the board's sight under the first LED that shows it. Raises StepFailedError if no LED shows it."""
     rig, why = bench.cell.rig, ""
     arm_camera(bench, exposure_us, hardware=bench.opened.ledbox.runs_tables)
     for led in leds:
@@ -250,7 +252,7 @@ def _first_sight(bench: Bench, board: Board, joints_deg: Floats, exposure_us: in
 
 
 def _first_pose(sight: Sight, intrinsics: Intrinsics) -> Transform:
-    """`camera_from_board` by this sight alone. Raises StepFailedError."""
+    """Return `camera_from_board` from this sight alone. Raises StepFailedError."""
     ids = np.arange(len(sight.pixels))
     try:
         return board_pose(Sighting("the first sight", ids, sight.board_mm, sight.pixels), intrinsics)

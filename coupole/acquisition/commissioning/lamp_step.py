@@ -1,4 +1,5 @@
-"""The lamps one by one: each draws current, brightens the picture, and lights from where the LED table has it."""
+"""The lamps one by one: each draws current, brightens the picture, and lights from the place that the LED table
+says."""
 
 from __future__ import annotations
 
@@ -14,10 +15,10 @@ from coupole.devices import NO_LED
 from coupole.plan.led_table import LedTable
 
 _LEAST_SPREAD = 0.05
-"""Smallest singular value of the normals in view, as a share of the largest: below it the object is too flat."""
+"""Smallest singular value of the visible normals, as a share of the largest. Below it the object is too flat."""
 _LEAST_SIGNAL_SIGMA, _LEAST_SIGNAL_SHARE = 8.0, 0.01
-"""Least signal of a picture, its mean over its dark frame: in standard deviations of that mean, and as a share of
-the median LED's."""
+"""Least signal of a picture, that is, its mean minus that of its dark frame. The first limit is in standard
+deviations of that mean, the second is a share of the median LED's signal."""
 _LEAST_CURRENT_SHARE = 0.5
 _MOST_PIXELS = 4000
 _LIT_SHARE = 0.1
@@ -81,7 +82,8 @@ def lamps(bench: Bench) -> None:
 
 
 def light_vectors(bench: Bench, table: LedTable) -> NDArray[np.float64]:
-    """[leds, 3] direction to each LED from the support's centre times its illuminance there; base frame."""
+    """Return [leds, 3]: the direction from the support's centre to each LED, times its illuminance there; base
+    frame."""
     centre = bench.cell.rig.support.base_from_support.matrix()[:3, 3]
     towards = table.positions_mm - centre
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
@@ -140,7 +142,8 @@ def _dark_leds(pictures: Pictures) -> list[int]:
 
 
 def _ask_for_dark_ones(bench: Bench, leds: list[int]) -> None:
-    """LEDs that draw current and light nothing that the camera sees (the arm hides them): a person looks."""
+    """Ask the person to look at LEDs that draw current but light nothing that the camera sees, because the arm
+    hides them."""
     findings, table = bench.findings, bench.cell.leds
     if not findings.at_most("LEDs whose light the camera does not see", len(leds), _MOST_ASKED, ""):
         findings.remarks.append(

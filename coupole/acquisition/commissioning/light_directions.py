@@ -1,12 +1,13 @@
 """Directions of light from pictures of a matte body; each LED is judged by the pictures of all others.
 
-Of a matte object with a constant shape, a pixel's value under a far light is `l . b`: l the direction of the light
-times its illuminance, b the pixel's normal times its reflectance (Woodham, "Photometric method for determining
-surface orientation from multiple images", Opt. Eng. 19, 1980). All pictures together give b from the table's
-directions; each picture then gives a direction, to be compared with the table's. No pixel's shape has to be known.
+On a matte object that does not move, a pixel's value under a far light is `l . b`. Here l is the direction of the
+light times its illuminance, and b is the pixel's normal times its reflectance (Woodham, "Photometric method for
+determining surface orientation from multiple images", Opt. Eng. 19, 1980). All pictures together give b from the
+table's directions. Each picture then gives a direction, which is compared with the table's. The shape of the
+object need not be known.
 
-An LED must not vouch for itself, so its direction comes from normals without it. These normals are not solved for
-again: taking one light out of a least-squares solution is a change of rank one (`Normals.without`).
+An LED must not confirm itself, so its direction comes from normals that were found without it. These normals need
+no new solution: removing one light from a least-squares solution is a change of rank one (`Normals.without`).
 """
 
 from __future__ import annotations
@@ -18,29 +19,30 @@ from numpy.typing import NDArray
 
 MOST_DEVIATION_DEG = 25.0
 """Greatest angle between the direction in a picture and the table's. Shadows, gloss and the nearness of the LEDs
-bend it; LEDs that are swapped within this angle are found by `coupole calibrate leds`."""
+change the direction in a picture. `coupole calibrate leds` finds LEDs that are swapped within this angle."""
 FEWEST_LEDS = 8
 _LIT_SHARE = 0.1
 _RIDGE = 1e-6
 _FEWEST_LIGHTS = 4
 """A pixel that fewer lights reach gives no normal."""
 _LEAST_REST = 1e-4
-"""Least share of a direction that may be left when a light is taken out. If less is left, the pixel is solved
-anew: the update would lose more than four digits."""
+"""Least share of a direction that must be left when a light is taken out. If less is left, the pixel is solved
+again, because the update would lose more than four digits."""
 _ROUNDS = 4
 Floats = NDArray[np.float64]
 Each = Callable[[str, Iterable[int]], Iterable[int]]
-"""Goes through numbers; whoever gives it shows how far that is, and may end it by an exception."""
+"""Function that goes through numbers. It may show the progress, and may end by an exception."""
 
 
 def deviations_deg(
     pictures: Floats, lights: Floats, iterate: Each = lambda _, numbers: numbers
 ) -> tuple[Floats, float]:
-    """Angles [leds] between the directions that pictures [leds, pixels] show and `lights` [leds, 3]; and how well
-    the object in view tells directions: the ratio of the smallest to the largest singular value of its normals.
+    """Return angles [leds] between the directions that pictures [leds, pixels] show and `lights` [leds, 3]. The
+    second value says how well the object shows directions: the smallest over the largest singular value of its
+    normals.
 
-    Each LED's direction comes from normals that the other pictures give; those whose LED turned out to be
-    elsewhere are left out of them.
+    Each LED's direction comes from normals that the other pictures give. Pictures of LEDs that are found to be
+    elsewhere are left out.
     """
     lights = lights / np.linalg.norm(lights, axis=1).mean()
     lit = pictures > _LIT_SHARE * np.maximum(pictures.max(axis=0), 1e-9)
@@ -60,8 +62,8 @@ def deviations_deg(
 
 
 class Normals:
-    """Normals times reflectance [3, pixels]: of each pixel the least-squares solution of `lights . b = picture`
-    over the `good` lights that reach it. Pixels that fewer than four reach count as black."""
+    """Normals times reflectance [3, pixels]. For each pixel it is the least-squares solution of `lights . b =
+    picture` over the `good` lights that reach the pixel. Pixels that fewer than four reach count as black."""
 
     def __init__(self, pictures: Floats, lights: Floats, lit: NDArray[np.bool_], good: NDArray[np.bool_]) -> None:
         self._pictures, self._lights, self._used = pictures, lights, lit & good[:, None]
@@ -79,9 +81,9 @@ class Normals:
     def without(self, led: int) -> Floats:
         """Return the normals from all good lights but one.
 
-        With b the solution of all, N their inverse normal matrix, y the pixel's value under the light l, u = N l
-        and h = l . u, that without l is b - u (y - l . b) / (1 - h) (Sherman and Morrison, Ann. Math. Stat. 21,
-        1950; Cook and Weisberg, Residuals and Influence in Regression, 1982, eq. 2.2.8).
+        Let b be the solution of all lights, N their inverse normal matrix, y the pixel's value under the light l,
+        u = N l and h = l . u. Then the solution without l is b - u (y - l . b) / (1 - h) (Sherman and Morrison,
+        Ann. Math. Stat. 21, 1950; Cook and Weisberg, Residuals and Influence in Regression, 1982, eq. 2.2.8).
         """
         light = self._lights[led]
         normals = self._solved.copy()

@@ -26,23 +26,24 @@ from coupole.plan.rig_devices import NOWHERE, device_for
 _METERED = 5
 _EDGES = 24
 _CODE = 0.37
-"""The k-th period of the burst of edges is longer by `(k * k * _CODE) mod 1` of the shortest: no frame fits
-another edge."""
+"""The k-th period of the burst of edges is longer by `(k * k * _CODE) mod 1` of the shortest period. So no frame
+fits another edge."""
 _PAIRS = 8
 _LEAST_EXPOSURE_US = 2000
 _SEGMENT_US = 200_000
 _WATCH_BEYOND_S = 4.0
 _DARK_LATE_S = 0.5
-"""Tolerance of the box itself: after the watchdog's time and this, no frame may show light."""
+"""Tolerance of the box itself: no frame may show light later than the watchdog's time plus this."""
 _LEAST_SIGNAL_SIGMA = 8.0
 
 
 def trigger(bench: Bench) -> None:
     """Delay and jitter from edge to exposure.
 
-    Jitter: camera timestamps against the box's times of its edges, after a straight line between the two clocks.
-    Delay: an LED that goes dark in the middle of the exposure gives half of its light; of exposure E, every
-    microsecond of delay takes one E-th of it away. The clocks of box and camera cannot tell a constant delay.
+    Jitter: camera timestamps are compared with the box's times of its edges, after a straight line between the two
+    clocks. Delay: an LED that goes dark in the middle of the exposure gives half of its light. For an exposure of
+    E microseconds, every microsecond of delay removes one E-th of the light. The clocks of box and camera cannot
+    show a constant delay.
     """
     findings = bench.findings
     findings.remedy = (
@@ -97,7 +98,8 @@ def _judge_jitter(bench: Bench) -> None:
 
 
 def _delays_us(bench: Bench, led: int, exposure_us: int) -> NDArray[np.float64]:
-    """Delays [pairs] from pairs of flashes: one that outlasts the exposure, one that ends in its middle."""
+    """Return delays [pairs] from pairs of flashes. One flash is longer than the exposure, the other ends in the
+    middle of it."""
     limits = bench.cell.rig.led_limits
     arm_camera(bench, exposure_us, hardware=True)
     dark = triggered_by_box(bench, _flash(bench, NO_LED, exposure_us, exposure_us))[0]
@@ -114,7 +116,7 @@ def _delays_us(bench: Bench, led: int, exposure_us: int) -> NDArray[np.float64]:
 
 
 def _flash(bench: Bench, led: int, exposure_us: int, lit_us: int) -> Step:
-    """An LED that goes dark `lit_us` after the edge."""
+    """Return a step whose LED goes dark `lit_us` after the edge."""
     limits = bench.cell.rig.led_limits
     on_us = limits.rise_us + lit_us
     rest_us = int(on_us * (1.0 + limits.cooldown_ratio))
@@ -122,7 +124,8 @@ def _flash(bench: Bench, led: int, exposure_us: int, lit_us: int) -> Step:
 
 
 def watchdog(bench: Bench) -> None:
-    """Light LEDs by a long table, say nothing more to the box, and see with the camera when the light goes out."""
+    """Light LEDs by a long table, send no more commands to the box, and see with the camera when the light goes
+    out."""
     findings, opened_cell = bench.findings, bench.opened
     findings.remedy = (
         "The box must switch off by itself: check its firmware's watchdog. Do not leave it unattended."
@@ -156,8 +159,9 @@ def watchdog(bench: Bench) -> None:
 
 
 def _last_light_s(bench: Bench, led: int, exposure_us: int, watchdog_s: float) -> tuple[float, float]:
-    """Seconds from the last command to the last frame with light, and to the first dark one after it: infinite if
-    there is none. Both are taken before the frame's exposure, so a slow machine never makes the box look late."""
+    """Return seconds from the last command to the last frame with light, and to the first dark frame after it
+    (infinite without one). Both times are read before the frame's exposure. So a slow machine never makes the box
+    look late."""
     opened_cell, clock = bench.opened, bench.opened.clock
     arm_camera(bench, exposure_us, hardware=False)
     darks = [_by_software(bench, exposure_us) for _ in range(3)]
@@ -183,7 +187,8 @@ def _last_light_s(bench: Bench, led: int, exposure_us: int, watchdog_s: float) -
 
 
 def _lasting_table(bench: Bench, led: int, seconds: float) -> NDArray[np.void]:
-    """A table that lights LEDs in turn, without edges, so that each has its rest; the given one among them."""
+    """Return a table that lights LEDs in turn, without edges, so that each LED can rest. The given LED is one of
+    them."""
     limits, ids = bench.cell.rig.led_limits, bench.cell.leds.ids
     at = int(np.flatnonzero(ids == led)[0])
     turn = np.roll(ids, -at)[: int(np.ceil(limits.cooldown_ratio)) + 2]

@@ -1,5 +1,5 @@
-"""The enabling switch that a person holds at the cell while a console moves the arm: its being held and released
-are seen."""
+"""The enabling switch, which a person holds at the cell while a console moves the arm. This step sees it held and
+released."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ _WITHIN_S, _POLL_S = 30.0, 0.05
 
 
 def presence(bench: Bench) -> None:
-    """Ask the person to hold and to release it. A cell without an enabling switch passes, and its record says so,
-    unless its rig has one.
+    """Ask the person to hold and to release the switch. If the rig has no enabling switch, a cell without one
+    passes, and its record says so.
     """
     findings, box = bench.findings, bench.opened.ledbox
     findings.remedy = (

@@ -15,10 +15,10 @@ REDUCED_MM_S = 250.0
 
 
 def at_reduced_speed(rig: Rig, bodies: CellBodies) -> Rig:
-    """The rig with a speed at which no point of arm and tool exceeds REDUCED_MM_S in any motion of any axes.
+    """Return the rig with a lower speed, so that no point of arm and tool exceeds REDUCED_MM_S in any motion.
 
-    The bound is the sum over the axes of their greatest speeds times the greatest distance of any point from the
-    axis (`CellBodies.reach_mm`). Raises InputError if the arm is not described or its driver cannot be slowed.
+    The bound is a sum over the axes: the greatest speed of an axis times the greatest distance of any point from
+    it (`CellBodies.reach_mm`). Raises InputError if the arm is not described or its driver cannot be slowed.
     """
     driver, _ = device_for(rig, "robot", dry_run=False)
     if "speed_fraction" not in settings_class(driver).model_fields:
@@ -29,7 +29,8 @@ def at_reduced_speed(rig: Rig, bodies: CellBodies) -> Rig:
 
 
 def greatest_speeds_deg_s(rig: Rig) -> NDArray[np.float64]:
-    """[6] of the axes, in the motions of the rig's driver. Raises InputError if the arm is not described."""
+    """Return the greatest speeds [6] of the axes, in the motions of the rig's driver. Raises InputError if the arm
+    is not described."""
     arm = planning_arm(rig)
     if arm is None:
         raise InputError("expected a described arm (`arm:` in the rig): its reach determines the slow speed")

@@ -1,4 +1,5 @@
-"""One `coupole commission`: the steps that are due, each kept in the cell's record as soon as it has ended."""
+"""One `coupole commission`: runs the steps that are due, and keeps each in the cell's record as soon as it has
+ended."""
 
 from __future__ import annotations
 
@@ -80,10 +81,10 @@ def commission(
 ) -> CommissioningRecord:
     """Do the steps that are due, or `only` one; returns the record.
 
-    `name` is that of the person, whom `person_at` gives for the opened cell; `board` is the file that describes
-    the board of the step geometry. Due is a step that was not done, did not pass, or does not fit the rig and its
-    devices any more. Raises CommissioningFailed after the first step that does not pass, DeviceError if a device
-    fails, Interrupted if the person does not go on.
+    `name` is the person's name; `person_at` gives the person for the opened cell. `board` is the file that
+    describes the board of the step geometry. A step is due if it was not done, did not pass, or does not fit the
+    rig and its devices any more. Raises CommissioningFailed after the first step that does not pass, DeviceError
+    if a device fails, Interrupted if the person does not go on.
     """
     faults_of(cell).refuse(cell.document.path)
     bodies = bodies_of(cell.rig, cell.leds, np.zeros((0, 3, 3)), cell.link_meshes, cell.files)
@@ -132,7 +133,7 @@ def commission(
 
 
 def shortcomings(result: StepResult) -> list[str]:
-    """List in words what did not pass in a step."""
+    """Return in words what failed in a step."""
     sentences = [
         f"{entry.what}: {entry.found:.4g} {entry.unit}, at most {entry.limit:.4g}".replace(" ,", ",")
         for entry in result.limits
@@ -170,8 +171,8 @@ def _due(cell: Cell, record: CommissioningRecord, opened_cell: OpenedCell) -> li
 
 
 def _run_step(step: Step, bench: Bench, cell: Cell, name: str) -> tuple[StepResult, DeviceError | None]:
-    """Do one step; returns its result, and the error of a device that ended it. Raises Interrupted if this process
-    did not run for a while, or was suspended."""
+    """Do one step. Returns its result, and the device's error if one ended the step. Raises Interrupted if this
+    process did not run for a while, or was suspended."""
     findings = bench.findings = Findings()
     failure, error = "", None
     try:

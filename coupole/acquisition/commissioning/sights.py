@@ -1,4 +1,5 @@
-"""Deviations of a rig's geometry, from sights of one board in several postures: pure geometry, no devices."""
+"""Deviations of a rig's geometry, from sights of one board in several postures. Pure geometry: no devices are
+used."""
 
 from __future__ import annotations
 
@@ -21,24 +22,24 @@ class Sight:
     support_from_camera: Transform
     """Pose of the camera by the rig, from the measured axes."""
     board_mm: Floats
-    """[n, 3] the corners that are seen, in the board's frame."""
+    """[n, 3] the corners that the camera sees, in the board's frame."""
     pixels: Floats
-    """[n, 2] where they are seen."""
+    """[n, 2] where the camera sees these corners."""
 
 
 @dataclass(frozen=True)
 class Deviations:
-    """Pose of the board by all sights together, minus the pose in which it lies; support frame."""
+    """Pose of the board by all sights together, minus the pose that the rig gives; support frame."""
 
     height_mm: float
-    """Height of the board's middle; above 0, it is seen higher."""
+    """Height of the board's middle. It is positive if the camera sees the board higher."""
     sideways_mm: float
     tilt_deg: float
     """Tilt of the board against the disk."""
     disagreement_mm: float
-    """Disagreement of the worst sight: root mean square distance on the board between where its corners are seen
-    and where they would be, if all sights were right. It shows errors of the camera's place on the flange, of its
-    lens and of the arm."""
+    """Disagreement of the worst sight: root mean square distance on the board between its corners as seen and as
+    predicted by all sights together. It shows errors of the camera's place on the flange, of its lens and of the
+    arm."""
     cause: str
     """The one error that explains the sights best, in words."""
 
@@ -46,8 +47,8 @@ class Deviations:
 def deviations(
     sights: Sequence[Sight], intrinsics: Intrinsics, middle_mm: Floats, expected_mm: Floats, start: Transform
 ) -> Deviations:
-    """`middle_mm` [3] of the board in its own frame, `expected_mm` [3] in the support's; `start` is a first
-    `support_from_board`."""
+    """Return the deviations. `middle_mm` [3] is the board's middle in its own frame, `expected_mm` [3] the same in
+    the support frame. `start` is a first `support_from_board`."""
     sees = _Model(sights, intrinsics)
     free = _least_squares_fit(lambda x: sees.residuals_mm(_pose_after(start, x), np.zeros(3)), 6)
     support_from_board = _pose_after(start, free)
@@ -75,8 +76,8 @@ class _Model:
         self._sights, self._intrinsics = sights, intrinsics
 
     def residuals_mm(self, support_from_board: Transform, camera_shift_mm: Floats) -> Floats:
-        """[2 corners] predicted less seen, as lengths at the board's distance; the projection centre is shifted in
-        the camera's frame."""
+        """Return [2 corners] predicted minus seen, as lengths at the board's distance. The projection centre is
+        shifted in the camera frame."""
         residuals = []
         for sight in self._sights:
             camera_from_board = inverse(sight.support_from_camera) @ support_from_board
@@ -102,7 +103,7 @@ def _pose_after(start: Transform, change: Floats) -> Transform:
 
 
 def _laid_flat(support_from_board: Transform, middle_mm: Floats, at_mm: Floats) -> Transform:
-    """The board square to the disk, with its middle at a point."""
+    """Return the pose of a board that lies flat on the disk, with its middle at a point."""
     pose = np.eye(4)
     along = np.array([*support_from_board[:2, 0], 0.0])
     up = np.array([0.0, 0.0, 1.0 if support_from_board[2, 2] > 0 else -1.0])

@@ -1,4 +1,4 @@
-"""Judges the looks of a burst: what changed in it, by which name, and which shots it concerns."""
+"""Judges the looks of a burst: names each change, and the shots that it concerns."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from coupole.plan.shot_id import Led, Sentinel, ShotLabel
 from coupole.plan.watch import SENTINELS, WatchLimits
 
 _OPAQUE = 0.3
-"""Greatest local change of brightness that a smudge on the lens can cause: it is far out of focus, and covers only
-a
-part of the aperture."""
+"""Greatest local change of brightness that a smudge on the lens can cause. A smudge is far out of focus, and
+covers only a part of the aperture."""
 _STILL_THERE = 0.5
-"""Share of a change in a place that the last frame of its LED must show: noise is below half of what is found."""
+"""Share of a local change that the last frame of its LED must still show. Noise is less than half of a change that
+is found."""
 _COMES_BACK_MM = 0.1
-"""Displacement of the picture that is normal after the arm has left the view and come back: industrial
-arms state a pose repeatability (ISO 9283) of some 0.02 to 0.06 mm, for each of the two poses."""
+"""Displacement of the picture that is normal after the arm has left the view and come back: makers of industrial
+arms state a pose repeatability (ISO 9283) of some 0.02 to 0.06 mm, which counts for each of the two poses."""
 Floats = NDArray[np.float64]
 
 
@@ -36,7 +36,7 @@ class LightTable:
     directions: Mapping[int, Floats]
     """[3] unit vectors from the target."""
     light: Mapping[int, float]
-    """Light of each, by the LED table."""
+    """Light of each LED, by the LED table."""
 
 
 @dataclass
@@ -52,12 +52,12 @@ class FirstFrames:
     """Exposures, us, whose sentinels were first lit in an earlier session."""
 
     def begin_view(self) -> None:
-        """The camera looks from elsewhere."""
+        """Begin a view: the camera looks from another place."""
         self.sentinels.clear()
         self.earlier.clear()
 
     def note_earlier(self, exposure_us: int, led: int, look: FrameLook) -> None:
-        """An earlier session has the view's first frame of this LED."""
+        """Note that an earlier session has the view's first frame of this LED."""
         self.sentinels.setdefault(exposure_us, {})[led] = look
         self.earlier.add(exposure_us)
 
@@ -74,7 +74,8 @@ class BurstJudge:
     first: FirstFrames
 
     def judge(self, frames: Sequence[SeenFrame], exposure_us: int) -> list[Found]:
-        """Findings in the frames of one burst, which are in the order of time; the most telling first."""
+        """Return findings in the frames of one burst; the strongest evidence comes first. The frames are in the
+        order of time."""
         if ambient := self._ambient(frames, exposure_us):
             return [ambient]
         lit = [frame for frame in frames if isinstance(frame.label.light, Led | Sentinel)]
@@ -105,7 +106,7 @@ class BurstJudge:
     # -- neighbouring lights ------------------------------------------------------------------------------
 
     def _by_neighbours(self, lit: Sequence[SeenFrame]) -> list[Found]:
-        """LEDs whose pictures are too dim or bright beside their neighbours, by far."""
+        """Find LEDs whose pictures are much too dim or bright beside their neighbours."""
         shots = [frame for frame in lit if isinstance(frame.label.light, Led)]
         leds = [_led_of(frame.label) for frame in shots]
         weights = foretelling(np.array([self.lights.directions[led] for led in leds])) if shots else None
@@ -153,7 +154,7 @@ class BurstJudge:
         return None
 
     def _places(self, series: _Series) -> _Places:
-        """Changes in places, as far as a displacement does not explain more."""
+        """Return changes in places, as far as a displacement does not explain them better."""
         over, shares, stays = [], [], []
         last_of_led = {_led_of(series.lit[place].label): k for k, place in enumerate(series.places)}
         for place, change in zip(series.places, series.changes, strict=True):
@@ -169,7 +170,8 @@ class BurstJudge:
     def _place_found(
         self, kind: Kind, series: _Series, begin: int, end: int | None, words: Callable[[float], str]
     ) -> Found:
-        """The finding of a change in places, with the figure of the place that is furthest beyond its limit."""
+        """Return the finding of a change in places, with the figure of the place that is farthest beyond its
+        limit."""
         change = series.changes[begin]
         limit = np.maximum(self.limits.least_share, self.limits.sigmas * change.tile_sigmas)
         worst = np.unravel_index(int(np.argmax(np.abs(change.tile_shares) / limit)), limit.shape)
@@ -177,7 +179,7 @@ class BurstJudge:
         return series.finding(kind, begin, end, abs(figure), float(limit[worst]), OF_THE_LIGHT, words(figure))
 
     def _thing(self, series: _Series) -> Found | None:
-        """A change in places that is too strong for a smudge, or that goes away."""
+        """Find a change in places that is too strong for a smudge, or that goes away."""
         places = self._places(series)
         is_passing = places.is_over & (places.is_strong | ~places.stays)
         if not is_passing.any():
@@ -191,7 +193,7 @@ class BurstJudge:
         )
 
     def _smudge(self, series: _Series) -> Found | None:
-        """A change in places that stays in the picture while all else is as it was."""
+        """Find a change in places that stays in the picture while everything else is as before."""
         is_over = self._places(series).is_over
         if not is_over.any():
             return None
@@ -207,7 +209,7 @@ class BurstJudge:
         )
 
     def _displacement(self, series: _Series) -> Found | None:
-        """The object or the camera: the sentinels' pictures are displaced, and stay so."""
+        """Find a motion of the object or the camera: the sentinels' pictures are displaced, and stay displaced."""
         shifts_mm = np.array([np.linalg.norm(change.shift_bins) for change in series.changes]) * self.mm_per_bin
         sigmas_mm = np.array([change.shift_sigma_bins for change in series.changes]) * self.mm_per_bin
         least_mm = self.limits.least_mm + (_COMES_BACK_MM if series.is_since_earlier else 0.0)
@@ -221,7 +223,7 @@ class BurstJudge:
         return series.finding("moved", since, None, figure, limit, "mm", words)
 
     def _of_light(self, series: _Series) -> Found | None:
-        """A change of brightness: of one LED alone, of all in one step, or a drift of all."""
+        """Find a change of brightness: of one LED alone, of all LEDs in one step, or a drift of all."""
         gains = np.array([change.gain for change in series.changes])
         noise = max(change.gain_sigma for change in series.changes)
         limit = max(
@@ -267,21 +269,22 @@ class _Places:
 
 @dataclass(frozen=True)
 class _Series:
-    """Sentinels that could be compared with the first of their LED, in the order of time."""
+    """Sentinels that could be compared with the first one of their LED, in the order of time."""
 
     lit: Sequence[SeenFrame]
     places: Sequence[int]
-    """Place of each among the frames that are lit."""
+    """Place of each sentinel among the lit frames."""
     changes: Sequence[Change]
     first: Mapping[int, FrameLook]
     is_since_earlier: bool
-    """The first frames are those of an earlier session: the arm has left the view meanwhile, and come back."""
+    """True if the first frames are those of an earlier session: the arm has left the view meanwhile, and come
+    back."""
 
     def finding(
         self, kind: Kind, begin: int, end: int | None, figure: float, limit: float, unit: str, words: str
     ) -> Found:
-        """A finding that shows in the sentinels from `begin` to `end` (None: the last): it concerns all shots from
-        the sentinel before to the one after."""
+        """Return a finding that shows in the sentinels from `begin` to `end` (None: the last). It concerns all
+        shots from the sentinel before `begin` to the sentinel after `end`."""
         first_place = self.places[begin - 1] if begin else -1
         end_place = len(self.lit) if end is None or end + 1 == len(self.places) else self.places[end + 1]
         labels = tuple(f.label for f in self.lit[first_place + 1 : end_place] if f.label.is_shot)
@@ -291,8 +294,8 @@ class _Series:
 
 
 def _is_step(times: Floats, gains: Floats) -> bool:
-    """True if gains [n] at these times are nearer to a step than to a line that begins somewhere; both begin at
-    0."""
+    """True if gains [n] at these times are nearer to a step than to a line that begins at some time. Step and line
+    both begin at 0."""
     step_squares, line_squares = [], []
     for begin in range(len(gains)):
         later = gains[begin:]
@@ -315,7 +318,8 @@ def _led_of(label: ShotLabel) -> int:
 
 
 def _lasting(is_over: NDArray[np.bool_]) -> int | None:
-    """The first of those that are over the limit up to the last one; None if the last is not."""
+    """Return the first value of those at the end that are all over the limit; None if the last value is not over
+    it."""
     if not len(is_over) or not is_over[-1]:
         return None
     within = np.flatnonzero(~is_over)

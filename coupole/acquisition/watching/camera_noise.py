@@ -1,6 +1,6 @@
 """Noise of a look's bins, from the rig's figures: photons, readout, rows, rounding (EMVA 1288).
 
-The pixels' own responses (PRNU) are the same in both frames of a comparison, and cancel.
+The pixels' own responses (PRNU) are the same in both frames of a comparison, so they cancel.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class CameraNoise:
     read_dn2: float
     """Variance of one pixel's readout, with its rounding."""
     row_dn2: float
-    """Variance of the offset that a row has in common."""
+    """Variance of the offset that all pixels of a row have in common."""
     pixels: int
     """Number of pixels in a bin."""
     rows: int

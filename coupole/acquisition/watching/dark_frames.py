@@ -1,4 +1,4 @@
-"""Ambient light: the dark frames of a burst against the first ones at the same exposure."""
+"""Ambient light: compares the dark frames of a burst with the first ones at the same exposure."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def ambient_light(
     limits: WatchLimits,
     exposure_us: int,
 ) -> Found | None:
-    """Light that later dark frames have more than the first ones: their median, by tiles. None if it is
-    within the limit, which allows for noise and for the dark current of a sensor that warms up."""
+    """Find light that is in later dark frames but not in the first ones, by tiles of their median. None if it is
+    within the limit. The limit allows for noise, and for the dark current of a sensor that warms up."""
     if not later:
         return None
     now_dn = dark_level(later)

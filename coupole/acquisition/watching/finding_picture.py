@@ -1,4 +1,4 @@
-"""The picture of a finding: before, after, and what differs."""
+"""The picture of a finding: before, after, and the difference."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ _WIDTH_PX = 320
 _GAP_PX = 8
 _GAMMA = 1 / 2.2
 _FULL_SHARE = 0.1
-"""Least difference, as a share of the bright places, at which the colour of the third part is full."""
+"""Least difference that the third part shows in full colour, as a share of the bright places."""
 
 
 def finding_picture(finding: Found) -> bytes:
-    """PNG of three looks beside each other: the one before, the one after, and their difference, where red is more
-    light and blue is less."""
+    """Return a PNG of three looks beside each other: before, after, and their difference. Red shows more light,
+    blue shows less."""
     before, after = (
         np.maximum(np.nan_to_num(look.astype(float)), 0.0) for look in (finding.before, finding.after)
     )
@@ -37,7 +37,7 @@ def _grey(share: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 
 def _red_and_blue(share: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """White where nothing differs."""
+    """Return colours: white where nothing differs."""
     less = 255.0 * (1.0 - np.clip(np.abs(share), 0.0, 1.0))
     red, blue = np.where(share >= 0.0, 255.0, less), np.where(share <= 0.0, 255.0, less)
     return np.stack([red, less, blue], axis=-1).astype(np.uint8)

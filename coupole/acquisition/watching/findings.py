@@ -1,4 +1,4 @@
-"""Findings of a watched run: their names, and what each says."""
+"""Findings of a watched run, with their names and contents."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Kind = Literal["ambient light", "LED", "drift", "moved", "smudge", "exposure ste
 OF_THE_LIGHT = "of the light"
 """Unit of changes of brightness."""
 FOR_A_PERSON: tuple[Kind, ...] = ("ambient light", "moved", "smudge")
-"""Findings that last until a person mends them."""
+"""Findings that last until a person removes the cause."""
 TAKEN_AGAIN: tuple[Kind, ...] = ("ambient light", "LED", "thing in the field")
-"""Findings whose shots may be good when they are taken again."""
+"""Findings whose shots may be good if they are taken again."""
 
 NOT_WATCHED = "not watched"
-"""Kind of the journal's line that says that watching itself has failed, wholly or in part."""
+"""Kind of the journal's line that says that watching itself has failed, completely or in part."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class SeenFrame:
 
 @dataclass(frozen=True)
 class Found:
-    """Something that changed in a burst and should not."""
+    """Something that changed in a burst but should not have changed."""
 
     kind: Kind
     labels: tuple[ShotLabel, ...]

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from coupole.devices import FrameFormat
 
 _COLUMNS = 128
-"""Bins across a frame, at most: with 32 pixels in a bin of the full camera, 0.2 mm are an eighth of one."""
+"""Greatest number of bins across a frame. With 32 pixels in a bin of the full camera, 0.2 mm are an eighth of a
+bin."""
 _ROWS_READ = 4
-"""Rows that are read of each bin, at most, in pairs spread over it: the memory is the bottleneck."""
+"""Greatest number of rows that are read of each bin, in pairs spread over it. The speed of the memory is the
+limit."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,8 @@ class LookGrid:
 
     frame_format: FrameFormat
     is_sparse: bool = False
-    """One pair of rows of each bin is read: enough for dark frames, in half of the time."""
+    """True if only one pair of rows of each bin is read. This is enough for dark frames, and takes half of the
+    time."""
 
     @property
     def bin_px(self) -> int:
@@ -42,7 +45,7 @@ class LookGrid:
 
     @property
     def _pair_step(self) -> int:
-        """Step in pairs of rows: one of this number of pairs is read."""
+        """Step in pairs of rows: one pair in this number of pairs is read."""
         return max(1, self.bin_px // (2 if self.is_sparse else _ROWS_READ))
 
     @property
@@ -66,7 +69,7 @@ class LookGrid:
 
 
 def compile_now() -> None:
-    """Compile before the first frame is due, for buffers that may be written to and for those that may not."""
+    """Compile before the first frame is due, for writable buffers and for read-only ones."""
     pixels = np.zeros((2, 2), np.uint16)
     grid = LookGrid(FrameFormat(2, 2, 12, "MONO", 0, 4095))
     grid.look(pixels)
@@ -76,7 +79,7 @@ def compile_now() -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _bin_means(pixels, mean_dn, is_clipped, bin_px, pair_step, white_dn, black_dn):  # type: ignore[no-untyped-def]
-    """Whole rows are added up before bins are, so that the loop over pixels is a vector's."""
+    """Add up whole rows before bins, so that the loop over pixels can be vectorised."""
     rows, columns = mean_dn.shape
     width = columns * bin_px
     sums = np.empty(width, np.uint32)

@@ -1,8 +1,8 @@
-"""Each frame against those of the neighbouring LEDs: an LED that is much too dim or bright.
+"""Compares each frame with those of the neighbouring LEDs, to find an LED that is much too dim or bright.
 
-A picture changes steadily with the direction of its light. So the picture under each LED is foretold from those of
-its nearest neighbours, by a weighted linear fit over directions, in units of the light that the LED table gives
-each. How well that does is measured on the view itself: its own scatter sets the limits.
+A picture changes steadily with the direction of its light. So the picture under each LED is predicted from those
+of its nearest neighbours. The prediction is a weighted linear fit over directions, in units of the light that the
+LED table gives each LED. The view itself shows how good the prediction is: its scatter sets the limits.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ _FEWEST = 24
 """Least number of LEDs; with fewer, neighbours are too far away for a prediction."""
 _RIDGE = 1e-2
 _LIT = 0.3
-"""Share of a place's median brightness below which it counts as if it were so bright."""
+"""Share of a place's median brightness. A place that is darker than this counts as if it had this brightness."""
 
 
 def foretelling(directions: Floats) -> Floats | None:
-    """[n, n] weights by which the light from each of n directions [n, 3] is foretold from its neighbours; None for
-    too few."""
+    """Return [n, n] weights that predict the light from each of n directions [n, 3] from its neighbours; None if
+    there are too few."""
     from scipy.spatial import cKDTree
 
     count = len(directions)
@@ -41,10 +41,11 @@ def foretelling(directions: Floats) -> Floats | None:
 
 
 def shares_over_neighbours(tiles_dn: Floats, light: Floats, weights: Floats) -> Floats:
-    """[n] excess of the light in frames over the prediction by their neighbours, as a share of the prediction.
+    """Return [n] the excess of the light in frames over the prediction from their neighbours, as a share of the
+    prediction.
 
-    Frames are the means of their tiles [n, tiles] under `light` [n] of the LED table. Of the tiles the weighted
-    median counts, so that a change of less than half of the picture does not.
+    Frames are the means of their tiles [n, tiles] under `light` [n] of the LED table. The weighted median of the
+    tiles counts, so that a change in less than half of the picture has no effect.
     """
     per_light = tiles_dn / light[:, None]
     foretold = np.maximum(weights @ per_light, 0.0) * light[:, None]
@@ -58,5 +59,5 @@ def shares_over_neighbours(tiles_dn: Floats, light: Floats, weights: Floats) -> 
 
 
 def scatter_of(values: Floats) -> float:
-    """Standard deviation of most values, whatever the others are."""
+    """Return the standard deviation of most values; outliers have no effect."""
     return 1.4826 * float(np.median(np.abs(values)))

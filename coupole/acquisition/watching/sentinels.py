@@ -1,7 +1,8 @@
-"""Sentinels: frames of the same LEDs again and again, each compared with the first one of its LED.
+"""Sentinels: frames of the same LEDs that are taken again and again. Each is compared with the first frame of its
+LED.
 
-Between two frames of one light a picture may change by its gain, by a displacement, and in places. Gain and
-displacement are those of the linear model of Lucas and Kanade (IJCAI 1981), by weighted least squares:
+Between two frames of one light, the picture may change by a gain, by a displacement, and in places. Gain and
+displacement come from the linear model of Lucas and Kanade (IJCAI 1981), by weighted least squares:
 
     after - before = gain mean - dx d(mean)/dx - dy d(mean)/dy
 """
@@ -23,7 +24,7 @@ _TUKEY, _ROUNDS = 4.685, 8
 _DIM = 0.3
 """Share of the picture's mean below which a place is dim."""
 _FEWEST_BINS, _LIT_SIGMAS = 64, 5.0
-"""Bins that must be lit, and what counts as lit."""
+"""Number of bins that must be lit, and the signal in standard deviations from which a bin counts as lit."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +38,10 @@ class Change:
     """[2] displacement of the picture, right and down."""
     shift_sigma_bins: float
     tile_shares: Floats
-    """[tiles, tiles] change of brightness in places beyond gain and displacement: a share of the place's light, or
-    in dim places of a part of the picture's mean."""
+    """[tiles, tiles] change of brightness in places, without gain and displacement. It is a share of the place's
+    light, or in dim places a share of a part of the picture's mean."""
     tile_sigmas: Floats
-    """[tiles, tiles] standard deviation of that by noise."""
+    """[tiles, tiles] standard deviation of that change by noise."""
     by_shift: float
     """Sum of squares, in units of noise, that the displacement explains."""
     by_places: float
@@ -48,7 +49,7 @@ class Change:
 
 
 def change_between(before: FrameLook, after: FrameLook, noise: CameraNoise) -> Change | None:
-    """The change between two frames of one light; None where nearly all is clipped or dark."""
+    """Return the change between two frames of one light; None if nearly all bins are clipped or dark."""
     is_known = ~(before.is_clipped | after.is_clipped)
     mean_dn = 0.5 * (before.mean_dn.astype(float) + after.mean_dn)
     down, right = np.gradient(mean_dn)
@@ -79,7 +80,8 @@ def change_between(before: FrameLook, after: FrameLook, noise: CameraNoise) -> C
 
 
 def _robust_gain(columns: Floats, values: NDArray[np.floating], variance: Floats) -> tuple[float, float]:
-    """Gain, the first of the columns [n, 3], and its standard deviation: what changes in places hardly counts."""
+    """Return the gain, which belongs to the first of the columns [n, 3], and its standard deviation. Changes in
+    places hardly count."""
     weight = 1.0 / variance
     for _ in range(_ROUNDS):
         weighted_columns = columns * weight[:, None]
@@ -93,8 +95,8 @@ def _robust_gain(columns: Floats, values: NDArray[np.floating], variance: Floats
 
 
 def _shift(columns: Floats, values: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """[2] displacement by the gradients [rows, columns, 2], with the covariance [2, 2] that its own fit has: edges
-    are all that tells it, so none is left out."""
+    """Return the displacement [2] by the gradients [rows, columns, 2], and the covariance [2, 2] of this fit. Only
+    edges show a displacement, so none of them is left out."""
     weighted_columns = columns * weight[..., None]
     normal = np.einsum("rci,rcj->ij", weighted_columns, columns)
     normal += np.eye(2) * (1e-9 * np.trace(normal) + 1e-12)
@@ -104,7 +106,8 @@ def _shift(columns: Floats, values: Floats, weight: Floats) -> tuple[Floats, Flo
 
 
 def _explained_by_places(values: Floats, foreseen_dn: Floats, weight: Floats) -> float:
-    """Sum of squares that a change of each tile explains, in proportion to its light or evenly."""
+    """Return the sum of squares that a change of each tile explains. The change is in proportion to the tile's
+    light, or even."""
     tiny = 1e-30
     in_proportion = tile_sums(weight * values * foreseen_dn) ** 2 / (tile_sums(weight * foreseen_dn**2) + tiny)
     evenly = tile_sums(weight * values) ** 2 / (tile_sums(weight) + tiny)

@@ -1,7 +1,7 @@
-"""A run that is watched: a recorder that looks at the frames it passes on, and judges them burst by burst.
+"""A watched run: a recorder that looks at the frames that it passes on, and judges them burst by burst.
 
-Where shots may be taken again, frames are proven when their burst has been judged, not before: nothing that is
-proven is ever overwritten. What is spoilt is then left unproven, and the sequencer takes it again as any other.
+If shots may be taken again, frames are proven only after their burst has been judged, because a proven frame is
+never overwritten. A spoilt frame stays unproven, and the sequencer takes its shot again as any other.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from coupole.storage.frame_file_creation import Collections
 from coupole.storage.journal_events import Event, FindingNoted
 
 _MOST_PICTURES = 200
-"""Pictures of one session, at most: what is found in each burst of a long run looks alike."""
+"""Greatest number of pictures of one session. In a long run the findings of many bursts look alike."""
 
 _FIRST_UNKEPT = 1_000_000
-"""Number of the first mark that is not kept, beyond those of all that are."""
+"""Number of the first mark that is not kept. It is beyond the numbers of all kept marks."""
 
 
 def judge_of(job: Job, grid: LookGrid, view: ViewPose, first: FirstFrames) -> BurstJudge:
-    """The judge of a view's bursts, by the figures of the job's rig."""
+    """Return the judge of a view's bursts, with the figures of the job's rig."""
     rig, leds = job.cell.rig, job.cell.leds
     target_mm = apply(rig.support.base_from_support.matrix(), view.target_mm or (0.0, 0.0, 0.0))
     offsets = leds.positions_mm - target_mm
@@ -56,7 +56,7 @@ def judge_of(job: Job, grid: LookGrid, view: ViewPose, first: FirstFrames) -> Bu
 
 
 def _unkept_mark(burst: Burst, step: int) -> ShotLabel:
-    """A label for a mark that has none, for the burst's judgement alone: no file has it."""
+    """Return a label for a mark that has none. It is used only to judge the burst; no file contains it."""
     return ShotLabel(Dark(_FIRST_UNKEPT + step), burst.exposure_index, burst.repeat)
 
 
@@ -65,7 +65,8 @@ def _is_unkept(label: ShotLabel) -> bool:
 
 
 class WatchedRecorder:
-    """A `coupole.acquisition.recorder.Recorder` before another one, which it watches the frames of."""
+    """A `coupole.acquisition.recorder.Recorder` in front of another one. It watches the frames that it passes
+    on."""
 
     def __init__(self, recorder: Recorder, job: Job, observer: Observer, control: Control) -> None:
         self._recorder, self._job, self._observer, self._control = recorder, job, observer, control
@@ -81,9 +82,9 @@ class WatchedRecorder:
         self._seen: dict[ShotLabel, FrameLook] = {}
         """Looks of the burst's proven frames."""
         self._timeline: list[ShotLabel] = []
-        """Labels of the burst under way, in the order of time; what was taken again stands at its last place."""
+        """Labels of the present burst, in the order of time. A shot that was taken again is at its last place."""
         self._held: dict[ShotId, tuple[int, Mapping[str, int]]] = {}
-        """Frames that are proven as soon as their burst is judged: slot and fields."""
+        """Frames that will be proven as soon as their burst is judged: slot and fields."""
         self._known_leds: set[int] = set()
         """LEDs that a finding has named already."""
         self._pictures = 0
@@ -121,7 +122,7 @@ class WatchedRecorder:
             self._compare_with_earlier(view)
 
     def _compare_with_earlier(self, view: str) -> None:
-        """Have the first sentinels of an earlier session be what those of this one are compared with."""
+        """Compare this session's sentinels with the first sentinels of an earlier session."""
         sentinels = sorted(
             (shot for shot in self._earlier if shot.view == view),
             key=lambda shot: (shot.label.repeat, cast("Sentinel", shot.light).number),
@@ -163,7 +164,8 @@ class WatchedRecorder:
             self._recorder.prove(slot, shot, fields)
 
     def see_mark(self, slot: int, burst: Burst, step: int) -> None:
-        """Keep the look at a dark mark, which shows the light of the room. With a panel marks are not dark."""
+        """Keep the look at a dark mark, which shows the light of the room. In a burst with a panel the marks are
+        not dark."""
         if slot in self._looks and not burst.panel:
             self._seen[_unkept_mark(burst, step)] = self._looks[slot]
 
@@ -188,8 +190,8 @@ class WatchedRecorder:
     # -- watching -----------------------------------------------------------------------------------------
 
     def judge(self, burst: Burst, *, may_retake: bool) -> str:
-        """Judge a burst that was fired, and prove its frames. What was found is noted and said; returns why shots
-        are left unproven, to be taken again, empty if none are."""
+        """Judge a burst that was fired, and prove its frames. Findings are noted and told. Returns why shots are
+        left unproven, to be taken again; the text is empty if there are none."""
         try:
             findings = self._findings_in(burst)
         except Exception as error:  # noqa: BLE001  a defect of what only looks must not end a run
@@ -208,7 +210,7 @@ class WatchedRecorder:
         return "; ".join(finding.words for finding in findings if finding.kind in TAKEN_AGAIN) if spoilt else ""
 
     def _findings_in(self, burst: Burst) -> list[Found]:
-        """Judge a burst; return what was not known before."""
+        """Judge a burst; return the findings that are new."""
         frames = self._frames_of(burst)
         if not frames or self._grid is None:
             return []
@@ -219,7 +221,7 @@ class WatchedRecorder:
         return [finding for finding in findings if self._is_news(finding) and new_labels & set(finding.labels)]
 
     def _go_on_unwatched(self, burst: Burst, error: Exception) -> None:
-        """Watch no more, and say so where findings are said."""
+        """Stop watching, and say so where findings are shown."""
         self._watch = NOTHING
         shots = tuple(ShotId(burst.view, label) for label in burst.labels if label)
         defect = f"{type(error).__name__}: {error}. This is a defect of Coupole: please report it"
@@ -231,7 +233,7 @@ class WatchedRecorder:
         )
 
     def _frames_of(self, burst: Burst) -> list[SeenFrame]:
-        """Frames of the burst, and of the attempts before, in the order of time."""
+        """Return frames of the burst, and of earlier attempts, in the order of time."""
         labels = [label or _unkept_mark(burst, step) for step, label in enumerate(burst.labels)]
         if not {label for label in burst.labels if label} <= set(self._timeline):
             self._timeline = []
@@ -241,8 +243,8 @@ class WatchedRecorder:
         return [SeenFrame(label, self._seen[label]) for label in self._timeline if label in self._seen]
 
     def _with_shots(self, burst: Burst, finding: Found) -> Found:
-        """The same without marks that are not kept, and with the shots of the burst, if only its dark frames were
-        looked at."""
+        """Return the same finding without marks that are not kept. If only dark frames were judged, add the shots
+        of the burst."""
         kept = (label for label in finding.labels if not _is_unkept(label))
         finding = replace(finding, labels=tuple(kept))
         if self._watch.frames == "all":
@@ -251,7 +253,8 @@ class WatchedRecorder:
         return replace(finding, labels=tuple(dict.fromkeys([*finding.labels, *shots])))
 
     def _is_news(self, finding: Found) -> bool:
-        """An LED that is known to be wrong is not named in each view again."""
+        """True unless the finding is an LED that is already known to be wrong: it is not named again in each
+        view."""
         if finding.kind != "LED":
             return True
         leds = {label.light.id for label in finding.labels if isinstance(label.light, Led)}
@@ -287,13 +290,13 @@ class WatchedRecorder:
             return ""
 
     def _tell(self, finding: FindingNoted) -> None:
-        """Say a finding, and note it for the journal."""
+        """Show a finding, and note it for the journal."""
         picture = f" ({finding.picture})" if finding.picture else ""
         self._observer.note(f"{finding.view}: {finding.kind}: {finding.message}{picture}")
         self._recorder.note(finding)
 
     def _prove_held(self, spoilt: set[ShotLabel]) -> None:
-        """Prove the frames that waited, but free those that are spoilt."""
+        """Prove the frames that waited, and free the spoilt ones."""
         held_frames, self._held = self._held, {}
         for shot, (slot, fields) in held_frames.items():
             if shot.label in spoilt:

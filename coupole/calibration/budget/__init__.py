@@ -1,4 +1,4 @@
-"""Uncertainty budget of a reflectance (JCGM 100 and 101).
+"""The uncertainty budget of a reflectance (JCGM 100 and 101).
 
 ::
 

@@ -1,4 +1,4 @@
-"""The accuracies of seed 003 beside those by calibration records, for one cell or several.
+"""The accuracies of seed 003 beside those from calibration records, for one cell or several.
 
 Our figures are computed from records: standard uncertainties, all directions together. The paper does not state
 the coverage of its own.
@@ -32,7 +32,7 @@ class Case:
 
     @property
     def robot(self) -> str:
-        """The largest noise of the robot by its records, as text."""
+        """The largest noise of the robot in its records, as text."""
         noises = [{line.name: line.found for line in item.record.noise} for item in self.records]
         noises = [noise for noise in noises if {"robot position", "robot orientation"} <= set(noise)]
         if not noises:
@@ -54,7 +54,7 @@ class Accuracy:
     """Our figure for each case: one number, or the two ends of an interval; None without a record."""
 
     def cell(self, case: int) -> str:
-        """Our figure as text."""
+        """Return our figure as text."""
         figure = self.our_figures[case]
         if figure is None:
             return "no record"
@@ -64,7 +64,7 @@ class Accuracy:
 
 
 def accuracies(cases: Sequence[Case]) -> tuple[Accuracy, ...]:
-    """The table. `read_records` has checked that the records' files exist."""
+    """Return the table. `read_records` has checked that the records' files exist."""
     lines = [
         Accuracy(label, unit, paper, tuple(_by_record(case, kind, figure) for case in cases))
         for label, unit, paper, kind, figure in _LINES
@@ -98,7 +98,7 @@ def _camera_in_base(item: InForce) -> float:
 
 
 def _led_centres_mm(item: InForce) -> Floats:
-    """[found LEDs] standard uncertainty of centres."""
+    """Return [found LEDs] the standard uncertainty of their centres."""
     covariance, found_leds = _leds(item, "centre_covariance")
     return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2))[found_leds])
 

@@ -1,10 +1,10 @@
 """The uncertainty budget of one reflectance: all inputs with their sources, propagated by two methods, and ranked.
 
-The result is by Monte Carlo (JCGM 101): in a mesh of 200 um edges with vertices known to 30 um the normal is
-uncertain by degrees, and 1 / cos is then far from linear. GUM's linear formula is the cross-check, and section 8
-of JCGM 101 tests whether it is sufficient. The importance of a source is given in three ways: its share of the
-linear variance, the width of the interval without the source (the paper's way), and the width of the interval from
-the source alone.
+The result comes from Monte Carlo (JCGM 101). The reason is that in a mesh of 200 um edges with vertices known to
+30 um, the normal is uncertain by degrees, and 1 / cos is then far from linear. GUM's linear formula is the
+cross-check. A test of section 8 of JCGM 101 shows whether it is sufficient. The importance of a source is given in
+three ways: its share of the linear variance, the width of the interval without the source (the paper's way), and
+the width of the interval from the source alone.
 """
 
 from __future__ import annotations
@@ -56,31 +56,31 @@ STATED = {
     "LED power, common": "assumed",
     "drift": "assumed",
 }
-"""All sources of uncertainty, and where each one's size comes from without a record."""
+"""All sources of uncertainty, each with the origin of its size if there is no record."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """Standard uncertainties of all inputs, and the source of each. Defaults are seed 003's figures, or ours where
-    it has none."""
+    """Standard uncertainties of all inputs, and the source of each. The defaults are seed 003's figures, or ours
+    if it has none."""
 
     vertex_mm: float = 0.030
-    """Bound of the error of each coordinate of each vertex: a manufacturer's accuracy is a bound, so its
-    distribution is rectangular (GUM 4.3.7). Taken as a standard uncertainty it would make normals uncertain by 12
+    """Bound of the error of each coordinate of each vertex. A manufacturer's accuracy is a bound, so its
+    distribution is rectangular (GUM 4.3.7). If it were a standard uncertainty, normals would be uncertain by 12
     degrees."""
     edge_mm: float = 0.2
     led_mm: float = 0.7
     """Uncertainty of an LED's centre, all directions together."""
     led_deg: float = 0.21
     mesh_mm: float = 0.1
-    """Uncertainty of the mesh's position against the robot, all directions together."""
+    """Uncertainty of the mesh's position relative to the robot, all directions together."""
     mesh_deg: float = 0.02
     robot_mm: float = 0.03
-    """Uncertainty of the robot's common error, which shifts LEDs and mesh alike and so correlates them."""
+    """Uncertainty of the robot's common error. It shifts LEDs and mesh equally, so it correlates them."""
     camera_mm: float = 0.3
-    """Uncertainty of the camera's ray where it meets the object, both directions across it together."""
+    """Uncertainty of the camera's ray where it meets the object: across the ray, both directions together."""
     lens_px: float = 0.3
-    """Uncertainty of the image of a direction by the lens's calibration, both coordinates together."""
+    """Uncertainty of the image of a direction from the lens's calibration, both coordinates together."""
     pixel_mm: float = 0.047
     """Side of a pixel on the object."""
     contrast_per_mm: float = 0.02
@@ -88,8 +88,9 @@ class Known:
     flat_field: float = 0.003
     response: float = 0.002
     glare: float = 0.005
-    """Uncertainty of the veil over the sample, in shares of a white target's signal: of what is left with a
-    record, else of all that a good lens makes of a scene half as bright as white."""
+    """Uncertainty of the veil over the sample, as a share of a white target's signal. With a record it is the
+    uncertainty of the remaining veil. Without a record it is that of all veil that a good lens makes of a scene
+    half as bright as white."""
     power_own: float = 0.003
     power_common: float = 0.01
     drift: float = 0.002
@@ -99,13 +100,13 @@ class Known:
     pixels: int = 5
     """Pixels of one channel that a triangle covers; their mean is used."""
     sources: tuple[tuple[str, str], ...] = ()
-    """Source of uncertainty and the record that its figure comes from."""
+    """Each source of uncertainty, and the record of its figure."""
 
     def source(self, group: str) -> str:
         return dict(self.sources).get(group, STATED[group])
 
     def figure(self, group: str) -> str:
-        """The figures used for a source, as text."""
+        """Return the figures that are used for a source, as text."""
         return {
             "vertices": f"{self.vertex_mm:.3g} mm, edges {self.edge_mm:.3g}",
             "pixel value": f"{self.read_noise_dn:.2g} DN, {self.pixels} pixels",
@@ -133,7 +134,7 @@ class Geometry:
     """Angle between the LED's normal and the direction to the sample."""
     distance_mm: float = 1000.0
     exposure_share: float = 0.6
-    """Share of full scale at which a white target facing the LED would be exposed."""
+    """Share of full scale that a white target facing the LED would reach."""
     reflectance: float = 0.5
     """Albedo of the sample."""
 
@@ -144,14 +145,14 @@ class Share:
 
     source: str
     figure: str
-    """Figures used for it, as text."""
+    """Figures that are used for it, as text."""
     said_by: str
     linear: float
     """Share of the linear variance."""
     width_decrease: float
-    """Relative decrease of the width of the 68 % interval without it."""
+    """Relative decrease of the width of the 68 % interval if the source is left out."""
     alone: float
-    """Half the width of its own 68 % interval, relative to the value."""
+    """Half the width of the 68 % interval of this source alone, relative to the value."""
 
 
 @dataclass(frozen=True)
@@ -165,11 +166,11 @@ class Budget:
     numeric: Propagated
     linear: Linear
     validations: tuple[Validation, ...]
-    """Tests of the linear formula for one and two significant digits of u, at each coverage."""
+    """Tests of the linear formula for one and two significant digits of u, for each coverage."""
     shares: tuple[Share, ...]
 
     def relative(self, coverage: float, kind: str = "symmetric") -> tuple[float, float]:
-        """Ends of an interval relative to the value: (-0.11, +0.14)."""
+        """Return the ends of an interval relative to the value, such as (-0.11, +0.14)."""
         interval = self.numeric.interval(coverage, kind)
         return interval.low / self.nominal - 1.0, interval.high / self.nominal - 1.0
 
@@ -177,7 +178,8 @@ class Budget:
 def sample_inputs(
     uncertainties: Known, geometry: Geometry, *, emission: Emission = "lambertian"
 ) -> tuple[Inputs, Floats]:
-    """The quantities of one sample and the LED's normal [3]. Raises InputError for a light below the horizon."""
+    """Return the quantities of one sample and the LED's normal [3]. Raises InputError for a light below the
+    horizon."""
     if not 0.0 <= geometry.incidence_deg < 88.0:
         raise InputError(f"budget: expected an incidence from 0 to 88 deg, found {geometry.incidence_deg:g}")
     a, b = np.radians(geometry.incidence_deg), np.radians(geometry.emission_deg)
@@ -244,7 +246,7 @@ def budget_of(
     most_trials: int = 500_000,
     seed: int = 1,
 ) -> Budget:
-    """Propagate one sample's uncertainty: with all sources, without each of them, and with each alone."""
+    """Propagate one sample's uncertainty with all sources, without each source, and with each source alone."""
     inputs, led_normal = sample_inputs(uncertainties, geometry, emission=emission)
     model = partial(_model, led_normal=led_normal, emission=emission)
     numeric = monte_carlo(model, inputs, coverages=coverages, digits=digits, most_trials=most_trials, seed=seed)
@@ -263,8 +265,8 @@ def budget_of(
 def shares_of(
     model: Model, inputs: Inputs, linearly: Linear, uncertainties: Known, *, seed: int = 1, trials: int = 20_000
 ) -> tuple[Share, ...]:
-    """Contribution of each group of inputs, the largest first. All propagations use the same random numbers, so
-    that their differences have little noise."""
+    """Return the contribution of each group of inputs, the largest first. All propagations use the same random
+    numbers, so that their differences have little noise."""
     groups = list(dict.fromkeys(q.source_group for q in inputs.quantities if q.u > 0.0))
 
     def half_width(fixed_groups: frozenset[str]) -> float:
@@ -300,9 +302,9 @@ class Spread:
     half: tuple[float, float]
     """Median of each end over all samples."""
     most: tuple[float, float]
-    """95 % of all."""
+    """Ends that 95 % of the samples do not exceed."""
     ends: Floats
-    """[samples, 2] low and high, relative."""
+    """[samples, 2] low and high ends, relative to the value."""
 
 
 def spread_over(
@@ -313,7 +315,7 @@ def spread_over(
     trials: int = 10_000,
     seed: int = 1,
 ) -> Spread:
-    """Relative intervals of many samples (seed 003, section 6.1)."""
+    """Return relative intervals of many samples (seed 003, section 6.1)."""
     relative = []
     for number, geometry in enumerate(geometries):
         inputs, led_normal = sample_inputs(uncertainties, geometry)

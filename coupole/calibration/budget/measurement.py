@@ -1,14 +1,14 @@
 """The measurement equation: from a pixel's value to a reflectance (seed 003, Eq. 3).
 
-With camera and LEDs calibrated in the same digital numbers (`calibration.light.led_power`), the constants of
-Eq. 1, pi among them, stand in numerator and denominator alike, and
+Camera and LEDs are calibrated in the same digital numbers (`calibration.light.led_power`). So the constants of Eq.
+1, with pi, are both in the numerator and in the denominator, and
 
     f = V / (t g Phi_k e(x, n, l_k, n_k)),        e = E / Phi of `coupole.calibration.light.irradiance`, in m^-2,
 
-with V the linearised signal above dark (DN), t the exposure (s), g the flat field, Phi_k the LED's power (DN s^-1
-m^2 sr). The emission profile enters through e: `lambertian`, or `paper`, which has the emitter's cosine twice. A
-pixel that is projected onto the wrong place of the mesh brings its neighbour's value, so a change of albedo along
-the surface enters f as well.
+Here V is the linearised signal above dark (DN), t the exposure (s), g the flat field, and Phi_k the LED's power
+(DN s^-1 m^2 sr). The emission profile enters through e: `lambertian`, or `paper`, which has the emitter's cosine
+twice. If a pixel is projected onto the wrong place of the mesh, it brings its neighbour's value. So a change of
+albedo along the surface enters f as well.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ def reflectance(
     emission: Emission = "lambertian",
     side_mm: float = LED_SIDE_MM,
 ) -> Floats:
-    """f in 1/sr; points and directions are [..., 3], all broadcast. Infinite for an LED below the horizon."""
+    """Return f in 1/sr. Points and directions are [..., 3], and all arguments are broadcast. f is infinite for an
+    LED below the horizon."""
     lit = irradiance_per_flux(point_mm, normal, led_mm, led_normal, side_mm=side_mm, emission=emission)
     signal, t, g, phi = (np.asarray(value, float) for value in (signal_dn, exposure_s, flat, power))
     with np.errstate(divide="ignore"):
@@ -51,13 +52,13 @@ def reflectance(
 
 
 def reflectance_of(q: Mapping[str, Floats], led_normal: Floats, *, emission: Emission = "lambertian") -> Floats:
-    """The measurement equation for a sample on a triangle; `q` has the quantities [trials] by name.
+    """Evaluate the measurement equation for a sample on a triangle. `q` has the quantities [trials] by name.
 
     Point and normal are computed from the triangle's `VERTICES` in the base frame, moved by `MESH_STEP` (a small
-    step of base_from_mesh about the triangle's middle); the LED's normal [3] is turned by `LED_TURN` about two
-    axes across it. `response`, `flat_field`, `power.own`, `power.common` and `drift` are factors about 1,
-    `veil_dn` is what is left of glare over the pixel. The mesh's step along x and `SEEN_OFF` are the error of the
-    place at which the surface is seen; its albedo changes there by `contrast_per_mm`.
+    step of base_from_mesh about the triangle's middle). The LED's normal [3] is turned by `LED_TURN` about two
+    axes across it. `response`, `flat_field`, `power.own`, `power.common` and `drift` are factors about 1.
+    `veil_dn` is the remaining glare over the pixel. The mesh's step along x and `SEEN_OFF` are the error of the
+    seen place on the surface. The albedo changes there by `contrast_per_mm`.
     """
     corners = np.stack([q[name] for name in VERTICES], axis=-1)
     corners = corners.reshape(*corners.shape[:-1], 3, 3)
@@ -86,7 +87,7 @@ def reflectance_of(q: Mapping[str, Floats], led_normal: Floats, *, emission: Emi
 
 
 def _turned_vectors(vectors: Floats, turns_rad: Floats) -> Floats:
-    """Vectors [..., 3] turned by small rotation vectors [..., 3], to second order, at unit length."""
+    """Return vectors [..., 3] turned by small rotation vectors [..., 3], to second order, with unit length."""
     once = np.cross(turns_rad, vectors)
     turned_vectors = vectors + once + 0.5 * np.cross(turns_rad, once)
     result: Floats = turned_vectors / np.linalg.norm(turned_vectors, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The uncertainty budget as a page: result, dominant sources, accuracies beside the paper's, all inputs."""
+"""The uncertainty budget as a page: result, dominant sources, accuracies beside those of the paper, all inputs."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def page(
     doubts: Sequence[str] = (),
     traces: Sequence[str] = (),
 ) -> str:
-    """The whole page as HTML; `picture` is the PNG, `doubts` are reasons not to rely on the records, `traces`
-    their certificates."""
+    """Return the whole page as HTML. `picture` is the PNG, `doubts` are reasons not to rely on the records, and
+    `traces` are the certificates of the records."""
     names = ", ".join(dict.fromkeys(case.name for case in cases))
     return render(
         Page(
@@ -73,7 +73,7 @@ def _next_step(budget: Budget, doubts: Sequence[str]) -> Inline:
 
 
 def verdict(validation: Validation) -> str:
-    """Say in words whether the linear formula is sufficient."""
+    """Return in words whether the linear formula is sufficient."""
     if not validation.sure:
         return "may or may not be good enough: more trials would show this"
     return "will do" if validation.is_within_tolerance else "will not do"

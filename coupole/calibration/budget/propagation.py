@@ -1,8 +1,8 @@
-"""Propagation of distributions: GUM's linear formula and Monte Carlo, and a test of the linear formula.
+"""Propagation of distributions by GUM's linear formula and by Monte Carlo, and a test of the linear formula.
 
-JCGM 100:2008 (GUM) section 5 for the linear formula; JCGM 101:2008 (Supplement 1) for Monte Carlo: adaptive number
-of trials (7.9), coverage intervals (7.7), test of the linear formula (8). A model is a function of arrays: it
-takes one array [trials] for each quantity and returns one, so a million trials are one call.
+The linear formula is that of JCGM 100:2008 (GUM), section 5. Monte Carlo follows JCGM 101:2008 (Supplement 1):
+adaptive number of trials (7.9), coverage intervals (7.7), test of the linear formula (8). A model is a function of
+arrays. It takes one array [trials] for each quantity and returns one array, so a million trials are one call.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Shape = Literal["normal", "student", "rectangular", "triangular", "arcsine"]
 Model = Callable[[Mapping[str, Floats]], Floats]
 _LEAST_BATCH = 10_000
 _ADVISED = 0.2
-"""Share of the tolerance that is advised as numerical accuracy of Monte Carlo's ends, for a validation (JCGM 101,
+"""Advised numerical accuracy of Monte Carlo's ends for a validation, as a share of the tolerance (JCGM 101,
 8.2)."""
 _STEP = 1e-3
 """Step of central differences, as a share of a standard uncertainty."""
@@ -39,7 +39,7 @@ class Quantity:
     """Standard uncertainty, in the name's unit."""
     shape: Shape = "normal"
     source: str = ""
-    """The record or document that value and u come from."""
+    """The record or document that gives value and u."""
     group: str = ""
     """Inputs of one group count as one source of uncertainty; if empty, the input is a group by itself."""
     degrees_of_freedom: float = np.inf
@@ -59,8 +59,8 @@ class Inputs:
     """Coefficients of pairs of normal quantities; all others are independent."""
 
     def matrix(self) -> Floats:
-        """Correlation matrix [n, n]. Raises InputError for a pair that does not exist or is not normal, and if the
-        matrix is not positive semidefinite."""
+        """Correlation matrix [n, n]. Raises InputError if a pair does not exist or is not normal, or if the matrix
+        is not positive semidefinite."""
         names = [q.name for q in self.quantities]
         matrix = np.eye(len(names))
         for first, second, coefficient in self.correlations:
@@ -83,7 +83,7 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Interval:
-    """A coverage interval, as ends."""
+    """A coverage interval, given by its ends."""
 
     coverage: float
     low: float
@@ -91,7 +91,8 @@ class Interval:
     kind: Literal["symmetric", "shortest", "normal"]
     """Probabilistically symmetric, shortest, or from the linear formula."""
     numerical: float = 0.0
-    """Twice the standard deviation of the worse end, from the scatter of the batches; 0 for the linear formula."""
+    """Numerical accuracy: twice the standard deviation of the worse end, from the scatter of the batches; 0 for
+    the linear formula."""
 
 
 @dataclass(frozen=True)
@@ -102,11 +103,11 @@ class Propagated:
     u: float
     intervals: tuple[Interval, ...]
     trials: int
-    """0 for the linear formula."""
+    """Number of trials; 0 for the linear formula."""
     samples: Floats
     """[trials] sorted; empty for the linear formula."""
     stable: bool = True
-    """False if the number of trials was too small for the digits asked for."""
+    """False if the number of trials was too small for the requested digits."""
 
     def interval(self, coverage: float, kind: str) -> Interval:
         return next(i for i in self.intervals if i.coverage == coverage and i.kind == kind)
@@ -120,15 +121,16 @@ class Linear:
     sensitivities: Floats
     """[inputs] derivative of the output by each input."""
     shares: Floats
-    """[inputs] of the variance; the term of a correlated pair is divided equally between both. They sum to 1."""
+    """[inputs] shares of the variance, which sum to 1. The term of a correlated pair is divided equally between
+    both."""
     degrees_of_freedom: float
-    """Effective (Welch-Satterthwaite, GUM G.4); independent inputs only."""
+    """Effective degrees of freedom (Welch-Satterthwaite, GUM G.4), for independent inputs only."""
 
 
 @dataclass(frozen=True)
 class Validation:
-    """Result of the test whether the linear formula is sufficient (JCGM 101, section 8), for u with a number of
-    significant digits."""
+    """Result of the test of the linear formula (JCGM 101, section 8), for u with a number of significant
+    digits."""
 
     coverage: float
     digits: int
@@ -136,7 +138,7 @@ class Validation:
     d_high: float
     """Distance of the linear interval's ends from Monte Carlo's."""
     tolerance: float
-    """Numerical tolerance of u with that number of digits (7.9.2)."""
+    """Numerical tolerance of u with this number of digits (7.9.2)."""
     numerical: float
     """Numerical accuracy of Monte Carlo's ends; 8.2 advises a fifth of the tolerance."""
 
@@ -152,7 +154,7 @@ class Validation:
 
 
 def linear(model: Model, inputs: Inputs, coverages: Sequence[float] = COVERAGES) -> Linear:
-    """GUM 5.2: u^2 = sum_ij c_i c_j u_i u_j r_ij, with derivatives by central differences."""
+    """Apply GUM 5.2: u^2 = sum_ij c_i c_j u_i u_j r_ij, with derivatives by central differences."""
     values = inputs.values()
     estimate = float(model({name: np.array([value]) for name, value in values.items()})[0])
     u = np.array([q.u for q in inputs.quantities])
@@ -191,10 +193,10 @@ def monte_carlo(
     most_trials: int = 4_000_000,
     seed: int = 1,
 ) -> Propagated:
-    """JCGM 101, 7.9.4: batches of trials until mean, u and the ends of the intervals are stable.
+    """Run batches of trials until mean, u and the ends of the intervals are stable (JCGM 101, 7.9.4).
 
     A figure is stable if two standard deviations of its mean over the batches are at most `within` times the
-    numerical tolerance of u for the number of significant `digits`; a validation asks for 0.2 (8.2). Raises
+    numerical tolerance of u for the number of significant `digits`. A validation needs 0.2 (8.2). Raises
     InputError if the model returns NaN.
     """
     batch = max(_LEAST_BATCH, int(np.ceil(100.0 / (1.0 - max(coverages)))))
@@ -225,22 +227,22 @@ def monte_carlo(
 
 
 def _pooled_uncertainty(means: Floats, batch_uncertainties: Floats) -> float:
-    """u of all trials so far (7.9.4, step j), from means and u of batches of equal size."""
+    """Return u of all trials so far (7.9.4, step j), from means and u of batches of equal size."""
     return float(np.sqrt(np.mean(batch_uncertainties**2) + np.var(means)))
 
 
 def trials_of(
     model: Model, inputs: Inputs, trials: int, seed: int = 1, fixed_groups: frozenset[str] = frozenset()
 ) -> Floats:
-    """[trials] sorted values of the output. Inputs of the groups `fixed_groups` keep their values; the others get
-    the same random numbers as if none were fixed. Up to 1 % of the values may be infinite, which leaves the ends
-    of intervals as they are. Raises InputError if there are more, or a NaN."""
+    """Return [trials] sorted values of the output. Inputs of the groups `fixed_groups` keep their values. The
+    others get the same random numbers as if no input were fixed. Up to 1 % of the values may be infinite; this
+    does not change the ends of intervals. Raises InputError if more are infinite, or if one is NaN."""
     random = np.random.default_rng(seed)
     return _sorted_values(model(draw(inputs, _root(inputs.matrix()), trials, random, fixed_groups)), infinite=0.01)
 
 
 def validate(linear_result: Propagated, numeric: Propagated, *, digits: int = 1) -> tuple[Validation, ...]:
-    """JCGM 101, 8.1: do the ends of the linear intervals agree with Monte Carlo's within the tolerance of u?"""
+    """Compare the ends of the linear intervals with Monte Carlo's, within the tolerance of u (JCGM 101, 8.1)."""
     validations = []
     for interval in linear_result.intervals:
         numeric_interval = numeric.interval(interval.coverage, "symmetric")
@@ -258,7 +260,7 @@ def validate(linear_result: Propagated, numeric: Propagated, *, digits: int = 1)
 
 
 def tolerance(u: float, digits: int) -> float:
-    """Numerical tolerance of u: half a unit of its last significant digit (JCGM 101, 7.9.2)."""
+    """Return the numerical tolerance of u: half a unit of its last significant digit (JCGM 101, 7.9.2)."""
     if u <= 0.0:
         return 0.0
     power = np.floor(np.log10(u)) - (digits - 1)
@@ -274,8 +276,8 @@ def draw(
     random: np.random.Generator,
     fixed_groups: frozenset[str] = frozenset(),
 ) -> dict[str, Floats]:
-    """Samples [trials] of each quantity (JCGM 101, section 6.4). `half` [n, n] is a root of the correlations. The
-    half widths of bounded distributions are those of JCGM 101, table 1."""
+    """Draw samples [trials] of each quantity (JCGM 101, section 6.4). `half` [n, n] is a root of the correlation
+    matrix. The half widths of bounded distributions are those of JCGM 101, table 1."""
     normal = random.standard_normal((trials, len(inputs.quantities))) @ half.T
     samples = {}
     for i, q in enumerate(inputs.quantities):
@@ -294,7 +296,8 @@ def draw(
 
 
 def _sorted_values(values: Floats, *, infinite: float = 0.0) -> Floats:
-    """Sorted values. Raises InputError if more than the share `infinite` of them is infinite, or one is NaN."""
+    """Return the sorted values. Raises InputError if more than the share `infinite` of them is infinite, or if one
+    is NaN."""
     if np.isnan(values).any() or float(np.mean(np.isinf(values))) > infinite:
         raise InputError(
             f"budget: {np.mean(~np.isfinite(values)):.2%} of the trials give no finite value: an input's "
@@ -311,7 +314,7 @@ def _root(correlation: Floats) -> Floats:
 
 
 def ends(sorted_samples: Floats, coverage: float) -> tuple[float, float]:
-    """Ends of the probabilistically symmetric interval of sorted samples (JCGM 101, 7.7.2)."""
+    """Return the ends of the probabilistically symmetric interval of sorted samples (JCGM 101, 7.7.2)."""
     count = len(sorted_samples)
     inside = round(coverage * count)
     first = (count - inside) // 2
@@ -319,7 +322,7 @@ def ends(sorted_samples: Floats, coverage: float) -> tuple[float, float]:
 
 
 def _shortest(sorted_samples: Floats, coverage: float) -> tuple[float, float]:
-    """JCGM 101, 7.7.4."""
+    """Return the ends of the shortest interval (JCGM 101, 7.7.4)."""
     inside = round(coverage * len(sorted_samples))
     widths = sorted_samples[inside:] - sorted_samples[:-inside]
     first = int(np.argmin(widths))

@@ -19,14 +19,15 @@ from coupole.calibration.traceability import overdue_of, trace_of
 from coupole.errors import InputError
 
 WORKING_MM = 334.0
-"""Distance from camera to object, for a record that has no focus distance (by seed 003's field and pixels)."""
+"""Distance from camera to object for a record that has no focus distance. It follows from seed 003's field and
+pixels."""
 _FIELD = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)])
 _SEEN_FROM_HAND_EYE = "flange_from_camera"
 
 
 @dataclass(frozen=True)
 class Said:
-    """Contribution of one record: figures of `Known` by name, and the sources of uncertainty that they
+    """Contribution of one record: figures of `Known` by name, and the sources of uncertainty that the figures
     describe."""
 
     figures: dict[str, float]
@@ -34,9 +35,9 @@ class Said:
 
 
 def read_records(paths: Sequence[Path]) -> tuple[InForce, ...]:
-    """The records at `paths`. From a folder, the records of the kinds that a budget uses are taken. Raises
-    InputError: no such file, no such record in a folder, a record of a kind that a budget does not use, two of one
-    kind.
+    """Return the records at `paths`. From a folder, the records of the kinds that a budget uses are taken. Raises
+    InputError for a missing file, a folder without such a record, a record of a kind that a budget does not use,
+    and two records of one kind.
     """
     records: list[InForce] = []
     for path in paths:
@@ -64,7 +65,8 @@ def of_use(items: Sequence[InForce]) -> tuple[InForce, ...]:
 
 
 def doubts(items: Sequence[InForce], now: datetime) -> tuple[str, ...]:
-    """Reasons not to rely on records: limits that were exceeded, an expired validity, a certificate too old."""
+    """Return reasons not to rely on records: limits that were exceeded, an expired validity, a certificate that is
+    too old."""
     missed_limits = [
         f"{item.path}: not accepted: {limit.what} is {limit.found:.3g} {limit.unit}, at most {limit.limit:.3g}"
         for item in items
@@ -81,12 +83,12 @@ def doubts(items: Sequence[InForce], now: datetime) -> tuple[str, ...]:
 
 
 def traces(items: Sequence[InForce]) -> tuple[str, ...]:
-    """The certificates that each record rests on, one line each."""
+    """Return the certificates that each record rests on, one line each."""
     return tuple(f"{_display_name(item.record)}: {line}" for item in items for line in trace_of(item.record))
 
 
 def known_from(items: Sequence[InForce], start: Known) -> Known:
-    """`start` with the figures of records in place of its own."""
+    """Return `start` with the figures of the records in place of its own."""
     changes: dict[str, Any] = {}
     sources: list[tuple[str, str]] = []
     kinds = {item.record.kind for item in items}
@@ -162,7 +164,7 @@ def _of_leds(record: Record, path: Path) -> Said:
 
 
 def _of_mesh(record: Record, path: Path) -> Said:
-    """The uncertainty of the worst sticker is used for all points of the object."""
+    """Use the uncertainty of the worst sticker for all points of the object."""
     turn = step_names("base_from_mesh")[3:]
     u = {parameter.name: parameter.u for parameter in record.parameters}
     figures = {
@@ -180,7 +182,7 @@ def _of_camera(record: Record, path: Path) -> Said:
 
 
 def _of_hand_eye(record: Record, path: Path) -> Said:
-    """Lens and hand-eye together, whose errors partly cancel, and the robot's noise at one pose."""
+    """Use lens and hand-eye together, because their errors partly cancel, and the robot's noise at one pose."""
     lens, _ = intrinsics_of(record)
     distance_mm = record.validity.focus_distance_mm or WORKING_MM
     noise = {line.name: line.found for line in record.noise}
@@ -232,13 +234,13 @@ def camera_reach_mm(record: Record) -> float:
 
 
 def ray_mm(record: Record, distance_mm: float) -> float:
-    """Standard uncertainty of the point where a ray meets an object at this distance: across the ray, both
-    directions together, root mean square over the field, by lens and hand-eye with their common covariance. The
-    zeros of the arm's axes are left out, as a record has no posture: with them the uncertainty falls by up to half
-    (the zero of the last axis is correlated with a rotation of the camera).
+    """Return the standard uncertainty of the point where a ray meets an object at this distance. It is across the
+    ray, both directions together, as root mean square over the field. It follows from the common covariance of
+    lens and hand-eye. The zeros of the arm's axes are left out, because a record has no posture. With them the
+    uncertainty falls by up to half (the zero of the last axis is correlated with a rotation of the camera).
 
-    A step of flange_from_camera by t (flange's axes) and r (camera's axes) moves a point p of the camera's frame
-    by -(R^T t + r x p).
+    A step of flange_from_camera by t (flange's axes) and r (camera's axes) moves a point p of the camera frame by
+    -(R^T t + r x p).
     """
     lens, free = intrinsics_of(record)
     names = [parameter.name for parameter in record.parameters]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def as_json(
     budget: Budget, sample_spread: Spread, cases: Sequence[Case] = (), table: Sequence[Accuracy] = ()
 ) -> dict[str, Any]:
-    """The figures, for programs."""
+    """Return the figures for programs."""
     return {
         "incidence_deg": budget.geometry.incidence_deg,
         "nominal_per_sr": budget.nominal,
@@ -88,7 +88,7 @@ def _validation(validation: Validation) -> dict[str, Any]:
 
 
 def draw_budget(budget: Budget, sample_spread: Spread) -> bytes:
-    """PNG, 1600 x 1200: the distribution, the dominant sources, and the uncertainty over the incidence."""
+    """Draw a PNG, 1600 x 1200: the distribution, the dominant sources, and the uncertainty over the incidence."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""A certificate of a whole cell, with what ISO/IEC 17025:2017 lists in 7.8.2 and 7.8.4.
+"""A certificate of a whole cell, with the contents that ISO/IEC 17025:2017 lists in 7.8.2 and 7.8.4.
 
 ::
 

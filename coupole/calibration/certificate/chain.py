@@ -1,4 +1,5 @@
-"""The chain from a cell's records to certificates: which record was made from which, and where it is broken."""
+"""The chain from a cell's records to certificates: which record was made from which others, and where the chain is
+broken."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from coupole.calibration.traceability import is_traceable, trace_of
 from coupole.storage.durable import sha256
 
 NEEDS: dict[Kind, tuple[Kind, ...]] = {"leds": ("hand-eye",), "mesh": ("hand-eye",), "drift": ("led-power",)}
-"""Kinds of records that hold only with one of another kind."""
+"""Kinds of records that hold only together with a record of another kind."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class ChainLink:
 
 
 def chain_of(paths: Sequence[Path]) -> tuple[ChainLink, ...]:
-    """Records, with those that they were made from and that lie beside them. Raises InputError."""
+    """Return the records, and the records beside them that they were made from. Raises InputError."""
     records_by_digest: dict[str, InForce] = {}
     waiting = [*read_in_force(records_named(list(paths)))]
     beside: dict[str, InForce] = {}
@@ -59,7 +60,7 @@ def _link(digest: str, item: InForce, records_by_digest: dict[str, InForce]) -> 
 
 
 def _gaps(item: InForce, records_by_digest: dict[str, InForce]) -> list[str]:
-    """Gaps in a record's chain, its own and that of all records that it was made from."""
+    """Return gaps in a record's chain: its own gaps, and those of all records that it was made from."""
     record = item.record
     name = f"{record.kind} {record.name}"
     made_from = [records_by_digest[line.sha256] for line in record.inputs if line.sha256 in records_by_digest]

@@ -40,13 +40,14 @@ _METHODS = {
 
 @dataclass(frozen=True)
 class CellCertificate:
-    """All that a certificate states."""
+    """The whole content of a certificate."""
 
     description: Description
     chain: tuple[ChainLink, ...]
     issue_time: datetime
     doubts: tuple[str, ...]
-    """Reasons not to issue it: records not accepted, expired by date or by drift, broken chains."""
+    """Reasons not to issue it: records that were not accepted, that expired by date or by drift, or whose chains
+    are broken."""
 
     @property
     def records(self) -> tuple[Record, ...]:
@@ -58,7 +59,7 @@ class CellCertificate:
 
 
 def document_of(certificate: CellCertificate) -> dict[str, Any]:
-    """The certificate for programs, with a checksum of its own content."""
+    """Return the certificate for programs, with a checksum of its own content."""
     content = {
         "title": "Certificate of calibration",
         "simulated": certificate.is_simulated,
@@ -96,7 +97,7 @@ def document_of(certificate: CellCertificate) -> dict[str, Any]:
 
 
 def certificate_page(certificate: CellCertificate) -> Page:
-    """The printable page."""
+    """Return the printable page."""
     description = certificate.description
     start, end = _dates(certificate)
     return Page(

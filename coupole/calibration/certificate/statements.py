@@ -40,15 +40,15 @@ class Person(Model):
 
 
 class Climate(Model):
-    """Climate of the room, entered by hand: no rig has a sensor for it."""
+    """Climate of the room. It is entered by hand, because no rig has a sensor for it."""
 
     temperature_c: Range
-    """Lowest and highest."""
+    """Lowest and highest temperature."""
     u_temperature_k: Annotated[float, Field(ge=0)]
     humidity_percent: Range | None = None
     u_humidity_percent: Annotated[float, Field(ge=0)] | None = None
     instrument: Words
-    """Instrument, with its certificate."""
+    """Measuring instrument, with its certificate."""
 
     @model_validator(mode="after")
     def _rises(self) -> Climate:
@@ -59,7 +59,7 @@ class Climate(Model):
 
 
 class Description(Model):
-    """All of it."""
+    """All statements of a laboratory."""
 
     schema_version: Literal[1] = 1
     number: Words
@@ -72,11 +72,11 @@ class Description(Model):
     authorised_by: Person
     climate: Climate | None = None
     methods: tuple[Words, ...] = ()
-    """Procedures of the laboratory, beside Coupole's own."""
+    """Procedures of the laboratory in addition to Coupole's own."""
     deviations: tuple[Words, ...] = ()
     """Additions to, deviations or exclusions from the methods."""
 
 
 def read_description(path: Path) -> Description:
-    """A laboratory's statements. Raises InputError with all problems of the file."""
+    """Read a laboratory's statements. Raises InputError with all problems of the file."""
     return yamlfile.read_document(path).validate(Description)

@@ -1,4 +1,4 @@
-"""Checks of a calibrated cell by artefacts that took part in no fit: a second board, a second tile.
+"""Checks of a calibrated cell with artefacts that were used in no fit: a second board, a second tile.
 
 ::
 

@@ -1,11 +1,11 @@
 """Lengths on a board as a calibrated cell measures them, with their uncertainties.
 
-The board's corners are points in the base, found from their images at many poses alone: nothing of the board's
-form is used but a start. With lens and hand-eye held at their record's values, and the arm's error at each pose
-unknown within its stated noise, least squares give the points. Their covariance has two parts: noise of corners
-and poses, independent between positions of the board; and the errors of lens, hand-eye and axis zeros, which all
-positions share, by the record's covariance. Lengths are compared as in ISO 10360-2 and VDI/VDE 2634: five along
-each of four lines at each position.
+The board's corners are points in the base frame. They are found only from their images at many poses; the board's
+known form is used only for a start. Lens and hand-eye are held at their record's values. The arm's error at each
+pose is unknown within its stated noise. Least squares then give the points. Their covariance has two parts. The
+first is noise of corners and poses, which is independent between positions of the board. The second is the errors
+of lens, hand-eye and axis zeros, from the record's covariance; all positions share them. Lengths are compared as
+in ISO 10360-2 and VDI/VDE 2634: five along each of four lines at each position.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from coupole.errors import InputError
 LEAST_VIEWS = 3
 _STEPS = 5
 _LENGTHS = 5
-"""Lengths along one line."""
+"""Number of lengths along one line."""
 _MOST_CORNERS = 300
-"""Most corners of a board that are adjusted together."""
+"""Greatest number of corners of a board that are adjusted together."""
 _LEAST_LENGTHS = 4
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of single observations by a hand-eye record: standard deviations of each coordinate."""
+    """Noise of single observations, from a hand-eye record: standard deviations of each coordinate."""
 
     corner_px: float
     position_mm: float
@@ -43,21 +43,21 @@ class Noise:
 
     @staticmethod
     def of(record: Record) -> Noise:
-        """The larger of what was stated and found."""
+        """Return the larger of stated and estimated noise."""
         noise = {line.name: max(line.found, line.stated) for line in record.noise}
         return Noise(noise["corners"], noise["robot position"], float(np.radians(noise["robot orientation"])))
 
 
 @dataclass(frozen=True)
 class Position:
-    """The board at one place, in pictures at several poses."""
+    """The board at one place, in pictures from several poses."""
 
     name: str
     sightings: tuple[Sighting, ...]
     base_from_flange: Floats
-    """[views, 4, 4], corrected by the axis zeros if the record has some."""
+    """[views, 4, 4] poses, corrected by the axis zeros if the record has some."""
     camera: CameraPrior
-    """Lens and hand-eye, and how these poses depend on the axis zeros."""
+    """Lens and hand-eye, and the dependence of these poses on the axis zeros."""
 
 
 @dataclass(frozen=True)
@@ -71,17 +71,19 @@ class Lengths:
     certified_mm: Floats
     """[n] at the temperature of the measurement."""
     noise_covariance: Floats
-    """[n, n] mm^2, by corners and poses of this position."""
+    """[n, n] covariance from corners and poses of this position, mm^2."""
     by_record: Floats
-    """[n, parameters] mm, by the figures of the record, in the order of `CameraPrior.covariance`."""
+    """[n, parameters] changes of the lengths by the figures of the record, mm, in the order of
+    `CameraPrior.covariance`."""
     u_certified_mm: Floats
-    """[n] without the scale that all lengths share: places of corners, flatness."""
+    """[n] uncertainty from places of corners and flatness. The scale, which all lengths share, is not included."""
     residual_ratio: float
-    """Residuals over what the record's noise explains, root mean square."""
+    """Residuals over those that the record's noise explains, root mean square."""
 
 
 def lengths_of(position: Position, board: Board, noise: Noise) -> Lengths:
-    """Lengths of a board at one position. Raises InputError: too few views, or corners in too few of them."""
+    """Return lengths of a board at one position. Raises InputError for too few views, or corners in too few of
+    them."""
     if len(position.sightings) < LEAST_VIEWS:
         raise InputError(
             f"{position.name}: the board was found in {len(position.sightings)} pictures; expected {LEAST_VIEWS} "
@@ -117,8 +119,9 @@ def lengths_of(position: Position, board: Board, noise: Noise) -> Lengths:
 
 
 def _own_u_mm(board: Board, lengths_mm: Floats) -> Floats:
-    """Uncertainty of certified lengths beside that of the scale. A surface between two planes a distance f apart
-    shortens a chord by at most 8 f^2 / (3 L), which counts as the half width of a rectangle."""
+    """Return the uncertainty of certified lengths without that of the scale. If a surface lies between two planes
+    at a distance f, a chord is shorter by at most 8 f^2 / (3 L). This counts as the half width of a rectangular
+    distribution."""
     artefact = board.artefact
     u_corner = 0.0 if artefact is None or artefact.corner_um is None else 1e-3 * artefact.corner_um.u
     flat = 0.0 if artefact is None or artefact.flatness_um is None else 1e-3 * artefact.flatness_um.value
@@ -130,8 +133,8 @@ def _own_u_mm(board: Board, lengths_mm: Floats) -> Floats:
 
 
 def _pairs(board: Board, ids: NDArray[np.intp]) -> list[tuple[int, int, str]]:
-    """Two corners by their place in `ids`, and the length's name: up to five lengths along the middle row, the
-    middle column and both diagonals."""
+    """Return pairs of corners by their places in `ids`, with names of the lengths. There are up to five lengths
+    along the middle row, the middle column and both diagonals."""
     across, down = board.corners
     place = {int(corner): n for n, corner in enumerate(ids)}
     square = min(across, down) - 1
@@ -182,13 +185,14 @@ class _Seen:
 @dataclass(frozen=True)
 class _Solution:
     by_noise: Floats
-    """[3 m, 3 m] covariance of the points by noise, mm^2."""
+    """[3 m, 3 m] covariance of the points from noise, mm^2."""
     by_record: Floats
-    """[3 m, parameters] points by the record's figures."""
+    """[3 m, parameters] changes of the points by the record's figures."""
 
 
 def _adjust(position: Position, corners: _Seen, noise: Noise) -> tuple[Floats, Floats, _Solution]:
-    """Points [m, 3] in the base, the arm's errors [views, 4, 4], and how the points depend on everything else."""
+    """Return points [m, 3] in the base frame, the arm's errors [views, 4, 4], and the dependence of the points on
+    everything else."""
     points = _start(position, corners)
     views, size = len(position.sightings), 3 * len(corners.ids)
     errors = np.broadcast_to(np.eye(4), (views, 4, 4)).copy()
@@ -213,7 +217,7 @@ def _adjust(position: Position, corners: _Seen, noise: Noise) -> tuple[Floats, F
 
 
 def _start(position: Position, corners: _Seen) -> Floats:
-    """Points [m, 3] by the board's pose in the view that shows most of it."""
+    """Return points [m, 3] from the board's pose in the view that shows most of it."""
     best = int(np.argmax([len(sighting.ids) for sighting in position.sightings]))
     base_from_camera = position.base_from_flange[best] @ position.camera.flange_from_camera
     base_from_board = base_from_camera @ board_pose(position.sightings[best], position.camera.lens)
@@ -228,10 +232,11 @@ def _start(position: Position, corners: _Seen) -> Floats:
 def _equations(
     position: Position, corners: _Seen, points: Floats, errors: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Residuals [2 n], their derivatives by points and errors [2 n, 3 m + 6 views], and by the record's figures.
+    """Return residuals [2 n], their derivatives by points and errors [2 n, 3 m + 6 views], and by the record's
+    figures.
 
-    A point is taken from the base to the flange, the flange without the arm's error, and the camera; derivatives
-    follow the same chain backwards, as in `lens.equations`.
+    A point is transformed from the base to the flange, to the flange without the arm's error, and to the camera.
+    Derivatives follow the same chain backwards, as in `lens.equations`.
     """
     camera, view = position.camera, corners.view
     hand_eye, flange = camera.flange_from_camera, position.base_from_flange[view]
@@ -258,7 +263,7 @@ def _equations(
 
 
 def _into(a_from_b: Floats, points_a: Floats) -> Floats:
-    """Points [k, 3] from frames a into frames b, each with its own transform [k, 4, 4]."""
+    """Transform points [k, 3] from frames a into frames b, each with its own transform [k, 4, 4]."""
     b_from_a = inverses(a_from_b)
     return np.asarray(np.einsum("kij,kj->ki", b_from_a[:, :3, :3], points_a) + b_from_a[:, :3, 3])
 

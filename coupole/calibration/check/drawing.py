@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def draw_comparisons(record: Record, figure: Figure) -> None:
-    """Errors with their uncertainties by position, E_n of each value, and their distribution."""
+    """Draw the errors with their uncertainties by position, E_n of each value, and their distribution."""
     grid = figure.add_gridspec(2, 2, width_ratios=(3, 1))
     values = record.comparisons
     is_length = values[0].unit == "mm"
@@ -35,7 +35,7 @@ def _worst(values: tuple[Comparison, ...]) -> float:
 
 
 def _draw_errors(ax: Axes, values: tuple[Comparison, ...], is_length: bool) -> None:
-    """Measured minus certified, by length or channel; a colour for each position."""
+    """Draw measured minus certified values, by length or channel, in a colour for each position."""
     positions = list(dict.fromkeys(value.position for value in values))
     factor = 1e3 if is_length else 1.0
     for number, position in enumerate(positions):
@@ -76,7 +76,7 @@ def _draw_en(ax: Axes, values: tuple[Comparison, ...]) -> None:
 
 
 def comparison_section(record: Record) -> Section:
-    """All values as a table."""
+    """Return a table of all values."""
     unit = record.comparisons[0].unit
     shown_unit = "" if unit == "1" else f" {unit}"
     rows = [

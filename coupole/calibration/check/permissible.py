@@ -1,4 +1,5 @@
-"""The largest permissible error of a length, as it is stated on the command line; without a heavy import."""
+"""The largest permissible error of a length, as it is written on the command line. This module has no heavy
+import."""
 
 from __future__ import annotations
 
@@ -10,18 +11,18 @@ from coupole.errors import InputError
 
 @dataclass(frozen=True)
 class Permissible:
-    """Largest permissible error of a length L: A + L / K, as ISO 10360-2 states it."""
+    """Largest permissible error of a length L: A + L / K, in the form of ISO 10360-2."""
 
     constant_mm: float
     per_mm: float
 
     def at(self, length_mm: float) -> float:
-        """The limit of that length, mm."""
+        """Return the limit for this length, mm."""
         return self.constant_mm + length_mm * self.per_mm
 
 
 def parse_permissible(words: str) -> Permissible:
-    """`A+L/K` or `A`, A in um, K in mm per um. Raises InputError."""
+    """Read `A+L/K` or `A`, with A in um and K in mm per um. Raises InputError."""
     constant, _, part = words.replace(" ", "").partition("+L/")
     try:
         a, k = float(constant), float(part) if part else math.inf

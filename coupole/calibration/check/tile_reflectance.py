@@ -1,13 +1,13 @@
 """Reflectance of a second tile, by the calibrated powers of the LEDs.
 
-In logarithms, for the LED k in the channel c, seen in a view of the tile at the place p,
+The model is logarithmic. For the LED k in the channel c, in a view of the tile at the place p, it is
 
     ln value_kc = ln power_kc + delta_pc + J_k . theta_p + j_k kappa + D_kc . phi + noise,
 
-value being the power that the LED would have if the tile were as described (`tile_views.Row`). delta is the
-logarithm of measured over certified reflectance, theta the tile's tilt and height, kappa its departure from
-Minnaert's law, phi the figures that the powers share, which stand for the first tile. All but delta have priors:
-the description of this tile, and the covariance in the record of the powers.
+Here value is the power that the LED would have if the tile were as described (`tile_views.Row`). delta is the
+logarithm of measured over certified reflectance. theta is the tile's tilt and height, kappa its departure from
+Minnaert's law. phi are the figures that the powers share; they represent the first tile. All but delta have
+priors: from the description of this tile, and from the covariance in the record of the powers.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ _FLASH = 5e-4
 """Relative scatter of an LED's flashes (as in `calibrate_led_power`)."""
 _LEAST_ROWS = 6
 _DARK = 0.1
-"""Share of the expected signal: less is a shadow, or a dead LED."""
+"""Least share of the expected signal. A smaller signal means a shadow, or a dead LED."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Observations of the tile at one place: rows of its views, by channel, with the figures of one place."""
+    """Observations of the tile at one place: rows of its views, by channel, with the figures of this place."""
 
     name: str
     tile: Mapping[str, Tile]
-    """The tile by channel, as certified."""
+    """The certified tile, by channel."""
     rows: Mapping[str, Sequence[Row]]
 
 
@@ -53,7 +53,7 @@ class MeasuredTile:
     reflectance: Floats
     """[places, channels]."""
     covariance: Floats
-    """[places channels] squared, relative: of their logarithms."""
+    """[places channels] squared: covariance of the logarithms of reflectance, so it is relative."""
     certified_reflectance: Floats
     """[places, channels]."""
     u_certified: Floats
@@ -65,10 +65,10 @@ class MeasuredTile:
 def reflectance_of(
     places: Sequence[Place], powers: Mapping[str, Powers], shared_covariance: Floats
 ) -> MeasuredTile:
-    """Reflectance of a tile at each place, per channel.
+    """Return the reflectance of a tile at each place, per channel.
 
-    `shared_covariance` is that of the figures that the powers share, channel after channel in the order of
-    `powers`. Raises InputError if too few LEDs can be used at a place.
+    `shared_covariance` is the covariance of the figures that the powers share, channel after channel in the order
+    of `powers`. Raises InputError if too few LEDs can be used at a place.
     """
     channels = tuple(powers)
     deltas, shared_count = len(places) * len(channels), len(shared_covariance)
@@ -133,7 +133,8 @@ def _solve(
 
 
 def _root(covariance: Floats) -> Floats:
-    """R [n, r] with R R' = a covariance [n, n]; units of its figures differ, so it is scaled first."""
+    """Return R [n, r] with R R' = a covariance [n, n]. The covariance is scaled first, because the units of its
+    figures differ."""
     u = np.sqrt(np.maximum(np.diag(covariance), LEAST_PRIOR**2))
     values, vectors = np.linalg.eigh(covariance / np.outer(u, u))
     root: Floats = u[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
@@ -141,13 +142,13 @@ def _root(covariance: Floats) -> Floats:
 
 
 def _usable(rows: Sequence[Row], powers: Powers) -> list[Row]:
-    """Rows under LEDs of known power that light the tile."""
+    """Return rows under LEDs of known power that light the tile."""
     known_rows = [row for row in rows if row.led in powers.row and powers.power[powers.row[row.led]] > 0]
     return [row for row in known_rows if row.value > _DARK * powers.power[powers.row[row.led]]]
 
 
 def place_of(name: str, frames: LightFrames, setting: Setting, progress: Progress) -> Place:
-    """The tile in all views of a run that show it whole. Raises InputError if none does."""
+    """Return the tile in all views of a run that show it completely. Raises InputError if no view does."""
     lit = [frame for frame in frames.lit if frame.led is not None]
     if not lit:
         raise InputError(f"{name}: no frame under an LED")

@@ -1,4 +1,4 @@
-"""The record of a check: which records and artefact, values beside certified ones, E_n, acceptance."""
+"""The record of a check: the records and the artefact, values beside certified ones, E_n, acceptance."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from coupole.errors import InputError
 K = 2.0
 """Coverage factor of all expanded uncertainties here."""
 _MANY = 1e6
-"""Degrees of freedom of figures whose uncertainty is stated."""
+"""Degrees of freedom of figures with a stated uncertainty."""
 
 
 @dataclass(frozen=True)
 class Checked:
-    """A check's values, and their mean relative error with its uncertainty."""
+    """Values of a check, and their mean relative error with its uncertainty."""
 
     comparisons: tuple[Comparison, ...]
     parameters: tuple[Parameter, ...]
@@ -45,7 +45,7 @@ class Checked:
 
 @dataclass(frozen=True)
 class Pictures:
-    """Camera of the check's pictures, and the files that it read."""
+    """Camera of the check's pictures, and the files that the check read."""
 
     about: About
     size_px: tuple[int, int]
@@ -53,12 +53,12 @@ class Pictures:
 
 
 def records_in_force(paths: Sequence[Path]) -> tuple[InForce, ...]:
-    """All records but those of other checks."""
+    """Return all records except those of other checks."""
     return tuple(item for item in read_in_force(paths) if item.record.kind != "artefact-check")
 
 
 def records_by_kind(items: Sequence[InForce], kinds: Sequence[Kind]) -> dict[Kind, InForce]:
-    """Records of some kinds. Raises InputError for two of one of them."""
+    """Return records of some kinds. Raises InputError for two records of one kind."""
     records: dict[Kind, InForce] = {}
     for item in items:
         if item.record.kind not in kinds:
@@ -72,8 +72,8 @@ def records_by_kind(items: Sequence[InForce], kinds: Sequence[Kind]) -> dict[Kin
 
 
 def refuse_dependent(artefact: Artefact | None, path: Path, items: Sequence[InForce]) -> Artefact:
-    """The artefact of a description. Raises InputError unless it has a certificate, and for one that took part
-    in a fit of the records."""
+    """Return the artefact of a description. Raises InputError if it has no certificate, or if it was used in a fit
+    of the records."""
     if artefact is None or artefact.certificate is None:
         raise InputError(
             f"{path}: a check needs the artefact's identity and certificate: expected a block `artefact` with "
@@ -90,7 +90,7 @@ def refuse_dependent(artefact: Artefact | None, path: Path, items: Sequence[InFo
 
 
 def refuse_used_images(items: Sequence[InForce], inputs: Sequence[tuple[str, str]]) -> None:
-    """Raise InputError if a record was made from some of these images: then they check nothing."""
+    """Raise InputError if a record was made from some of these images, because these then check nothing."""
     for item in items:
         image_hashes = {line.sha256 for line in item.record.inputs if "/" in line.name}
         if common := [name for name, sha256 in inputs if "/" in name and sha256 in image_hashes]:
@@ -106,10 +106,10 @@ def refuse_used_images(items: Sequence[InForce], inputs: Sequence[tuple[str, str
 def compare_lengths(
     position_lengths: Sequence[Lengths], covariance: Floats, u_scale: float, permissible: Permissible | None
 ) -> Checked:
-    """Lengths of all positions beside the certified ones.
+    """Return lengths of all positions beside the certified ones.
 
-    `covariance` is that of the record's figures (`CameraPrior.covariance`), `u_scale` the relative standard
-    uncertainty of the board's certified lengths at the temperature of the measurement.
+    `covariance` is the covariance of the record's figures (`CameraPrior.covariance`). `u_scale` is the relative
+    standard uncertainty of the board's certified lengths at the temperature of the measurement.
     """
     comparisons, slopes, noises, certified_own = [], [], [], []
     for part in position_lengths:
@@ -152,7 +152,8 @@ def compare_lengths(
 
 
 def compare_reflectances(tile: MeasuredTile) -> Checked:
-    """Reflectances of all places and channels beside the certified ones, whose errors are fully correlated."""
+    """Return reflectances of all places and channels beside the certified ones. The errors of the certified ones
+    are fully correlated."""
     u = np.sqrt(np.diag(tile.covariance)).reshape(tile.reflectance.shape) * tile.reflectance
     comparisons = [
         Comparison(
@@ -184,7 +185,7 @@ def _check_of(
     covariance: Floats,
     remarks: tuple[str, ...],
 ) -> Checked:
-    """Values with a parameter for each position, and E_n of their mean."""
+    """Return values with a parameter for each position, and E_n of their mean."""
     parameters = tuple(
         Parameter(
             name=name,
@@ -206,7 +207,7 @@ def check_outcome(
     records: Mapping[Kind, InForce],
     request: Request,
 ) -> Outcome:
-    """The record of a check, with its picture and the table on its page."""
+    """Return the record of a check, with its picture and the table on its page."""
     inputs = (*pictures.inputs, *(line for item in records.values() for line in record_input(item.path)))
     record = seal_record(
         kind="artefact-check",
@@ -230,7 +231,7 @@ def check_outcome(
 
 
 def limits_of(check: Checked, operator_limits: Mapping[str, float]) -> tuple[Limit, ...]:
-    """Acceptance limits of a check; `operator_limits` are those that the operator set."""
+    """Return the acceptance limits of a check. `operator_limits` are the limits that the operator set."""
     values = np.array([value.en for value in check.comparisons])
     figures = {
         "mean_en": check.mean_en,
@@ -247,7 +248,7 @@ def _against(records: Mapping[Kind, InForce]) -> list[str]:
 
 
 def needed_record(records: Mapping[Kind, InForce], kind: Kind) -> Record:
-    """The record of a kind. Raises InputError if there is none."""
+    """Return the record of a kind. Raises InputError if there is none."""
     if kind not in records:
         raise InputError(
             f"--records: expected a record of the kind `{kind}`; found {', '.join(records) or 'none'}"

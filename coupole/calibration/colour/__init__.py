@@ -1,4 +1,4 @@
-"""Colour from a chart: profile of a camera under its lights, and figures of image quality.
+"""Colour from a chart: the profile of a camera under its lights, and figures of image quality.
 
 ::
 

@@ -1,4 +1,4 @@
-"""Acceptance limits of the colour profile: CIEDE2000 of patches that were left out of it."""
+"""Acceptance limits of the colour profile, on CIEDE2000 of patches that were left out of the fit."""
 
 from __future__ import annotations
 

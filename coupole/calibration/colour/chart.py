@@ -1,7 +1,7 @@
 """A colour chart: its description (YAML), its patches' colours, and where its parts are in a picture.
 
-The chart's frame has its origin in the middle of the patches, x along the rows to the right, y up, z out of the
-face, mm.
+The chart's frame has its origin in the middle of the patches. x is along the rows to the right, y up, and z out of
+the face; mm.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 _PLACE = re.compile(r"([A-Z])([1-9][0-9]?)")
 _VALUES_ENDINGS = (".txt", ".csv", ".cgats", ".it8", ".tsv")
 _USED_OF_UNKNOWN = 0.5
-"""Share of the pitch that is read of a chart whose patches' size is not known."""
+"""Share of the pitch that is read if the size of the chart's patches is not known."""
 _LEAST_GREY_LIGHTNESS = 20.0
-"""L* of the greys that balance the channels: noise and stray light dominate darker ones."""
+"""Least L* of the greys that balance the channels. In darker greys, noise and stray light dominate."""
 
 
 class Edge(Model):
-    """A rectangle of the chart that one straight, slanted edge between light and dark crosses."""
+    """A rectangle of the chart with one straight, slanted edge between light and dark across it."""
 
     name: str
     centre_mm: tuple[float, float]
@@ -57,21 +57,23 @@ class Chart(Described):
     patch_mm: tuple[_Length, _Length]
     """Width and height of a patch."""
     used: Annotated[float, Field(gt=0, le=0.95)] = 0.7
-    """Share of a patch's width and height that is read, about its middle."""
+    """Share of a patch's width and height that is read, around its middle."""
     names: tuple[tuple[str, ...], ...] | None = None
-    """Names of the patches in the file of values, row by row from the top; without it A1, A2, ..., B1, ..."""
+    """Names of the patches in the file of values, row by row from the top. Without it they are A1, A2, ..., B1,
+    ..."""
     values: FilePath
     """Spectra, L*a*b* or XYZ of the patches (CGATS, CSV or CxF), beside this file."""
     cxf_type: str | None = None
-    """ObjectType of the objects of a CxF file that are used, where a patch is measured more than once."""
+    """ObjectType of the objects of a CxF file that are used, if a patch is measured more than once."""
     unit: Unit = "auto"
-    """Unit of spectra: percent or fraction; auto tells by their size."""
+    """Unit of spectra: percent or fraction. `auto` decides by the size of the values."""
     u_lab: Annotated[float, Field(ge=0)] = 0.3
-    """Standard uncertainty of each of L*, a*, b* of a patch: instrument, and the patch's own unevenness."""
+    """Standard uncertainty of each of L*, a*, b* of a patch, from the instrument and the patch's own
+    unevenness."""
     neutral: tuple[str, ...] | None = None
-    """Names of the grey patches; without it those of chroma below 5."""
+    """Names of the grey patches. Without it these are the patches with a chroma below 5."""
     support_from_chart: Pose | None = None
-    """Pose of the chart on the support; without it name its corners in the picture (`--corners`)."""
+    """Pose of the chart on the support. Without it, give the chart's corners in the picture (`--corners`)."""
     without: tuple[str, ...] = ()
     """Names of patches that are not used."""
     edges: tuple[Edge, ...] = ()
@@ -112,7 +114,7 @@ class Chart(Described):
 
     @property
     def corners_mm(self) -> Floats:
-        """[4, 2] middles of the corner patches: top left, top right, bottom right, bottom left."""
+        """[4, 2] middles of the corner patches, in the order top left, top right, bottom right, bottom left."""
         count, last = self.rows * self.columns, self.columns - 1
         return self._all_centres_mm()[[0, last, count - 1, count - 1 - last]]
 
@@ -140,14 +142,15 @@ class KnownChart:
     xyz: Floats
     """[patches, 3] under D50, Y = 1 for the perfect white."""
     files: tuple[Path, ...]
-    """Its description and its values."""
+    """Files of its description and its values."""
 
     @property
     def lab(self) -> Floats:
         return lab_of(self.xyz)
 
     def without(self, names: Sequence[str]) -> KnownChart:
-        """The same without some patches. Raises InputError if too few are left, or no grey one."""
+        """Return the same chart without some patches. Raises InputError if too few patches are left, or no grey
+        one."""
         chart = self.chart.model_copy(update={"without": (*self.chart.without, *names)})
         kept_patches = np.array([name not in names for name in self.chart.patch_names])
         known_chart = KnownChart(chart, self.xyz[kept_patches], self.files)
@@ -162,7 +165,7 @@ class KnownChart:
 
     @property
     def neutral(self) -> tuple[int, ...]:
-        """Numbers of the grey patches, bright enough to balance the channels."""
+        """Numbers of the grey patches that are bright enough to balance the channels."""
         lab = self.lab
         if self.chart.neutral is not None:
             names = self.chart.patch_names
@@ -172,8 +175,8 @@ class KnownChart:
 
 
 def read_chart(path: Path, without: Sequence[str] = ()) -> KnownChart:
-    """A chart's description and values, `without` some patches more. Raises InputError with all problems: wrong
-    keys, patches without values, too few patches, no grey one."""
+    """Read a chart's description and values, and leave out the patches `without` too. Raises InputError with all
+    problems: wrong keys, patches without values, too few patches, no grey patch."""
     document = yamlfile.read_document(path)
     whole = read_described(path, Chart)
     if strange := sorted({*whole.without, *without} - set(whole.model_copy(update={"without": ()}).patch_names)):
@@ -197,15 +200,15 @@ def read_chart(path: Path, without: Sequence[str] = ()) -> KnownChart:
 
 
 def is_values_file(path: Path) -> bool:
-    """True for a file of values alone, without a description, by its name."""
+    """True for a file of values without a description, by its name."""
     return path.suffix.lower() in (*cxf_values.ENDINGS, *_VALUES_ENDINGS)
 
 
 def chart_of_values(path: Path, without: Sequence[str] = ()) -> KnownChart:
-    """A chart of which only the values are given: a full table of patches A1, A2, ..., B1, ..., a letter for each
-    row, of equal pitch along rows and columns; the middle half of each is read.
+    """Return a chart that is given only by its values. They are a full table of patches A1, A2, ..., B1, ..., with
+    a letter for each row. The pitch is equal along rows and columns, and the middle half of each patch is read.
 
-    Raises InputError: other names, a patch missing, and as `read_chart`.
+    Raises InputError for other names and for a missing patch, and like `read_chart`.
     """
     values = _values(path, "auto", None)
     places = {name: _PLACE.fullmatch(name) for name in values.xyz}

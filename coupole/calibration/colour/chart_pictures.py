@@ -1,7 +1,8 @@
-"""The chart in plain linear pictures of any camera: where it lies, which way up, and the signals of its patches.
+"""The chart in plain linear pictures of any camera: its place, its orientation, and the signals of its patches.
 
-The middles of the corner patches are given, or searched for (`chart_search`). Which corner is which follows from
-the colours: of all ways round, the one is taken whose patches a matrix turns into the chart's colours best.
+The middles of the corner patches are given, or searched for (`chart_search`). The colours identify the corners.
+All orders of the corners are tried, and the order is taken for which a matrix converts the patches best into the
+chart's colours.
 """
 
 from __future__ import annotations
@@ -22,22 +23,25 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 _LARGEST_MISS = 15.0
-"""Largest mean CIEDE2000 of patches by the best matrix without any correction, where the chart lies."""
+"""Largest mean CIEDE2000 of patches at the chart's place, by the best matrix without any correction."""
 _BETTER = 1.25
-"""Ratio of the misses of the second best and the best way round from which the best is certain."""
+"""Least ratio of the miss of the second best order of corners to that of the best one. Above it the best order is
+certain."""
 _LEAST_PIXELS = 36
 _SIDE_TILES = 6
-"""Most tiles along a patch's side, by which its noise and evenness are judged."""
+"""Greatest number of tiles along a patch's side. The tiles show the noise and evenness of the patch."""
 _TILE_PIXELS = 4
 _UNEVEN = 0.05
-"""Root mean square of a patch's tiles about a plane, of its mean, beyond noise, from which it is uneven."""
+"""Root mean square of a patch's tiles about a plane, beyond noise, as a share of the patch's mean. Above it the
+patch is uneven."""
 _FULL_SHARE = 1e-3
-"""Share of a patch's pixels that may be saturated, as hot pixels are."""
+"""Share of a patch's pixels that may be saturated, because some pixels are hot."""
 _STUCK_SHARE = 0.3
-"""Share of a patch's pixels with the picture's largest value from which a converter has cut it off there."""
+"""Share of a patch's pixels with the picture's largest value. Above it, a converter has cut off the values
+there."""
 _LEVELS_FOR_STUCK = 4096
 _MOST_UNEVEN = 1.0 / 3.0
-"""Share of uneven patches from which the chart's place must be wrong."""
+"""Share of uneven patches above which the chart's place must be wrong."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +50,9 @@ class PlainPicture:
 
     name: str
     values: NDArray[np.float32]
-    """[H, W, 3] red, green, blue in any unit; NaN where nothing is known."""
+    """[H, W, 3] red, green, blue in any unit; NaN where the value is not known."""
     full: NDArray[np.bool_]
-    """[H, W] saturated in a channel."""
+    """[H, W] True where a channel is saturated."""
     levels: int | None = None
     """Number of levels of a value; None for floating point."""
 
@@ -68,12 +72,12 @@ class PlacedChart:
     """The chart in one picture."""
 
     corners_px: Floats
-    """[4, 2] middles of the chart's own top left, top right, bottom right and bottom left patch."""
+    """[4, 2] middles of the chart's own patches at the top left, top right, bottom right and bottom left."""
     is_turned: bool
     """True if the corners were given in another order, or the chart is not upright in the picture."""
 
     def polygons_px(self, chart: Chart, polygons_mm: Floats) -> Floats:
-        """[n, 4, 2] px of polygons [n, 4, 2] mm of the chart's face."""
+        """Return [n, 4, 2] px for polygons [n, 4, 2] mm of the chart's face."""
         flat = polygons_mm.reshape(1, -1, 2).astype(np.float64)
         if not flat.size:
             return polygons_mm
@@ -82,9 +86,10 @@ class PlacedChart:
 
 
 def place_chart(picture: PlainPicture, known_chart: KnownChart, corners_px: Floats | None = None) -> PlacedChart:
-    """Find the chart. `corners_px` [4, 2] are the middles of its corner patches in turn, from any of them.
+    """Find the chart. `corners_px` [4, 2] are the middles of its corner patches in turn, beginning at any of them.
 
-    Raises InputError: no chart, another one, a mirrored picture, a chart that looks the same from several sides.
+    Raises InputError if there is no chart or another one, if the picture is mirrored, or if the chart looks the
+    same from several sides.
     """
     chart = known_chart.chart
     if min(chart.rows, chart.columns) < 2:
@@ -142,20 +147,20 @@ def _refuse_miss(picture: PlainPicture, miss: float, *, is_given: bool) -> None:
 
 
 def _projection(chart: Chart, corners_px: Floats) -> Floats:
-    """[3, 3] from mm of the chart's face to px."""
+    """Return [3, 3], from mm of the chart's face to px."""
     chart_corners, picture_corners = chart.corners_mm.astype(np.float32), corners_px.astype(np.float32)
     return np.asarray(cv2.getPerspectiveTransform(chart_corners, picture_corners), np.float64)
 
 
 def _area(corners_px: Floats) -> float:
-    """Twice the signed area, above 0 for corners that run clockwise in the picture."""
+    """Return twice the signed area. It is positive for corners that run clockwise in the picture."""
     x, y = corners_px.T
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
 def _miss(picture: PlainPicture, known_chart: KnownChart, corners_px: Floats) -> float:
-    """Mean CIEDE2000 of the patches by the best matrix, if the chart's corners are there; infinite if the patches
-    leave the picture or do not have light."""
+    """Return the mean CIEDE2000 of the patches by the best matrix, for these corners of the chart. It is infinite
+    if patches are outside the picture or dark."""
     chart = known_chart.chart
     half = 0.25 * chart.used * np.array(chart.patch_mm)
     around = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 2), axis=-1).reshape(-1, 2) * half
@@ -185,14 +190,15 @@ class PlainReading:
 
     reading: Reading
     uneven: NDArray[np.bool_]
-    """[patches] their parts differ by more than noise and a slope of light."""
+    """[patches] True if parts of the patch differ by more than noise and a slope of light."""
 
 
 def read_plain_patches(picture: PlainPicture, polygons_px: Floats, names: Sequence[str]) -> PlainReading:
-    """Means of the patches inside polygons [patches, 4, 2]. The uncertainty comes from tiles of each patch, about
-    a plane, so noise that neighbouring pixels share (interpolated colours, compression) counts in full.
+    """Return means of the patches inside polygons [patches, 4, 2]. The uncertainty comes from the scatter of tiles
+    of each patch about a plane. So noise that neighbouring pixels share (interpolated colours, compression) counts
+    fully.
 
-    Raises InputError: patches outside the picture or too small in it, or a place that is not the chart's.
+    Raises InputError if patches are outside the picture or too small in it, or if the place is not the chart's.
     """
     count = len(names)
     mean, u, sd = (np.zeros((count, 3)) for _ in range(3))
@@ -233,7 +239,7 @@ def read_plain_patches(picture: PlainPicture, polygons_px: Floats, names: Sequen
 
 
 def _tiles(pixels: Floats, polygon: Floats, count: int) -> tuple[NDArray[np.intp], int]:
-    """Number of each pixel's tile, and of tiles along a side."""
+    """Return the number of each pixel's tile, and the number of tiles along a side."""
     sides = int(np.clip(np.sqrt(count / _TILE_PIXELS), 3, _SIDE_TILES))
     square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
     to_square = cv2.getPerspectiveTransform(polygon.astype(np.float32), square)
@@ -243,8 +249,8 @@ def _tiles(pixels: Floats, polygon: Floats, count: int) -> tuple[NDArray[np.intp
 
 
 def _scatter(values: Floats, tiles: NDArray[np.intp], sides: int) -> tuple[Floats, Floats, bool]:
-    """Standard uncertainty [3] of the mean, standard deviation [3] of pixels about a plane, and if the patch is
-    uneven."""
+    """Return the standard uncertainty [3] of the mean, the standard deviation [3] of pixels about a plane, and
+    whether the patch is uneven."""
     sizes = np.bincount(tiles, minlength=sides**2)
     filled_tiles = np.flatnonzero(sizes > 0)
     sums = np.stack([np.bincount(tiles, channel, minlength=sides**2) for channel in values.T], axis=1)

@@ -1,8 +1,8 @@
-"""Search for a chart's rows and columns in a picture: even areas of similar size that lie on a grid.
+"""Searches for a chart's rows and columns in a picture: even areas of similar size on a grid.
 
-The picture is reduced, and its even areas are found at several bounds of evenness. Three of them that are
-neighbours start a grid, which grows by one step after the other, so perspective and distortion are followed.
-Patches that were not found (black ones in a black frame) are known by the others.
+The picture is reduced, and its even areas are found at several bounds of evenness. Three neighbouring areas start
+a grid. The grid grows step by step, so it follows perspective and distortion. Patches that were not found (black
+ones in a black frame) follow from the others.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ from coupole.calibration.rotations import Floats
 _REDUCED_PX = 900
 """Longer side of the picture that is searched."""
 _STEPS = (0.015, 0.025, 0.04, 0.07, 0.12)
-"""Bounds of evenness: largest steps between neighbouring pixels, of the picture's white, in values for the eye."""
+"""Bounds of evenness: largest steps between neighbouring pixels, as a share of the picture's white, in values for
+the eye."""
 _AREA = (40.0, 0.06)
-"""Least area of a patch, reduced pixels, and its largest share of the picture."""
+"""Least area of a patch, in reduced pixels, and its largest share of the picture."""
 _CONVEX, _SQUARE = 0.85, 0.7
-"""Least share that an area has of its convex hull, and of the rectangle around it."""
+"""Least shares of an area: of its convex hull, and of the rectangle around it."""
 _MOST_AREAS = 200
 _NEIGHBOURS = 6
 _ALIKE = (0.55, 1.8)
-"""Ratio of the sizes of areas of one chart that are neighbours."""
+"""Limits of the ratio of the sizes of neighbouring areas of one chart."""
 _NEAR = 0.25
-"""Largest distance of an area from its expected place, of the step between patches."""
+"""Largest distance of an area from its expected place, as a share of the step between patches."""
 _LEAST_SHARE = 0.4
 """Least share of a chart's patches that must be found."""
 _LEAST_FOUND = 6
@@ -48,14 +49,15 @@ class _Areas:
 
 
 Grid = dict[tuple[int, int], int]
-"""Number of an area by its column and row, from anywhere."""
+"""Number of an area by its column and row. The count of columns and rows begins anywhere."""
 
 
 def search_corners(values: NDArray[np.float32], rows: int, columns: int) -> list[Floats]:
-    """Places [4, 2] px that the middles of a chart's corner patches may have, in turn, the likeliest grids first.
+    """Return places [4, 2] px that the middles of a chart's corner patches may have, in turn. The most likely
+    grids are first.
 
-    `values` [H, W, 3] are linear. A place may begin at any corner of the chart: `KnownChart` tells which. Empty if
-    no grid is found.
+    `values` [H, W, 3] are linear. A place may begin at any corner of the chart; `KnownChart` shows which. The list
+    is empty if no grid is found.
     """
     factor = max(1.0, max(values.shape[:2]) / _REDUCED_PX)
     areas = _even_areas(_for_the_eye(values, factor))
@@ -67,7 +69,7 @@ def search_corners(values: NDArray[np.float32], rows: int, columns: int) -> list
 
 
 def _for_the_eye(values: NDArray[np.float32], factor: float) -> NDArray[np.float32]:
-    """[h, w, 3] reduced, 0 to 1, with steps that are alike in dark and light."""
+    """Return [h, w, 3] reduced, from 0 to 1, with equal steps for the eye in dark and light."""
     height, width = values.shape[:2]
     size = (max(1, round(width / factor)), max(1, round(height / factor)))
     small = cv2.resize(np.nan_to_num(values, nan=0.0), size, interpolation=cv2.INTER_AREA)
@@ -111,7 +113,7 @@ def _is_patch(outline: NDArray[Any], area: float) -> bool:
 
 
 def _grids(areas: _Areas, rows: int, columns: int) -> Iterator[Grid]:
-    """Grids of the right size, the ones of most patches first; each set of areas once."""
+    """Yield grids of the right size, those with most patches first. Each set of areas comes once."""
     grids_found: dict[frozenset[int], Grid] = {}
     patch_count = rows * columns
     for start in range(len(areas.sizes)):
@@ -127,7 +129,7 @@ def _grids(areas: _Areas, rows: int, columns: int) -> Iterator[Grid]:
 
 
 def _around(areas: _Areas, start: int) -> list[int]:
-    """Numbers of the nearest areas of similar size."""
+    """Return the numbers of the nearest areas of similar size."""
     ratio = areas.sizes / areas.sizes[start]
     away = np.linalg.norm(areas.middles - areas.middles[start], axis=1)
     alike = (ratio > _ALIKE[0]) & (ratio < _ALIKE[1]) & (away > 0.8 * areas.sizes[start])
@@ -136,7 +138,8 @@ def _around(areas: _Areas, start: int) -> list[int]:
 
 
 def _grow_grid(areas: _Areas, start: int, right: int, down: int, most: int) -> Grid:
-    """The grid of an area and its neighbours to the right and below; empty if these do not lie so."""
+    """Return the grid of an area and its neighbours to the right and below; empty if these are not neighbours on a
+    grid."""
     middles = areas.middles
     x, y = middles[right] - middles[start], middles[down] - middles[start]
     lengths = np.linalg.norm(x), np.linalg.norm(y)
@@ -167,7 +170,7 @@ def _grow_grid(areas: _Areas, start: int, right: int, down: int, most: int) -> G
 
 
 def _extent(grid: Grid) -> tuple[int, int, int, int]:
-    """First column and row, and how many."""
+    """Return the first column and row, and the numbers of columns and rows."""
     places = np.array(list(grid))
     low, high = places.min(axis=0), places.max(axis=0)
     return int(low[0]), int(low[1]), int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
@@ -179,8 +182,8 @@ def _fits(grid: Grid, rows: int, columns: int) -> bool:
 
 
 def _placed_grid(grid: Grid, areas: _Areas, rows: int, columns: int) -> Iterator[Floats]:
-    """Middles [4, 2] of the corner patches, reduced pixels, clockwise, for every way in which the grid may be a
-    part of the chart."""
+    """Yield middles [4, 2] of the corner patches, in reduced pixels, clockwise, for every way in which the grid
+    may be a part of the chart."""
     first_column, first_row, wide, high = _extent(grid)
     places = np.array(list(grid), np.float64) - (first_column, first_row)
     projection: Any = cv2.findHomography(places, areas.middles[list(grid.values())])[0]

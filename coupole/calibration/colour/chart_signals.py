@@ -1,8 +1,9 @@
-"""Signals of a chart's patches: means over the pixels of each in a picture, then one value from many lights.
+"""Signals of a chart's patches: means over the pixels of each patch in a picture, then one value from many lights.
 
-On a matt chart each light k gives the patch p the signal s = g_k E_kp b_p: E is the light's irradiance there,
-known or from a white sheet in the chart's place, g the light's own strength. Medians over patches and lights give
-g and b; a patch that departs from them under a light is in shadow there, or glossy, and is left out.
+On a matt chart each light k gives the patch p the signal s = g_k E_kp b_p. Here E is the light's irradiance at the
+patch, which is known or comes from a white sheet in the chart's place. g is the light's own strength. Medians over
+patches and lights give g and b. If a patch departs from them under a light, it is in shadow or glossy there, and
+is left out.
 """
 
 from __future__ import annotations
@@ -20,21 +21,22 @@ COLOUR, MONO = "COLOUR", "MONO"
 _LEAST_PIXELS = 12
 """Least number of pixels of each colour on a patch."""
 _ODD, _ODD_SIGMA = 0.03, 6.0
-"""Relative departure of a patch under one light, beyond noise, that counts as shadow or gloss."""
+"""Relative departure of a patch under one light, and its size in units of noise, above which it counts as shadow
+or gloss."""
 _LEAST_LIGHTS = 3
-"""Least number of lights that is needed to tell shadows."""
+"""Least number of lights that is needed to find shadows."""
 _ROUNDS = 5
 
 
 @dataclass(frozen=True)
 class ChartPicture:
-    """One picture of the chart: its light, and where patches and edges are."""
+    """One picture of the chart, with its light and the places of patches and edges."""
 
     name: str
     signal: Floats
-    """[H, W] above dark, linear, over the flat field; of pattern `COLOUR` [H, W, 3]."""
+    """[H, W] signal above dark, linear, over the flat field; for the pattern `COLOUR` it is [H, W, 3]."""
     full: NDArray[np.bool_]
-    """Saturated; of the shape of `signal`."""
+    """True where saturated; it has the shape of `signal`."""
     pattern: str
     """Names of the four pixels at the top left, row by row; or `COLOUR`."""
     patches_px: Floats
@@ -42,7 +44,7 @@ class ChartPicture:
     edges_px: Floats
     """[edges, 4, 2]."""
     light: Floats
-    """[patches] irradiance in any unit; ones if it is taken as uniform."""
+    """[patches] irradiance in any unit. It is 1 if the light is assumed to be uniform."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Reading:
     mean: Floats
     """[patches, 3] red, green, blue."""
     u: Floats
-    """[patches, 3] of the means, by noise."""
+    """[patches, 3] uncertainty of the means from noise."""
     pixel_sd: Floats
     """[patches, 3] standard deviation of single pixels."""
     full: NDArray[np.bool_]
@@ -64,18 +66,18 @@ class Signals:
     """The patches under all lights."""
 
     mean: Floats
-    """[patches, 3] of uniform light."""
+    """[patches, 3] means under uniform light."""
     u: Floats
     """[patches, 3] standard uncertainty, from noise and from the disagreement of the lights."""
     pixel_sd: Floats
-    """[patches, 3] relative standard deviation of single pixels, in the median of the lights."""
+    """[patches, 3] relative standard deviation of single pixels, as the median over the lights."""
     remarks: tuple[str, ...]
 
 
 def samples_of(
     picture: ChartPicture, channel: str, inside: tuple[NDArray[np.intp], NDArray[np.intp]]
 ) -> NDArray[np.intp]:
-    """Return the numbers [k] of those pixels, among some (rows, columns), that have a channel."""
+    """Return the numbers [k] of those pixels (rows, columns) that have a channel."""
     if picture.pattern == COLOUR:
         return np.arange(len(inside[0]))
     letters = np.array(list(picture.pattern)).reshape(2, 2)
@@ -85,13 +87,14 @@ def samples_of(
 def values_at(
     picture: ChartPicture, channel: int, inside: tuple[NDArray[np.intp], NDArray[np.intp]]
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Signals and saturation [k] of pixels (rows, columns)."""
+    """Return signals and saturation [k] of pixels (rows, columns)."""
     at = (*inside, channel) if picture.pattern == COLOUR else inside
     return picture.signal[at], picture.full[at]
 
 
 def pixels_inside(polygon: Floats, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
-    """Rows and columns of the pixels inside a convex polygon [4, 2]; None if it leaves the picture."""
+    """Return rows and columns of the pixels inside a convex polygon [4, 2]; None if the polygon is partly outside
+    the picture."""
     if (polygon < 0).any() or (polygon > np.array([shape[1], shape[0]]) - 1).any():
         return None
     low, high = np.floor(polygon.min(axis=0)).astype(int), np.ceil(polygon.max(axis=0)).astype(int)
@@ -104,7 +107,7 @@ def pixels_inside(polygon: Floats, shape: tuple[int, ...]) -> tuple[NDArray[np.i
 
 
 def read_patches(picture: ChartPicture, names: Sequence[str]) -> Reading:
-    """Means of all patches. Raises InputError: patches outside the picture, or too small in it."""
+    """Return means of all patches. Raises InputError for patches outside the picture, or too small in it."""
     if picture.pattern == MONO:
         raise InputError(f"{picture.name}: the camera has one channel, so it has no colours")
     count = len(names)
@@ -140,11 +143,11 @@ def combined_signals(
     *,
     are_pictures: bool = False,
 ) -> Signals:
-    """One signal for each patch, from its readings under all lights.
+    """Return one signal for each patch, from its readings under all lights.
 
-    `lights` [lights, patches] or [lights, patches, 3] are irradiances, `lit` the lights' names. `are_pictures`:
-    each is a picture, of which the caller tells what is saturated. Raises InputError with the names of patches
-    that are dark, or saturated or in shadow under more than half of them.
+    `lights` [lights, patches] or [lights, patches, 3] are irradiances, and `lit` are the lights' names. With
+    `are_pictures`, each reading is a picture, and the caller reports the saturated patches. Raises InputError with
+    the names of patches that are dark, or that are saturated or in shadow under more than half of the lights.
     """
     light = lights if lights.ndim == 3 else lights[:, :, None]
     mean, u = (np.stack([getattr(reading, field) for reading in readings]) / light for field in ("mean", "u"))
@@ -179,7 +182,8 @@ def combined_signals(
 
 
 def _split(mean: Floats, good: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Strengths [lights, 3], of mean 1, and patches [patches, 3] whose products are the signals, by medians."""
+    """Return strengths [lights, 3], with a mean of 1, and patches [patches, 3]. Their products are the signals.
+    They are found by medians."""
     good_mean = np.where(good[:, :, None], mean, np.nan)
     patch = np.nanmedian(good_mean, axis=0)
     strength = np.ones((len(mean), mean.shape[2]))
@@ -194,7 +198,7 @@ def _split(mean: Floats, good: NDArray[np.bool_]) -> tuple[Floats, Floats]:
 def _averaged_signals(
     mean: Floats, u: Floats, sd: Floats, good: NDArray[np.bool_], remarks: tuple[str, ...]
 ) -> Signals:
-    """Means over the lights; their uncertainty is the larger of noise and scatter."""
+    """Return means over the lights. Their uncertainty is the larger of noise and scatter."""
     count = good.sum(axis=0)[:, None]
     good_mean = np.where(good[:, :, None], mean, np.nan)
     average = np.nanmean(good_mean, axis=0)

@@ -1,8 +1,8 @@
-"""Values of a chart's patches as spectrophotometers and makers write them: CGATS text (ANSI CGATS.17) or CSV.
+"""Values of a chart's patches in the files of spectrophotometers and makers: CGATS text (ANSI CGATS.17) or CSV.
 
-One patch a line: its name, and a spectrum (columns `SPECTRAL_NM400`, `SPECTRAL_400`, `nm400` or `400`), or L*a*b*
-(`LAB_L LAB_A LAB_B`, `L a b`) or XYZ (`XYZ_X ...`, `X Y Z`, white having Y = 100), both under D50 for the 1931
-observer. Spectra are preferred where a file has several.
+Each line has one patch: its name, and a spectrum (columns `SPECTRAL_NM400`, `SPECTRAL_400`, `nm400` or `400`), or
+L*a*b* (`LAB_L LAB_A LAB_B`, `L a b`) or XYZ (`XYZ_X ...`, `X Y Z`; white has Y = 100). L*a*b* and XYZ are under
+D50 for the 1931 observer. If a file has several forms, spectra are preferred.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ class ChartValues:
 
 
 def read_chart_values(path: Path, unit: Unit = "auto") -> ChartValues:
-    """Values in a file. Raises InputError: no such file, no table, a name twice, a value that is none."""
+    """Return the values in a file. Raises InputError for a missing file, no table, a name that occurs twice, and a
+    value that is not a number."""
     try:
         text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
@@ -77,7 +78,7 @@ Rows = list[tuple[int, list[str]]]
 
 
 def _cgats(path: Path, text: str) -> tuple[list[str], Rows]:
-    """Names of the fields, and the lines of data."""
+    """Return the names of the fields, and the lines of data."""
     fields: list[str] = []
     rows: Rows = []
     part = ""
@@ -99,7 +100,7 @@ def _cgats(path: Path, text: str) -> tuple[list[str], Rows]:
 
 
 def _words(path: Path, number: int, line: str) -> list[str]:
-    """Fields of a line of data: between tabs, or between blanks, names in quotes."""
+    """Return the fields of a line of data, which are separated by tabs or blanks. Names may be in quotes."""
     if "\t" in line.strip():
         return [field.strip().strip('"') for field in line.strip().split("\t")]
     try:
@@ -126,7 +127,7 @@ def _of_width(path: Path, rows: Rows, width: int) -> Rows:
 
 
 def _numbers(path: Path, rows: Rows, columns: Sequence[int]) -> Floats:
-    """[rows, columns]."""
+    """Return [rows, columns] numbers."""
     table = np.empty((len(rows), len(columns)))
     for n, (number, row) in enumerate(rows):
         for m, column in enumerate(columns):
@@ -140,7 +141,8 @@ def _numbers(path: Path, rows: Rows, columns: Sequence[int]) -> Floats:
 
 
 def reflectance_fractions(path: Path, table: Floats, unit: Unit) -> Floats:
-    """The table as fractions. Raises InputError: a unit that cannot be told, values that no reflectance has."""
+    """Return the table as fractions. Raises InputError if the unit cannot be determined, or for values that no
+    reflectance has."""
     peak = float(table.max())
     if unit == "auto" and _FRACTION_AT_MOST < peak < _PERCENT_AT_LEAST:
         raise InputError(

@@ -1,4 +1,5 @@
-"""The chart in frames of runs: linear signals, its place by its described pose or its corners in the picture."""
+"""The chart in frames of runs: linear signals, and its place from its described pose or from its corners in the
+picture."""
 
 from __future__ import annotations
 
@@ -20,16 +21,16 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 _LEAST_COSINE = 0.3
-"""Least cosine of incidence on the chart: light nearer to its plane than 17 degrees shows its surface, not its
-colour."""
+"""Least cosine of incidence on the chart. Light that is nearer to its plane than 17 degrees shows its surface, not
+its colour."""
 _GLOSS_DEG = 25.0
-"""Angle about the mirrored direction to the camera: light from within it is not used (45/0 geometry keeps away
-from it)."""
+"""Angle about the mirrored direction to the camera. Light from within this angle is not used (45/0 geometry also
+avoids it)."""
 
 
 @dataclass(frozen=True)
 class ChartSetting:
-    """Descriptions and calibrations that the chart's frames are read with."""
+    """Descriptions and calibrations for reading the chart's frames."""
 
     chart: Chart
     base_from_support: Floats
@@ -70,13 +71,13 @@ class ChartReader:
         self._base_from_chart = self._find_chart()
 
     def pictures(self) -> Iterator[tuple[LightFrame, ChartPicture]]:
-        """Each frame whose light suits, when it is asked for."""
+        """Yield each frame with suitable light. A frame is read when it is requested."""
         for frame in self.suitable_frames():
             yield frame, self.picture(frame, self._light(frame))
 
     def suitable_frames(self) -> list[LightFrame]:
-        """Frames under light that does not graze the chart or shine from it into the camera. Raises InputError if
-        there is none."""
+        """Return the frames under light that does not graze the chart, and that the chart does not reflect into
+        the camera. Raises InputError if there are none."""
         frames = [frame for frame in self._frames.lit if self._suits(frame)]
         if not frames:
             raise InputError(
@@ -86,7 +87,7 @@ class ChartReader:
         return frames
 
     def picture(self, frame: LightFrame, light: Floats) -> ChartPicture:
-        """A frame as linear signals, DN/s over the flat field."""
+        """Return a frame as linear signals, DN/s over the flat field."""
         raw = frame.read()
         signal = (raw - self._dark(frame)).astype(np.float64)
         for channel, mask in self._masks.items():
@@ -104,7 +105,7 @@ class ChartReader:
         return ChartPicture(str(frame.shot), signal, full, self._frames.pattern, patches, edges, light)
 
     def _find_chart(self) -> Floats:
-        """base_from_chart [4, 4], by the description or by the corners of the first view."""
+        """Return base_from_chart [4, 4], from the description or from the corners in the first view."""
         setting = self._setting
         if setting.corners_px is None:
             if setting.chart.support_from_chart is None:
@@ -129,7 +130,8 @@ class ChartReader:
         return np.asarray(self._frames.lit[0].base_from_camera @ camera_from_chart)
 
     def _projected_polygons(self, polygons_mm: Floats, frame: LightFrame) -> Floats:
-        """[n, 4, 2] px of polygons [n, 4, 2] of the chart's face. Raises InputError if it is behind the camera."""
+        """Return [n, 4, 2] px for polygons [n, 4, 2] of the chart's face. Raises InputError if the face is behind
+        the camera."""
         flat = np.column_stack([polygons_mm.reshape(-1, 2), np.zeros(4 * len(polygons_mm))])
         camera_from_chart = np.linalg.inv(frame.base_from_camera) @ self._base_from_chart
         points = flat @ camera_from_chart[:3, :3].T + camera_from_chart[:3, 3]
@@ -138,7 +140,7 @@ class ChartReader:
         return optics.project(points, self._setting.lens.vector()).pixels.reshape(-1, 4, 2)
 
     def _points(self) -> tuple[Floats, Floats]:
-        """Middles of the patches [patches, 3] and the chart's normal [3], in the base frame."""
+        """Return the middles of the patches [patches, 3] and the chart's normal [3], in the base frame."""
         centres = self._setting.chart.centres_mm
         flat = np.column_stack([centres, np.zeros(len(centres))])
         return flat @ self._base_from_chart[:3, :3].T + self._base_from_chart[:3, 3], self._base_from_chart[:3, 2]
@@ -157,7 +159,7 @@ class ChartReader:
         return bool((towards @ normal).min() > _LEAST_COSINE and off_deg.min() > _GLOSS_DEG)
 
     def _light(self, frame: LightFrame) -> Floats:
-        """[patches] irradiance of the frame's LED over its flux; ones under a panel."""
+        """Return [patches], the irradiance of the frame's LED over its flux; 1 under a panel."""
         points, normal = self._points()
         if frame.led is None:
             return np.ones(len(points))
@@ -166,19 +168,21 @@ class ChartReader:
 
 
 def white_of(frames: LightFrames, setting: ChartSetting) -> dict[tuple[str, str], ChartPicture]:
-    """Pictures of a white sheet in the chart's place, by view and light, in place of the known irradiance."""
+    """Return pictures of a white sheet in the chart's place, by view and light. They replace the known
+    irradiance."""
     reader = ChartReader(frames, setting)
     ones = np.ones(len(setting.chart.centres_mm))
     return {key_of(frame): reader.picture(frame, ones) for frame in reader.suitable_frames()}
 
 
 def key_of(frame: LightFrame) -> tuple[str, str]:
-    """View and light, by which frames of the chart and of the white sheet belong together."""
+    """Return view and light. Frames of the chart and of the white sheet with the same key belong together."""
     return frame.view, str(frame.shot.light)
 
 
 def mean_picture(pictures: Sequence[ChartPicture]) -> ChartPicture:
-    """The mean of pictures of one view; pixels that are saturated in one picture are saturated in the mean."""
+    """Return the mean of pictures of one view. A pixel that is saturated in one picture is saturated in the
+    mean."""
     first = pictures[0]
     signal = np.mean([picture.signal for picture in pictures], axis=0)
     full = np.any([picture.full for picture in pictures], axis=0)

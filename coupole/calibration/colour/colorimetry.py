@@ -23,7 +23,8 @@ _MOST_MISSING_NM = 50.0
 
 
 def xyz_of_spectra(wavelengths_nm: Floats, reflectances: Floats) -> Floats:
-    """XYZ [n, 3] of reflectances [n, bands], Y = 1 for the perfect white under D50, which is `D50_WHITE` exactly.
+    """Return XYZ [n, 3] of reflectances [n, bands]. Y is 1 for the perfect white under D50, which is `D50_WHITE`
+    exactly.
 
     Spectra are interpolated by cubic splines to 1 nm and continued by their last value (CIE 15:2018, 7.2).
     Raises InputError if they do not span 430 to 730 nm, or without colour-science.
@@ -43,7 +44,8 @@ def xyz_of_spectra(wavelengths_nm: Floats, reflectances: Floats) -> Floats:
 
 @cache
 def _weights() -> tuple[Floats, Floats]:
-    """Wavelengths [m] in nm, and D50 times the observer's functions [3, m], the sums of which are `D50_WHITE`."""
+    """Return wavelengths [m] in nm, and D50 times the observer's functions [3, m]. The sums of these are
+    `D50_WHITE`."""
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message='"Matplotlib" related')
@@ -62,7 +64,8 @@ def _weights() -> tuple[Floats, Floats]:
 
 
 def lab_of(xyz: ArrayLike) -> Floats:
-    """CIE 1976 L*, a*, b* [..., 3] of XYZ under D50; continued straight below 0 (CIE 15:2018, 8.2.1)."""
+    """Return CIE 1976 L*, a*, b* [..., 3] of XYZ under D50. Below 0 the formula continues as a straight line (CIE
+    15:2018, 8.2.1)."""
     ratio = np.asarray(xyz, dtype=np.float64) / D50_WHITE
     f = np.where(ratio > (6.0 / 29.0) ** 3, np.cbrt(ratio), ratio * (29.0 / 6.0) ** 2 / 3.0 + 4.0 / 29.0)
     return np.stack(
@@ -71,7 +74,7 @@ def lab_of(xyz: ArrayLike) -> Floats:
 
 
 def xyz_of(lab: ArrayLike) -> Floats:
-    """The inverse of `lab_of`."""
+    """Return the inverse of `lab_of`."""
     lightness, a, b = np.moveaxis(np.asarray(lab, dtype=np.float64), -1, 0)
     y = (lightness + 16.0) / 116.0
     f = np.stack([y + a / 500.0, y, y - b / 200.0], axis=-1)
@@ -79,21 +82,23 @@ def xyz_of(lab: ArrayLike) -> Floats:
 
 
 def d65_from_d50() -> Floats:
-    """[3, 3] XYZ under D65 of XYZ under D50, by Bradford's adaptation as in ICC.1:2022, annex E."""
+    """Return [3, 3], which maps XYZ under D50 to XYZ under D65, by Bradford's adaptation as in ICC.1:2022, annex
+    E."""
     scale = (_BRADFORD @ _D65_WHITE) / (_BRADFORD @ D50_WHITE)
     return np.asarray(np.linalg.solve(_BRADFORD, scale[:, None] * _BRADFORD))
 
 
 def de00(lab: Floats, reference: Floats) -> Floats:
-    """CIEDE2000 [...] (CIE 142-2001), all weights 1."""
+    """Return CIEDE2000 [...] (CIE 142-2001), with all weights 1."""
     return np.asarray(np.linalg.norm(de00_parts(lab, reference), axis=-1))
 
 
 def de00_parts(lab: Floats, reference: Floats) -> Floats:
-    """Three differences [..., 3] whose length is CIEDE2000: smooth where two colours agree, as its root is not.
+    """Return three differences [..., 3] whose length is CIEDE2000. They are smooth where two colours agree;
+    CIEDE2000 itself, a root, is not smooth there.
 
-    The formula's dL'/S_L, dC'/S_C, dH'/S_H with its rotation term, of which the quadratic form has the matrix
-    [[1, R/2], [R/2, 1]] in the last two, as a sum of squares: (c + R h / 2, h sqrt(1 - R^2 / 4)).
+    They are the formula's dL'/S_L, dC'/S_C, dH'/S_H with its rotation term. The quadratic form of the last two has
+    the matrix [[1, R/2], [R/2, 1]]. It is written as a sum of squares: (c + R h / 2, h sqrt(1 - R^2 / 4)).
     """
     l_1, a_1, b_1 = np.moveaxis(np.asarray(reference), -1, 0)
     l_2, a_2, b_2 = np.moveaxis(np.asarray(lab), -1, 0)

@@ -1,9 +1,11 @@
-"""The profile of a camera from a chart: XYZ under D50 from balanced channels, which are 1, 1, 1 of perfect white.
+"""The profile of a camera from a chart. It converts balanced channels, which are 1, 1, 1 for perfect white, to XYZ
+under D50.
 
-Two forms: a matrix [3, 3], and a root-polynomial of degree 2 (Finlayson, Mackiewicz and Hurlbert, Color correction
-using root-polynomial regression, IEEE Trans. Image Processing 24, 2015), whose terms r, g, b, sqrt(rg), sqrt(rb),
-sqrt(gb) scale with the exposure as a matrix does. Both keep white exactly. They are found by least squares in XYZ,
-weighted by the slope of L*, then for the least sum of squares of CIEDE2000, held weakly to the first.
+There are two forms: a matrix [3, 3], and a root-polynomial of degree 2 (Finlayson, Mackiewicz and Hurlbert, Color
+correction using root-polynomial regression, IEEE Trans. Image Processing 24, 2015). Its terms r, g, b, sqrt(rg),
+sqrt(rb), sqrt(gb) scale with the exposure, like those of a matrix. Both forms keep white exactly. First they are
+found by least squares in XYZ, weighted by the slope of L*. Then the sum of squares of CIEDE2000 is minimised, held
+weakly to the first solution.
 """
 
 from __future__ import annotations
@@ -22,21 +24,22 @@ from coupole.errors import InputError
 Form = Literal["matrix", "root-polynomial"]
 FORMS: tuple[Form, ...] = ("matrix", "root-polynomial")
 _HELD = 0.3
-"""Weight of a coefficient's departure from the first solution: CIEDE2000 for a change of 1."""
+"""Weight of a coefficient's departure from the first solution, as CIEDE2000 for a change of 1."""
 _LAB_STEP, _LOG_STEP = 1e-3, 1e-5
 _WORTH = 0.95
-"""A root-polynomial is taken if its mean error on patches left out is less than this share of the matrix's."""
+"""A root-polynomial is used if its mean error on left-out patches is less than this share of the matrix's
+error."""
 _LARGEST_CONDITION = 1e6
 
 
 @dataclass(frozen=True)
 class Balanced:
-    """Signals of the patches as the camera saw them, of one scale with the patches' colours."""
+    """Signals of the patches as the camera saw them, on the same scale as the patches' colours."""
 
     signal: Floats
     """[patches, 3] red, green, blue above dark under uniform light, in any unit."""
     u: Floats
-    """[patches, 3] standard uncertainty of each by noise, independent."""
+    """[patches, 3] standard uncertainty of each signal from noise; these errors are independent."""
     xyz: Floats
     """[patches, 3] under D50."""
     u_lab: float
@@ -44,10 +47,10 @@ class Balanced:
     neutral: tuple[int, ...]
     """Numbers of the grey patches."""
     white: Floats | None = None
-    """[3] signal of the perfect white, if it is known otherwise; None: from the grey patches."""
+    """[3] signal of the perfect white, if it is known from elsewhere; None: it comes from the grey patches."""
     light_u: Floats | None = None
-    """[patches, effects] relative changes of signals by one standard uncertainty of each of some independent
-    errors of the light, which all patches share; None: the light is known."""
+    """[patches, effects] relative changes of signals. Each effect is one standard uncertainty of an independent
+    error of the light, which all patches share. None: the light is known."""
 
     def without(self, patch: int) -> Balanced:
         keep = np.arange(len(self.signal)) != patch
@@ -56,7 +59,7 @@ class Balanced:
         return Balanced(self.signal[keep], self.u[keep], self.xyz[keep], self.u_lab, grey, self.white, light_u)
 
     def white_signal(self) -> Floats:
-        """[3] signal of the perfect white: that of the greys over their Y, weighted by it."""
+        """Signal [3] of the perfect white: the signal of the greys over their Y, weighted by Y."""
         if self.white is not None:
             return self.white
         luminance = self.xyz[list(self.neutral), 1]
@@ -69,21 +72,21 @@ class Profile:
 
     form: Form
     coefficients: Floats
-    """[3, terms]; each row sums to the white's X, Y or Z."""
+    """[3, terms]; each row sums to X, Y or Z of the white."""
     white_signal: Floats
-    """[3] of the perfect white."""
+    """[3] signal of the perfect white."""
 
     def xyz(self, signal: Floats) -> Floats:
-        """[n, 3] of signals [n, 3]."""
+        """Return [n, 3] for signals [n, 3]."""
         return self.xyz_of_balanced(signal / self.white_signal)
 
     def xyz_of_balanced(self, balanced_channels: Floats) -> Floats:
-        """[n, 3] of channels [n, 3] of which white has 1, 1, 1."""
+        """Return [n, 3] for channels [n, 3] that are 1, 1, 1 for white."""
         return np.asarray(terms_of(balanced_channels, self.form) @ self.coefficients.T)
 
 
 def terms_of(balanced_channels: Floats, form: Form) -> Floats:
-    """[n, 3] or [n, 6] terms; roots of negative products, which noise makes, are 0."""
+    """Return [n, 3] or [n, 6] terms. Roots of negative products, which come from noise, are 0."""
     if form == "matrix":
         return balanced_channels
     r, g, b = np.maximum(balanced_channels, 0.0).T
@@ -91,8 +94,8 @@ def terms_of(balanced_channels: Floats, form: Form) -> Floats:
 
 
 def fit_profile(patch_signals: Balanced, form: Form) -> Profile:
-    """The profile of patches. Raises InputError: no grey patch is left, or the channels do not tell colours
-    apart."""
+    """Find the profile of patches. Raises InputError if no grey patch is left, or if the channels do not
+    distinguish colours."""
     if not patch_signals.neutral and patch_signals.white is None:
         raise InputError("colour: no grey patch can be used; the channels cannot be balanced. Expose anew")
     white = patch_signals.white_signal()
@@ -102,7 +105,7 @@ def fit_profile(patch_signals: Balanced, form: Form) -> Profile:
 
 
 def _free(coefficients: Floats) -> Floats:
-    """The coefficients without the last of each row, which keeps white."""
+    """Return the coefficients without the last one of each row, which keeps white."""
     return np.asarray(coefficients[:, :-1])
 
 
@@ -111,7 +114,8 @@ def _whole(free: Floats) -> Floats:
 
 
 def _least_squares(terms: Floats, xyz: Floats) -> Floats:
-    """[3, terms] least squares in XYZ with weights that make relative errors of dark patches count, as L* does."""
+    """Return [3, terms], by least squares in XYZ. The weights make relative errors of dark patches count, as in
+    L*."""
     weight = 1.0 / (0.01 + xyz[:, 1]) ** (2.0 / 3.0)
     design = (terms[:, :-1] - terms[:, -1:]) * weight[:, None]
     if np.linalg.cond(design) > _LARGEST_CONDITION:
@@ -125,7 +129,7 @@ def _least_squares(terms: Floats, xyz: Floats) -> Floats:
 
 
 def _least_de00(terms: Floats, lab: Floats, first: Floats) -> Floats:
-    """[3, terms] with the least sum of squares of CIEDE2000."""
+    """Return [3, terms] with the least sum of squares of CIEDE2000."""
     from scipy.optimize import least_squares
 
     shape = _free(first).shape
@@ -134,7 +138,7 @@ def _least_de00(terms: Floats, lab: Floats, first: Floats) -> Floats:
 
 
 def _residuals(terms: Floats, lab: Floats, first: Floats, shape: tuple[int, int], free: Floats) -> Floats:
-    """Residuals: CIEDE2000's parts of all patches, and departures from the first solution."""
+    """Return residuals: CIEDE2000's parts of all patches, and departures from the first solution."""
     coefficients = _whole(free.reshape(shape))
     parts = de00_parts(lab_of(terms @ coefficients.T), lab).ravel()
     return np.concatenate([parts, _HELD * (coefficients - first).ravel()])
@@ -145,7 +149,7 @@ def _residuals(terms: Floats, lab: Floats, first: Floats, shape: tuple[int, int]
 
 @dataclass(frozen=True)
 class LeftOut:
-    """CIEDE2000 of patches, each by a profile that was made without it."""
+    """CIEDE2000 of patches, each with a profile that was made without this patch."""
 
     de: Floats
     """[patches]."""
@@ -162,9 +166,10 @@ class LeftOut:
         return float(self.de.max())
 
     def bound(self, share: float) -> tuple[float, float]:
-        """CIEDE2000 that a share of further colours like the patches' does not exceed, and the share it is for:
-        the smallest order statistic k with k / (n + 1) of the share or more (split conformal prediction: Vovk,
-        Gammerman and Shafer, Algorithmic Learning in a Random World, 2005), of n patches the largest at most."""
+        """Return a bound of CIEDE2000 for a share of further colours like the patches', and the share that it
+        holds for. The bound is the smallest order statistic k for which k / (n + 1) is at least the share, or the
+        largest of the n patches (split conformal prediction: Vovk, Gammerman and Shafer, Algorithmic Learning in a
+        Random World, 2005)."""
         count = len(self.de)
         place = min(int(np.ceil(share * (count + 1))), count)
         return float(np.sort(self.de)[place - 1]), min(share, place / (count + 1))
@@ -176,10 +181,10 @@ def leave_out(
     tell: Callable[[], None] = lambda: None,
     seen_without: Sequence[Balanced] | None = None,
 ) -> LeftOut:
-    """Each patch by the profile of the others, with their balance. `tell` is called after each.
+    """Predict each patch by the profile of the others, with their balance. `tell` is called after each patch.
 
-    `seen_without` has for each patch the signals of all patches under a light that was found without it. Raises
-    InputError if there is one grey patch only.
+    `seen_without` has, for each patch, the signals of all patches under a light that was found without this patch.
+    Raises InputError if there is only one grey patch.
     """
     de = np.empty(len(patch_signals.signal))
     lab = lab_of(patch_signals.xyz)
@@ -192,8 +197,8 @@ def leave_out(
 
 
 def better(matrix: LeftOut, roots: LeftOut) -> Form:
-    """The form with the smaller error for left-out patches; the matrix, unless the other form is clearly
-    better.
+    """Return the form with the smaller error for left-out patches. It is the matrix, unless the other form is
+    clearly better.
     """
     return "root-polynomial" if roots.mean < _WORTH * matrix.mean and roots.worst < matrix.worst else "matrix"
 
@@ -202,12 +207,12 @@ def better(matrix: LeftOut, roots: LeftOut) -> Form:
 
 
 def covariance_of(patch_signals: Balanced, profile: Profile) -> tuple[Floats, Floats, Floats]:
-    """Covariances [3 terms, 3 terms] of the coefficients, row by row: by the noise of signals, by the patches' own
-    uncertainty, and by that of the light.
+    """Return covariances [3 terms, 3 terms] of the coefficients, row by row. The first is from the noise of
+    signals, the second from the patches' own uncertainty, and the third from that of the light.
 
-    The misses' derivatives J by the coefficients and K by the data give dm = -(J'J)^-1 J'K dd (the implicit
-    function theorem on the normal equations, with Gauss and Newton's approximation). What the form itself cannot
-    follow (metamerism) is no noise: `leave_out` has it.
+    Let J and K be the derivatives of the misses by the coefficients and by the data. Then dm = -(J'J)^-1 J'K dd
+    (the implicit function theorem on the normal equations, with Gauss and Newton's approximation). Errors that the
+    form itself cannot follow (metamerism) are not noise; `leave_out` shows them.
     """
     lab = lab_of(patch_signals.xyz)
     signal = patch_signals.signal / profile.white_signal
@@ -241,7 +246,8 @@ Parts = Callable[[Floats, Floats, Floats], Floats]
 def _by_noise(
     patch_signals: Balanced, profile: Profile, balanced_channels: Floats, parts: Parts, free: Floats, lab: Floats
 ) -> Sequence[Floats]:
-    """Changes of the misses by one standard uncertainty of each signal, with that of the balance it makes."""
+    """Return changes of the misses by one standard uncertainty of each signal. They include the change of the
+    balance."""
     columns = []
     grey = list(patch_signals.neutral)
     luminance = patch_signals.xyz[grey, 1]
@@ -264,7 +270,7 @@ def _by_noise(
 def _by_chart(
     patch_signals: Balanced, balanced_channels: Floats, parts: Parts, free: Floats, lab: Floats
 ) -> Sequence[Floats]:
-    """The same by the patches' L*, a*, b*; a grey's L* moves the balance too."""
+    """Return the same for the patches' L*, a*, b*. The L* of a grey patch changes the balance too."""
     columns = []
     grey = list(patch_signals.neutral)
     for patch in range(len(lab)):
@@ -287,7 +293,7 @@ def _by_chart(
 def _by_light(
     patch_signals: Balanced, balanced_channels: Floats, parts: Parts, free: Floats, lab: Floats
 ) -> Sequence[Floats]:
-    """The same by each error of the light, with that of the balance it makes."""
+    """Return the same for each error of the light, including the change of the balance."""
     columns = []
     grey = list(patch_signals.neutral)
     luminance = patch_signals.xyz[grey, 1]

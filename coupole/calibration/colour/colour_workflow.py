@@ -1,4 +1,4 @@
-"""Make the record of a colour profile from a chart's signals."""
+"""Makes the record of a colour profile from a chart's signals."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from coupole.errors import InputError
 from coupole.pages.page_parts import Section, Table
 
 MATRIX = "xyz_d50_from_balanced."
-"""Begins the names of the matrix's coefficients: then X, Y or Z, and r, g or b."""
+"""First part of the names of the matrix's coefficients. X, Y or Z follows, then r, g or b."""
 _TERMS = ("r", "g", "b", "sqrt_rg", "sqrt_rb", "sqrt_gb")
 _MOST_EDGE_PICTURES = 8
 _SHARE = 0.95
@@ -65,13 +65,15 @@ class Seen:
     edges: Mapping[str, Sequence[SlantedEdge]] = field(default_factory=dict)
     white: ChartPicture | None = None
     light_u: Floats | None = None
-    """Errors of the light, as in `Balanced`."""
+    """Errors of the light, as in `Balanced.light_u`."""
     signals_without: Sequence[Signals] | None = None
-    """Signals of all patches, for each patch under a light found without it; None if the light is known."""
+    """Signals of all patches for each patch, under a light that was found without this patch; None if the light is
+    known."""
     shown_chart: ShownChart | None = None
     """The chart in a plain picture."""
     remarks: tuple[str, ...] = ()
-    """Sentences about plain pictures: what was left out, turned or found of the light."""
+    """Sentences about plain pictures: patches that were left out, turned pictures, and the light that was
+    found."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +88,8 @@ class Origin:
 
 
 def see_in_runs(frames: LightFrames, setting: ChartSetting, white: LightFrames | None, progress: Progress) -> Seen:
-    """The chart in runs, under all suitable lights; `white` are frames of a white sheet in its place. Raises
-    InputError: frames without their white ones, and as `combined`, `edges_of`."""
+    """Read the chart in runs, under all suitable lights. `white` are frames of a white sheet in its place. Raises
+    InputError if white frames are missing, and like `combined_signals` and `edges_of`."""
     reader = ChartReader(frames, setting)
     names = setting.chart.patch_names
     whites = {} if white is None else white_of(white, setting)
@@ -115,7 +117,7 @@ def see_in_runs(frames: LightFrames, setting: ChartSetting, white: LightFrames |
 
 @dataclass(frozen=True)
 class _Made:
-    """Both forms of the profile, and which is taken."""
+    """Both forms of the profile, and the chosen one."""
 
     profiles: Mapping[Form, Profile]
     left_out: Mapping[Form, LeftOut]
@@ -137,7 +139,7 @@ def colour_outcome(
     request: Request,
     progress: Progress,
 ) -> Outcome:
-    """The record of a profile, with the profile as ICC file and a table of the patches beside it."""
+    """Return the record of a profile. Beside it are the profile as an ICC file and a table of the patches."""
     forms, balanced_signals = make_profiles(measurements, known_chart, progress)
     lab = lab_of(forms.chosen_profile.xyz(balanced_signals.signal))
     figures = figures_of(measurements, known_chart, forms, balanced_signals, lab)
@@ -174,13 +176,13 @@ def colour_outcome(
 
 
 def balanced_of(signals: Signals, known_chart: KnownChart, light_u: Floats | None = None) -> Balanced:
-    """The signals with the colours of their patches."""
+    """Return the signals with the colours of their patches."""
     chart = known_chart.chart
     return Balanced(signals.mean, signals.u, known_chart.xyz, chart.u_lab, known_chart.neutral, light_u=light_u)
 
 
 def make_profiles(measurements: Seen, known_chart: KnownChart, progress: Progress) -> tuple[_Made, Balanced]:
-    """Both forms with their errors on patches left out."""
+    """Return both forms with their errors on left-out patches."""
     balanced_signals = balanced_of(measurements.signals, known_chart, measurements.light_u)
     seen_without = (
         None
@@ -196,7 +198,7 @@ def make_profiles(measurements: Seen, known_chart: KnownChart, progress: Progres
 def figures_of(
     measurements: Seen, known_chart: KnownChart, profile_choice: _Made, patch_signals: Balanced, lab: Floats
 ) -> list[Figure]:
-    """All figures of image quality that these pictures give."""
+    """Return all figures of image quality that these pictures give."""
     figures = colour_figures(profile_choice.left_out_errors.de)
     figures += tone_figures(lab, known_chart.lab, known_chart.neutral)
     figures += noise_figures(
@@ -242,7 +244,7 @@ def _patch_section(known_chart: KnownChart, profile_choice: _Made, lab: Floats) 
 
 
 def _parameters(matrix: Profile, covariances: Sequence[Floats], patches: int) -> list[Parameter]:
-    """The matrix's coefficients, row by row."""
+    """Return the matrix's coefficients, row by row."""
     parameters = []
     origins = ("noise of signals", "patches' own values", "light over the chart")
     for n, (axis, channel) in enumerate((axis, channel) for axis in "XYZ" for channel in "rgb"):
@@ -260,7 +262,7 @@ def _parameters(matrix: Profile, covariances: Sequence[Floats], patches: int) ->
 
 
 def _fixed_figures(profile_choice: _Made, figures: Sequence[Figure]) -> dict[str, float]:
-    """Balance, DNG's matrix, the root-polynomial, errors and figures."""
+    """Return the balance, DNG's matrix, the root-polynomial, errors and figures."""
     matrix, roots = profile_choice.profiles["matrix"], profile_choice.profiles["root-polynomial"]
     white = matrix.white_signal
     fixed_figures = {
@@ -289,8 +291,8 @@ def _fixed_figures(profile_choice: _Made, figures: Sequence[Figure]) -> dict[str
 
 
 def _patch_table(known_chart: KnownChart, patch_signals: Balanced, profile_choice: _Made, lab: Floats) -> str:
-    """CSV: each patch's balanced channels, its L*a*b* on the chart and by the profile, CIEDE2000 with and without
-    it."""
+    """Return CSV with, for each patch, its balanced channels, its L*a*b* on the chart and from the profile, and
+    CIEDE2000 with and without it."""
     text = io.StringIO()
     text.write("# channels: the perfect white has 1; L*, a*, b* under D50, 1931 observer\n")
     text.write("patch,r,g,b,u_r,u_g,u_b,L,a,b_star,L_found,a_found,b_found,de00,de00_left_out\n")

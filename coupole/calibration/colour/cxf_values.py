@@ -1,11 +1,12 @@
-"""Values of a chart's patches from CxF3 files (ISO 17972-1), which instruments of today write; read by colour-cxf.
+"""Values of a chart's patches from CxF3 files (ISO 17972-1), which today's instruments write. colour-cxf reads
+them.
 
 A patch is an object with a name. i1Profiler numbers its objects instead (`M1_Measurement12`) and gives their row
-and column: such patches are A1, A2, ... by their place. The reflectance spectrum of a patch is preferred. Its
-wavelengths follow from the first one (of the spectrum, or of its colour specification) and from the increment of
-the specification. Without spectra, L*a*b* or XYZ is taken, under D50 for the 1931 observer alone. A file may hold
-each patch several times, once for each condition of measurement (ISO 13655: M0, M1, M2). The type of the objects
-tells which are meant.
+and column: such patches are named A1, A2, ... by their place. The reflectance spectrum of a patch is preferred.
+Its wavelengths follow from the first one (of the spectrum, or of its colour specification) and from the increment
+of the specification. Without spectra, L*a*b* or XYZ is taken, under D50 for the 1931 observer alone. A file may
+hold each patch several times, once for each condition of measurement (ISO 13655: M0, M1, M2). The type of the
+objects tells which are meant.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ _LEAST_BANDS = 10
 
 
 def read_cxf_values(path: Path, unit: Unit = "auto", object_type: str | None = None) -> ChartValues:
-    """Colours of the named objects, of those of one type if it is given.
+    """Return the colours of the named objects; of only one type, if it is given.
 
-    Raises InputError: no CxF3, a patch twice, spectra without wavelengths, no colours, or colours under another
-    light.
+    Raises InputError if the file is not CxF3, a patch occurs twice, spectra have no wavelengths, or colours are
+    missing or under another light.
     """
     document = _parse(path)
     resources = document.resources
@@ -81,7 +82,7 @@ def _parse(path: Path) -> CxF:
 
 
 def _patch_name(item: Any) -> str:
-    """The object's name, or A1, A2, ... of the place of an object that only has a number."""
+    """Return the object's name. If the object has only a number, return A1, A2, ... by its place."""
     name = str(item.name)
     tags = {
         str(tag.name): str(tag.value)
@@ -102,7 +103,7 @@ def _patch_name(item: Any) -> str:
 def _objects_of_type(
     path: Path, objects: Sequence[tuple[str, str, Any]], object_type: str | None
 ) -> list[tuple[str, str, Any]]:
-    """The objects of the type, each name once."""
+    """Return the objects of the type, each name once."""
     types = list(dict.fromkeys(of_type for _, of_type, _ in objects))
     if object_type is not None and object_type not in types:
         raise InputError(f"{path}: has no objects of type {object_type}; it has {', '.join(types) or 'none'}")
@@ -119,7 +120,7 @@ def _objects_of_type(
 
 
 def _first_colour(values: Any, kind: str) -> Any | None:
-    """The first colour of a kind, by the name of its element."""
+    """Return the first colour of a kind, by the name of its element."""
     return next((item for item in values.choice if type(item).__name__.lower() == kind.lower()), None)
 
 
@@ -137,7 +138,8 @@ def _colours_of_spectra(
 
 
 def _numbers(path: Path, name: str, values: Sequence[Any]) -> Floats:
-    """[n]. Raises InputError: the parser keeps what is no number as it is, and what is missing as None."""
+    """[n]. Raises InputError for a value that is not a number or is missing, because the parser keeps such
+    values."""
     try:
         numbers = np.asarray(values, float)
     except (TypeError, ValueError):
@@ -165,7 +167,8 @@ def _wavelengths_nm(path: Path, name: str, spectrum: Any, specification: Any) ->
 
 
 def _colour(path: Path, name: str, values: Any, specifications: dict[str, Any]) -> Floats:
-    """XYZ of L*a*b* or XYZ. Raises InputError if neither is there, or if it is for another light or observer."""
+    """Return XYZ from L*a*b* or XYZ. Raises InputError if both are missing, or if they are for another light or
+    observer."""
     lab = _first_colour(values, "ColorCielab")
     colour = lab if lab is not None else _first_colour(values, "ColorCiexyz")
     if colour is None:

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ShownChart:
-    """A plain picture of the chart, reduced, and where its patches were read."""
+    """A plain picture of the chart, reduced, with the places where its patches were read."""
 
     picture: Floats
-    """[h, w, 3] 0 to 1, encoded for displays."""
+    """[h, w, 3] from 0 to 1, encoded for displays."""
     polygons_px: Floats
     """[patches, 4, 2] in pixels of `picture`."""
     names: Sequence[str]
@@ -40,8 +40,8 @@ def draw_colour(
     record: Record,
     figure: Figure,
 ) -> None:
-    """Fill the figure; `lab` [patches, 3] is by the profile, `de` [patches] CIEDE2000 of patches left out.
-    The last part is the chart where it was found in a picture, or the response at `edges`."""
+    """Fill the figure. `lab` [patches, 3] is from the profile, and `de` [patches] is CIEDE2000 of left-out
+    patches. The last part shows the chart as it was found in a picture, or the response at `edges`."""
     axes = figure.subplots(2, 2)
     names = known_chart.chart.patch_names
     axes[0, 0].bar(range(len(de)), de, color=BLUE)

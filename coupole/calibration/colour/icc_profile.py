@@ -1,8 +1,8 @@
 """A camera's profile as ICC.1:2022 (version 4.4): an input profile from balanced linear channels to XYZ under D50.
 
-The device's red, green, blue are 1 where the perfect white is, and linear. Matrix and curves (8.3.3) are always
-written; a root-polynomial also as `A2B0` (10.12, lutAToBType): roots of the channels, a table of roots of X, Y, Z
-over them, and powers, so that the table is finer in the dark, as L* is.
+The device's red, green, blue are linear, and are 1 for the perfect white. Matrix and curves (8.3.3) are always
+written. A root-polynomial is also written as `A2B0` (10.12, lutAToBType): roots of the channels, a table of roots
+of X, Y, Z over them, and powers. So the table is finer in the dark, like L*.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from coupole.calibration.colour.colour_profile import Profile
 from coupole.calibration.rotations import Floats
 
 _GRID, _POWER = 49, 2.5
-"""A compromise of errors in bright and dark colours: below 0.06 in L*, a*, b* of the simulated chart's patches,
-and 0.13 at a twentieth of their light."""
+"""Points of the table's grid, and exponent. They are a compromise of errors in bright and dark colours: the errors
+are below 0.06 in L*, a*, b* for the simulated chart's patches, and below 0.13 at a twentieth of their light."""
 _HEAD_BYTES, _TAG_BYTES = 128, 12
 _LARGEST_XYZ = 1.0 + 32767.0 / 32768.0
-"""Value that the largest code of X, Y, Z stands for (ICC.1:2022, 6.3.4.2)."""
+"""The value of the largest code of X, Y, Z (ICC.1:2022, 6.3.4.2)."""
 
 
 def icc_profile(chosen_profile: Profile, matrix: Profile, name: str, creation_time: datetime) -> bytes:
-    """The whole file. `chosen_profile` goes into the table if it is a root-polynomial, `matrix` into matrix and
-    curves. `name` is its description, in ASCII."""
+    """Return the whole file. `chosen_profile` goes into the table if it is a root-polynomial; `matrix` goes into
+    matrix and curves. `name` is the profile's description, in ASCII."""
     columns = matrix.coefficients.T
     tags: dict[bytes, bytes] = {
         b"desc": _text(name),

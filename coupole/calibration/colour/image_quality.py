@@ -22,12 +22,12 @@ from coupole.errors import InputError
 _STEP = 1e-4
 _NYQUIST = 0.5
 _BLOCKS = (9, 7)
-"""Across and down the picture, for uniformity."""
+"""Numbers of blocks across and down the picture, for uniformity."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure, and what it means."""
+    """One figure and its meaning."""
 
     name: str
     value: float
@@ -37,8 +37,8 @@ class Figure:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Largest values (least ones, if `at_least`) of ISO's levels A, B, C and FADGI's 4, 3, 2, 1 stars; the first
-    may be reached, the second must not be."""
+    """Limits of ISO's levels A, B, C and FADGI's 4, 3, 2, 1 stars: largest values, or least ones if `at_least`.
+    ISO's limits may be reached; FADGI's must not be reached."""
 
     iso: tuple[float, ...]
     fadgi: tuple[float, ...]
@@ -74,11 +74,11 @@ TOLERANCES: Mapping[str, Tolerance] = {
     "noise": Tolerance((1.6, 2.0, 2.2), (1.0, 2.0, 3.0, 4.0)),
     "sampling_efficiency": Tolerance((0.85, 0.80, 0.70), (0.90, 0.80, 0.70, 0.60), at_least=True),
 }
-"""Tolerances by the name of a figure; the other figures have none that could be verified."""
+"""Tolerances by the name of a figure. The other figures have no tolerance that could be verified."""
 
 
 def sentence_of(figure: Figure) -> str:
-    """A figure in words, with its level."""
+    """Return a figure in words, with its level."""
     unit = f" {figure.unit}" if figure.unit else ""
     tolerance = TOLERANCES.get(figure.name)
     level = tolerance.level(figure.value) if tolerance else "no verified tolerance"
@@ -104,8 +104,8 @@ def tone_figures(found_lab: Floats, known_lab: Floats, neutral: Sequence[int]) -
 
 
 def noise_figures(mean: Floats, pixel_sd: Floats, profile: Profile, neutral: Sequence[int]) -> list[Figure]:
-    """Standard deviation of L* over the pixels of a grey, and its signal over noise, of one frame. A pixel's three
-    colours count as independent; a RAW frame's are measured at three places."""
+    """Return the standard deviation of L* over the pixels of a grey, and its signal over noise, for one frame. The
+    three colours of a pixel count as independent, because a RAW frame measures them at three places."""
     grey = mean[list(neutral)]
     slopes = np.empty_like(grey)
     for channel in range(3):
@@ -122,7 +122,8 @@ def noise_figures(mean: Floats, pixel_sd: Floats, profile: Profile, neutral: Seq
 
 
 def edges_of(picture: ChartPicture, names: Sequence[str]) -> dict[str, tuple[SlantedEdge, ...]]:
-    """Each edge in red, green and blue. Raises InputError for edges outside the picture, and as `slanted_edge`."""
+    """Return each edge in red, green and blue. Raises InputError for edges outside the picture, and like
+    `slanted_edge`."""
     edges = {}
     for name, polygon in zip(names, picture.edges_px, strict=True):
         inside = pixels_inside(polygon, picture.signal.shape)
@@ -141,7 +142,7 @@ def edges_of(picture: ChartPicture, names: Sequence[str]) -> dict[str, tuple[Sla
 
 
 def edge_figures(edges: Mapping[str, Sequence[SlantedEdge]]) -> list[Figure]:
-    """Sharpness in green, the worst of the edges, and the largest shift between colours."""
+    """Return the sharpness in green, which is that of the worst edge, and the largest shift between colours."""
     green = [colours[1] for colours in edges.values()]
     shifts = [abs(_shift(colours[k], colours[1])) for colours in edges.values() for k in (0, 2)]
     mtf50, mtf10 = (min(min(edge.frequency_at(share), 1.0) for edge in green) for share in (0.5, 0.1))
@@ -156,12 +157,13 @@ def edge_figures(edges: Mapping[str, Sequence[SlantedEdge]]) -> list[Figure]:
 
 
 def _shift(edge: SlantedEdge, green: SlantedEdge) -> float:
-    """Return how far an edge is from green's along the normal, at the middle of green's pixels, px."""
+    """Return the distance of an edge from green's edge along the normal, at the middle of green's pixels, px."""
     return edge.offset_px - float(edge.normal @ (green.middle_px - edge.middle_px)) - green.offset_px
 
 
 def uniformity_figure(white: ChartPicture, shape: tuple[int, int] = _BLOCKS) -> Figure:
-    """Largest difference of L* in green between blocks of a picture of a white sheet; its brightest has L* 100."""
+    """Return the largest difference of L* in green between blocks of a picture of a white sheet. Its brightest
+    block has L* 100."""
     rows, columns = np.mgrid[: white.signal.shape[0], : white.signal.shape[1]]
     inside = (rows.ravel(), columns.ravel())
     take = samples_of(white, "G", inside)

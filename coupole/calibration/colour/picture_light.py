@@ -1,10 +1,11 @@
-"""The light over a chart in a plain picture that no white card shows: found with the matrix, from the patches.
+"""The light over a chart in a plain picture without a white card. It is found from the patches, together with the
+matrix.
 
 Light and the lens's fall-off are taken as one smooth factor, exp(sum of t_k f_k(x, y)), of all three channels. Its
-t_k and the matrix's coefficients have together the least sum of squares of CIEDE2000 (after Finlayson, Gong and
+t_k and the matrix's coefficients together minimise the sum of squares of CIEDE2000 (after Finlayson, Gong and
 Fisher, Color homography: theory and applications, IEEE Trans. PAMI 41, 2019, who have a factor for each patch).
-What the matrix cannot follow of the patches' colours counts as noise of this adjustment, of another size for each
-patch and for lightness, chroma and hue.
+Errors of the patches' colours that the matrix cannot follow count as noise of this adjustment. The noise differs
+between patches, and between lightness, chroma and hue.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from coupole.calibration.colour.colour_profile import Balanced, fit_profile
 from coupole.calibration.rotations import Floats
 
 _LEAST_FOR_CURVES = 18
-"""Least number of patches for a light with curvature; with fewer it is a slope."""
+"""Least number of patches for a light with curvature. With fewer patches the light is a slope."""
 _MOST = 0.7
 """Largest t_k in absolute value, as a natural logarithm."""
 
@@ -30,30 +31,30 @@ class FoundLight:
     terms: Floats
     """[n] t_k."""
     covariance: Floats
-    """[n, n] of these."""
+    """[n, n] covariance of the terms."""
     basis: Floats
     """[patches, n] f_k at the patches."""
 
     def factor(self) -> Floats:
-        """[patches] of the light at the patches; the mean of its logarithms is 0."""
+        """Factor [patches] of the light at the patches. The mean of its logarithms is 0."""
         return np.asarray(np.exp(self.basis @ self.terms))
 
     def effects(self) -> Floats:
-        """[patches, n] relative changes of signals by one standard uncertainty of each of n independent errors."""
+        """Relative changes [patches, n] of signals by one standard uncertainty of each of n independent errors."""
         values, directions = np.linalg.eigh(self.covariance)
         return np.asarray(self.basis @ (directions * np.sqrt(np.maximum(values, 0.0))))
 
     @property
     def span(self) -> tuple[float, float]:
-        """Largest factor over the smallest less 1, and the standard uncertainty of this difference."""
+        """Largest factor over the smallest, minus 1, and the standard uncertainty of this difference."""
         logarithm = self.basis @ self.terms
         across = self.basis[int(np.argmax(logarithm))] - self.basis[int(np.argmin(logarithm))]
         return float(np.exp(np.ptp(logarithm)) - 1.0), float(np.sqrt(across @ self.covariance @ across))
 
 
 def light_basis(centres: Floats) -> Floats:
-    """[patches, n] of patches at [patches, 2]: two slopes, and three curvatures where there are patches enough;
-    each has a mean of 0 over the patches. A chart of one row has no slope across it."""
+    """Return [patches, n] for patches at [patches, 2]: two slopes, and three curvatures if there are enough
+    patches. Each has a mean of 0 over the patches. A chart of one row has no slope across it."""
     middle, half = (centres.max(axis=0) + centres.min(axis=0)) / 2.0, np.ptp(centres, axis=0) / 2.0
     x, y = ((centres - middle) / np.where(half > 0.0, half, 1.0)).T
     shapes = [x, y] if len(centres) < _LEAST_FOR_CURVES else [x, y, x * x, x * y, y * y]
@@ -66,8 +67,8 @@ def light_basis(centres: Floats) -> Floats:
 
 
 def find_light(patch_signals: Balanced, basis: Floats, at: Floats | None = None) -> FoundLight:
-    """The light of patches whose signals are not yet divided by it; `at` [m, n] are the functions where it is
-    wanted, by default `basis` [patches, n]. Raises InputError as `fit_profile`."""
+    """Find the light of patches whose signals are not yet divided by it. `at` [m, n] are the functions at the
+    places where the light is wanted; the default is `basis` [patches, n]. Raises InputError like `fit_profile`."""
     from scipy.optimize import least_squares
 
     lab = lab_of(patch_signals.xyz)
@@ -90,11 +91,12 @@ def find_light(patch_signals: Balanced, basis: Floats, at: Floats | None = None)
 
 
 def _robust_covariance(design: Floats, residuals: Floats) -> Floats:
-    """[unknowns, unknowns] of a least-squares solution with the derivatives `design` [3 patches, unknowns].
+    """Return the covariance [unknowns, unknowns] of a least-squares solution with the derivatives `design` [3
+    patches, unknowns].
 
-    The three `residuals` of a patch depend on each other and differ in size: they are clusters, with the
-    correction CR2 (Bell and McCaffrey, Bias reduction in standard errors for linear regression with multi-stage
-    samples, Survey Methodology 28, 2002).
+    The three `residuals` of a patch depend on each other and differ in size. So they are treated as a cluster,
+    with the correction CR2 (Bell and McCaffrey, Bias reduction in standard errors for linear regression with
+    multi-stage samples, Survey Methodology 28, 2002).
     """
     inverse = np.linalg.inv(design.T @ design)
     by_patch = design.reshape(-1, 3, design.shape[1])

@@ -1,4 +1,4 @@
-"""See a chart in plain pictures: from linear pictures to signals of the patches under even light.
+"""Reads a chart in plain pictures: from linear pictures to signals of the patches under even light.
 
 The light over the chart comes from a picture of a white card in its place, or is found with the matrix from the
 patches (`picture_light`).
@@ -32,16 +32,16 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 _GAMMA = (0.8, 1.25)
-"""Slopes of the greys' logarithmic signals over their logarithmic luminance that are taken as linear, with room
-for uneven light and stray light; sRGB's is 0.45."""
+"""Slopes of the greys' logarithmic signals over their logarithmic luminance that count as linear. They leave room
+for uneven light and stray light; sRGB's slope is 0.45."""
 _LEAST_GREYS, _LEAST_RANGE = 3, 3.0
-"""Greys, and ratio of their luminances, by which it can be told."""
+"""Least number of greys, and least ratio of their luminances, for a test of linearity."""
 _ROUGH = 0.15
 """Largest departure of a white card's signals from a smooth light, in natural logarithms."""
 _OFFSET_TOLD = 0.004
-"""Signal of a perfect black, of the perfect white's, from which it is told."""
+"""Signal of a perfect black, as a share of the perfect white's, from which it is reported."""
 _TINT_TOLD, _TINT_REFUSED = 0.01, 0.05
-"""Differences of the light's colour between pictures, relative."""
+"""Relative differences of the light's colour between pictures, from which they are reported and refused."""
 _SHOWN_PX = 1200
 
 
@@ -51,7 +51,7 @@ class SeenInPictures:
 
     sighting: Seen
     known_chart: KnownChart
-    """Chart without the patches that most pictures do not show well."""
+    """The chart without patches that most pictures show badly."""
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,10 @@ def see_in_pictures(
     white: PlainPicture | None,
     progress: Progress,
 ) -> SeenInPictures:
-    """The chart in pictures of one camera under one light; the chart may lie otherwise in each of them.
+    """Read the chart in pictures of one camera under one light. The chart's place may differ between pictures.
 
-    `corners_px` [4, 2] hold for all of them. Raises InputError: no picture shows the chart, values that are not
-    linear, lights of other colours, a white card that is saturated or elsewhere, too few patches left.
+    `corners_px` [4, 2] hold for all pictures. Raises InputError if no picture shows the chart, values are not
+    linear, lights differ in colour, the white card is saturated or elsewhere, or too few patches are left.
     """
     _refuse_sizes(pictures, white)
     tell = counter(progress, len(pictures))
@@ -135,7 +135,8 @@ def _pixel(place: PlacedChart) -> str:
 def _without_bad(
     known_chart: KnownChart, views: Sequence[_ChartView], remarks: list[str]
 ) -> tuple[KnownChart, list[_ChartView]]:
-    """Chart and readings without patches that are saturated, uneven or dark in most pictures; all are told."""
+    """Return chart and readings without patches that are saturated, uneven or dark in most pictures. All of these
+    are reported."""
     names = known_chart.chart.patch_names
     full = np.stack([view.reading.full for view in views])
     uneven = np.stack([view.plain.uneven for view in views])
@@ -208,7 +209,7 @@ def _refuse_tints(views: Sequence[_ChartView], known_chart: KnownChart, remarks:
 def _by_white(
     views: Sequence[_ChartView], known_chart: KnownChart, white: PlainPicture, remarks: list[str]
 ) -> tuple[Floats, list[_ChartView]]:
-    """[pictures, patches, 3] the card's signals, and readings that have its noise too."""
+    """Return [pictures, patches, 3], the card's signals, and readings that include the card's noise."""
     chart = known_chart.chart
     lights, noisy = [], []
     for view in views:
@@ -235,7 +236,7 @@ def _by_white(
 
 
 def _refuse_rough(white: PlainPicture, card: Reading, chart: Chart) -> None:
-    """Raise InputError if the card's signals are no smooth light."""
+    """Raise InputError if the card's signals are not a smooth light."""
     light = np.log(card.mean)
     basis = np.column_stack([np.ones(len(light)), light_basis(chart.centres_mm)])
     smooth, *_ = np.linalg.lstsq(basis, light)
@@ -272,7 +273,7 @@ def _by_found_light(
 
 
 def _light_of(reading: Reading, known_chart: KnownChart, basis: Floats, without: int | None) -> FoundLight:
-    """The light of one picture by its good patches, all but one of them."""
+    """Find the light of one picture from its good patches, all or all but one."""
     patch_signals = balanced_of(Signals(reading.mean, reading.u, reading.pixel_sd, ()), known_chart)
     good = ~reading.full
     if without is not None:
@@ -283,7 +284,7 @@ def _light_of(reading: Reading, known_chart: KnownChart, basis: Floats, without:
 
 
 def _offsets(signals: Signals, known_chart: KnownChart) -> list[str]:
-    """A sentence if straight lines through the greys do not end at 0: neither profile can follow that."""
+    """Return a sentence if straight lines through the greys do not end at 0. Neither profile can follow this."""
     grey = list(known_chart.neutral)
     luminance = known_chart.xyz[grey, 1]
     if len(grey) < _LEAST_GREYS or luminance.max() < _LEAST_RANGE * luminance.min():

@@ -1,8 +1,9 @@
-"""Spatial frequency response from a slanted edge, and where the edge is in each colour.
+"""Spatial frequency response from a slanted edge, and the place of the edge in each colour.
 
-After ISO 12233:2017, annex D (e-SFR), with two differences. The edge's line (a parabola, as lenses bend it) is
-fitted to all pixels at once in place of centroids by rows, so that pixels of one colour of a RAW frame can be used
-where they are, without interpolation; and besides the derivative, the width of the bins is corrected for.
+The method is that of ISO 12233:2017, annex D (e-SFR), with two differences. First, the edge's line (a parabola,
+because lenses bend it) is fitted to all pixels at once, instead of centroids by rows. So pixels of one colour of a
+RAW frame can be used at their places, without interpolation. Second, not only the derivative but also the width of
+the bins is corrected for.
 """
 
 from __future__ import annotations
@@ -17,11 +18,12 @@ from coupole.errors import InputError
 _BIN_PX = 0.25
 _LEAST_PIXELS = 60
 _REACH_PX = 3.0
-"""The least width of either side of the edge."""
+"""Least width of each side of the edge."""
 _LEAST_CONTRAST = 0.2
 """Least contrast of an edge, (light - dark) / (light + dark)."""
 _LEAST_SLANT_DEG = 1.0
-"""Least slant of an edge against the pixels' rows and columns: below it bins would stay empty or be biased."""
+"""Least slant of an edge against the pixels' rows and columns. With a smaller slant, bins would be empty or
+biased."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,8 @@ class SlantedEdge:
     """[n], 1 at frequency 0."""
 
     def frequency_at(self, share: float) -> float:
-        """The first frequency at which the response falls to a share, cycles per pixel; 0.5 or above it beyond the
-        sampling's limit, infinite if it never falls so far."""
+        """Return the first frequency at which the response falls to a share, cycles per pixel. The sampling's
+        limit is 0.5. The result is infinite if the response never falls so far."""
         below = np.flatnonzero(self.response <= share)
         if not len(below):
             return float("inf")
@@ -52,10 +54,10 @@ class SlantedEdge:
 
 
 def slanted_edge(x_px: Floats, y_px: Floats, values: Floats, where: str = "edge") -> SlantedEdge:
-    """The edge in pixels at x [n], y [n] with linear values [n].
+    """Find the edge in pixels at x [n], y [n] with linear values [n].
 
-    Raises InputError, with `where` as its name: too few pixels, no contrast, no room beside the edge, or an edge
-    along the pixels' rows or columns.
+    Raises InputError if there are too few pixels, no contrast or no room beside the edge, or if the edge is along
+    the pixels' rows or columns. The message names the edge by `where`.
     """
     from scipy.optimize import least_squares
 
@@ -91,7 +93,7 @@ def slanted_edge(x_px: Floats, y_px: Floats, values: Floats, where: str = "edge"
 
 
 def _distance(angle: float, offset: float, bend: float, x: Floats, y: Floats) -> Floats:
-    """[n] from the edge along its normal, towards the light."""
+    """Return the distance [n] from the edge along its normal, towards the light."""
     along = -x * np.sin(angle) + y * np.cos(angle)
     return np.asarray(x * np.cos(angle) + y * np.sin(angle) - offset - bend * along**2)
 
@@ -104,7 +106,7 @@ def _model(unknowns: Floats, x: Floats, y: Floats) -> Floats:
 
 
 def _response(away: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Frequencies and the modulus of the transform of the line spread, from values over distances."""
+    """Return frequencies and the modulus of the transform of the line spread, from values over distances."""
     reach = min(-away.min(), away.max())
     half = int(reach / _BIN_PX)
     number = np.floor(away / _BIN_PX).astype(int) + half

@@ -10,15 +10,16 @@ IMAGES = (
     Allowed("rejected", "corners left out", 0.05),
     Allowed("clipped", "images too clipped for corners", 0.2),
 )
-"""`bare_field`: share of the field's 8 x 6 cells. `rejected`: share of the corners left out as gross errors."""
+"""`bare_field` is the share of the field's 8 x 6 cells without corners. `rejected` is the share of the corners
+left out as gross errors."""
 DOUBTS = (
     Allowed("pattern", "lens: error of the model's form, over its uncertainty", 1.0),
     Allowed("predicted", "views left out: prediction error over uncertainty", 1.5),
 )
-"""`pattern`: root mean square over the field of what a richer lens would change, over the standard uncertainty of
-a direction's image. `predicted`: of all views, each left out in turn."""
+"""`pattern` is the root mean square over the field of the change that a richer lens would make, over the standard
+uncertainty of a direction's image. `predicted` is for all views, each of which is left out in turn."""
 CAMERA = (*IMAGES, *DOUBTS, Allowed("ray_px", "uncertainty at the field's corners", 0.5, "px"))
-"""`ray_px`: standard uncertainty of the image of a direction at the field's corners."""
+"""`ray_px` is the standard uncertainty of the image of a direction at the field's corners."""
 HAND_EYE = (
     *IMAGES,
     *DOUBTS,
@@ -26,9 +27,9 @@ HAND_EYE = (
     Allowed("turn_deg", "camera's turn", 0.05, "deg"),
     Allowed("robot_ratio", "robot's noise, estimated over stated value", 3.0),
 )
-"""`centre_mm`: standard uncertainty, all directions together (seed 003: 300 um)."""
+"""`centre_mm` is a standard uncertainty, all directions together (seed 003: 300 um)."""
 CHROMATIC = (
     *IMAGES,
     Allowed("shift_px", "uncertainty of the shift between colours", 0.1, "px"),
 )
-"""`shift_px`: standard uncertainty, the largest over the field."""
+"""`shift_px` is a standard uncertainty, the largest over the field."""

@@ -1,8 +1,8 @@
 """The board: its pattern, and its corners in an image.
 
-A board's frame is OpenCV's: x along the rows of squares, y along the columns, z into the board; the origin is the
-outer corner of a ChArUco board, the first inner corner of a chess board. OpenCV finds the corners in an 8-bit
-image of one colour; they are then fitted to the pixels of that colour with their full bit depth (`corner_fit`).
+A board's frame is OpenCV's: x along the rows of squares, y along the columns, z into the board. The origin is the
+outer corner of a ChArUco board, or the first inner corner of a chess board. OpenCV finds the corners in an 8-bit
+image of one colour. They are then fitted to the pixels of that colour with their full bit depth (`corner_fit`).
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ Millimetres = Annotated[float, Field(gt=0, le=1000)]
 
 LEAST_CORNERS = 8
 _SEARCHED_PX = 700
-"""Least side of a reduced image in which a board is searched."""
+"""Least side of a reduced image in which a board is searched for."""
 _REDUCTIONS = (4, 2)
 _SAME_SIDE = 0.01
-"""Largest difference of a certified side of squares from that of the description."""
+"""Largest relative difference between the certified side of squares and that of the description."""
 CLIPPED_SHARE = 0.02
-"""An image with a larger share of white pixels about the corners is left out: clipping shifts edges."""
+"""Largest share of white pixels about the corners. An image with more is left out, because clipping shifts
+edges."""
 
 
 class Board(Described):
-    """A board as its owner or its certificate has it (YAML)."""
+    """A board as its owner or its certificate describes it (YAML)."""
 
     schema_version: Literal[1] = 1
     kind: Literal["charuco", "chessboard"]
@@ -43,8 +44,8 @@ class Board(Described):
     """Inner corners along x and y: one less than squares."""
     square_mm: Millimetres
     scale_u_ppm: Annotated[float, Field(ge=0, le=20_000)] = 50.0
-    """Standard uncertainty of its scale: print, measurement, temperature. Left out where `artefact` has a
-    certified `square_mm`."""
+    """Standard uncertainty of its scale, from print, measurement and temperature. It is left out if `artefact` has
+    a certified `square_mm`."""
     marker_mm: Millimetres | None = None
     dictionary: str = "DICT_5X5_250"
     """OpenCV's name of the markers' dictionary."""
@@ -78,8 +79,8 @@ class Board(Described):
         return self
 
     def measured_at(self, temperature: Temperature) -> tuple[Board, tuple[UsedArtefact, ...]]:
-        """The board with the lengths that it has at a temperature, by its certificate, and what a record keeps of
-        that; the same board if it has no certificate."""
+        """Return the board with the lengths that it has at a temperature, by its certificate, and the data of it
+        that a record keeps. Without a certificate it is the same board."""
         artefact = self.artefact
         if artefact is None:
             return self, ()
@@ -129,17 +130,18 @@ class Sighting:
     pixels: Floats
     """[n, 2], centre of the first pixel (0, 0)."""
     u_px: Floats | None = None
-    """[n] standard uncertainty of a corner's coordinates, root mean square of both, by its pixels alone; None if
-    they were not fitted."""
+    """[n] standard uncertainty of a corner's coordinates, root mean square of both, from its pixels alone; None if
+    the corners were not fitted."""
 
 
 def read_board(path: Path) -> Board:
-    """A board's description. Raises InputError with every problem of the file."""
+    """Read a board's description. Raises InputError with every problem of the file."""
     return read_described(path, Board)
 
 
 def detect(board: Board, picture: Picture) -> Sighting | str:
-    """The board's corners in a picture (in green if it has colours), or the reason why it cannot be used."""
+    """Return the board's corners in a picture (in green if it has colours), or the reason why it cannot be
+    used."""
     import cv2
 
     best: Sighting | None = None
@@ -166,8 +168,9 @@ def detect(board: Board, picture: Picture) -> Sighting | str:
 
 
 def _searches(board: Board, picture: Picture) -> Iterator[tuple[NDArray[np.intp], Floats]]:
-    """Numbers and places of corners, to a pixel or so: of a large image at a quarter and at half of its size where
-    all are found, then at its own. Corners of a reduced image are as good to begin the fit from."""
+    """Yield numbers and approximate places of corners, to about a pixel. A large image is first searched at a
+    quarter and at half of its size; these results count only if all corners are found. Then it is searched at its
+    own size. Corners of a reduced image are as good for the begin of the fit."""
     search = _chess if board.kind == "chessboard" else _charuco
     most: tuple[NDArray[np.intp], Floats] = np.zeros(0, dtype=np.intp), np.zeros((0, 2))
     for factor in (*(n for n in _REDUCTIONS if min(picture.size_px) >= n * _SEARCHED_PX), 1):
@@ -179,13 +182,13 @@ def _searches(board: Board, picture: Picture) -> Iterator[tuple[NDArray[np.intp]
 
 
 def in_channel(board: Board, picture: Picture, channel: Channel, green: Sighting) -> Sighting:
-    """The corners of a sighting in green, fitted in another colour of its picture."""
+    """Return the corners of a sighting in green, fitted in another colour of its picture."""
     return _refined_corners(green, board, picture, channel)
 
 
 def _refined_corners(rough: Sighting, board: Board, picture: Picture, channel: Channel) -> Sighting:
-    """The corners to a fraction of a pixel, without false ones. Corners that are too close together for a fit are
-    located by OpenCV's gradient method."""
+    """Return the corners to a fraction of a pixel, without false ones. OpenCV's gradient method locates corners
+    that are too close together for a fit."""
     window_px = _window_px(board, rough.ids, rough.pixels)
     values, mask = picture.values_and_mask(channel)
     if not enough_pixels(mask, window_px):
@@ -197,7 +200,7 @@ def _refined_corners(rough: Sighting, board: Board, picture: Picture, channel: C
 
 
 def refine(image: NDArray[Any], corners: Floats, window_px: int) -> Floats:
-    """Corners [n, 2] by OpenCV's `cornerSubPix`, `window_px` being half its window."""
+    """Return corners [n, 2] by OpenCV's `cornerSubPix`; `window_px` is half of its window."""
     import cv2
 
     grey = np.ascontiguousarray(image, dtype=np.float32)
@@ -209,7 +212,7 @@ def refine(image: NDArray[Any], corners: Floats, window_px: int) -> Floats:
 
 
 def _eight_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """8 bits for the search alone, scaled to the image's extremes."""
+    """Return 8 bits for the search only, scaled to the image's extremes."""
     import cv2
 
     if image.dtype == np.uint8:
@@ -222,9 +225,9 @@ def _eight_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _window_px(board: Board, ids: NDArray[np.intp], corners: Floats) -> float:
-    """Radius of the window about a corner, 2 to 11 px: a third of the distance to the nearest corner, and less
-    than that to a ChArUco board's markers, whose corners lie on the diagonals and would shift the result by half a
-    pixel."""
+    """Return the radius of the window about a corner, 2 to 11 px. It is a third of the distance to the nearest
+    corner, and less than the distance to a ChArUco board's markers. Corners of markers lie on the diagonals, and
+    would shift the result by half a pixel."""
     apart = np.linalg.norm(corners[:, None] - corners[None], axis=-1)
     np.fill_diagonal(apart, np.inf)
     steps = np.linalg.norm(board.points_mm[ids][:, None] - board.points_mm[ids][None], axis=-1)
@@ -270,7 +273,7 @@ def _chess(board: Board, picture: NDArray[np.uint8]) -> tuple[NDArray[np.intp], 
 
 
 def _starts_dark(board: Board, picture: NDArray[np.uint8], points: Floats) -> bool:
-    """True if the square between the first four corners is darker than the next; it fixes the order of the
+    """True if the square between the first four corners is darker than the next one. This fixes the order of the
     corners."""
     across = board.corners[0]
     centre = points[[0, 1, across, across + 1]].mean(axis=0)

@@ -3,9 +3,9 @@
 Corners, positions and orientations of the robot each have a noise that is estimated from their residuals. The zero
 errors of the axes and the error of the board's scale have priors with the stated standard deviations.
 
-Two errors cannot be determined from such images and are not needed: a constant error of the base becomes part of
-base_from_board, and one of the flange part of flange_from_camera. Both are only ever used in a product with
-reported poses, in which they cancel.
+Two errors cannot be determined from such images, and are not needed. A constant error of the base becomes part of
+base_from_board, and a constant error of the flange becomes part of flange_from_camera. Both are used only in a
+product with reported poses, in which they cancel.
 """
 
 from __future__ import annotations
@@ -47,12 +47,13 @@ class RobotNoise:
     repeatability_mm: float = 0.03
     repeatability_deg: float = 0.003
     absolute_mm: float = 0.3
-    """Absolute error beside repeatability. Not used where axes are known: their zeros are estimated instead."""
+    """Absolute error in addition to repeatability. It is not used if axes are known, because their zeros are then
+    estimated."""
     absolute_deg: float = 0.02
-    """Absolute error of orientation; that of each axis zero where axes are known."""
+    """Absolute error of orientation. If axes are known, it is the error of each axis zero."""
 
     def pose_sigmas(self, *, axes_known: bool) -> tuple[float, float]:
-        """Stated noise of one pose: mm, radians."""
+        """Return the stated noise of one pose: mm, radians."""
         if axes_known:
             return self.repeatability_mm, float(np.radians(self.repeatability_deg))
         return (
@@ -69,7 +70,7 @@ class HandEyeCalibration:
     base_from_board: Floats
     intrinsics: Intrinsics
     names: tuple[str, ...]
-    """[s] of the parameters that all images share, with units."""
+    """[s] names of the parameters that all images share, with units."""
     covariance: Floats
     """[s, s] in these units, marginalised over the errors of the poses."""
     degrees: Floats
@@ -81,9 +82,9 @@ class HandEyeCalibration:
     board_scale: float
     """Relative excess of the board's size over its description."""
     axis_zeros_deg: Floats
-    """[axes] excess of the true over the reported angles; empty if axes were not known."""
+    """[axes] true minus reported angles; empty if axes were not known."""
     pose_errors: Floats
-    """[n, 6] of each pose in the flange's frame, mm and degrees."""
+    """[n, 6] errors of each pose in the flange's frame, mm and degrees."""
     residuals_px: tuple[Floats, ...]
     """[k, 2] of each image, observed minus computed."""
     start: Solution
@@ -92,7 +93,7 @@ class HandEyeCalibration:
     sightings: tuple[Sighting, ...]
     steps: int
     doubts: Doubts | None = None
-    """Possible errors of the model, already in values and covariance; None if they were not asked for."""
+    """Possible errors of the model, already included in values and covariance; None if they were not requested."""
 
     def u(self, name: str) -> float:
         """Standard uncertainty of a parameter."""
@@ -102,7 +103,7 @@ class HandEyeCalibration:
 
 @dataclass(frozen=True)
 class RobotFound:
-    """Noise by the residuals, and as stated."""
+    """Estimated and stated noise of the robot."""
 
     pixel_px: float
     position_mm: float
@@ -121,12 +122,12 @@ def calibrate_hand_eye(
     board_scale_u_ppm: float = 0.0,
     size_px: tuple[int, int] | None = None,
 ) -> HandEyeCalibration:
-    """Hand-eye, board and intrinsics from images [n] and the robot's poses.
+    """Estimate hand-eye, board and intrinsics from images [n] and the robot's poses.
 
     `lens` is a start for the intrinsics (all parameters of `model` free), or an earlier calibration, whose
     covariance then counts as an observation. `sightings` are without gross errors (`camera.without_gross_errors`).
-    With `size_px`, width and height of the images, the residuals are searched for what the model lacks
-    (`lens.doubts`). Raises InputError: too few poses, or poses that do not determine the result.
+    With `size_px`, width and height of the images, the residuals are searched for errors of the model
+    (`lens.doubts`). Raises InputError for too few poses, or poses that do not determine the result.
     """
     if len(sightings) != len(poses.base_from_flange):
         raise InputError(
@@ -174,7 +175,7 @@ def calibrate_hand_eye(
 def _with_doubts(
     adjustment: Adjusted[State], problem: Bundle, size_px: tuple[int, int]
 ) -> tuple[Adjusted[State], Doubts]:
-    """The result with what the model may lack."""
+    """Return the result with possible errors of the model."""
     state, count = adjustment.state, len(problem.corners.parts)
     field = Field.of(state.intrinsics, problem.layout.free, size_px)
     scene = Seen(field, problem.corners, problem.camera_from_board(state))

@@ -40,7 +40,7 @@ class CameraCalibration:
     intrinsics: Intrinsics
     free: tuple[str, ...]
     covariance: Floats
-    """[free, free] of the free parameters, in their order."""
+    """[free, free] covariance of the free parameters, in their order."""
     degrees: Floats
     """[free] effective degrees of freedom."""
     sigma_px: float
@@ -55,16 +55,16 @@ class CameraCalibration:
     size_px: tuple[int, int]
     """Width and height."""
     doubts: Doubts | None = None
-    """Possible errors of the model, already in values and covariance; None if they were not asked for."""
+    """Possible errors of the model, already included in values and covariance; None if they were not requested."""
 
 
 def calibrate_camera(
     sightings: Sequence[Sighting], size_px: tuple[int, int], model: str = "brown5", *, with_doubts: bool = False
 ) -> CameraCalibration:
-    """Intrinsics from images [views] of one board; `model` is a key of `optics.MODELS`. With `with_doubts` the
-    residuals are searched for what the model lacks (`lens.doubts`).
+    """Estimate intrinsics from images [views] of one board. `model` is a key of `optics.MODELS`. With
+    `with_doubts`, the residuals are searched for errors of the model (`lens.doubts`).
 
-    Raises InputError: too few images, or views that do not determine the model.
+    Raises InputError for too few images, or views that do not determine the model.
     """
     if not LEAST_VIEWS <= len(sightings) <= MOST_VIEWS:
         raise InputError(
@@ -137,8 +137,8 @@ def _result(
 
 
 def first_guess(sightings: Sequence[Sighting], size_px: tuple[int, int], model: str) -> CameraState:
-    """OpenCV's calibration from up to 20 images (Zhang, PAMI 22(11), 2000), and the poses of all images with
-    it."""
+    """Return OpenCV's calibration from up to 20 images (Zhang, PAMI 22(11), 2000), and the poses of all images
+    with it."""
     import cv2
 
     start_sightings = [
@@ -169,7 +169,7 @@ def first_guess(sightings: Sequence[Sighting], size_px: tuple[int, int], model: 
 
 
 def board_pose(sighting: Sighting, intrinsics: Intrinsics) -> Floats:
-    """`camera_from_board` from one image with known intrinsics. Raises InputError if there is none."""
+    """Return `camera_from_board` from one image with known intrinsics. Raises InputError if no pose is found."""
     import cv2
 
     is_solved, turn, shift = cv2.solvePnP(
@@ -184,7 +184,7 @@ def board_pose(sighting: Sighting, intrinsics: Intrinsics) -> Floats:
 
 
 def without_gross_errors(calibration: CameraCalibration) -> tuple[Sighting, ...]:
-    """The sightings, less the corners that were left out."""
+    """Return the sightings without the corners that were left out."""
     return tuple(
         replace(
             sighting,

@@ -1,9 +1,9 @@
 """Lateral chromatic aberration: a lens for each colour channel, all from the same images.
 
-All lenses share the board's poses, so their common errors (focal length correlated with distance, principal point
-with tilt) cancel in their differences, which are known far better than each lens alone. Colours differ in scale,
-centre and the first term of radial distortion; the higher terms, which few corners at the field's rim determine,
-are common to all.
+All lenses share the board's poses. So their common errors (focal length correlated with distance, principal point
+with tilt) cancel in their differences. The differences are known far better than each lens alone. Colours differ
+in scale, centre and the first term of radial distortion. The higher terms, which only few corners at the field's
+rim determine, are common to all colours.
 """
 
 from __future__ import annotations
@@ -33,17 +33,18 @@ class ChannelLenses:
 
     intrinsics: Mapping[str, Intrinsics]
     names: tuple[str, ...]
-    """[s] of the parameters, as `red.fx`, or `shared.k2` of those that all colours have in common."""
+    """[s] names of the parameters, such as `red.fx`, or `shared.k2` for a parameter that all colours have in
+    common."""
     covariance: Floats
-    """[s, s] of all channels together."""
+    """[s, s] covariance of all channels together."""
     degrees: Floats
     """[s]."""
     sigma_px: Mapping[str, float]
     """Noise of a corner by channel."""
 
     def shift(self, channel: str, against: str, pixels: Floats) -> tuple[Floats, Floats]:
-        """Shift of a channel's image against another's, px [k, 2], and its covariance, px^2 [k, 2, 2]. `pixels`
-        [k, 2] are the places in the field at which a lens without distortion would image the directions.
+        """Return the shift of a channel's image against another's, px [k, 2], and its covariance, px^2 [k, 2, 2].
+        `pixels` [k, 2] are places in the field, to which a lens without distortion would map the directions.
         """
         channel_lens, reference_lens = self.intrinsics[channel], self.intrinsics[against]
         directions = (pixels - (reference_lens.cx, reference_lens.cy)) / (reference_lens.fx, reference_lens.fy)
@@ -67,9 +68,9 @@ class ChannelLenses:
 def calibrate_channels(
     sightings: Mapping[str, Sequence[Sighting]], size_px: tuple[int, int], model: str = "brown5"
 ) -> ChannelLenses:
-    """Lenses from the same images [n] in several channels (`board.in_channel`).
+    """Estimate lenses from the same images [n] in several channels (`board.in_channel`).
 
-    Raises InputError: channels with different numbers of images, or images that do not determine a lens.
+    Raises InputError if channels differ in the number of images, or if images do not determine a lens.
     """
     channels = tuple(sightings)
     counts = {len(channel_sightings) for channel_sightings in sightings.values()}

@@ -1,4 +1,4 @@
-"""Make the record of lateral chromatic aberration and its picture from a board's images in three colours."""
+"""Makes the record of lateral chromatic aberration and its picture, from a board's images in three colours."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _STEPS = (13, 10)
 
 @dataclass(frozen=True)
 class ChromaticFound:
-    """The result and what the report draws."""
+    """The result, and the data that the report draws."""
 
     record: Record
     lenses: ChannelLenses
@@ -39,13 +39,13 @@ class ChromaticFound:
     field_px: Floats
     """[k, 2] places in the field at which shifts are given."""
     shifts: dict[str, tuple[Floats, Floats]]
-    """Shifts by channel: against green, px [k, 2], and their covariance, px^2 [k, 2, 2]."""
+    """Shifts by channel against green, px [k, 2], and their covariances, px^2 [k, 2, 2]."""
 
 
 def chromatic_from(
     board_images: Found, sources: Sources, board: Board, model: str, request: Request
 ) -> ChromaticFound:
-    """A lens for each colour from the same images. Raises InputError for images without colours."""
+    """Estimate a lens for each colour from the same images. Raises InputError for images without colours."""
     fit = calibrate_camera(board_images.sightings, board_images.size_px, model)
     good_sightings = without_gross_errors(fit)
     sightings: dict[str, list[Sighting]] = {
@@ -90,7 +90,7 @@ def chromatic_from(
 def _in_channel(
     channel: Channel, accepted_sightings: tuple[Sighting, ...], board_images: Found, sources: Sources, board: Board
 ) -> list[Sighting]:
-    """The sightings in a channel, from those in green."""
+    """Return the sightings in a channel, from those in green."""
     if channel == "green":
         return list(accepted_sightings)
     return [
@@ -100,7 +100,7 @@ def _in_channel(
 
 
 def _field(size_px: tuple[int, int]) -> Floats:
-    """[k, 2] a grid over the field, rim included."""
+    """Return [k, 2], a grid over the field with its rim."""
     across, down = (np.linspace(0.0, size - 1.0, count) for size, count in zip(size_px, _STEPS, strict=True))
     return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
 
@@ -124,7 +124,7 @@ def _parameters(lenses: ChannelLenses) -> tuple[Parameter, ...]:
 
 
 def _redundancy(accepted_sightings: tuple[Sighting, ...], free: tuple[str, ...]) -> float:
-    """Redundancy of one channel, which shares the poses of the images with the others."""
+    """Return the redundancy of one channel, which shares the poses of the images with the others."""
     return float(
         sum(2 * len(sighting.ids) for sighting in accepted_sightings)
         - len(free)
@@ -146,7 +146,8 @@ def _remark(channel: str, shift: Floats, shift_covariance: Floats) -> str:
 
 
 def draw_chromatic(result: ChromaticFound, figure: Figure) -> None:
-    """Fill the figure: shifts over the field above, along the radius below, red to the left, blue to the right."""
+    """Fill the figure: shifts over the field above, and along the radius below. Red is on the left, blue on the
+    right."""
     axes = figure.subplots(2, 2)
     longest = max(float(np.linalg.norm(shift, axis=1).max()) for shift, _ in result.shifts.values())
     enlargement = float(f"{0.06 * result.size_px[0] / max(longest, 1e-6):.1g}")
@@ -174,7 +175,7 @@ def _draw_field(ax: Axes, result: ChromaticFound, channel: str, colour: str, enl
 
 
 def _draw_radius(ax: Axes, result: ChromaticFound, channel: str, colour: str) -> None:
-    """The shift away from the principal point, with its 95 % interval."""
+    """Draw the shift away from the principal point, with its 95 % interval."""
     shift, covariance = result.shifts[channel]
     lens = result.lenses.intrinsics["green"]
     away = result.field_px - (lens.cx, lens.cy)

@@ -1,14 +1,14 @@
-"""Corners of a board to a few thousandths of a pixel: a model of two crossing edges, fitted to RAW pixels.
+"""Locates corners of a board to a few thousandths of a pixel: fits a model of two crossing edges to RAW pixels.
 
-The model (`corner_kernel`) is that of a square pixel behind a blurred lens: sharp edges have no error that depends
-on their place between pixels, and no colour needs to be interpolated: pixels of other colours are not used. Each
-edge has a blur of its own. Two things are found from all corners of an image together:
+The model (`corner_kernel`) describes a square pixel behind a blurred lens. So sharp edges have no error that
+depends on their place between pixels. No colour is interpolated, because pixels of other colours are not used.
+Each edge has a blur of its own. Two things are found from all corners of an image together:
 
-- noise: the variance a + b v of a pixel of value v, by the squared residuals. It gives each corner a covariance.
+- noise: the variance a + b v of a pixel of value v, from the squared residuals. It gives each corner a covariance.
 - asymmetry of the blur (coma): its third cumulant across an edge of normal n is K n n n. The four numbers of K are
   polynomials over the image, fitted to the residuals of all corners. Then the corners are fitted again with K. If
-  K were found from a single corner, the noise of this corner would be a fifth larger. So a corner's place is that
-  of an image of a point, taken as the centre of gravity of the blur.
+  K were found from a single corner, the noise of this corner would be a fifth larger. So a corner's place is the
+  image of a point, which is taken as the centre of gravity of the blur.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from coupole.calibration.rotations import Floats
 
 _LEAST_PIXELS = 24
 _FIRST_RADIUS_PX = 6.5
-"""Largest radius of the window of the first fit, which only centres the second one's."""
+"""Largest radius of the window of the first fit, which is only used to centre the window of the second fit."""
 _PART = 16
-"""Corners that a thread fits at a time."""
+"""Number of corners that a thread fits at a time."""
 _REACH = 2.0
-"""Half of a window that holds all pixels of both fits, in radii: each fit may move by half a radius."""
+"""Half of a window that holds all pixels of both fits, in radii. Each fit may move the corner by half a radius."""
 _ANGLES, _SIGMA, _SIGMA_2, _SKEWS = slice(2, 4), 4, 9, slice(12, 14)
 _ROUNDS = 3
 _LEAST_CORNERS = (12, 30, 60)
-"""Least number of corners for an asymmetry that is the same, linear, quadratic over the image."""
+"""Least number of corners for an asymmetry that is constant, linear, or quadratic over the image."""
 _CLEAR = 3.0
-"""Least fall of the squared residuals, over their variance and the number of coefficients, for an asymmetry."""
+"""Least decrease of the squared residuals for an asymmetry, over their variance and the number of coefficients."""
 _FLOOR_PX = 3e-4
-"""Error of the fit without noise where the blur is symmetric: rms, by `tools/prove_corners.py`."""
+"""Error of the fit without noise if the blur is symmetric: rms, from `tools/prove_corners.py`."""
 _SKEW_LEFT = 0.17
-"""Error that is left of an asymmetry's correction in windows of 8 px, as a share of it, by the same. In windows of
-4.5 px nearly half is left, which the covariance does not have."""
+"""Error that remains after an asymmetry's correction in windows of 8 px, as a share of the correction, from the
+same tool. In windows of 4.5 px nearly half remains, and the covariance does not include this."""
 Blur = Literal["own", "round"]
 
 
@@ -52,25 +52,25 @@ class Corners:
     pixels: Floats
     """[n, 2], centre of the first pixel (0, 0)."""
     fits: NDArray[np.bool_]
-    """[n] False where no corner was found; `pixels` are then those of the start."""
+    """[n] False where no corner was found; `pixels` then has the start."""
     sigma_px: Floats
-    """[n] blur of the image: geometric mean of those across both edges."""
+    """[n] blur of the image: geometric mean of the blurs across both edges."""
     covariance_px2: Floats
-    """[n, 2, 2] of the places; NaN where no corner was found."""
+    """[n, 2, 2] covariance of the places; NaN where no corner was found."""
 
 
 def enough_pixels(mask_tile: NDArray[np.bool_], radius_px: float) -> bool:
-    """Tell whether a window of that radius has enough pixels for a fit."""
+    """Tell whether a window of this radius has enough pixels for a fit."""
     return bool(np.pi * radius_px**2 * mask_tile.mean() >= _LEAST_PIXELS)
 
 
 def fit_corners(
     image: NDArray[Any], mask_tile: NDArray[np.bool_], rough: Floats, radius_px: float, *, blur: Blur = "own"
 ) -> Corners:
-    """Corners about `rough` [n, 2] from the pixels within `radius_px`, of which there must be `enough_pixels`.
+    """Fit corners near `rough` [n, 2] to the pixels within `radius_px`, of which there must be `enough_pixels`.
 
     `image` [H, W] are RAW values; `mask_tile` [h, w] is the mask of the pixels to use, a tile that repeats over
-    the image. With a `round` blur, both edges have the same, and it is symmetric.
+    the image. With `round`, both edges have the same blur, and it is symmetric.
     """
     first_radius_px = radius_px
     if radius_px > _FIRST_RADIUS_PX and enough_pixels(mask_tile, _FIRST_RADIUS_PX):
@@ -105,7 +105,7 @@ def _fit_in_threads(windows: _Windows, starts: Floats, skew: Floats) -> _Fitted:
 
 @dataclass(frozen=True)
 class _Windows:
-    """An image, and how corners are fitted in it."""
+    """An image, and the way in which corners are fitted in it."""
 
     image: NDArray[Any]
     mask_tile: NDArray[np.bool_]
@@ -113,7 +113,7 @@ class _Windows:
     many: int
 
     def fit(self, rough: Floats, skew: Floats, corner_fits: _Fitted) -> None:
-        """Fit corners [n] of a given asymmetry [n, 2]; only the pixels that a fit can reach are converted."""
+        """Fit corners [n] with a given asymmetry [n, 2]. Only the pixels that a fit can reach are converted."""
         shape = self.image.shape[:2]
         size_px = np.minimum(2 * int(_REACH * self.radii_px[0] + 2.0) + 1, shape)
         firsts = np.clip(np.rint(rough[:, ::-1]).astype(np.intp) - size_px // 2, 0, shape - size_px)
@@ -126,8 +126,8 @@ class _Windows:
 
 @dataclass(frozen=True)
 class _Fitted:
-    """Solutions [n, 14], normal matrices [n, 15, 15], plain and weighted by the pixels' values, sums [n, 5]: as
-    `corner_kernel.fit_all` writes them."""
+    """Results of `corner_kernel.fit_all`: solutions [n, 14], normal matrices [n, 15, 15], plain and weighted by
+    the pixels' values, and sums [n, 5]."""
 
     solutions: Floats
     normals: Floats
@@ -143,7 +143,8 @@ class _Fitted:
         return _Fitted(self.solutions[rows], self.normals[rows], self.scaled_normals[rows], self.sums[rows])
 
     def noise(self, many: int) -> tuple[float, float]:
-        """Variance a + b v of a pixel of value v: a, b, not negative, by the squared residuals of all corners."""
+        """Return a and b of the variance a + b v of a pixel of value v, not negative, from the squared residuals
+        of all corners."""
         freedom = self.sums[:, 0] / np.maximum(self.sums[:, 0] - many, 1.0)
         count, value, value2 = np.maximum(self.sums[:, :3].sum(axis=0), 1e-30)
         square, by_value = (self.sums[:, 3:] * freedom[:, None]).sum(axis=0)
@@ -153,8 +154,8 @@ class _Fitted:
         return (square - b * value) / count, b
 
     def covariance(self, noise: tuple[float, float], many: int) -> Floats:
-        """[n, 2, 2] of the places, px^2. Where a corner's residuals are larger than this noise, all of its
-        covariance is."""
+        """Return [n, 2, 2], covariances of the places, px^2. If a corner's residuals are larger than this noise,
+        its whole covariance is increased."""
         a, b = noise
         normal, scaled_normals = self.normals[:, :many, :many], self.scaled_normals[:, :many, :many]
         across = np.linalg.pinv(normal, hermitian=True)[:, :2]
@@ -168,8 +169,8 @@ class _Fitted:
 
 
 def _asymmetry(corner_fits: _Fitted, noise: tuple[float, float]) -> Floats:
-    """[n, 2] by how much the residuals ask to change the third cumulants of the blur across both edges; zero if
-    they do not ask clearly."""
+    """Return [n, 2], the changes of the third cumulants of the blur across both edges that the residuals show;
+    zero if they are not clear."""
     none = np.zeros((len(corner_fits.solutions), 2))
     is_found = np.isfinite(corner_fits.solutions[:, 0])
     corners = corner_fits.part(is_found)
@@ -194,7 +195,7 @@ def _asymmetry(corner_fits: _Fitted, noise: tuple[float, float]) -> Floats:
 
 
 def _tensor_rows(solutions: Floats, degree: int) -> Floats:
-    """[n, 2, k] derivatives of the cumulants across the edges by the polynomials' coefficients."""
+    """Return [n, 2, k], derivatives of the cumulants across the edges by the polynomials' coefficients."""
     # The distance of an edge grows along (-sin, cos).
     angles = solutions[:, _ANGLES]
     normal_x, normal_y = -np.sin(angles), np.cos(angles)

@@ -1,17 +1,17 @@
-"""The image of two crossing edges, fitted to the pixels of a window: what is compiled.
+"""The image of two crossing edges, fitted to the pixels of a window. This is the compiled part.
 
-About a corner at q the values are, with S_k the image of edge k integrated over a pixel's square,
+Let S_k be the image of edge k integrated over a pixel's square. Near a corner at q the values are
 
     (m + c ((2 S_1 - 1) (2 S_2 - 1) + r)) (1 + g (p - q))
 
-for level m, contrast c and a gradient g of the light. An edge under the angle a, blurred by a Gaussian of sigma,
-is seen by a square pixel as S(d) = [G(d + s) - G(d + t) - G(d - t) + G(d - s)] / (|cos a| |sin a|), where d is the
+for level m, contrast c and a gradient g of the light. A square pixel sees an edge with the angle a, blurred by a
+Gaussian of sigma, as S(d) = [G(d + s) - G(d + t) - G(d - t) + G(d - s)] / (|cos a| |sin a|), where d is the
 distance of pixel and edge, s and t are half the sum and the difference of |cos a| and |sin a|, and G'' is the
-normal distribution (two boxes, then a Gaussian). Blurs that are no Gaussian, of the third cumulant k across the
-edge and the excess e of kurtosis, add the next terms of Gram and Charlier's series: -k/6 of the third and e
-sigma^4/24 of the fourth derivative of S. The term r is the effect of blur where the blurs across both edges are
-correlated: of the sign's expectation over two normal variables with the correlation c, the terms up to c^3 of the
-tetrachoric series (Pearson 1900). For a round blur c = n_1 n_2 of the edges' normals.
+normal distribution (two boxes, then a Gaussian). A blur that is not Gaussian has a third cumulant k across the
+edge and an excess e of kurtosis. It adds the next terms of Gram and Charlier's series: -k/6 of the third and e
+sigma^4/24 of the fourth derivative of S. The term r is the effect of correlated blurs across both edges. It has
+the terms up to c^3 of the tetrachoric series (Pearson 1900) for the sign's expectation over two normal variables
+with the correlation c. For a round blur, c = n_1 n_2 of the edges' normals.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from scipy.special import ndtr
 from coupole.calibration.rotations import Floats
 
 UNKNOWNS, ROUND, OWN = 14, 9, 12
-"""Number of unknowns: all; with one round Gaussian blur; with a blur of each edge's own, their correlation and
-kurtosis, but symmetric."""
+"""Numbers of unknowns: all; for one round Gaussian blur; for a symmetric blur of each edge's own, with their
+correlation and kurtosis."""
 (
     _X,
     _Y,
@@ -47,20 +47,21 @@ SUMS = 5
 _LEAST_PIXELS = 18
 _MOST_STEPS = 40
 _ABOUT_PX, _CLOSE_PX = 2e-3, 1e-4
-"""Last steps of the fits about the start, and about the corner found: a hundredth of the noise of a corner."""
+"""Bounds of the last step of a fit: of the fit near the start, and of the fit near the found corner, which is a
+hundredth of the noise of a corner."""
 _WORST = 0.2
-"""Largest rms residual, as a share of the contrast: with a larger one the image is not that of a corner."""
+"""Largest rms residual, as a share of the contrast. An image with a larger one is not that of a corner."""
 _LEAST_SIGMA_PX = 0.05
 _THIN = 0.01
-"""Least width of a box: an edge along the pixels' rows."""
+"""Least width of a box, for an edge along the pixels' rows."""
 _MOST_CORRELATION, _MOST_KURTOSIS = 0.9, 1.5
 _SECTORS = 64
 _BELL_REACH, _BELLS_PER_SIGMA = 6.0, 32
 
 
 def _bell_table() -> Floats:
-    """[n, 4] at the places z from -6 to 6: the normal distribution, integrated twice, once and not at all, and its
-    density."""
+    """Return [n, 4], at the places z from -6 to 6: the normal distribution, integrated twice, once and not at all,
+    and its density."""
     z = np.arange(-_BELL_REACH * _BELLS_PER_SIGMA, _BELL_REACH * _BELLS_PER_SIGMA + 1) / _BELLS_PER_SIGMA
     below, bell = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
     return np.column_stack([0.5 * ((z * z + 1.0) * below + z * bell), z * below + bell, below, bell])
@@ -71,12 +72,12 @@ _BELLS = _bell_table()
 
 @numba.njit(cache=True, nogil=True)
 def fit_all(windows, firsts, mask_tile, rough, skews, radii, many, results):  # type: ignore[no-untyped-def]
-    """Fit corners [n] with `many` unknowns, the blurs' third cumulants `skews` [n, 2] being given.
+    """Fit corners [n] with `many` unknowns, for given third cumulants `skews` [n, 2] of the blurs.
 
     Places are within a window [h, w], whose first pixel is `firsts` [row, column] of the image, until the end.
-    `results` to be written are the solutions [n, 14], NaN where none was found, the normal matrices [n, 15, 15]
-    bordered by residuals, the same with each pixel weighted by its value, and sums for the noise: [n, 5] number of
-    pixels, values, the values' squares, squared residuals, these times the values.
+    `results` is filled with the solutions [n, 14] (NaN if none was found), the normal matrices [n, 15, 15]
+    bordered by residuals, the same with each pixel weighted by its value, and sums [n, 5] for the noise. The sums
+    are: number of pixels, values, squared values, squared residuals, and squared residuals times the values.
     """
     solutions, normals, scaled_normals, sums = results
     radius, first_radius = radii
@@ -126,7 +127,8 @@ def fit_all(windows, firsts, mask_tile, rough, skews, radii, many, results):  # 
 
 @numba.njit(cache=True, nogil=True)
 def start_of(image, mask_tile, radius, unknowns):  # type: ignore[no-untyped-def]
-    """Directions of both edges, level and contrast by the values around the corner; False without four sectors."""
+    """Find directions of both edges, level and contrast from the values around the corner. Returns False if there
+    are not four sectors."""
     sums, counts = np.zeros(_SECTORS), np.zeros(_SECTORS)
     x, y = unknowns[_X], unknowns[_Y]
     for row in range(max(0, math.ceil(y - radius)), min(image.shape[0], math.floor(y + radius) + 1)):
@@ -174,7 +176,8 @@ def start_of(image, mask_tile, radius, unknowns):  # type: ignore[no-untyped-def
 
 @numba.njit(cache=True, nogil=True)
 def _fit(image, mask_tile, x, y, radius, unknowns, close_px, many, rows):  # type: ignore[no-untyped-def]
-    """Levenberg-Marquardt until a step is below `close_px`; False if it diverges or the residual is too large."""
+    """Run Levenberg-Marquardt until a step is below `close_px`. Returns False if it diverges, or if the residual
+    is too large."""
     products = np.empty((many + 1, many + 1))
     count = _equations(image, mask_tile, x, y, radius, unknowns, many, rows, products)
     damping = 1e-3
@@ -213,8 +216,8 @@ def _fit(image, mask_tile, x, y, radius, unknowns, close_px, many, rows):  # typ
 
 @numba.njit(cache=True, nogil=True)
 def _equations(image, mask_tile, x, y, radius, unknowns, many, rows, products):  # type: ignore[no-untyped-def]
-    """Number of pixels; `products` [many + 1, many + 1] are the normal matrix, bordered by right-hand side and sum
-    of squared residuals."""
+    """Return the number of pixels. `products` [many + 1, many + 1] becomes the normal matrix, bordered by the
+    right-hand side and the sum of squared residuals."""
     count = _rows(image, mask_tile, x, y, radius, unknowns, many, rows)
     if many < UNKNOWNS:
         rows[many, :count] = rows[UNKNOWNS, :count]
@@ -224,7 +227,7 @@ def _equations(image, mask_tile, x, y, radius, unknowns, many, rows, products): 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _products(rows, count, many, products):  # type: ignore[no-untyped-def]
-    """Sums of products of the first `many` rows, over `count` pixels."""
+    """Fill in sums of products of the first `many` rows, over `count` pixels."""
     for i in range(many):
         for j in range(i + 1):
             total = 0.0
@@ -236,8 +239,8 @@ def _products(rows, count, many, products):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _rows(image, mask_tile, middle_x, middle_y, radius, unknowns, many, rows):  # type: ignore[no-untyped-def]
-    """Number of pixels; `rows` [16, pixels] are the derivatives by the unknowns, the residuals, and the values of
-    the model."""
+    """Return the number of pixels. `rows` [16, pixels] becomes the derivatives by the unknowns, the residuals, and
+    the values of the model."""
     x, y, sigma, sigma_2 = unknowns[_X], unknowns[_Y], unknowns[_SIGMA], unknowns[_SIGMA_2]
     level, contrast, together = unknowns[_LEVEL], unknowns[_CONTRAST], unknowns[_CORRELATION]
     cos1, sin1 = math.cos(unknowns[_FIRST]), math.sin(unknowns[_FIRST])
@@ -284,8 +287,8 @@ def _rows(image, mask_tile, middle_x, middle_y, radius, unknowns, many, rows):  
 
 @numba.njit(cache=True, nogil=True)
 def _crossing(a, b, together):  # type: ignore[no-untyped-def]
-    """The term r at a point `a` and `b` standard deviations of blur away from the edges, and its derivative by the
-    correlation."""
+    """Return the term r at a point that is `a` and `b` standard deviations of blur away from the edges, and its
+    derivative by the correlation."""
     squares = a * a + b * b
     if squares > 72.0:
         return 0.0, 0.0
@@ -296,8 +299,8 @@ def _crossing(a, b, together):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _edge(apart, wide, high, sigma):  # type: ignore[no-untyped-def]
-    """2 S - 1 of an edge at distance `apart` from a pixel's middle, its derivatives by that and by sigma, its
-    third derivative by the distance, and its fourth times sigma^4."""
+    """Return 2 S - 1 for an edge at distance `apart` from a pixel's middle, its derivatives by the distance and by
+    sigma, its third derivative by the distance, and its fourth derivative times sigma^4."""
     wide, high = max(wide, _THIN), max(high, _THIN)
     outer, inner = 0.5 * (wide + high), 0.5 * (wide - high)
     if abs(apart) > outer + _BELL_REACH * sigma:
@@ -325,8 +328,8 @@ def _edge(apart, wide, high, sigma):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _integrals(z):  # type: ignore[no-untyped-def]
-    """Normal distribution at z, integrated twice, once and not at all, and its density: Taylor's series from the
-    nearest place of the table, to 1e-10 (the density to 1e-7)."""
+    """Return the normal distribution at z, integrated twice, once and not at all, and its density. It is computed
+    by Taylor's series from the nearest place of the table, to 1e-10 (the density to 1e-7)."""
     if z >= _BELL_REACH:
         return 0.5 * (z * z + 1.0), z, 1.0, 0.0
     if z <= -_BELL_REACH:

@@ -21,7 +21,7 @@ class Corners:
     board_mm: Floats
     pixels: Floats
     view: np.ndarray[tuple[int], np.dtype[np.intp]]
-    """[n], the number of the image."""
+    """[n] number of the image of each corner."""
     parts: tuple[slice, ...]
     """Slice of each image's corners."""
 
@@ -37,6 +37,6 @@ class Corners:
         )
 
     def in_camera(self, camera_from_board: Floats) -> Floats:
-        """[n, 3], mm."""
+        """Return [n, 3], mm."""
         pose = camera_from_board[self.view]
         return np.asarray((pose[:, :3, :3] @ self.board_mm[:, :, None])[..., 0] + pose[:, :3, 3])

@@ -1,8 +1,8 @@
 """Diagnosis of robot and camera that contradict each other: the most likely cause.
 
 If the board's position scatters from pose to pose by more than noise explains, the data are wrong. Each hypothesis
-(another unit, other angles, the inverse pose, a board that was moved, a wrong pair) is another interpretation of
-the data; one that removes the contradiction is a likely cause.
+is another interpretation of the data: another unit, other angles, the inverse pose, a board that was moved, or a
+wrong pair. A hypothesis that removes the contradiction is a likely cause.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from coupole.calibration.rotations import Floats, between, inverses, moved_trans
 from coupole.errors import InputError
 
 CONTRADICTION = 3.0
-"""Scatter over that expected from noise, beyond which it has another cause."""
+"""Scatter over the scatter expected from noise. Above this ratio it has another cause."""
 CURE = 3.0
-"""A hypothesis that reduces the scatter by this factor is a likely cause."""
+"""A hypothesis that divides the scatter by this factor is a likely cause."""
 _NO_WORSE = 0.7
 _WORTH_A_LOOK = 0.3
-"""Scatter over the expected one, above which single faults are looked for: a moved board may be hidden in the
-noise that is stated for a poor robot."""
+"""Scatter over the expected one. Above this ratio single faults are searched for, because the stated noise of a
+poor robot may hide a moved board."""
 _AS_GOOD = 1.5
-"""Hypotheses whose scatter is within this factor of the best are ranked by how little they change."""
+"""Hypotheses whose scatter is within this factor of the best are ranked: the smallest change comes first."""
 _DEPTH_WORSE = 5.0
 """Uncertainty of a board's distance, divided by that of its position across the image."""
 _FALSE_ALARMS = 0.01
@@ -44,9 +44,9 @@ class Disagreement:
     distance_mm: float
     angle_deg: float
     sigmas: float
-    """Largest of the six components' differences over their uncertainty."""
+    """Largest difference of the six components, over its uncertainty."""
     beyond_noise: bool
-    """They differ by more than the noise of the poses explains."""
+    """True if they differ by more than the noise of the poses explains."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Diagnosis:
     scatter_deg: float
     noise_scatter: Expected
     likely: tuple[Hypothesis, ...]
-    """Best first; empty if all is well or no hypothesis helps."""
+    """Likely causes, best first; empty if nothing is wrong, or if no hypothesis helps."""
     disagreements: tuple[Disagreement, ...]
 
     @property
@@ -66,7 +66,7 @@ class Diagnosis:
 
     @property
     def cause(self) -> str | None:
-        """The likely cause's name, several joined by `and`."""
+        """The likely cause's name; several names are joined by `and`."""
         return " and ".join(self.likely[0].causes) if self.likely else None
 
     def sentences(self) -> tuple[str, ...]:
@@ -96,7 +96,7 @@ class Diagnosis:
         return tuple(lines)
 
     def of_methods(self) -> str:
-        """Differences of the closed forms, significant or not; empty with too few poses."""
+        """Differences of the closed forms, significant or not; empty if there are too few poses."""
         if not self.disagreements:
             return ""
         apart = ", ".join(
@@ -110,7 +110,8 @@ class Diagnosis:
 def expected_scatter(
     camera_from_board: Floats, *, pixel_px: float, focal_px: float, robot_mm: float, robot_deg: float
 ) -> Expected:
-    """Return the scatter to expect by the corners' noise and the robot's stated noise, at the board's distance."""
+    """Return the scatter that follows from the corners' noise and the robot's stated noise, at the board's
+    distance."""
     distance_mm = float(np.median(np.linalg.norm(camera_from_board[:, :3, 3], axis=1)))
     seen_rad = _DEPTH_WORSE * pixel_px / focal_px
     turned_rad = np.radians(robot_deg)
@@ -121,7 +122,7 @@ def expected_scatter(
 def diagnose(
     poses: ReportedPoses, camera_from_board: Floats, noise_scatter: Expected, names: Sequence[str]
 ) -> Diagnosis:
-    """Compare poses [n] with the board's poses by the images [n, 4, 4]; `names` are those of the images."""
+    """Compare poses [n] with the board's poses from the images [n, 4, 4]; `names` are the names of the images."""
     scatter = scatter_of(poses.base_from_flange, camera_from_board)
     diagnosis, score = Diagnosis(*scatter, noise_scatter, (), ()), noise_scatter.score(*scatter)
     if score > _WORTH_A_LOOK:
@@ -137,11 +138,11 @@ def diagnose(
 def disagreements(
     base_from_flange: Floats, camera_from_board: Floats, noise_scatter: Expected
 ) -> tuple[Disagreement, ...]:
-    """Difference of each two methods, and whether it is larger than expected noise explains.
+    """Return the difference of each two methods, and whether expected noise explains it.
 
-    The effect of noise is simulated: poses made consistent by Park's result, with noise drawn anew (parametric
-    bootstrap; Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 6). Empty where the poses have
-    no solution.
+    The effect of noise is simulated: poses are made consistent by Park's result, and new noise is drawn
+    (parametric bootstrap; Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 6). The result is
+    empty if the poses have no solution.
     """
     try:
         hand_eye_of = _by_method(base_from_flange, camera_from_board)
@@ -176,7 +177,7 @@ def disagreements(
 
 
 def _by_method(base_from_flange: Floats, camera_from_board: Floats) -> dict[str, Floats]:
-    """`flange_from_camera` by each method."""
+    """Return `flange_from_camera` by each method."""
     pairs = motions(base_from_flange, camera_from_board)
     return {name: method(pairs) for name, method in METHODS.items()}
 
@@ -184,10 +185,10 @@ def _by_method(base_from_flange: Floats, camera_from_board: Floats) -> dict[str,
 def _likely(
     hypotheses: list[Hypothesis], noise_scatter: Expected, measured_scatter: tuple[float, float]
 ) -> tuple[Hypothesis, ...]:
-    """Hypotheses that remove the contradiction; equally good ones ordered by how little they change.
+    """Return hypotheses that remove the contradiction. Of equally good ones, the smallest change comes first.
 
-    Such a hypothesis reduces the scatter of positions or of orientations by the factor `CURE` and does not
-    increase the other; or it explains what noise cannot.
+    Such a hypothesis divides the scatter of positions or of orientations by the factor `CURE` and does not
+    increase the other. Or it explains a deviation that noise cannot explain.
     """
     cures = []
     for h in hypotheses:

@@ -1,6 +1,8 @@
-"""Doubts about a fit of a board's images: what its model may lack, and how it predicts views that were left out.
+"""Doubts about a fit of a board's images: possible errors of its model, and its predictions of views that were
+left out.
 
-Both are part of the record. A pattern that a richer lens would explain widens the lens's covariance, to a limit.
+Both are part of the record. A pattern that a richer lens would explain widens the lens's covariance, up to a
+limit.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from coupole.calibration.model_error import ModelError, Suspected, with_suspects
 from coupole.calibration.rotations import Floats
 
 CLEAR = 15.0
-"""Evidence from which a suspect is named: by noise alone once in 20,000 fits."""
+"""Evidence from which a suspect is named. Noise alone exceeds it once in 20,000 fits."""
 _WORDS = {
     LENS: "the lens has a form that its model lacks",
     BOARD: "the board is not flat",
@@ -46,8 +48,8 @@ class Doubts:
     field: Field
     predictions: LeftOut
     pattern: float
-    """Root mean square over the field of what the lens's form leaves of the true one, over the standard
-    uncertainty of a direction's image by the record's lens."""
+    """Root mean square over the field of the part of the true lens that the lens's form cannot follow, over the
+    standard uncertainty of a direction's image by the record's lens."""
 
     @property
     def sigma_px(self) -> float:
@@ -75,7 +77,7 @@ class Doubts:
 
 
 def _words_of(suspect: Suspected) -> str:
-    """Name a suspect; of a print, with how far it is off."""
+    """Return the name of a suspect. For a print, it includes the size of the error."""
     if suspect.name != PRINT:
         return _WORDS[suspect.name]
     percent, u_percent = (
@@ -96,10 +98,10 @@ def doubts_of(
     computed_corners: Seen,
     lens: Sequence[int],
 ) -> tuple[Doubts, Floats, Floats]:
-    """The doubts, the step of the parameters and their covariance with them.
+    """Return the doubts, and the step of the parameters and their covariance with these doubts.
 
-    `blocks` are those of `adjustment`, the corners' (group 0) first and in their order; `views` the numbers of
-    each view's blocks; `lens` the columns of the free intrinsics.
+    `blocks` are those of `adjustment`; the corners' blocks (group 0) come first, in the order of the corners.
+    `views` has the numbers of each view's blocks, `lens` the columns of the free intrinsics.
     """
     factors = np.array([component.factor for component in adjustment.components])
     weights = [keep.astype(np.float64) for keep in adjustment.accepted_masks]

@@ -1,8 +1,8 @@
 """The picture of a lens and hand-eye calibration.
 
-It shows four properties of the residuals: a pattern over the field (then the lens model is insufficient), coverage
-of the field, single bad images, and normality (without it intervals do not hold). For a hand-eye calibration the
-robot's errors by pose take the place of the last.
+It shows four properties of the residuals: a pattern over the field (which means that the lens model is
+insufficient), coverage of the field, single bad images, and normality (without it intervals are not valid). A
+picture of a hand-eye calibration shows the robot's errors by pose instead of normality.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def draw_lens(lens_report: Shown, figure: Figure) -> None:
 
 
 def _draw_field(ax: Axes, lens_report: Shown) -> None:
-    """Residual vectors where they were seen, enlarged; long ones red."""
+    """Draw residual vectors at the corners, enlarged; long ones are red."""
     pixels, residuals = np.concatenate(lens_report.pixels), np.concatenate(lens_report.residuals_px)
     step = max(1, len(pixels) // _MOST_ARROWS)
     pixels, residuals = pixels[::step], residuals[::step]
@@ -79,7 +79,7 @@ def _draw_coverage(ax: Axes, lens_report: Shown) -> None:
 
 
 def _draw_images(ax: Axes, lens_report: Shown) -> None:
-    """Root mean square residual of each image, and that expected from noise alone."""
+    """Draw the root mean square residual of each image, and the one expected from noise alone."""
     rms = [np.sqrt(np.mean(np.sum(r**2, axis=1))) for r in lens_report.residuals_px]
     expected_px = lens_report.pixel_px * np.sqrt(2)
     place = np.arange(len(rms))
@@ -100,7 +100,7 @@ def _draw_images(ax: Axes, lens_report: Shown) -> None:
 
 
 def _draw_distribution(ax: Axes, lens_report: Shown) -> None:
-    """Residuals over their noise beside the normal distribution."""
+    """Draw the residuals over their noise, beside the normal distribution."""
     normal = np.concatenate(lens_report.residuals_px).ravel() / max(lens_report.pixel_px, 1e-12)
     grid = np.linspace(-4.5, 4.5, 181)
     ax.hist(np.clip(normal, -4.5, 4.5), bins=60, density=True, color=GREY, range=(-4.5, 4.5))
@@ -114,7 +114,7 @@ def _draw_distribution(ax: Axes, lens_report: Shown) -> None:
 
 
 def _draw_robot(ax: Axes, lens_report: Shown) -> None:
-    """Error of each pose, position on the left and rotation on the right."""
+    """Draw the error of each pose, position on the left and rotation on the right."""
     assert lens_report.pose_errors is not None
     off_mm = np.linalg.norm(lens_report.pose_errors[:, :3], axis=1)
     off_deg = np.linalg.norm(lens_report.pose_errors[:, 3:], axis=1)

@@ -1,12 +1,12 @@
-"""Equations of the hand-eye adjustment: what each observation depends on, with derivatives.
+"""Equations of the hand-eye adjustment: the dependence of each observation on the parameters, with derivatives.
 
-A corner at p on the board is seen through
+The image of a corner at p on the board follows from
 
     p_camera = (base_from_flange_i . T(S_i a) . E_i . flange_from_camera)^-1 . base_from_board . (1 + s) p
 
-with base_from_flange_i as the robot reports it, E_i the arm's error at this pose alone (repeatability, and
-whatever else differs from pose to pose), a the zero errors of its axes (the part of its absolute error that all
-poses share; S_i is the arm's Jacobian), s the relative error of the board's scale.
+Here base_from_flange_i is the pose that the robot reports. E_i is the arm's error at this pose alone
+(repeatability, and other errors that differ from pose to pose). a are the zero errors of its axes (the part of its
+absolute error that all poses share), and S_i is the arm's Jacobian. s is the relative error of the board's scale.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Poses:
     """The robot's poses, one for each image."""
 
     base_from_flange: Floats
-    """[n, 4, 4] as reported."""
+    """[n, 4, 4] reported poses."""
     axis_sensitivity: Floats | None = None
     """[n, 6, axes] step of the flange in its own frame (mm, rad) for each degree of each axis; None if the axes
     were not reported."""
@@ -46,7 +46,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class EarlierLens:
-    """A lens from an earlier calibration, held or improved."""
+    """A lens from an earlier calibration, which is held or improved."""
 
     intrinsics: Intrinsics
     free: tuple[str, ...] = ()
@@ -102,7 +102,7 @@ class Layout:
 
     @property
     def units(self) -> Floats:
-        """[s] factors from the adjustment's units (mm, radians) to those of `names`."""
+        """Factors [s] from the adjustment's units (mm, radians) to those of `names`."""
         return np.concatenate(
             [np.ones(len(self.free)), _STEP_UNITS, _STEP_UNITS, np.ones(self.shared_count - self.scale)]
         )
@@ -110,7 +110,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Bundle:
-    """The observations, and how they depend on the state."""
+    """The observations, and their dependence on the state."""
 
     layout: Layout
     corners: Corners
@@ -130,7 +130,7 @@ class Bundle:
 
     @property
     def _lens_weight(self) -> Floats | None:
-        """W [free, free] with W'W the inverse covariance of an earlier lens."""
+        """Return W [free, free], where W'W is the inverse covariance of an earlier lens."""
         if self.earlier is None or not self.earlier.free or self.earlier.covariance is None:
             return None
         return np.asarray(np.linalg.cholesky(np.linalg.inv(self.earlier.covariance)).T)
@@ -140,7 +140,7 @@ class Bundle:
         return [*self._corner_blocks(state), *self._robot_blocks(state), *self._held_blocks(state, names)]
 
     def camera_from_board(self, state: State) -> Floats:
-        """[n, 4, 4] at each pose."""
+        """Return [n, 4, 4] at each pose."""
         base_from_camera = (
             self.poses.base_from_flange @ self._zero_steps(state) @ state.pose_errors @ state.flange_from_camera
         )
@@ -161,8 +161,9 @@ class Bundle:
         )
 
     def _corner_blocks(self, state: State) -> list[Block]:
-        """p is transformed from the board to the base, the reported flange, the flange with corrected axis zeros,
-        the true flange and the camera; derivatives follow the same chain backwards."""
+        """Return the blocks of the corners. p is transformed from the board to the base, the reported flange, the
+        flange with corrected axis zeros, the true flange and the camera. Derivatives follow the same chain
+        backwards."""
         at, view = self.layout, self.corners.view
         printed_mm = self.corners.board_mm
         board_mm = printed_mm * (1 + state.scale)
@@ -208,8 +209,8 @@ class Bundle:
         ]
 
     def _robot_blocks(self, state: State) -> list[Block]:
-        """The error of each pose is zero within its noise. Rotations are small: the derivative of the logarithm is
-        1."""
+        """Return the blocks of the robot: the error of each pose is zero within its noise. Rotations are small, so
+        the derivative of the logarithm is 1."""
         turns_rad = rotation_vector(state.pose_errors[:, :3, :3])
         position_mm, orientation_rad = self.sigmas
         blocks = []
@@ -221,7 +222,7 @@ class Bundle:
         return blocks
 
     def _held_blocks(self, state: State, names: list[str]) -> list[Block]:
-        """Priors: the board's scale, the axis zeros, an earlier lens."""
+        """Return the priors: of the board's scale, the axis zeros, and an earlier lens."""
         at, blocks = self.layout, []
         if at.has_scale:
             sigma = self.scale_sigma
@@ -245,7 +246,7 @@ class Bundle:
         return slice(first, first + 6)
 
     def _zero_steps(self, state: State) -> Floats:
-        """[n, 4, 4] motion of the flange by the axis zeros, in its own frame."""
+        """Return [n, 4, 4], the motion of the flange by the axis zeros, in its own frame."""
         steps = np.broadcast_to(np.eye(4), (len(self.poses.base_from_flange), 4, 4)).copy()
         if self.poses.axis_sensitivity is not None:
             vectors = self.poses.axis_sensitivity @ state.axis_zeros_deg
@@ -254,6 +255,6 @@ class Bundle:
 
 
 def _into(a_from_b: Floats, points_a: Floats) -> Floats:
-    """Points [k, 3] from frames a into frames b, each with its own transform [k, 4, 4]."""
+    """Transform points [k, 3] from frames a into frames b, each with its own transform [k, 4, 4]."""
     away = points_a - a_from_b[:, :3, 3]
     return np.asarray(np.einsum("kij,ki->kj", a_from_b[:, :3, :3], away))

@@ -1,8 +1,8 @@
-"""Place of the camera on the flange: A X = X B in closed form, by three methods.
+"""Pose of the camera on the flange: solves A X = X B in closed form, by three methods.
 
 X is `flange_from_camera`. The board and the base stand still, so base_from_flange_i X camera_from_board_i is the
 same for all poses i, and each pair of poses gives one equation A X = X B with the motions A of the flange and B of
-the camera. The methods weigh errors differently: if they disagree by more than noise explains, the data have
+the camera. The methods weight errors differently. If they disagree by more than noise explains, the data have
 another error (`coupole.calibration.lens.diagnosis`).
 """
 
@@ -27,7 +27,7 @@ from coupole.errors import InputError
 LEAST_POSES = 3
 _LEAST_TURN_RAD = 0.02
 _NEAR_HALF_TURN = 0.05
-"""cos(half the angle): below it the sign of the rotation axis is determined by noise."""
+"""Limit of cos(half the angle). Below it, noise determines the sign of the rotation axis."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Solution:
     flange_from_camera: Floats
     base_from_board: Floats
     scatter: Floats
-    """[n, 6] deviation from the mean of the board's pose by each pose: mm, radians."""
+    """[n, 6] deviations of the board's pose in each pose from the mean: mm, radians."""
 
     @property
     def scatter_mm(self) -> float:
@@ -62,7 +62,7 @@ def motions(base_from_flange: Floats, camera_from_board: Floats) -> Motions:
     """Return the motions of all pairs of poses [n, 4, 4], without those with a rotation of nearly 180 degrees,
     whose axes have no sign.
 
-    Raises InputError if all motions have the same rotation axis: then X is not determined.
+    Raises InputError if all motions have the same rotation axis, because X is then not determined.
     """
     count = len(base_from_flange)
     if count < LEAST_POSES:
@@ -141,13 +141,13 @@ METHODS: dict[str, Callable[[Motions], Floats]] = {"Park": park, "Daniilidis": d
 def solve(
     base_from_flange: Floats, camera_from_board: Floats, method: Callable[[Motions], Floats] = park
 ) -> Solution:
-    """Hand-eye and board from poses [n, 4, 4]; the board's place is the mean over the poses."""
+    """Return hand-eye and board from poses [n, 4, 4]. The board's place is the mean over the poses."""
     flange_from_camera = method(motions(base_from_flange, camera_from_board))
     return solution(base_from_flange, camera_from_board, flange_from_camera)
 
 
 def solution(base_from_flange: Floats, camera_from_board: Floats, flange_from_camera: Floats) -> Solution:
-    """Board's pose and scatter for a given hand-eye transform."""
+    """Return the board's pose and scatter for a given hand-eye transform."""
     boards = base_from_flange @ flange_from_camera @ camera_from_board
     mean = np.eye(4)
     mean[:3, :3], mean[:3, 3] = nearest_rotation(boards[:, :3, :3].mean(axis=0)), boards[:, :3, 3].mean(axis=0)
@@ -155,7 +155,7 @@ def solution(base_from_flange: Floats, camera_from_board: Floats, flange_from_ca
 
 
 def _with_translation(turn: Floats, pairs: Motions) -> Floats:
-    """(R_A - I) t_X = R_X t_B - t_A, by least squares over all pairs."""
+    """Solve (R_A - I) t_X = R_X t_B - t_A by least squares over all pairs."""
     x = np.eye(4)
     x[:3, :3] = turn
     left_side = (pairs.flange[:, :3, :3] - np.eye(3)).reshape(-1, 3)
@@ -165,7 +165,7 @@ def _with_translation(turn: Floats, pairs: Motions) -> Floats:
 
 
 def _dual(q: Floats, translation_mm: Floats) -> Floats:
-    """Dual part (0, t) q / 2 of rigid motions [n, 4]."""
+    """Return the dual part (0, t) q / 2 of rigid motions [n, 4]."""
     scalar, vector = q[:, :1], q[:, 1:]
     top = -np.sum(translation_mm * vector, axis=1, keepdims=True)
     return np.asarray(0.5 * np.hstack([top, scalar * translation_mm + np.cross(translation_mm, vector)]))

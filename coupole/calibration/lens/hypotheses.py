@@ -1,8 +1,8 @@
 """Possible errors in the poses of a robot or the images of a board, and the scatter that remains if they are real.
 
 Each hypothesis is another interpretation of the data (other units or angles, the inverse pose, another pairing, a
-board in two places) with the scatter of the board's position under it. `coupole.calibration.lens.diagnosis` ranks
-them.
+board in two places), with the scatter of the board's position that it leaves. `coupole.calibration.lens.diagnosis`
+ranks them.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from coupole.errors import InputError
 _LEAST_SEGMENT = 3
 _SUSPECTS = 6
 _PLAUSIBLE_MM = (5.0, 5000.0)
-"""Distances between camera and board, and travels of the robot, that are possible in a cell."""
+"""Possible distances in a cell: between camera and board, and of the robot's travel."""
 _SURE = 1e-4
-"""Probability that a step of the board is noise; below it the board was moved, however small the step."""
+"""Probability that a step of the board is noise. Below it the board was moved, even if the step is small."""
 
 UNITS, ANGLES, INVERSE, MOVED_BOARD, WRONG_PAIR, SHIFTED = (
     "wrong unit",
@@ -38,13 +38,13 @@ UNITS, ANGLES, INVERSE, MOVED_BOARD, WRONG_PAIR, SHIFTED = (
 
 @dataclass(frozen=True)
 class Expected:
-    """Scatter of the board that noise explains, root mean square."""
+    """Root mean square scatter of the board that noise explains."""
 
     position_mm: float
     orientation_deg: float
 
     def score(self, scatter_mm: float, scatter_deg: float) -> float:
-        """Scatter over the expected one, the worse of position and orientation."""
+        """Return the scatter over the expected one, for position or orientation, whichever is worse."""
         return max(scatter_mm / self.position_mm, scatter_deg / self.orientation_deg)
 
 
@@ -58,11 +58,11 @@ class Hypothesis:
     scatter_mm: float
     scatter_deg: float
     sure: bool = False
-    """True for deviations that noise cannot explain, even if the scatter falls little."""
+    """True for deviations that noise cannot explain, even if the scatter decreases only a little."""
 
 
 def scatter_of(base_from_flange: Floats, camera_from_board: Floats) -> tuple[float, float]:
-    """mm and degrees; infinite where the motions have no solution."""
+    """Return the scatter, mm and degrees; infinite if the motions have no solution."""
     try:
         hand_eye = solve(base_from_flange, camera_from_board)
     except InputError:
@@ -71,7 +71,7 @@ def scatter_of(base_from_flange: Floats, camera_from_board: Floats) -> tuple[flo
 
 
 def rereadings(poses: ReportedPoses, camera_from_board: Floats) -> Iterator[Hypothesis]:
-    """Hypotheses on the convention of all poses."""
+    """Yield hypotheses on the convention of all poses."""
     yield from _other_conventions(poses, camera_from_board)
     yield from _other_board_unit(poses.base_from_flange, camera_from_board)
 
@@ -79,7 +79,7 @@ def rereadings(poses: ReportedPoses, camera_from_board: Floats) -> Iterator[Hypo
 def faults(
     base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str], noise_scatter: Expected
 ) -> Iterator[Hypothesis]:
-    """Hypotheses on single poses and images."""
+    """Yield hypotheses on single poses and images."""
     yield from _wrong_pairs(base_from_flange, camera_from_board, names)
     yield from _moved_board(base_from_flange, camera_from_board, names, noise_scatter)
 
@@ -148,7 +148,7 @@ _WORDS = {"deg": "degrees", "rad": "radians"}
 
 
 def _other_board_unit(base_from_flange: Floats, camera_from_board: Floats) -> Iterator[Hypothesis]:
-    """The board's squares given in m, or in um."""
+    """Yield the hypotheses that the board's squares are given in m, or in um."""
     for factor, unit in ((1000.0, "m"), (1e-3, "um")):
         scaled_poses = camera_from_board.copy()
         scaled_poses[:, :3, 3] *= factor
@@ -161,7 +161,8 @@ def _other_board_unit(base_from_flange: Floats, camera_from_board: Floats) -> It
 def _wrong_pairs(
     base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str]
 ) -> Iterator[Hypothesis]:
-    """One image does not belong to its pose, two are exchanged, or all are off by one."""
+    """Yield the hypotheses that one image does not belong to its pose, that two images are exchanged, or that all
+    are shifted by one."""
     count = len(base_from_flange)
     for left_out in range(count if count > _LEAST_SEGMENT + 1 else 0):
         keep = [i for i in range(count) if i != left_out]
@@ -183,8 +184,8 @@ def _wrong_pairs(
 
 
 def _worst(base_from_flange: Floats, camera_from_board: Floats) -> list[int]:
-    """The poses with the largest deviation of the board from its median position; few, as all pairs of them are
-    tried."""
+    """Return the poses with the largest deviation of the board from its median position. They are few, because all
+    pairs of them are tried."""
     try:
         boards = (
             base_from_flange @ solve(base_from_flange, camera_from_board).flange_from_camera @ camera_from_board
@@ -199,7 +200,8 @@ def _worst(base_from_flange: Floats, camera_from_board: Floats) -> list[int]:
 def _moved_board(
     base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str], noise_scatter: Expected
 ) -> Iterator[Hypothesis]:
-    """The board was in two places: motions within each part are valid, those between the parts are not."""
+    """Yield the hypotheses that the board was in two places. Motions within each part are then valid, those
+    between the parts are not."""
     count = len(base_from_flange)
     for change in range(_LEAST_SEGMENT, count - _LEAST_SEGMENT + 1):
         parts = slice(None, change), slice(change, None)
@@ -225,10 +227,11 @@ def _moved_board(
 
 
 def _by_chance(before: Solution, after: Solution) -> float:
-    """Probability that noise alone causes a step as large as that between the boards of the two parts.
+    """Return the probability that noise alone causes a step as large as that between the boards of the two parts.
 
-    Hotelling's T^2 of two samples with a common covariance (Anderson, An Introduction to Multivariate Statistical
-    Analysis, 3rd ed., 2003, section 5.3.4), less six degrees of freedom for the hand-eye that both parts share.
+    It is Hotelling's T^2 of two samples with a common covariance (Anderson, An Introduction to Multivariate
+    Statistical Analysis, 3rd ed., 2003, section 5.3.4), less six degrees of freedom for the hand-eye that both
+    parts share.
     """
     first, second = len(before.scatter), len(after.scatter)
     degrees = first + second - 2 - 6

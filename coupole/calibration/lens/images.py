@@ -15,11 +15,11 @@ from coupole.errors import InputError
 
 @dataclass(frozen=True)
 class Found:
-    """The board in the images, and why other images were left out."""
+    """The board in the images, and the reasons why other images were left out."""
 
     sightings: tuple[Sighting, ...]
     image_numbers: NDArray[np.intp]
-    """[sightings] which of the images they are."""
+    """[sightings] number of the image of each sighting."""
     size_px: tuple[int, int]
     """Width and height."""
     left_out: tuple[str, ...]
@@ -29,7 +29,8 @@ class Found:
 def find_board(
     board: Board, sources: Sources, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Found:
-    """Find the board in all images. Raises InputError if they differ in size, or none shows it."""
+    """Find the board in all images. Raises InputError if the images differ in size, or if no image shows the
+    board."""
     sightings, numbers, left_out = [], [], []
     size_px: tuple[int, int] | None = None
     for number, source in enumerate(sources.images):

@@ -1,7 +1,8 @@
-"""Make a record and the report's data from images and poses: the functions that the commands call.
+"""Makes a record and the report's data from images and poses, with the functions that the commands call.
 
-Each function makes a sealed record. A contradiction with a known cause raises an error with that cause, as the
-result would be meaningless; one without a simple cause becomes a remark of the record, which exceeds its limits.
+Each function makes a sealed record. A contradiction with a known cause raises an error with that cause, because
+the result would be meaningless. A contradiction without a simple cause becomes a remark of the record, which then
+exceeds its limits.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class Shown:
     """[k, 2], observed minus computed."""
     pixel_px: float
     pose_errors: Floats | None
-    """[n, 6] of the robot, mm and degrees."""
+    """[n, 6] errors of the robot, mm and degrees."""
 
 
 def camera_from(
@@ -168,7 +169,7 @@ def hand_eye_from(
 def _refused_if_contradicting(
     fit: CameraCalibration, reported_poses: ReportedPoses, robot: RobotNoise, names: Sequence[str]
 ) -> Diagnosis:
-    """Diagnose how well robot and camera agree. Raises InputError if they do not and the cause is known."""
+    """Diagnose how well robot and camera agree. Raises InputError if they do not agree and the cause is known."""
     robot_mm, robot_rad = robot.pose_sigmas(axes_known=False)
     expectation = expected_scatter(
         fit.camera_from_board,
@@ -196,10 +197,11 @@ def _lens_report(
 
 
 def ray_u_px(fit: CameraCalibration) -> float:
-    """Largest standard uncertainty of the image of a direction at the corners and edges of the field, px.
+    """Return the largest standard uncertainty of the image of a direction at the corners and edges of the field,
+    px.
 
-    Changes of the intrinsics that are equivalent to a rotation of the camera do not count: the board's poses
-    absorb them.
+    Changes of the intrinsics that are equivalent to a rotation of the camera do not count, because the board's
+    poses absorb them.
     """
     width, height = fit.size_px
     steps = np.linspace(0.0, 1.0, 9)
@@ -218,7 +220,7 @@ def ray_u_px(fit: CameraCalibration) -> float:
 
 
 def field_without_corners(sightings: Sequence[Sighting], size_px: tuple[int, int]) -> float:
-    """Share of the field's cells, 8 x 6, in which no corner was seen."""
+    """Return the share of the field's cells, 8 x 6, without a corner."""
     pixels = np.concatenate([sighting.pixels for sighting in sightings])
     cells = np.floor(pixels * FIELD_CELLS / size_px).astype(int)
     return 1.0 - len(np.unique(cells, axis=0)) / (FIELD_CELLS[0] * FIELD_CELLS[1])
@@ -227,7 +229,7 @@ def field_without_corners(sightings: Sequence[Sighting], size_px: tuple[int, int
 def image_lines(
     accepted_sightings: Sequence[Sighting], residuals: Sequence[Floats], all_seen: Sequence[Sighting]
 ) -> tuple[ImageResidual, ...]:
-    """Number of corners and residual of each image."""
+    """Return the number of corners and the residual of each image."""
     return tuple(
         ImageResidual(
             name=sighting.name,
@@ -240,7 +242,7 @@ def image_lines(
 
 
 def content_of(board_images: Found, sources: Sources, request: Request) -> dict[str, object]:
-    """The content that all records from a board's images share."""
+    """Return the content that all records from a board's images share."""
     about = sources.about
     return {
         **request.head(),
@@ -252,12 +254,12 @@ def content_of(board_images: Found, sources: Sources, request: Request) -> dict[
 
 
 def held_parameters(intrinsics: optics.Intrinsics, free: Sequence[str]) -> dict[str, float]:
-    """The lens parameters that were not estimated, by the record's names."""
+    """Return the lens parameters that were not estimated, by the record's names."""
     return {unit_name(n): getattr(intrinsics, n) for n in optics.NAMES if n not in free}
 
 
 def image_figures(fit: CameraCalibration, board_images: Found) -> dict[str, float]:
-    """The figures that `acceptance.IMAGES` limits."""
+    """Return the figures that `acceptance.IMAGES` limits."""
     is_rejected = np.concatenate([~keep for keep in fit.accepted_masks])
     clipped_count = sum(": clipped" in line for line in board_images.left_out)
     return {
@@ -269,7 +271,7 @@ def image_figures(fit: CameraCalibration, board_images: Found) -> dict[str, floa
 
 
 def doubted_figures(doubts: Doubts | None) -> dict[str, float]:
-    """The figures that `acceptance.DOUBTS` limits."""
+    """Return the figures that `acceptance.DOUBTS` limits."""
     return {} if doubts is None else {"pattern": doubts.pattern, "predicted": doubts.predictions.ratio}
 
 
@@ -278,7 +280,7 @@ def sentences_of(doubts: Doubts | None) -> tuple[str, ...]:
 
 
 def sentences_of_pixels(sightings: Sequence[Sighting], found_px: float) -> tuple[str, ...]:
-    """Compare the corners' noise in the adjustment with what their pixels say of it."""
+    """Compare the corners' noise in the adjustment with the noise that their pixels show."""
     u_px = [sighting.u_px for sighting in sightings if sighting.u_px is not None]
     if not u_px:
         return ()
@@ -352,5 +354,5 @@ def _noise(
 
 
 def unit_name(name: str) -> str:
-    """A lens parameter with its unit, as records call it."""
+    """Return a lens parameter's name with its unit, as in records."""
     return f"{name}_px" if name in ("fx", "fy", "cx", "cy") else name

@@ -1,4 +1,4 @@
-"""Acceptance limits of the radiometric calibrations; uncertainties are relative."""
+"""Acceptance limits of the radiometric calibrations. Uncertainties are relative."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """A sensor without light: offset, dark current and noise of each pixel, hot pixels.
 
-A pixel's dark signal is offset + current * exposure * 2^((T - T0) / doubling): EMVA 1288 release 4.0, section 7,
-with a doubling temperature that is taken as known. Frames are read one by one, so memory does not grow with their
-number: the straight line of each pixel needs only the sums of y, y^2 and y t over the frames.
+A pixel's dark signal is offset + current * exposure * 2^((T - T0) / doubling): EMVA 1288 release 4.0, section 7.
+The doubling temperature is taken as known. Frames are read one by one, and the straight line of each pixel needs
+only the sums of y, y^2 and y t over the frames. So memory does not grow with the number of frames.
 
 Read and row noise come from differences of two frames of one exposure, in which all fixed patterns cancel.
 """
@@ -19,13 +19,13 @@ from coupole.errors import InputError
 
 Maps = NDArray[np.float32]
 HOT_SIGMA = 8.0
-"""Robust standard deviations above the median, beyond which a pixel's dark current makes it hot."""
+"""Robust standard deviations above the median. A pixel with a larger dark current is hot."""
 _ROUNDING = 1.0 / 12.0
 """Variance of rounding to whole DN (EMVA 1288 release 4.0, section 2.4)."""
 _MAD = 1.4826
 _LEAST_FRAMES = 4
 _LIT = 10.0
-"""A frame whose mean lies above the line by more than this, over the scatter of the others, was not dark."""
+"""A frame was not dark if its mean lies above the line by more than this, over the scatter of the other frames."""
 _LIT_DN = 0.5
 
 
@@ -36,9 +36,9 @@ class DarkFrame:
     name: str
     exposure_s: float
     temperature_c: float
-    """NaN if unknown."""
+    """Temperature of the frame; NaN if unknown."""
     read: Callable[[], NDArray[np.uint16]]
-    """[H, W] DN."""
+    """Reads [H, W] DN."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ class Dark:
     noise_dn: Maps
     """Standard deviation of each pixel about its own line."""
     cofactor: NDArray[np.float64]
-    """[2, 2] of offset and current: times a pixel's noise squared it is their covariance (DN, s)."""
+    """[2, 2] cofactor matrix of offset and current. Multiplied by a pixel's squared noise, it is their covariance
+    (DN, s)."""
     degrees_of_freedom: int
     """Degrees of freedom of `noise_dn`."""
     read_noise_dn: float
@@ -77,9 +78,9 @@ def calibrate_dark(
 ) -> Dark:
     """Fit a line to each pixel of frames without light.
 
-    `doubling_k` is the rise of temperature that doubles dark current: a figure of silicon (Janesick, Photon
-    Transfer, 2007, section 11.1.2), which is not estimated. Raises InputError: too few frames or exposures, frames
-    with light, saturated ones.
+    `doubling_k` is the rise of temperature that doubles dark current. It is a figure of silicon (Janesick, Photon
+    Transfer, 2007, section 11.1.2), and is not estimated. Raises InputError for too few frames or exposures, for
+    frames with light, and for saturated frames.
     """
     series = sorted(frames, key=lambda frame: (frame.exposure_s, frame.temperature_c))
     exposures = {frame.exposure_s for frame in series}
@@ -126,7 +127,7 @@ def calibrate_dark(
 
 
 def hot_pixels(current_dn_per_s: Maps, sigma: float = HOT_SIGMA) -> NDArray[np.int64]:
-    """[hot, 2] row and column of pixels with a high dark current, the hottest first."""
+    """Return [hot, 2], row and column of pixels with a high dark current, the hottest first."""
     median = np.median(current_dn_per_s)
     scatter = _MAD * np.median(np.abs(current_dn_per_s - median))
     places = np.argwhere(current_dn_per_s > median + sigma * max(scatter, 1e-9))
@@ -135,7 +136,7 @@ def hot_pixels(current_dn_per_s: Maps, sigma: float = HOT_SIGMA) -> NDArray[np.i
 
 
 def _noises(pairs: list[tuple[float, float, float]], height: int, width: int) -> tuple[float, float, float, float]:
-    """Read noise and its uncertainty, row noise and its uncertainty, DN.
+    """Return read noise and its uncertainty, and row noise and its uncertainty, DN.
 
     `pairs` are exposure time (s), variance within rows and variance of the rows (DN^2) of two successive frames.
     """
@@ -160,7 +161,7 @@ def _noises(pairs: list[tuple[float, float, float]], height: int, width: int) ->
 
 
 class _Sums:
-    """Sums over frames, four maps in all: y, y t and y^2 relative to the first frame, and the first frame."""
+    """Sums over frames, in four maps: the first frame, and y, y t and y^2 relative to it."""
 
     def __init__(self) -> None:
         self._t: list[float] = []
@@ -181,7 +182,7 @@ class _Sums:
         self._maps[2] += y * y
 
     def lines(self) -> tuple[Maps, Maps, Maps, NDArray[np.float64]]:
-        """Offset, slope, scatter about the line, and the cofactor matrix of the first two."""
+        """Return offset, slope, scatter about the line, and the cofactor matrix of offset and slope."""
         assert self._first is not None
         t = np.array(self._t)
         design = np.column_stack([np.ones_like(t), t])
@@ -195,7 +196,8 @@ class _Sums:
 
 
 def _pair_variances(a: NDArray[np.uint16], b: NDArray[np.uint16]) -> tuple[float, float]:
-    """Variance of a pixel within its row and variance of the rows, of one frame, from the difference of two.
+    """Return the variance of a pixel within its row and the variance of the rows, for one frame, from the
+    difference of two frames.
 
     Pixels with shot noise of their own (hot ones) are left out.
     """
@@ -235,7 +237,7 @@ def _refuse_lit(names: list[str], t_s: NDArray[np.float64], mean_dn: NDArray[np.
 
 
 def _robust_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Theil-Sen estimator: median of the slopes of all pairs."""
+    """Return the Theil-Sen estimate: the median of the slopes of all pairs."""
     i, j = np.triu_indices(len(x), 1)
     apart = np.abs(x[i] - x[j]) > 1e-9
     slope = float(np.median((y[i] - y[j])[apart] / (x[i] - x[j])[apart]))
@@ -243,5 +245,5 @@ def _robust_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float,
 
 
 def warmth_of(temperature_c: float, reference_c: float | None, doubling_k: float) -> float:
-    """Dark current at a temperature over that at the reference; 1 where that is not known."""
+    """Return the dark current at a temperature over that at the reference; 1 if this is not known."""
     return 1.0 if reference_c is None else float(2.0 ** ((temperature_c - reference_c) / doubling_k))

@@ -1,4 +1,4 @@
-"""Pictures of the radiometric calibrations' reports: each shows what may be wrong with its result."""
+"""Pictures of the radiometric calibrations' reports. Each shows possible errors of its result."""
 
 from __future__ import annotations
 
@@ -180,8 +180,8 @@ def draw_led_power(powers: Mapping[str, LedPower], positions: Positions, record:
 
 
 def _dome_map(positions: Positions, ids: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions of LEDs on a plane map, degrees: seen from the point where their axes intersect, with true angles
-    to the dome's axis."""
+    """Return positions of LEDs on a plane map, degrees, as seen from the point where their axes intersect, with
+    true angles to the dome's axis."""
     centres_mm, normals = positions.of(ids)
     across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
     middle_mm = np.linalg.lstsq(across.sum(axis=0), (across @ centres_mm[:, :, None]).sum(axis=0)[:, 0])[0]
@@ -199,7 +199,7 @@ def _dome_map(positions: Positions, ids: NDArray[np.int64]) -> tuple[NDArray[np.
 
 
 def _map(ax: Axes, values: NDArray[np.float32], title: str) -> None:
-    """A map [H, W], subsampled, between its 0.5 and 99.5 % quantiles."""
+    """Draw a map [H, W], subsampled, between its 0.5 and 99.5 % quantiles."""
     step = max(1, -(-max(values.shape) // _MOST_SIDE))
     thin = values[::step, ::step]
     low, high = np.nanquantile(thin, [0.005, 0.995])

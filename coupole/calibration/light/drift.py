@@ -1,11 +1,11 @@
 """Drift of the LEDs between their calibration and a run, measured on a tile in the run's views.
 
-A reading is the tile's signal over that expected from the calibrated power: 1 if nothing changed. Its logarithm is
-common level + rate * hours + coefficient * (T - T0) + noise, T0 being the board's temperature when the LED's power
-was calibrated. The coefficient has a prior (white power LEDs: about -0.3 % per kelvin), because temperature and
-time are correlated within a run. So each frame gets its own factor, by its board's temperature and its time, with
-an uncertainty. Errors that all readings share (the tile's tilt, in the run and in the calibration of the powers)
-are estimated too, with their priors.
+A reading is the tile's signal over the signal expected from the calibrated power. It is 1 if nothing has changed.
+Its logarithm is common level + rate * hours + coefficient * (T - T0) + noise, where T0 is the board's temperature
+when the LED's power was calibrated. The coefficient has a prior (white power LEDs: about -0.3 % per kelvin),
+because temperature and time are correlated within a run. So each frame gets its own factor from its board's
+temperature and its time, with an uncertainty. Errors that all readings share (the tile's tilt, in the run and in
+the calibration of the powers) are estimated too, with their priors.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ NAMES = ("level", "rate_per_h", "per_k")
 LEAST_READINGS = 3
 _SUDDEN_SIGMA = 5.0
 _SUDDEN = 0.003
-"""Relative: smaller steps are accepted."""
+"""Largest relative step that is accepted."""
 _UNKNOWN = 10.0
 _NEIGHBOURS = 11
 _ODD_SIGMA, _ODD = 6.0, 0.01
-"""A reading farther than this from its neighbours' median shows a fault of its LED, not drift."""
+"""Largest distance of a reading from its neighbours' median. A larger one shows a fault of its LED, not drift."""
 _NO_FIGURES: Floats = np.zeros((0, 0))
 
 
@@ -38,7 +38,8 @@ class Reading:
     name: str
     t_s: float
     warmer_k: float
-    """Temperature of the LED's board minus that at which its power was calibrated; NaN if either is not known."""
+    """Temperature of the LED's board minus its temperature when the power was calibrated; NaN if one of them is
+    not known."""
     ratio: float
     """Measured signal over that expected from the LED's calibrated power."""
     u_ratio: float
@@ -49,36 +50,37 @@ class Reading:
 
 @dataclass(frozen=True)
 class Drift:
-    """Factor of LED power against its calibration."""
+    """Factor of LED power relative to its calibration."""
 
     parameters: Floats
-    """[3] as `NAMES`."""
+    """[3] values of the parameters `NAMES`."""
     covariance: Floats
     """[3, 3]."""
     start_s: float
     """Time of the first reading, on the frames' clock."""
     noise: float
-    """Relative noise of one reading: the estimated one, but not less than the stated one."""
+    """Relative noise of one reading: the estimated noise, but at least the stated one."""
     used_readings: tuple[Reading, ...]
     """Readings that were used, in their order."""
     residuals: Floats
-    """[used] relative."""
+    """[used] relative residuals."""
     odd: tuple[Reading, ...]
-    """Left out: single readings far from their neighbours."""
+    """Readings that were left out, because they are far from their neighbours."""
     freedom: float
 
     @property
     def hours(self) -> float:
-        """Time from the first to the last reading; beyond them the factor is an extrapolation."""
+        """Time from the first to the last reading. Outside this time the factor is an extrapolation."""
         return (self.used_readings[-1].t_s - self.used_readings[0].t_s) / 3600.0
 
     def factor(self, warmer_k: ArrayLike, t_s: ArrayLike) -> Floats:
-        """Power over calibrated power [...], by boards' temperatures relative to the calibration (K) and times."""
+        """Return power over calibrated power [...] for boards' temperatures relative to the calibration (K) and
+        times."""
         value: Floats = np.exp(self._design(warmer_k, t_s) @ self.parameters)
         return value
 
     def u_factor(self, warmer_k: ArrayLike, t_s: ArrayLike) -> Floats:
-        """Its relative standard uncertainty [...]."""
+        """Return the relative standard uncertainty [...] of the factor."""
         design = self._design(warmer_k, t_s)
         u: Floats = np.sqrt(np.einsum("...i,ij,...j->...", design, self.covariance, design))
         return u
@@ -98,10 +100,10 @@ def fit_drift(
     rate_per_h: float = 0.0,
     u_rate_per_h: float = 0.005,
 ) -> Drift:
-    """The factor from a run's readings; `shared_covariance` [c, c] is the prior of the shared figures, whose mean
-    is 0.
+    """Find the factor from a run's readings. `shared_covariance` [c, c] is the prior of the shared figures, whose
+    mean is 0.
 
-    Raises InputError: too few readings, a dark tile, a sudden change (with the frames before and after it).
+    Raises InputError for too few readings, a dark tile, or a sudden change (with the frames before and after it).
     """
     ordered_readings = sorted(readings, key=lambda reading: reading.t_s)
     _refuse_few(ordered_readings)
@@ -141,14 +143,14 @@ class _Solved:
     residuals: Floats
     """[readings] residuals, relative."""
     noise: Floats
-    """[readings] as stated, relative."""
+    """[readings] stated noise, relative."""
     scale: float
-    """Estimated over stated noise, 1 or more."""
+    """Estimated over stated noise, at least 1."""
     freedom: float
 
 
 def _solve(readings: Sequence[Reading], prior: Floats, precision: Floats) -> _Solved:
-    """Least squares with a prior; the noise is scaled by the residuals."""
+    """Solve by least squares with a prior. The residuals scale the noise."""
     ratio = np.array([reading.ratio for reading in readings])
     hours = np.array([(reading.t_s - readings[0].t_s) / 3600.0 for reading in readings])
     warm = np.nan_to_num(np.array([reading.warmer_k for reading in readings]))
@@ -175,14 +177,15 @@ def _refuse_few(readings: Sequence[Reading]) -> None:
 
 
 def _excess(residuals: Floats, noise: Floats) -> float:
-    """Estimated over stated noise, by the median of neighbours' differences, which a single step hardly
-    changes."""
+    """Return the estimated over the stated noise, from the median of neighbours' differences. A single step hardly
+    changes it."""
     differences = np.abs(np.diff(residuals)) / np.hypot(noise[1:], noise[:-1])
     return max(1.0, float(np.median(differences) * 1.4826))
 
 
 def _odd(residuals: Floats, noise: Floats) -> NDArray[np.bool_]:
-    """Mark single readings [n] that are far from their neighbours' median; a lasting step does not count."""
+    """Return a mask [n] of single readings that are far from their neighbours' median. A lasting step does not
+    count."""
     from scipy.ndimage import median_filter
 
     if len(residuals) < _NEIGHBOURS:
@@ -192,8 +195,8 @@ def _odd(residuals: Floats, noise: Floats) -> NDArray[np.bool_]:
 
 
 def _refuse_sudden(names: Sequence[str], residuals: Floats, noise: Floats) -> None:
-    """Raise InputError if the level of the readings has a step, by the largest difference of means before and
-    after, over its noise."""
+    """Raise InputError if the level of the readings has a step. The test uses the largest difference of the means
+    before and after, over its noise."""
     weight = (_excess(residuals, noise) * noise) ** -2.0
     before, sums = np.cumsum(weight)[:-1], np.cumsum(weight * residuals)[:-1]
     after, rest = weight.sum() - before, (weight * residuals).sum() - sums

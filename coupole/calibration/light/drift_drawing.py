@@ -19,7 +19,7 @@ _MOST = 4000
 
 
 def draw_drift(drift: Drift, warmer_k: Floats, t_s: Floats, record: Record, figure: Figure) -> None:
-    """Fill the figure; `warmer_k` and `t_s` [n] are those of the run's frames."""
+    """Fill the figure. `warmer_k` and `t_s` [n] belong to the run's frames."""
     axes = figure.subplots(2, 2)
     minutes = np.array([reading.t_s - drift.start_s for reading in drift.used_readings]) / 60.0
     warm = np.array([reading.warmer_k for reading in drift.used_readings])

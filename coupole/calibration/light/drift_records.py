@@ -1,4 +1,4 @@
-"""Make the record of a run's drift from its frames that show the reference tile."""
+"""Makes the record of a run's drift from the frames that show the reference tile."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 CHANNEL = "G"
-"""One channel is sufficient: the power of an LED drifts, its colour hardly."""
+"""The channel that is used. One channel is sufficient, because an LED's power drifts, but its colour hardly
+changes."""
 _DARK = 0.1
-"""Share of the expected signal: less is a shadow, or a dead LED."""
+"""Least share of the expected signal. A smaller signal means a shadow, or a dead LED."""
 _FLASH = 5e-4
 """Relative scatter of an LED's flashes (as in `calibrate_led_power`)."""
 
@@ -44,9 +45,9 @@ class Powers:
     power: Floats
     u_own: Floats
     board_c: Floats
-    """[n] temperature of its board when it was calibrated."""
+    """[n] temperature of each LED's board when its power was calibrated."""
     common: Floats
-    """[n, c] relative change of each power by one unit of each figure that the LEDs shared."""
+    """[n, c] relative change of each power by one unit of each figure that the LEDs share."""
     names: tuple[str, ...]
     covariance: Floats
     """[c, c]."""
@@ -55,8 +56,8 @@ class Powers:
 
 
 def read_powers(path: Path, channel: str = CHANNEL) -> Powers:
-    """The table beside a record of the kind `led-power`, in one channel. Raises InputError for another, or for
-    an older record."""
+    """Read the table beside a record of the kind `led-power`, in one channel. Raises InputError for another kind,
+    or for an older record."""
     record = read_accepted(path, "led-power")
     table = path.parent / record.files[0].name
     lines = [line for line in table.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
@@ -86,9 +87,9 @@ def read_powers(path: Path, channel: str = CHANNEL) -> Powers:
 def drift_outcome(
     frames: LightFrames, setting: Setting, led_power: Path, request: Request, progress: Progress
 ) -> Outcome:
-    """Drift of the LEDs' power from its calibration to a run, from views that show the reference tile.
+    """Find the drift of the LEDs' power from its calibration to a run, from views that show the reference tile.
 
-    Raises InputError: no view shows the tile, or as `fit_drift` does.
+    Raises InputError if no view shows the tile, and like `fit_drift`.
     """
     powers = read_powers(led_power)
     read_with = {"response": setting.response, "flat-field": setting.flat, GLARE: setting.glare}
@@ -151,7 +152,7 @@ def _readings(
     remarks: list[str],
     progress: Progress,
 ) -> list[Reading]:
-    """Readings of the tile under each LED of known power, from the frames of the views that show it.
+    """Return readings of the tile under each LED of known power, from the frames of the views that show the tile.
 
     Observations that cannot be used are added to `remarks`. Raises InputError if no view shows the tile.
     """
@@ -177,7 +178,7 @@ def _readings(
 
 
 def _by_view(lit: Sequence[LightFrame]) -> list[list[LightFrame]]:
-    """Frames by view, exposure and repeat: each LED once."""
+    """Return frames by view, exposure and repeat, with each LED once."""
     frames_of: dict[tuple[str, int, int], list[LightFrame]] = {}
     for frame in lit:
         label = frame.shot.label
@@ -186,7 +187,8 @@ def _by_view(lit: Sequence[LightFrame]) -> list[list[LightFrame]]:
 
 
 def _reading(frame: LightFrame, value: float, u: float, design: Floats, powers: Powers) -> Reading:
-    """The tile under one LED relative to the LED's calibrated power; `design` is that of `rows_of`."""
+    """Return the tile's signal under one LED relative to the LED's calibrated power. `design` is that of
+    `rows_of`."""
     assert frame.led is not None, "only frames under LEDs are read"
     row = powers.row[frame.led]
     ratio, u_own = value / powers.power[row], float(powers.u_own[row])
@@ -232,7 +234,7 @@ def _parameters(drift: Drift) -> list[Parameter]:
 
 
 def _table(drift: Drift) -> str:
-    """CSV of the readings."""
+    """Return the readings as CSV."""
     text = io.StringIO()
     text.write("# the reference tile: signal over that expected from the calibrated power; residual of the fit\n")
     text.write("shot,t_s,warmer_k,ratio,u_ratio,residual\n")

@@ -1,17 +1,17 @@
-"""Flat field: light at each pixel over that at the field's brightest point, per channel.
+"""Flat field: the light at each pixel over the light at the field's brightest point, per channel.
 
-Seed 003, section 4.2 (g in its Eq. 1). A luminous panel is photographed shifted and turned. Its signal is a_v *
-g(p) * s(q), with a_v the view's brightness, g the lens's fall-off, which depends on the pixel p, and s the panel's
-unevenness, which depends on the place q on the panel. Views that differ in shift and rotation separate the two. In
-logarithms
+The source is seed 003, section 4.2 (g in its Eq. 1). A luminous panel is photographed, shifted and turned. Its
+signal is a_v * g(p) * s(q). Here a_v is the view's brightness. g is the lens's fall-off, which depends on the
+pixel p. s is the panel's unevenness, which depends on the place q on the panel. Views that differ in shift and
+rotation separate the two. In logarithms
 
     ln g = -2 ln(1 + r^2/f^2) + k1 (r/R)^2 + k2 (r/R)^4 + k3 (r/R)^6,   r = |p - centre|,   R half the diagonal,
     ln s = e1 x + e2 y + e3 x^2 + e4 x y + e5 y^2,                      (x, y) = q / `panel_scale_mm`.
 
 The first term is cos^4 with the focal length f; the polynomial is the departure of a real lens from it. Images are
-reduced to means of blocks of pixels. Dust and dead pixels do not affect the result, as a block's mean leaves out
-outliers and its weight decreases with its residual (Tukey). The error of a block is the same in all views (its
-pixels' responses), so the covariance is that of clusters of blocks ("sandwich", Liang and Zeger 1986), with
+reduced to means of blocks of pixels. Dust and dead pixels do not affect the result, because a block's mean leaves
+out outliers, and its weight decreases with its residual (Tukey). A block has the same error in all views (from its
+pixels' responses). So the covariance is that of clusters of blocks ("sandwich", Liang and Zeger 1986), with
 leave-one-out residuals (Bell and McCaffrey 2002).
 """
 
@@ -43,9 +43,9 @@ class FlatView:
     pixels: Floats
     """[n, 2] centres of the blocks, column and row."""
     signal: Floats
-    """[n] means, any unit that is linear in light."""
+    """[n] means, in any unit that is linear in light."""
     panel_mm: Floats
-    """[n, 2] places on the panel that they see."""
+    """[n, 2] places on the panel that the blocks show."""
 
 
 @dataclass(frozen=True)
@@ -54,18 +54,18 @@ class FlatField:
 
     channel: str
     parameters: Floats
-    """[5] as `G_NAMES`."""
+    """[5] values of the parameters `G_NAMES`."""
     covariance: Floats
     """[5, 5]."""
     focal_px: float
-    """f, held: the polynomial absorbs its error."""
+    """Focal length f, held. The polynomial absorbs its error."""
     size_px: tuple[int, int]
     """Width and height."""
     panel: Floats
-    """[5] unevenness of the panel as `PANEL_NAMES`."""
+    """[5] unevenness of the panel, as the parameters `PANEL_NAMES`."""
     panel_covariance: Floats
     residual: float
-    """Relative, robust standard deviation of a block."""
+    """Robust relative standard deviation of a block."""
     residuals: tuple[Floats, ...]
     """Relative residuals of each view; NaN where a block was not used."""
     rejected_share: float
@@ -74,13 +74,13 @@ class FlatField:
     degrees_of_freedom: float
 
     def at(self, pixels: Floats) -> Floats:
-        """g [...] at pixels [..., 2]; 1 at its centre."""
+        """Return g [...] at pixels [..., 2]. It is 1 at its centre."""
         radial, _ = _radial(pixels, self.parameters[:2], self.focal_px, self.size_px)
         value: Floats = np.exp(radial[0] + np.tensordot(self.parameters[2:], radial[1:], 1))
         return value
 
     def u_at(self, pixels: Floats) -> Floats:
-        """Relative standard uncertainty [...] of g at pixels [..., 2] against the mean over the field.
+        """Return the relative standard uncertainty [...] of g at pixels [..., 2] against the mean over the field.
 
         A common factor of g is also in the LEDs' power and cancels in every reflectance.
         """
@@ -89,14 +89,14 @@ class FlatField:
         return np.asarray(np.sqrt(np.einsum("i...,ij,j...->...", by, self.covariance, by)))
 
     def map(self) -> NDArray[np.float32]:
-        """[H, W] g of every pixel."""
+        """Return [H, W], g of every pixel."""
         width, height = self.size_px
         columns = np.arange(width, dtype=float)
         rows = (np.column_stack([columns, np.full(width, float(row))]) for row in range(height))
         return np.stack([self.at(row).astype(np.float32) for row in rows])
 
     def _slopes(self, pixels: Floats) -> Floats:
-        """[5, ...] derivatives of ln g."""
+        """Return [5, ...], derivatives of ln g."""
         radial, by_centre = _radial(pixels, self.parameters[:2], self.focal_px, self.size_px)
         centre_slopes = by_centre[:, 0] + np.einsum("k,ck...->c...", self.parameters[2:], by_centre[:, 1:])
         return np.concatenate([centre_slopes, radial[1:]])
@@ -173,21 +173,21 @@ def _gathered_blocks(
 @dataclass(frozen=True)
 class _Fit:
     parameters: Floats
-    """[5] as `G_NAMES`."""
+    """[5] values of the parameters `G_NAMES`."""
     panel: Floats
-    """[5] as `PANEL_NAMES`."""
+    """[5] values of the parameters `PANEL_NAMES`."""
     design: Floats
     """[b, 10 + views] derivatives of the logarithms."""
     residuals: Floats
     """[b] residuals."""
     weight: Floats
-    """[b] Tukey's."""
+    """[b] Tukey's weights."""
     sigma: float
     """Robust standard deviation of the residuals."""
 
 
 def _fit(blocks: _Blocks, views: int, focal_px: float, size_px: tuple[int, int]) -> _Fit:
-    """Gauss-Newton with Tukey's weights. Raises InputError if panel and lens cannot be separated."""
+    """Run Gauss-Newton with Tukey's weights. Raises InputError if panel and lens cannot be separated."""
     brightness = np.eye(views)[blocks.view]
     p = np.concatenate([np.array([size_px[0] - 1, size_px[1] - 1]) / 2.0, np.zeros(3)])
     rest = np.zeros(views + 5)
@@ -222,9 +222,11 @@ def _fit(blocks: _Blocks, views: int, focal_px: float, size_px: tuple[int, int])
 def block_means(
     image: Floats, mask: NDArray[np.bool_], block_px: int, *, saturation_mask: NDArray[np.bool_] | None = None
 ) -> tuple[Floats, Floats]:
-    """Centres [n, 2] and means [n] of the masked pixels of square blocks; NaN for a block with saturated pixels.
+    """Return centres [n, 2] and means [n] of the masked pixels of square blocks; NaN for a block with saturated
+    pixels.
 
-    A block's mean leaves out pixels that lie 4 robust standard deviations from its median: dust, hot pixels.
+    A block's mean leaves out pixels that lie 4 robust standard deviations from its median, such as dust and hot
+    pixels.
     """
     height, width = image.shape
     rows, columns = height // block_px, width // block_px
@@ -254,7 +256,8 @@ class Spot:
 
 
 def dust_spots(ratio: NDArray[np.float32], *, smooth_px: int = 5, least_depth: float = 0.01) -> list[Spot]:
-    """Spots in [H, W] mean over views of signal / fitted signal (NaN where unknown), the deepest first.
+    """Find spots in the ratio [H, W], the mean over views of signal over fitted signal (NaN where unknown). The
+    deepest spot is first.
 
     The ratio is smoothed over `smooth_px`, so that single pixels with a low response do not count as dust.
     """
@@ -279,7 +282,7 @@ def dust_spots(ratio: NDArray[np.float32], *, smooth_px: int = 5, least_depth: f
 def panel_places(
     pixels: Floats, focal_px: float, size_px: tuple[int, int], base_from_camera: Floats, base_from_panel: Floats
 ) -> Floats:
-    """[n, 2] mm: the points of the panel's plane z = 0 that pixels [n, 2] of a pinhole camera see."""
+    """Return [n, 2] mm: the points of the panel's plane z = 0 at pixels [n, 2] of a pinhole camera."""
     centre = (np.array(size_px) - 1) / 2.0
     rays = np.column_stack([(pixels - centre) / focal_px, np.ones(len(pixels))])
     panel_from_camera = np.linalg.inv(base_from_panel) @ base_from_camera
@@ -289,7 +292,8 @@ def panel_places(
 
 
 def _radial(pixels: Floats, centre: Floats, focal_px: float, size_px: tuple[int, int]) -> tuple[Floats, Floats]:
-    """ln cos^4 and the powers 2, 4, 6 of r/R [4, ...]; their derivatives by the centre's x and y [2, 4, ...]."""
+    """Return ln cos^4 and the powers 2, 4, 6 of r/R [4, ...], and their derivatives by the centre's x and y [2, 4,
+    ...]."""
     reach = 0.5 * float(np.hypot(*size_px))
     away = np.moveaxis(np.asarray(pixels, float), -1, 0) - np.reshape(centre, (2, *[1] * (np.ndim(pixels) - 1)))
     square = (away**2).sum(axis=0)
@@ -302,7 +306,7 @@ def _radial(pixels: Floats, centre: Floats, focal_px: float, size_px: tuple[int,
 
 
 def _clustered_covariance(design: Floats, weight: Floats, residuals: Floats, pixels: Floats) -> Floats:
-    """Covariance of a weighted fit in which the errors of a block are the same in all views."""
+    """Return the covariance of a weighted fit in which a block has the same error in all views."""
     scale = np.linalg.norm(design, axis=0)
     scaled_design = design / scale
     bread = np.linalg.inv(scaled_design.T @ (scaled_design * weight[:, None]))

@@ -1,4 +1,4 @@
-"""Make the record of the flat field from views of a luminous panel."""
+"""Makes the record of the flat field from views of a luminous panel."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ from coupole.errors import InputError
 from coupole.plan.shot_id import Light
 
 _BLOCKS = 64
-"""Across the field."""
+"""Number of blocks across the field."""
 _ROWS = 64
-"""Rows that are processed together where all pixels are used, which limits memory."""
+"""Number of rows that are processed together if all pixels are used. This limits the memory."""
 _MOST_SATURATED = 1e-3
 _MOST_FLAT_U = 0.005
 _MOST_DUST_DEPTH = 0.05
@@ -58,7 +58,7 @@ def flat_field_outcome(
     *,
     hand_eye: Path | None = None,
 ) -> Outcome:
-    """Views of a panel, shifted and turned: fall-off per channel, dust. The panel is `panel_mm` in front of the
+    """Find fall-off and dust from views of a panel, shifted and turned. The panel is `panel_mm` in front of the
     camera's mean position, perpendicular to its mean axis. `hand_eye` is the record that posed the frames."""
     if not frames.lit:
         raise InputError("flat field: no frame with light; acquire `coupole plan new flat-field`")
@@ -118,7 +118,7 @@ def _flat_views(
     straight: Mapping[str, Callable[[Floats], Floats]],
     base_from_panel: Floats,
 ) -> dict[str, FlatView]:
-    """One view's frames as means of blocks, by channel."""
+    """Return one view's frames as means of blocks, by channel."""
     mean, black = mean_of(view_frames), dark(view_frames[0])
     height, width = mean.shape
     block_px = max(8, 2 * round(width / _BLOCKS / 2))
@@ -135,7 +135,8 @@ def _flat_views(
 
 
 def _brightest(frames: LightFrames) -> dict[tuple[str, Light], list[LightFrame]]:
-    """Frames by view and light, of the longest exposure with a share of saturated pixels below `_MOST_SATURATED`.
+    """Return frames by view and light, of the longest exposure with a share of saturated pixels below
+    `_MOST_SATURATED`.
 
     Raises InputError if fewer than three views have such frames.
     """
@@ -150,7 +151,7 @@ def _brightest(frames: LightFrames) -> dict[tuple[str, Light], list[LightFrame]]
 
 
 def _plane_before(base_from_cameras: Sequence[Floats], panel_mm: float) -> Floats:
-    """[4, 4] base_from_panel."""
+    """Return base_from_panel [4, 4]."""
     centre = np.mean([pose[:3, 3] for pose in base_from_cameras], axis=0)
     axis = np.mean([pose[:3, 2] for pose in base_from_cameras], axis=0)
     axis /= np.linalg.norm(axis)
@@ -192,8 +193,8 @@ def _ratio(
     frames: LightFrames,
     base_from_panel: Floats,
 ) -> tuple[NDArray[np.float32], float]:
-    """[H, W] mean over views of signal over fitted signal, the response of single pixels and dust, and its
-    standard uncertainty by the differences between views."""
+    """Return [H, W], the mean over views of signal over fitted signal, which shows the response of single pixels
+    and dust. Also return its standard uncertainty from the differences between views."""
     size_px = next(iter(fits.values())).size_px
     width, height = size_px
     total, squares = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
@@ -228,7 +229,7 @@ def _any_saturated(frames: Sequence[LightFrame], white_dn: int) -> NDArray[np.bo
 
 
 def _map_of_pattern(maps: Mapping[str, NDArray[np.float32]], pattern: str) -> NDArray[np.float32]:
-    """[H, W] with the pixels of each channel from that channel's map."""
+    """Return [H, W], with the pixels of each channel from the map of that channel."""
     shape = next(iter(maps.values())).shape
     pattern_map = np.zeros(shape, np.float32)
     for channel, values in maps.items():

@@ -1,6 +1,6 @@
 """Frames of runs for radiometric calibrations, with light, exposure, time and temperature.
 
-A frame is read when it is used, so a calibration that processes frames in turn needs memory for few.
+A frame is read when it is used. So a calibration that processes frames in turn needs memory for only few frames.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ class LightFrame:
     t_s: float
     """Time of the frame's trigger, on the box's clock."""
     temperature_c: float
-    """Temperature of the LED's board; NaN where the box gave none."""
+    """Temperature of the LED's board; NaN if the box did not measure it."""
     base_from_flange: Floats
-    """[4, 4] measured, mm."""
+    """[4, 4] measured pose, mm."""
     base_from_camera: Floats
-    """[4, 4] mm, by the rig's hand-eye, or by a record's (`seen_through`)."""
+    """[4, 4] pose of the camera, mm, by the rig's hand-eye, or by a record's (`seen_through`)."""
     read: Callable[[], NDArray[np.uint16]]
-    """[H, W] DN."""
+    """Reads [H, W] DN."""
     joints_deg: Floats | None = None
-    """[6] measured with the pose."""
+    """[6] angles that were measured with the pose."""
     read_into: Callable[[NDArray[np.uint16]], None] | None = None
-    """The same as `read` into memory [H, W], C order, if the frame's file can do that."""
+    """Reads the frame into memory [H, W], C order, if the frame's file can do this."""
     is_kept: bool = True
-    """False if its pixels were discarded when their samples were safe: it cannot be read."""
+    """False if its pixels were discarded when their samples were safe. It cannot be read then."""
 
     @property
     def view(self) -> str:
@@ -71,7 +71,7 @@ class LightFrames:
     white_dn: int
     about: About
     focal_px: float
-    """Image distance over pixel pitch, f (1 + m): length on the sensor, px, of a tangent of 1."""
+    """Image distance over pixel pitch, f (1 + m): the length on the sensor, px, for a tangent of 1."""
     inputs: tuple[tuple[str, str], ...]
     """Name and SHA-256 of every file that was or will be read."""
     gain_db: float = 0.0
@@ -79,7 +79,7 @@ class LightFrames:
 
     @property
     def temperature_range_c(self) -> tuple[float, float] | None:
-        """Lowest and highest of the LEDs' boards; None if no frame has one."""
+        """Lowest and highest temperature of the LEDs' boards; None if no frame has one."""
         return temperatures_of(self.frames)
 
     @property
@@ -91,7 +91,7 @@ class LightFrames:
         return tuple(frame for frame in self.frames if not frame.shot.is_shot)
 
     def until(self, view: str) -> LightFrames:
-        """The frames of a view and of those that were begun before it, with the files of these."""
+        """Return the frames of a view and of the views that were begun before it, with their files."""
         views = list(dict.fromkeys(frame.view for frame in self.frames))
         kept_views = set(views[: views.index(view) + 1])
         files = {f"/views/{name}.h5" for name in kept_views} | {"/run.json"}
@@ -102,8 +102,8 @@ class LightFrames:
         )
 
     def brightest(self, most_saturated: float) -> dict[tuple[str, Light], list[LightFrame]]:
-        """Lit frames by view and light, of the longest exposure in which a smaller share of pixels than
-        `most_saturated` is saturated; an empty list where there is none."""
+        """Return lit frames by view and light. They have the longest exposure with a share of saturated pixels
+        below `most_saturated`. The list is empty if there is no such exposure."""
         groups: dict[tuple[str, Light], list[LightFrame]] = {}
         for frame in sorted(self.lit, key=lambda frame: -frame.exposure_us):
             group = groups.setdefault((frame.view, frame.shot.light), [])
@@ -120,8 +120,8 @@ class LightFrames:
         return width_px, height_px
 
     def seen_through(self, flange_from_camera: Floats, arm: CalibratedArm | None = None) -> LightFrames:
-        """The same frames with another pose [4, 4] of the camera on the flange, and the flange's own corrected by
-        the axis zeros of `arm`. Raises InputError for frames without joints that an arm is to correct."""
+        """Return the same frames with another pose [4, 4] of the camera on the flange. With `arm`, its axis zeros
+        correct the flange's pose. Raises InputError if frames without joints are to be corrected."""
         flanges = [frame.base_from_flange for frame in self.frames] if arm is None else self._corrected_poses(arm)
         frames = (
             replace(frame, base_from_flange=flange, base_from_camera=flange @ flange_from_camera)
@@ -142,7 +142,7 @@ class LightFrames:
 
 @dataclass(frozen=True)
 class PlainSources:
-    """Sources of a record that are plain pictures; frames have the same in `LightFrames`."""
+    """Sources of a record that is made from plain pictures. For frames, `LightFrames` has the same."""
 
     about: About
     inputs: tuple[tuple[str, str], ...]
@@ -151,8 +151,8 @@ class PlainSources:
 
 
 def open_light_frames(paths: Sequence[Path]) -> LightFrames:
-    """All proven frames of some runs, without the bursts' marks. Raises InputError: no frames, different cameras,
-    lenses or levels of black."""
+    """Open all proven frames of some runs, without the bursts' marks. Raises InputError if there are no frames, or
+    if cameras, lenses or levels of black differ."""
     frames: list[LightFrame] = []
     inputs: list[tuple[str, str]] = []
     common: tuple[Any, ...] | None = None
@@ -177,26 +177,26 @@ def open_light_frames(paths: Sequence[Path]) -> LightFrames:
 
 
 def channel_mask(shape: tuple[int, int], pattern: str, channel: str) -> NDArray[np.bool_]:
-    """[H, W] True where the Bayer filter has a channel; all of a MONO sensor is green."""
+    """Return [H, W], True where the Bayer filter has a channel. All pixels of a MONO sensor are green."""
     letters = np.array(list("GGGG" if pattern == "MONO" else pattern)).reshape(2, 2)
     rows, columns = np.ogrid[: shape[0], : shape[1]]
     return np.asarray(letters[rows % 2, columns % 2] == channel)
 
 
 def channels_of(pattern: str) -> tuple[str, ...]:
-    """The channels that a sensor has."""
+    """Return the channels of a sensor."""
     return ("G",) if pattern == "MONO" else CHANNELS
 
 
 def temperatures_of(frames: Sequence[LightFrame]) -> tuple[float, float] | None:
-    """Lowest and highest, C; None if no frame has one."""
+    """Return the lowest and highest temperature, C; None if no frame has one."""
     temperatures_c = [frame.temperature_c for frame in frames if np.isfinite(frame.temperature_c)]
     return (min(temperatures_c), max(temperatures_c)) if temperatures_c else None
 
 
 def _by_view(run: Run) -> dict[Path, list[FrameProven]]:
-    """Proven frames by their view's file, without marks, which are dark, but light may still glow when they
-    end, and without sentinels."""
+    """Return proven frames by their view's file, without marks and sentinels. Marks are dark, but light may still
+    glow when they end."""
     frames_of: dict[Path, list[FrameProven]] = {}
     for shot, frame in run.proven().items():
         if not isinstance(shot.light, PanelMark | Sentinel):

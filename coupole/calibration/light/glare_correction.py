@@ -1,7 +1,8 @@
-"""Veiling glare taken off frames, by a record of `calibrate glare`.
+"""Subtracts veiling glare from frames, with a record of `calibrate glare`.
 
-The veil is found from a frame's own light. What is left: noise of the shares and the form of the veil, which the
-record states; light from beyond the picture's edge, and saturated pixels, whose light is known from below only.
+The veil is found from a frame's own light. These errors remain: noise of the shares and the form of the veil,
+which the record states; light from beyond the picture's edge; and saturated pixels, for which only a lower bound
+of the light is known.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class GlareCorrection:
     covariances: Floats
     """[channels, parts, parts]"""
     u_form: Floats
-    """[channels] relative standard uncertainty of a veil by its form."""
+    """[channels] relative standard uncertainty of a veil from its form."""
     size_px: tuple[int, int]
 
     @property
@@ -39,8 +40,8 @@ class GlareCorrection:
         return block_px_of(self.size_px[0])
 
     def veil(self, light: Floats, channel: int) -> tuple[Floats, float]:
-        """[block rows, block columns] veil in one channel's `light` of blocks, which has it, in its unit; and its
-        relative standard uncertainty, root mean square over the picture."""
+        """Return the veil [block rows, block columns] in one channel's `light` of blocks, which includes the veil,
+        in the same unit. Also return its relative standard uncertainty, root mean square over the picture."""
         width_blocks = self.size_px[0] / self.block_px
         veil = veil_of(light, self.shares[channel], width_blocks)
         parts = parts_of(light - veil, width_blocks).reshape(len(PARTS), -1)
@@ -49,7 +50,8 @@ class GlareCorrection:
         return veil, float(np.sqrt(variance / square + self.u_form[channel] ** 2)) if square else 0.0
 
     def without_veil(self, signal: Floats, masks: Mapping[str, NDArray[np.bool_]]) -> Floats:
-        """[h, w] linear signal above dark without its veil; `masks` [h, w] say which pixels are a channel's."""
+        """Return the linear signal [h, w] above dark, without its veil. `masks` [h, w] are True at the pixels of a
+        channel."""
         clean = signal.copy()
         for number, channel in enumerate(self.channels):
             veil, _ = self.veil(light_of_blocks(signal, masks[channel], self.block_px), number)
@@ -59,8 +61,8 @@ class GlareCorrection:
 
 
 def read_glare(path: Path, frames: LightFrames) -> GlareCorrection:
-    """The correction by a record that holds for these frames. Raises InputError for one of another kind or
-    camera."""
+    """Return the correction by a record that holds for these frames. Raises InputError for a record of another
+    kind or camera."""
     record = read_earlier(path, "glare", frames.about, frames.size_px)
     names = [parameter.name for parameter in record.parameters]
     channels = channels_of(frames.pattern)

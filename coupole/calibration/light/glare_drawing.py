@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def draw_glare(fits: Mapping[str, GlareFit], record: Record, figure: Figure) -> None:
-    """The veil of a white picture, the traps against their prediction, what is left of them by place, the
+    """Draw the veil of a white picture, the traps against their prediction, the remaining errors by place, and the
     parts."""
     axes = figure.subplots(2, 2)
     green = fits["G"]

@@ -1,10 +1,10 @@
 """Shares of the veil's parts from pictures of black traps beside white.
 
-A trap shows t W + sum over k of a_k B_k: its own light, the share t of the white W beside it, and what each part
-of the veil (`veil.py`) brings from the picture's own light. The shares a_k are found by least squares, none below
-0. Own light is what is left without the veil, so both are found in turn. All that the form of the veil does
-not have, and all noise, shows in how a fit without a view predicts that view's traps: covariance and remaining
-error come from leaving out each view in turn (Bell and McCaffrey's CR3 of clusters).
+A trap shows t W + sum over k of a_k B_k. The first term is its own light, as the share t of the white W beside it.
+The others are the light that each part of the veil (`veil.py`) brings from the picture's own light. The shares a_k
+are found by least squares, none below 0. Own light is the light without the veil, so both are found in turn.
+Noise, and errors of the veil's form, appear when a fit without a view predicts that view's traps. So covariance
+and remaining error come from leaving out each view in turn (Bell and McCaffrey's CR3 of clusters).
 """
 
 from __future__ import annotations
@@ -32,12 +32,14 @@ Floats = NDArray[np.float64]
 LEAST_VIEWS, LEAST_TRAPS = 3, 12
 """Fewest views, and fewest traps of all views together."""
 U_NEAR = 0.15
-"""Relative standard uncertainty of the nearest part by what lies nearer than the traps' rims, where blur hides it:
-a lobe with half its core there was found by 13 % too faint."""
+"""Relative standard uncertainty of the nearest part of the veil. It allows for light nearer than the traps' rims,
+where blur hides it: for a lobe with half its core there, the result was 13 % too faint."""
 _LEAST_SPREAD = 0.35
-"""Least distance of traps from each other, over the picture's width: traps in one place tell nothing of others."""
+"""Least distance of traps from each other, over the picture's width. Traps in one place say nothing about other
+places."""
 _LEAST_VEIL = 1e-6
-"""Least veil over white of which a share is taken: a fit without a view may predict none, which is no figure."""
+"""Least veil over white for a relative error. A fit without a view may predict no veil, and then no relative error
+exists."""
 _ROUNDS = 4
 
 
@@ -47,12 +49,12 @@ class TrapView:
 
     name: str
     light: Floats
-    """[block rows, block columns] DN/s, veil and all."""
+    """[block rows, block columns] DN/s, with the veil."""
     traps: tuple[Trap, ...]
     dark: Floats
-    """[2 traps] DN/s of the traps: outer and inner part of each in turn."""
+    """[2 traps] DN/s of the traps: outer and inner part of each trap in turn."""
     beside: Floats
-    """[2 traps] DN/s of the white beside, its veil and all."""
+    """[2 traps] DN/s of the white beside, with its veil."""
     size_px: tuple[int, int]
     """Width and height."""
 
@@ -76,23 +78,24 @@ class GlareFit:
     """[parts, parts]"""
     degrees_of_freedom: float
     u_form: float
-    """Relative standard uncertainty of a veil by what its form does not have: how far the traps of a view that was
-    left out are from their prediction (root mean square), in the worst view."""
+    """Relative standard uncertainty of a veil from errors of its form: the distance of the traps of a left-out
+    view from their prediction (root mean square), in the worst view."""
     predicted_veil: Floats
-    """[n] veil at each trap over the white beside, by a fit without its view."""
+    """[n] veil at each trap over the white beside, predicted by a fit without its view."""
     found_veil: Floats
-    """[n] the same, measured."""
+    """[n] the same veil, measured."""
     pixels: Floats
     """[n, 2] x, y of the traps."""
     size_px: tuple[int, int]
 
     @property
     def off(self) -> float:
-        """Root mean square of `found_veil` less `predicted_veil`, in shares of white."""
+        """Root mean square of `found_veil` minus `predicted_veil`, as a share of white."""
         return float(np.sqrt(np.mean((self.found_veil - self.predicted_veil) ** 2)))
 
     def index(self, pixels: Floats) -> tuple[Floats, Floats]:
-        """[n] what a black point at pixels [n, 2] has of a wholly white picture, and its standard uncertainty."""
+        """Return [n], the light at a black point at pixels [n, 2] as a share of a completely white picture, and
+        its standard uncertainty."""
         weights = of_white(self.size_px, pixels)
         value = weights @ self.shares
         u = np.sqrt(np.einsum("ni,ij,nj->n", weights, self.covariance, weights) + (self.u_form * value) ** 2)
@@ -100,7 +103,8 @@ class GlareFit:
 
 
 def trap_view(name: str, signal: NDArray[np.float32], mask: NDArray[np.bool_], traps: Sequence[Trap]) -> TrapView:
-    """One channel, the pixels of `mask` [h, w], of a picture's linear signal [h, w] above dark, any unit."""
+    """Read one channel of a picture: the pixels of `mask` [h, w] in the linear signal [h, w] above dark, in any
+    unit."""
     offsets = np.argwhere(mask[:2, :2])
 
     def mean(cells: NDArray[np.intp]) -> float:
@@ -119,8 +123,8 @@ def trap_view(name: str, signal: NDArray[np.float32], mask: NDArray[np.bool_], t
 
 
 def fit_glare(views: Sequence[TrapView], trap_light: TrapLight, channel: str) -> GlareFit:
-    """Shares of the veil's parts. Raises InputError: too few views or traps, traps that are all in one place,
-    views in which no veil can be told from noise."""
+    """Find the shares of the veil's parts. Raises InputError for too few views or traps, for traps that are all in
+    one place, and for views in which no veil can be distinguished from noise."""
     _refuse_few(views)
     shares, equations = np.zeros(len(PARTS)), []
     for _ in range(_ROUNDS):
@@ -157,15 +161,14 @@ def fit_glare(views: Sequence[TrapView], trap_light: TrapLight, channel: str) ->
 
 
 def _worst_view(views: Sequence[TrapView], off: Floats) -> float:
-    """Root mean square of what the traps of a view are off [2 traps of all views], in the view where it is
-    largest."""
+    """Return the root mean square of the errors `off` [2 traps of all views] in the worst view."""
     ends = np.cumsum([len(view.dark) for view in views])
     return max(float(np.sqrt(np.mean(part**2))) for part in np.split(off, ends[:-1]))
 
 
 def _equations(view: TrapView, shares: Floats, trap_share: float) -> tuple[Floats, Floats]:
-    """[2 traps, parts] veil of each part at a trap, and [2 traps] the veil that was found there, both over
-    the white beside."""
+    """Return [2 traps, parts], the veil of each part at a trap, and [2 traps], the measured veil there. Both are
+    over the white beside."""
     width = view.size_px[0]
     block_px = block_px_of(width)
     veil = veil_of(view.light, shares, width / block_px)
@@ -182,7 +185,7 @@ def _equations(view: TrapView, shares: Floats, trap_share: float) -> tuple[Float
 
 
 def _solve(equations: Sequence[tuple[Floats, Floats]]) -> Floats:
-    """[parts] shares, none below 0."""
+    """Return [parts] shares, none below 0."""
     from scipy.optimize import nnls
 
     design, values = (np.concatenate(part) for part in zip(*equations, strict=True))

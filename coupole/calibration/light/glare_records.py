@@ -1,4 +1,4 @@
-"""Make the record of veiling glare from views of black traps beside white."""
+"""Makes the record of veiling glare from views of black traps beside white."""
 
 from __future__ import annotations
 
@@ -36,27 +36,28 @@ from coupole.errors import InputError
 from coupole.plan.shot_id import Light
 
 SHARE = "share"
-"""Begins the names of the shares: `share.even.G`."""
+"""First part of the names of the shares, such as `share.even.G`."""
 U_FORM = "u_form"
-"""Begins the names of the relative uncertainties of a veil by its form: `u_form.G`."""
+"""First part of the names of the relative uncertainties of a veil from its form, such as `u_form.G`."""
 _MOST_SATURATED = 1e-4
-"""Greatest share of saturated pixels of a frame: their light is not known, and makes glare."""
+"""Greatest share of saturated pixels of a frame. Their light is not known, and it causes glare."""
 
 
 class GlareTarget(Described):
-    """A white target with black traps, as its description says."""
+    """A white target with black traps, from its description."""
 
     schema_version: int = 1
     name: str = "black traps in a white card (not described)"
     certificate: str = ""
-    """Name of who measured the traps, and the date."""
+    """Name of the person or laboratory that measured the traps, and the date."""
     trap_share: Annotated[float, Field(ge=0, le=0.02)] = 0.0003
-    """Light that comes out of a trap, divided by that of the white beside it."""
+    """Light that leaves a trap, divided by the light of the white beside it."""
     u_trap_share: Annotated[float, Field(ge=0, le=0.02)] = 0.0002
 
 
 def read_target(path: Path | None) -> GlareTarget:
-    """The description of a target (YAML); usual figures without one. Raises InputError with all problems."""
+    """Read the description of a target (YAML); without one, return usual figures. Raises InputError with all
+    problems."""
     return GlareTarget() if path is None else read_described(path, GlareTarget)
 
 
@@ -68,7 +69,8 @@ def glare_outcome(
     response_record: Path | None,
     progress: Progress,
 ) -> Outcome:
-    """Shares of the veil's parts per channel, from views of a target. Raises InputError as `fit_glare` does."""
+    """Find the shares of the veil's parts per channel, from views of a target. Raises InputError like
+    `fit_glare`."""
     target = read_target(target_path)
     groups = _usable_frames(frames)
     dark, channels = dark_signal(frames, dark_record), channels_of(frames.pattern)
@@ -155,8 +157,8 @@ def _parameters(fits: Mapping[str, GlareFit]) -> tuple[list[Parameter], Floats]:
 
 
 def _usable_frames(frames: LightFrames) -> dict[tuple[str, Light], list[LightFrame]]:
-    """Frames by view and light, of the longest exposure in which hardly a pixel is saturated. Raises InputError if
-    there is none."""
+    """Return frames by view and light, of the longest exposure with almost no saturated pixel. Raises InputError
+    if there are none."""
     if not frames.lit:
         raise InputError("glare: no frame with light; acquire `coupole plan new glare`")
     groups = frames.brightest(_MOST_SATURATED)
@@ -170,7 +172,7 @@ def _usable_frames(frames: LightFrames) -> dict[tuple[str, Light], list[LightFra
 
 
 def _even_brightness(signal: Floats, masks: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.float32]:
-    """[h, w] all channels at the brightness of white, for finding traps."""
+    """Return [h, w] with all channels at the brightness of white, for finding traps."""
     even = np.empty(signal.shape, np.float32)
     for mask in masks.values():
         even[mask] = signal[mask] / max(float(np.quantile(signal[mask], 0.9)), 1e-9)

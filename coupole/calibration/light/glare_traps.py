@@ -1,4 +1,4 @@
-"""Black traps beside a white field in a picture: where they are, and what their pixels show."""
+"""Black traps beside a white field in a picture: their places, and the light of their pixels."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
 _DARK = 0.2
-"""Share of the picture's white below which a pixel may be a trap's."""
+"""Share of the picture's white. A darker pixel may be a trap's."""
 _WHITE = 0.3
-"""Share of the picture's white that everything around a trap must have."""
+"""Least share of the picture's white that everything around a trap must have."""
 _LEAST_CELLS = 12
 """Fewest cells of 2 x 2 pixels inside a trap."""
 _RIM_CELLS = 2.0
@@ -31,19 +31,19 @@ class Trap:
     outer: Integers
     inner: Integers
     """[n, 2] rows and columns of the first pixels of its cells near the rim, and of those in its middle. The rim
-    itself is left out. Light from near by reaches the middle less."""
+    itself is left out. Less light from nearby reaches the middle."""
     beside: Integers
-    """[n, 2] of the white around it."""
+    """[n, 2] cells of the white around it."""
 
     @property
     def middle_px(self) -> tuple[float, float]:
-        """x, y."""
+        """x, y of the trap's middle."""
         row, column = np.concatenate([self.outer, self.inner]).mean(axis=0)
         return float(column) + 0.5, float(row) + 0.5
 
 
 def find_traps(signal: NDArray[np.float32]) -> list[Trap]:
-    """Traps in a picture [h, w] of linear signal: dark places that white surrounds wholly."""
+    """Find traps in a picture [h, w] of linear signal: dark places that are completely surrounded by white."""
     from scipy import ndimage
 
     height, width = (size // 2 * 2 for size in signal.shape)
@@ -67,8 +67,8 @@ def find_traps(signal: NDArray[np.float32]) -> list[Trap]:
 def _cells_of_trap(
     trap_mask: NDArray[np.bool_], is_white: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]] | None:
-    """Outer and inner cells of a trap and those beside it; None if something else than white is around it or in
-    it, or if it is too small."""
+    """Return outer and inner cells of a trap, and the cells beside it. None if something that is not white is
+    around it or in it, or if it is too small."""
     from scipy import ndimage
 
     near = ndimage.binary_dilation(trap_mask, iterations=2)

@@ -1,9 +1,9 @@
-"""Irradiance by an LED: a finite square that radiates by Lambert's law.
+"""Irradiance by an LED, which is a finite square that radiates by Lambert's law.
 
-This formula of the processing is not shared with the simulator. Lambert's for a polygon (Photometria, 1760; seed
-003, Eq. 2 and supplement): with unit vectors v_i from the point to the corners, G = sum_i angle(v_i, v_i+1) *
-unit(v_i x v_i+1), and E = Phi / (2 A) * G.n / pi for a flux Phi that leaves the square of area A. The factor 1 /
-pi is that of a Lambertian emitter's radiance, Phi / (pi A).
+The processing does not share this formula with the simulator. It is Lambert's formula for a polygon (Photometria,
+1760; seed 003, Eq. 2 and supplement). With unit vectors v_i from the point to the corners, it is G = sum_i
+angle(v_i, v_i+1) * unit(v_i x v_i+1), and E = Phi / (2 A) * G.n / pi for a flux Phi that leaves the square of area
+A. The factor 1 / pi is that of a Lambertian emitter's radiance, Phi / (pi A).
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ LED_SIDE_MM = 7.0
 
 
 def led_corners_mm(centre_mm: ArrayLike, normal: ArrayLike, side_mm: float = LED_SIDE_MM) -> Floats:
-    """[..., 4, 3] corners of squares about `centre_mm` [..., 3] that look along the unit `normal` [..., 3].
+    """Return [..., 4, 3], corners of squares about `centre_mm` [..., 3] that face along the unit `normal` [...,
+    3].
 
     The direction of the sides is not measured: at 1 m it changes irradiance by less than 1e-6.
     """
@@ -36,8 +37,9 @@ def led_corners_mm(centre_mm: ArrayLike, normal: ArrayLike, side_mm: float = LED
 
 
 def lambert_vector(points_mm: ArrayLike, corners_mm: ArrayLike) -> Floats:
-    """G [..., 3] of polygons [..., k, 3] at points [..., 3]; it points to the light, and |G| is twice the largest
-    projected solid angle. From points in front of the polygon its corners run clockwise about its normal."""
+    """Return G [..., 3] of polygons [..., k, 3] at points [..., 3]. It points to the light, and |G| is twice the
+    largest projected solid angle. As seen from points in front of the polygon, its corners run clockwise about its
+    normal."""
     towards = np.asarray(corners_mm, float) - np.asarray(points_mm, float)[..., None, :]
     unit = towards / np.sqrt(np.einsum("...i,...i", towards, towards))[..., None]
     after = np.roll(unit, -1, axis=-2)
@@ -51,7 +53,7 @@ def lambert_vector(points_mm: ArrayLike, corners_mm: ArrayLike) -> Floats:
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    """Cross product [..., 3], several times faster than numpy's own for many short vectors."""
+    """Return the cross product [..., 3]. This is several times faster than numpy's own for many short vectors."""
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
@@ -66,11 +68,11 @@ def irradiance_per_flux(
     side_mm: float = LED_SIDE_MM,
     emission: Emission = "lambertian",
 ) -> Floats:
-    """E / Phi in m^-2 at points [..., 3] with unit normals [..., 3]; all arguments broadcast.
+    """Return E / Phi in m^-2 at points [..., 3] with unit normals [..., 3]. All arguments are broadcast.
 
-    0 for a point behind the LED or an LED whose centre is below the point's horizon: at a metre the LED's size
-    matters within less than half a degree of the horizon. `paper` has the emitter's cosine twice (seed 003, Eq.
-    2).
+    It is 0 for a point behind the LED, or an LED whose centre is below the point's horizon. At a metre the LED's
+    size matters only within less than half a degree of the horizon. `paper` has the emitter's cosine twice (seed
+    003, Eq. 2).
     """
     points, facing = np.asarray(points_mm, float), np.asarray(normals, float)
     centres, axes = np.asarray(led_centres_mm, float), np.asarray(led_normals, float)

@@ -1,15 +1,16 @@
 """Power of each LED from pictures of a Spectralon tile: Phi_k of seed 003, Eq. 2 and section 4.2.
 
-A patch of the tile at x gives the signal S = f(i, o) * E/Phi(x) * Phi_k, S being DN per second over the flat
-field. So Phi_k is in those units times m^2 sr, and the camera's constants cancel in a reflectance. In logarithms
+A patch of the tile at x gives the signal S = f(i, o) * E/Phi(x) * Phi_k, where S is DN per second over the flat
+field. So Phi_k is in these units times m^2 sr, and the camera's constants cancel in a reflectance. In logarithms
 the problem is linear,
 
     ln S_kv - ln h_kv = ln Phi_k + J_kv . theta + noise,
 
-theta being the figures that all LEDs share: the tile's tilt about two axes and its height at each of its places,
-the logarithm of its reflectance, its departure from Lambert's law. They have priors from the tile's description;
-data from several places of the tile improve them. So the covariance of all powers is a diagonal (noise of each
-LED) plus a matrix of low rank (the shared figures), and 1080 LEDs need no matrix of 1080 by 1080.
+where theta are the figures that all LEDs share: the tile's tilt about two axes and its height at each of its
+places, the logarithm of its reflectance, and its departure from Lambert's law. They have priors from the tile's
+description; data from several places of the tile improve them. So the covariance of all powers is a diagonal
+(noise of each LED) plus a matrix of low rank (the shared figures). A matrix of 1080 by 1080 for 1080 LEDs is not
+needed.
 """
 
 from __future__ import annotations
@@ -38,41 +39,42 @@ from coupole.errors import InputError
 
 _UNLIKELY = 1e-6
 LEAST_PRIOR = 1e-12
-"""Standard uncertainty of a figure that is stated as exact."""
+"""Standard uncertainty of a figure that is stated to be exact."""
 
 
 @dataclass(frozen=True)
 class LedPower:
-    """Power of one channel; relative figures refer to the LED's power."""
+    """Power of each LED in one channel. Relative figures refer to the LED's power."""
 
     ids: NDArray[np.int64]
     power: Floats
     """[n] DN s^-1 m^2 sr; 0 for a dead LED, NaN for one without a usable view."""
     u_own: Floats
-    """[n] relative standard uncertainty by errors that are independent between LEDs."""
+    """[n] relative standard uncertainty from errors that are independent between LEDs."""
     common: Floats
     """[n, c] relative change of each power by one unit of each common figure."""
     common_names: tuple[str, ...]
     common_covariance: Floats
     """[c, c]."""
     departures: Floats
-    """[c] the common figures' departures from the description."""
+    """[c] departures of the common figures from the description."""
     noise: float
-    """Relative, of one LED in one view, as found."""
+    """Estimated relative noise of one LED in one view."""
     residuals: tuple[Floats, ...]
-    """Relative residuals of each view [n]; NaN where not used."""
+    """Relative residuals of each view [n]; NaN where a row was not used."""
     remarks: tuple[str, ...]
-    """Faults by name: dead LEDs, shadows, saturation."""
+    """Named faults: dead LEDs, shadows, saturation."""
     degrees_of_freedom: float
 
     def u(self) -> Floats:
-        """[n] relative standard uncertainty, all errors together."""
+        """Relative standard uncertainty [n], from all errors together."""
         together = np.einsum("ni,ij,nj->n", self.common, self.common_covariance, self.common)
         total: Floats = np.sqrt(self.u_own**2 + together)
         return total
 
     def u_against_mean(self) -> Floats:
-        """[n] relative standard uncertainty of an LED's power over the mean of all, without the common scale."""
+        """Relative standard uncertainty [n] of an LED's power over the mean of all LEDs. The common scale does not
+        count."""
         off = self.common - np.nanmean(self.common[self.power > 0], axis=0)
         together = np.einsum("ni,ij,nj->n", off, self.common_covariance, off)
         total: Floats = np.sqrt(self.u_own**2 + together)
@@ -80,13 +82,13 @@ class LedPower:
 
 
 def prior_of(tile: Tile, places: int = 1) -> Floats:
-    """[c] standard uncertainties of the shared figures, by the tile's description."""
+    """Return [c], the standard uncertainties of the shared figures, from the tile's description."""
     of_place = [tile.u_tilt_deg, tile.u_tilt_deg, tile.u_height_mm]
     return np.array([*of_place * places, tile.u_reflectance / tile.reflectance, tile.u_minnaert])
 
 
 def _common_names(places: Sequence[int]) -> tuple[str, ...]:
-    """[c] names of the shared figures, in the order of `prior_of`."""
+    """Return [c], the names of the shared figures, in the order of `prior_of`."""
     of_places = [f"place{p}.{figure}" for p in places for figure in ("tilt_x_deg", "tilt_y_deg", "height_mm")]
     return (*of_places, "ln_reflectance", "minnaert")
 
@@ -100,10 +102,10 @@ def calibrate_led_power(
     side_mm: float = LED_SIDE_MM,
     flash_noise: float = 5e-4,
 ) -> LedPower:
-    """Powers of one channel from the tile's views.
+    """Find the powers of one channel from the tile's views.
 
-    `flash_noise` is the stated relative scatter of an LED's flashes. Raises InputError: no view shows the tile
-    lit, all are saturated, or the tile was moved between views of one place.
+    `flash_noise` is the stated relative scatter of an LED's flashes. Raises InputError if no view shows the tile
+    lit, if all views are saturated, or if the tile was moved between views of one place.
     """
     if not views:
         raise InputError("LED power: expected views of the tile, found none")
@@ -156,7 +158,7 @@ def calibrate_led_power(
 def _by_view(
     views: Sequence[TileView], view_of: NDArray[np.intp], led_of: NDArray[np.int64], row_residuals: Floats
 ) -> tuple[Floats, ...]:
-    """Residuals of each view in the order of its LEDs [n]; NaN where an LED was not used."""
+    """Return residuals of each view in the order of its LEDs [n]; NaN where an LED was not used."""
     residuals = []
     for v, view in enumerate(views):
         view_residuals = np.full(len(view.leds), np.nan)
@@ -173,14 +175,14 @@ class _Solved:
     weight: Floats
     """[leds] sum of weights."""
     mean_design: Floats
-    """[leds, c]."""
+    """[leds, c] weighted mean of the design."""
     theta: Floats
     covariance: Floats
     residuals: Floats
 
 
 def _solve(y: Floats, w: Floats, led: NDArray[np.intp], design: Floats, leds: int, prior: Floats) -> _Solved:
-    """Least squares with the LEDs' own unknowns eliminated first."""
+    """Solve by least squares. The LEDs' own unknowns are eliminated first."""
     weight: Floats = np.bincount(led, w, leds).astype(np.float64)
     safe = np.maximum(weight, 1e-300)
     mean_y = np.bincount(led, w * y, leds) / safe
@@ -201,7 +203,8 @@ def _refuse_moved(
     design: Floats,
     redundancy: float,
 ) -> None:
-    """Raise InputError if one view fits far better with its own tilt, although it has the same place as others."""
+    """Raise InputError if one view fits far better with a tilt of its own, although it has the same place as
+    others."""
     for place in {view.place for view in views}:
         members = [v for v, view in enumerate(views) if view.place == place]
         if len(members) < 2:

@@ -1,4 +1,4 @@
-"""Make the record of the LEDs' power from frames of a white tile."""
+"""Makes the record of the LEDs' power from frames of a white tile."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from coupole.errors import InputError
 
 
 def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, progress: Progress) -> Outcome:
-    """Power of each LED per channel, from the tile's views. Raises InputError as `calibrate_led_power` does."""
+    """Find the power of each LED per channel, from the tile's views. Raises InputError like
+    `calibrate_led_power`."""
     lit = [frame for frame in frames.lit if frame.led is not None]
     if not lit:
         raise InputError("LED power: no frame under an LED; acquire `coupole plan new spectralon`")
@@ -81,7 +82,8 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
 
 
 def board_temperatures(lit: Sequence[LightFrame]) -> dict[int, float]:
-    """Mean temperature of each LED's board over its frames, C, for which its power holds; NaN if not known."""
+    """Return the mean temperature of each LED's board over its frames, C; NaN if it is not known. The LED's power
+    holds for this temperature."""
     temperatures_c: dict[int, list[float]] = {}
     for frame in lit:
         assert frame.led is not None, "only frames under LEDs are read"
@@ -90,10 +92,11 @@ def board_temperatures(lit: Sequence[LightFrame]) -> dict[int, float]:
 
 
 def power_table(powers: Mapping[str, LedPower], board_c: Mapping[int, float]) -> str:
-    """CSV: each LED's board temperature, power by channel, own uncertainty, derivative by each common figure.
+    """Return CSV with, for each LED, its board temperature, its power by channel, its own uncertainty, and its
+    derivative by each common figure.
 
-    The covariance of two LEDs' relative powers is that of the common figures between their derivatives, and
-    u_own^2 on the diagonal.
+    The covariance of two LEDs' relative powers is the covariance of the common figures, multiplied by their
+    derivatives from both sides. On the diagonal u_own^2 is added.
     """
     first = next(iter(powers.values()))
     text = io.StringIO()
@@ -113,7 +116,7 @@ def power_table(powers: Mapping[str, LedPower], board_c: Mapping[int, float]) ->
 
 
 def _parameters(powers: Mapping[str, LedPower], covariance: Floats) -> list[Parameter]:
-    """The mean power and the shared figures, by channel; the power of each LED is in the table."""
+    """Return the mean power and the shared figures, by channel. The power of each LED is in the table."""
     parameters = []
     u = iter(np.sqrt(np.diag(covariance)))
     for channel, power in powers.items():
@@ -133,7 +136,7 @@ def _parameters(powers: Mapping[str, LedPower], covariance: Floats) -> list[Para
 
 
 def _mean_and_slopes(power: LedPower) -> tuple[float, Floats]:
-    """The mean power of all LEDs, and its derivatives [c] by the shared figures."""
+    """Return the mean power of all LEDs, and its derivatives [c] by the shared figures."""
     good = np.isfinite(power.power) & (power.power > 0)
     return float(power.power[good].mean()), np.asarray((power.power[good, None] * power.common[good]).mean(axis=0))
 
@@ -141,10 +144,10 @@ def _mean_and_slopes(power: LedPower) -> tuple[float, Floats]:
 def covariance_of(powers: Mapping[str, LedPower], priors: Mapping[str, Floats]) -> Floats:
     """Return the covariance of `_parameters`, [channels (1 + c)] squared.
 
-    All channels see the same tile, so errors of their priors are fully correlated, also where a certificate's
-    spectrum gives each its own. With priors of standard uncertainties s_a, s_b and posteriors C_a, C_b the errors
-    of channels a and b have the covariance C_a diag(1 / (s_a s_b)) C_b, the remaining part of the priors' error;
-    their noise is independent.
+    All channels see the same tile. So errors of their priors are fully correlated, even if a certificate's
+    spectrum gives each channel its own prior. Let the priors have the standard uncertainties s_a, s_b and the
+    posteriors C_a, C_b. Then the errors of channels a and b have the covariance C_a diag(1 / (s_a s_b)) C_b, which
+    is the remaining part of the priors' error. Their noise is independent.
     """
     size = 1 + len(next(iter(priors.values())))
     whole = np.zeros((size * len(powers), size * len(powers)))

@@ -1,4 +1,5 @@
-"""A white tile in frames: mean signals of its patches, and the calibrations that are needed to read them."""
+"""A white tile in frames: mean signals of its patches, and the calibrations that are needed to read the
+patches."""
 
 from __future__ import annotations
 
@@ -24,13 +25,13 @@ from coupole.errors import InputError
 from coupole.plan.led_table import read_led_table
 
 _PATCHES = 4
-"""Along each side of the tile."""
+"""Number of patches along each side of the tile."""
 _LEAST_PIXELS = 6
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Calibrations and descriptions that the tile's frames are read with."""
+    """Calibrations and descriptions for reading the tile's frames."""
 
     tile: Tile
     base_from_support: Floats
@@ -44,18 +45,18 @@ class Setting:
     files: tuple[Path, ...] = ()
     """Files of tile, support and LEDs: inputs of the record."""
     light: LightSpectrum | None = None
-    """Spectrum of the LEDs, if the rig names one: weighs a certificate's wavelengths."""
+    """Spectrum of the LEDs, if the rig names one. It weights a certificate's wavelengths."""
 
     @property
     def base_from_tile(self) -> Floats:
         return self.base_from_support @ self.tile.support_from_tile.matrix()
 
     def tile_of(self, channel: str) -> Tile:
-        """The tile as a channel sees it."""
+        """Return the tile as a channel sees it."""
         return self.tile.of_channel(channel, self.light)
 
     def artefacts(self, channels: Sequence[str]) -> tuple[UsedArtefact, ...]:
-        """Part of a record: the tile's certificate."""
+        """Return the part of a record with the tile's certificate."""
         figures: dict[str, float] = {}
         for channel in channels:
             tile = self.tile_of(channel)
@@ -70,9 +71,11 @@ class Setting:
 
 
 def calibrated_positions(leds: Path) -> Positions:
-    """Positions of the LEDs by a record of the kind `leds`. Raises InputError for one of another kind.
+    """Return the positions of the LEDs from a record of the kind `leds`. Raises InputError for a record of another
+    kind.
 
-    Its uncertainties are neglected: 0.05 mm at 1.5 m change an irradiance by a tenth of the scatter of flashes.
+    The record's uncertainties are neglected, because 0.05 mm at 1.5 m change an irradiance by only a tenth of the
+    scatter of flashes.
     """
     record = read_accepted(leds, "leds")
     table = read_led_table(leds.parent / next(file.name for file in record.files if file.name.endswith(".csv")))
@@ -95,7 +98,8 @@ class TileReader:
         self._glare = None if setting.glare is None else read_glare(setting.glare, frames)
 
     def view(self, view_frames: Sequence[LightFrame], tell: Callable[[], None]) -> dict[str, TileView]:
-        """The tile in the frames of one view, each under one LED, by channel; `tell` is called after each.
+        """Read the tile in the frames of one view, each under one LED, by channel. `tell` is called after each
+        frame.
 
         Raises InputError if the view does not show the whole tile.
         """
@@ -130,8 +134,8 @@ class TileReader:
         return min(map(len, self.patches(base_from_camera)[1])) > 0
 
     def patches(self, base_from_camera: Floats) -> tuple[Floats, list[NDArray[np.intp]]]:
-        """Centres [m, 3] of the patches in the base frame, and the pixels [k, 2] (row, column) that see each; none
-        for a patch that is not completely in the picture."""
+        """Return centres [m, 3] of the patches in the base frame, and the pixels [k, 2] (row, column) that see
+        each patch. A patch that is not completely in the picture has no pixels."""
         tile = self._setting.tile
         base_from_tile = self._setting.base_from_tile
         half = tile.side_mm / 2.0 - tile.margin_mm
@@ -155,8 +159,8 @@ class TileReader:
     def means(
         self, frame: LightFrame, patches: Sequence[NDArray[np.intp]]
     ) -> dict[str, tuple[Floats, Floats, bool]]:
-        """Return for each channel: mean signal of each patch over flat field, DN/s; its uncertainty; whether
-        saturated."""
+        """Return for each channel the mean signal of each patch over the flat field, DN/s, its uncertainty, and
+        whether the patch is saturated."""
         raw = frame.read()
         signal = self._linear_signal(raw, frame)
         means_of = {}
@@ -176,7 +180,8 @@ class TileReader:
         return means_of
 
     def _linear_signal(self, raw: NDArray[np.uint16], frame: LightFrame) -> NDArray[Any]:
-        """[h, w] signal above dark; made linear and without its veil if there is a record of the glare."""
+        """Return the signal [h, w] above dark. If there is a record of the glare, the signal is linear and has no
+        veil."""
         signal = raw - self._dark(frame)
         if self._glare is None:
             return signal
@@ -200,7 +205,8 @@ def _refuse_few(least: int) -> None:
 
 
 def _inside(polygon: Floats, shape: tuple[int, int]) -> NDArray[np.intp]:
-    """[k, 2] row and column of the pixels inside a convex polygon [4, 2]; none if it leaves the picture."""
+    """Return [k, 2], row and column of the pixels inside a convex polygon [4, 2]; none if the polygon is partly
+    outside the picture."""
     if (polygon < 0).any() or (polygon > np.array(shape[::-1]) - 1).any():
         return np.zeros((0, 2), np.intp)
     low, high = np.floor(polygon.min(axis=0)).astype(int), np.ceil(polygon.max(axis=0)).astype(int)

@@ -1,9 +1,9 @@
 """Linearity of a sensor, with uncertainty (EMVA 1288, release 4.0, section 8).
 
 Under constant light the signal of any pixel is its rate times the exposure time. Pixels of several brightnesses
-share one curve, y + c2 y^2/R + c3 y^3/R^2 = rate * (t + t0), so that an error of the exposure time and a curvature
-of the response are separated. Each exposure has its own factor of light (flicker), which could otherwise be
-mistaken for curvature.
+share one curve, y + c2 y^2/R + c3 y^3/R^2 = rate * (t + t0). This separates an error of the exposure time from a
+curvature of the response. Each exposure has its own factor of light (flicker), because flicker could otherwise
+look like curvature.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 _GROUPS = 12
-"""Groups of pixels of similar brightness."""
+"""Number of groups of pixels of similar brightness."""
 _CLIPPED_SHARE = 1e-3
 _CHANGED = 0.01
-"""Relative: if ratios between groups of pixels change by more, the scene was changed."""
+"""Largest relative change of ratios between groups of pixels. If they change by more, the scene was changed."""
 _SCENE_SIGMA = 8.0
 
 
@@ -33,13 +33,13 @@ class Linearity:
     """Deviation of the response from a line, and the polynomial that corrects it."""
 
     coefficients: Floats
-    """c2, c3 of y + c2 y^2/R + c3 y^3/R^2; zeros if a line is sufficient."""
+    """c2, c3 of y + c2 y^2/R + c3 y^3/R^2. They are zero if a line is sufficient."""
     covariance: Floats
     """[2, 2]."""
     with_offset: Floats
-    """[2] covariance of c2 and c3 with the time offset."""
+    """[2] covariances of c2 and c3 with the time offset."""
     range_dn: float
-    """R, above dark."""
+    """R, the range above dark."""
     time_offset_us: Estimate
     worst_deviation: float
     """Largest deviation from a line between 5 and 95 % of the range, relative (EMVA 1288, 8.3)."""
@@ -53,17 +53,17 @@ class Linearity:
     """Relative scatter of the light from frame to frame."""
 
     def linear(self, signal_dn: Floats) -> Floats:
-        """Linearised signal; same shape, DN above dark."""
+        """Return the linearised signal, of the same shape, DN above dark."""
         x = signal_dn / self.range_dn
         linear_dn: Floats = signal_dn * (1.0 + x * (self.coefficients[0] + x * self.coefficients[1]))
         return linear_dn
 
 
 def linearity(pairs: Sequence[Pair], range_dn: float, *, significance: float = 1e-3) -> Linearity:
-    """Deviation from a line, and its correction if the probability of this deviation for a straight line is below
+    """Find the deviation from a line. It is corrected if its probability for a straight line is below
     `significance`.
 
-    Raises InputError: clipped frames, a scene that changed, flickering light, a longer exposure that is not
+    Raises InputError for clipped frames, a scene that changed, flickering light, or a longer exposure that is not
     brighter.
     """
     refuse_all_clipped(pairs)
@@ -118,7 +118,8 @@ class _Fit:
 
 
 def _fit(signals: Floats, u_signals: Floats, exposures: Floats, range_dn: float, flicker: float) -> _Fit:
-    """Curve, time offset (ms), logarithm of each group's rate over its start, relative light of each exposure."""
+    """Fit the curve, the time offset (ms), the logarithm of each group's rate over its start, and the relative
+    light of each exposure."""
     is_known = np.isfinite(signals)
     start = np.nanmedian(signals / exposures, axis=1)
     scatter = max(flicker / np.sqrt(2.0), 1e-6)
@@ -143,8 +144,8 @@ def _fit(signals: Floats, u_signals: Floats, exposures: Floats, range_dn: float,
 
 
 def _grouped_signals(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
-    """[groups, exposures] mean signals of pixels of similar brightness, and their standard uncertainties; NaN
-    where more than `_CLIPPED_SHARE` of a group is saturated."""
+    """Return mean signals [groups, exposures] of pixels of similar brightness, and their standard uncertainties.
+    They are NaN if more than `_CLIPPED_SHARE` of a group is saturated."""
     bright = max(
         pairs, key=lambda p: float(np.where(p.saturation_mask.mean() < _CLIPPED_SHARE, p.first.mean(), -1.0))
     )
@@ -164,7 +165,8 @@ def _grouped_signals(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
 
 
 def _flicker(pairs: Sequence[Pair]) -> float:
-    """Relative standard deviation of the light from frame to frame, from the two frames of each pair."""
+    """Return the relative standard deviation of the light from frame to frame, from the two frames of each
+    pair."""
     differences = []
     for pair in pairs:
         keep = ~pair.saturation_mask
@@ -208,6 +210,6 @@ def _refuse_other_scene(
 
 
 def _from_line(x: Floats, relative: Floats) -> Floats:
-    """Relative deviations from the proportional line that halves their range."""
+    """Return relative deviations from the proportional line that halves their range."""
     deviations: Floats = relative - 0.5 * (relative.max() + relative.min())
     return deviations

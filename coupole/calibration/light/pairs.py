@@ -12,19 +12,20 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 BLOCK = 64
-"""Number of neighbouring pixels over which the scene is assumed to be a smooth curve."""
+"""Number of neighbouring pixels in which the scene is assumed to be a smooth curve."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two frames of one scene, light and exposure; [pixels] DN above the dark frame, of one channel."""
+    """Two frames of one scene, light and exposure. Their values are [pixels], DN above the dark frame, of one
+    channel."""
 
     name: str
     exposure_us: float
     first: Floats
     second: Floats
     saturation_mask: NDArray[np.bool_]
-    """[pixels] True where either frame is saturated."""
+    """[pixels] True where at least one of the frames is saturated."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Photon transfer: gain, read noise and full well of a sensor, with uncertainties (EMVA 1288, release 4.0, 6.5).
 
-The temporal variance of a pixel is read^2 + 1/12 + K * signal, with K in DN per electron; variance is half the
+The temporal variance of a pixel is read^2 + 1/12 + K * signal, with K in DN per electron. The variance is half the
 mean square of the difference of two frames, in which fixed patterns cancel. Pixels of equal mean are evaluated
 together, so the scene need not be uniform.
 """
@@ -20,9 +20,9 @@ from coupole.errors import InputError
 ROUNDING_VARIANCE = 1.0 / 12.0
 _LEVELS = 24
 _LEAST_PIXELS = 400
-"""Least number of pixels of one level: fewer do not determine its variance."""
+"""Least number of pixels of one level. Fewer pixels do not determine its variance."""
 _COLLAPSED = 0.7
-"""A level counts as saturated if its variance, divided by that of the line, is below this."""
+"""A level counts as saturated if its variance, divided by the variance of the line, is below this."""
 _GROSS = 6.0
 
 
@@ -32,20 +32,20 @@ class PhotonTransfer:
 
     gain_dn_per_e: Estimate
     read_noise_dn: Estimate
-    """Read noise of one frame, without rounding; row noise included."""
+    """Read noise of one frame, with row noise, without rounding."""
     read_noise_e: Estimate
     saturation_dn: float
     """Signal above dark at which variance has its maximum (EMVA 1288, 6.6)."""
     saturation_e: Estimate
     saturated_seen: bool
-    """False if no frame reached saturation: `saturation_dn` is then only the highest level."""
+    """False if no frame reached saturation. `saturation_dn` is then only the highest level."""
     prnu: Estimate | None
-    """Relative; None if the scene was not uniform enough."""
+    """Relative PRNU; None if the scene was not uniform enough."""
     covariance: Floats
     """[2, 2] of intercept (DN^2) and gain (DN)."""
     chi2_per_degree: float
     signal_dn: Floats
-    """[levels] and variance of each, with its standard uncertainty."""
+    """[levels] mean signal of each level; the next two fields are for the same levels."""
     variance_dn2: Floats
     u_variance_dn2: Floats
     used_levels: NDArray[np.bool_]
@@ -57,9 +57,10 @@ class PhotonTransfer:
 
 
 def photon_transfer(pairs: Sequence[Pair]) -> PhotonTransfer:
-    """Gain, read noise and saturation of one channel, from pairs of frames at several levels.
+    """Find gain, read noise and saturation of one channel, from pairs of frames at several levels.
 
-    Raises InputError: no pair, too few levels below saturation, variance that does not grow with the signal.
+    Raises InputError for no pair, too few levels below saturation, or a variance that does not grow with the
+    signal.
     """
     if not pairs:
         raise InputError("response: expected two frames of each exposure; set `repeats: 2` in the plan")
@@ -108,7 +109,8 @@ class _Line:
 
 
 def _squared_differences(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
-    """Mean of the two frames and their squared difference over 2, at each unsaturated pixel of all pairs."""
+    """Return the mean of the two frames and their squared difference over 2, at each unsaturated pixel of all
+    pairs."""
     signal, squares = [], []
     for pair in pairs:
         keep = ~pair.saturation_mask
@@ -126,7 +128,8 @@ def _squared_differences(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
 
 
 def _line_of_sound_levels(levels: Floats, variances: Floats, counts: Floats) -> tuple[_Line, NDArray[np.bool_]]:
-    """The line through the levels that are neither saturated nor gross errors, and a mask [levels] of these."""
+    """Return the line through the levels that are neither saturated nor gross errors, and a mask [levels] of these
+    levels."""
     is_used = np.ones(len(levels), np.bool_)
     fit = _line(levels, variances, counts, is_used)
     for _ in range(10):
@@ -146,7 +149,7 @@ def _line_of_sound_levels(levels: Floats, variances: Floats, counts: Floats) -> 
 
 
 def _levels(signal: Floats, squared_differences: Floats) -> tuple[Floats, Floats, Floats]:
-    """Mean signal, mean squared difference over 2 and number of pixels, in levels of similar signal."""
+    """Return mean signal, mean squared difference over 2 and number of pixels, in levels of similar signal."""
     order = np.argsort(signal, kind="stable")
     # Equal steps of signal, not of rank: bright pixels may be few, and they determine most of the gain.
     edges = np.linspace(signal[order[len(order) // 500]], signal[order[-1 - len(order) // 2000]], _LEVELS + 1)
@@ -163,7 +166,8 @@ def _levels(signal: Floats, squared_differences: Floats) -> tuple[Floats, Floats
 
 
 def _line(signal: Floats, variance: Floats, counts: Floats, used_levels: NDArray[np.bool_]) -> _Line:
-    """Weighted line; weights by the line itself, as weights by single variances would bias it downwards."""
+    """Fit a weighted line. The weights come from the line itself, because weights from single variances would bias
+    it downwards."""
     x, y, n = signal[used_levels], variance[used_levels], counts[used_levels]
     expected_variance = np.maximum(y, 1e-6)
     design = np.column_stack([np.ones_like(x), x])
@@ -179,9 +183,10 @@ def _line(signal: Floats, variance: Floats, counts: Floats, used_levels: NDArray
 
 
 def _prnu(pairs: Sequence[Pair]) -> Estimate | None:
-    """Relative scatter of the pixels' responses (EMVA 1288, 6.8), from the brightest even pair without saturation.
+    """Return the relative scatter of the pixels' responses (EMVA 1288, 6.8), from the brightest even pair without
+    saturation.
 
-    In each block of neighbours the scene is modelled by a parabola; None if that is not sufficient.
+    In each block of neighbours the scene is modelled by a parabola. Returns None if this is not sufficient.
     """
     clean = [pair for pair in pairs if not pair.saturation_mask.any()]
     if not clean:

@@ -1,4 +1,4 @@
-"""Make the records of dark frames and response from frames of runs; functions that all radiometric records share.
+"""Makes the records of dark frames and response. All radiometric records share some of its functions.
 
 Each calibration returns an `Outcome`: a sealed record, its maps or tables, its picture.
 """
@@ -71,7 +71,7 @@ def sealed_outcome(
     more_inputs: Sequence[tuple[str, str]] = (),
     artefacts: Sequence[UsedArtefact] = (),
 ) -> Outcome:
-    """A record of a radiometric calibration, with its files; `draw` gets the record and an empty figure."""
+    """Return a record of a calibration with its files. `draw` gets the record and an empty figure."""
     contents = files or {}
     record = seal_record(
         kind=kind,
@@ -97,7 +97,7 @@ def sealed_outcome(
 
 
 def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> Outcome:
-    """Dark frames of runs: maps of offset and current, noise, hot pixels."""
+    """Find maps of offset and current, noise, and hot pixels from dark frames of runs."""
     if not frames.dark:
         raise InputError("dark: no dark frame in these runs; acquire `coupole plan new darks`")
     dark_frames = [DarkFrame(str(f.shot), f.exposure_us * 1e-6, f.temperature_c, f.read) for f in frames.dark]
@@ -145,8 +145,8 @@ def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> O
 
 
 def _of_means(dark: Dark, u: Floats) -> Floats:
-    """[4, 4] covariance of the two noises, which are independent, and of mean offset and current, which the line
-    correlates."""
+    """Return [4, 4], the covariance of the two noises, which are independent, and of mean offset and mean current,
+    which the line correlates."""
     covariance = np.diag(u**2)
     together = float(dark.cofactor[0, 1] / np.sqrt(dark.cofactor[0, 0] * dark.cofactor[1, 1]))
     covariance[2, 3] = covariance[3, 2] = together * u[2] * u[3]
@@ -154,8 +154,8 @@ def _of_means(dark: Dark, u: Floats) -> Floats:
 
 
 def dark_signal(frames: LightFrames, record_path: Path | None) -> Callable[[LightFrame], NDArray[np.float32]]:
-    """The signal of a frame without light [H, W], DN: from a dark record, else from the dark frames of the same
-    exposure, else the camera's black level."""
+    """Return a function for the dark signal [H, W], DN: from a dark record, or else from the dark frames of the
+    same exposure, or else from the camera's black level."""
     if record_path is not None:
         offset = map_beside(record_path, "dark", "offset_dn", frames)
         current = map_beside(record_path, "dark", "current_dn_per_s", frames)
@@ -179,7 +179,7 @@ def dark_signal(frames: LightFrames, record_path: Path | None) -> Callable[[Ligh
 
 
 def map_beside(path: Path, kind: Kind, name: str, frames: LightFrames) -> NDArray[np.float32]:
-    """[H, W] a map beside a record that holds for these frames. Raises InputError for another record."""
+    """Return a map [H, W] beside a record for these frames. Raises InputError for another record."""
     record = read_earlier(path, kind, frames.about, frames.size_px)
     with h5py.File(path.parent / record.files[0].name, "r") as file:
         values: NDArray[np.float32] = file[name][()]
@@ -189,7 +189,7 @@ def map_beside(path: Path, kind: Kind, name: str, frames: LightFrames) -> NDArra
 def _mean_and_u(
     values: NDArray[np.float32], u: NDArray[np.float32], hot: NDArray[np.int64]
 ) -> tuple[float, float]:
-    """Mean of a map without hot pixels, and its standard uncertainty; errors of pixels are independent."""
+    """Return mean and standard uncertainty of a map without hot pixels. Errors of pixels are independent."""
     cold = np.ones(values.shape, np.bool_)
     cold[hot[:, 0], hot[:, 1]] = False
     variance = np.mean(np.square(u[cold], dtype=np.float64))
@@ -202,7 +202,7 @@ def _mean_and_u(
 def response_outcome(
     frames: LightFrames, request: Request, dark_record: Path | None, progress: Progress
 ) -> Outcome:
-    """Bracketed exposures of a constant scene, each taken twice: gain, noise, linearity."""
+    """Find gain, noise and linearity from bracketed exposures of a constant scene, each taken twice."""
     lit = _one_scene(frames)
     by_exposure: dict[float, list[LightFrame]] = {}
     for frame in lit:
@@ -255,7 +255,7 @@ def _pairs_by_channel(
     dark: Callable[[LightFrame], NDArray[np.float32]],
     progress: Progress,
 ) -> dict[str, list[Pair]]:
-    """The first two frames of each exposure, dark signal subtracted."""
+    """Return the first two frames of each exposure, without the dark signal."""
     channels = channels_of(frames.pattern)
     pairs: dict[str, list[Pair]] = {channel: [] for channel in channels}
     for number, (exposure_us, exposure_frames) in enumerate(sorted(by_exposure.items())):
@@ -282,7 +282,7 @@ def _saturation_figures(transfers: Mapping[str, PhotonTransfer]) -> dict[str, fl
 
 
 def _one_scene(frames: LightFrames) -> list[LightFrame]:
-    """The frames of one view under one light: those with the most frames."""
+    """Return the frames of one view under one light: those with the most frames."""
     if not frames.lit:
         raise InputError("response: no frame with light; acquire `coupole plan new response`")
     frames_of: dict[tuple[str, Light], list[LightFrame]] = {}
@@ -292,7 +292,8 @@ def _one_scene(frames: LightFrames) -> list[LightFrame]:
 
 
 def _sample(shape: tuple[int, ...], pattern: str, channel: str) -> NDArray[np.bool_]:
-    """[H, W] mask of a sample of a channel's pixels, in whole rows so that neighbours stay neighbours."""
+    """Return a mask [H, W] of a sample of a channel's pixels, in whole rows, so that neighbours stay
+    neighbours."""
     mask = channel_mask((shape[0], shape[1]), pattern, channel)
     step = max(1, round(float(mask.sum()) / _MOST_PIXELS))
     rows = (np.arange(shape[0]) // 2) % step == 0
@@ -333,7 +334,7 @@ def _linear_remark(channel: str, line: Linearity) -> str:
 
 
 def linearise(record_path: Path | None, channel: str, frames: LightFrames) -> Callable[[Floats], Floats]:
-    """Signal above dark to linear signal, from a record of the kind `response`; the signal itself without one.
+    """Return a function from signal above dark to linear signal, by a record of the kind `response`, if any.
 
     Raises InputError for a record of another kind, camera or sensor's pattern.
     """
@@ -358,7 +359,7 @@ def linearise(record_path: Path | None, channel: str, frames: LightFrames) -> Ca
 
 
 def mean_of(frames: Sequence[LightFrame]) -> NDArray[np.float32]:
-    """[H, W] mean of frames, read one after the other."""
+    """Return the mean [H, W] of frames, which are read one after the other."""
     total: NDArray[np.float32] | None = None
     for frame in frames:
         pixels = frame.read()
@@ -368,13 +369,13 @@ def mean_of(frames: Sequence[LightFrame]) -> NDArray[np.float32]:
 
 
 def counter(progress: Progress, total: int) -> Callable[[], None]:
-    """A function that advances a progress bar by one of `total`."""
+    """Return a function that advances a progress bar by one of `total`."""
     numbers = count(1)
     return lambda: progress(next(numbers), total)
 
 
 def h5_of(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """An HDF5 file of these arrays; large ones compressed."""
+    """Return an HDF5 file of these arrays. Large arrays are compressed."""
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
         for name, values in arrays.items():
@@ -384,17 +385,17 @@ def h5_of(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 def block_diagonal(blocks: Sequence[Floats]) -> Floats:
-    """Covariance of groups of parameters that are independent of each other."""
+    """Return the covariance of groups of parameters that are independent of each other."""
     from scipy.linalg import block_diag
 
     return np.asarray(block_diag(*blocks))
 
 
 def limit_of(description: str, figure: float, limit: float, unit: str = "") -> Limit:
-    """A figure with its acceptance limit."""
+    """Return a figure with its acceptance limit."""
     return Limit(what=description, found=figure, limit=limit, unit=unit)
 
 
 def record_input(path: Path | None) -> tuple[tuple[str, str], ...]:
-    """Name and SHA-256 of a file that a calibration used; empty for None."""
+    """Return name and SHA-256 of a file that a calibration used; empty for None."""
     return () if path is None else ((path.name, hashlib.sha256(path.read_bytes()).hexdigest()),)

@@ -1,15 +1,15 @@
 """Reflectance of a Spectralon tile, as a function of directions, with an uncertainty.
 
-Minnaert's law (Astrophysical Journal 93, 1941): f = rho (k + 1) / (2 pi) (cos_i cos_o)^(k - 1). It is reciprocal,
-k = 1 is Lambert's law, and for light along the normal the hemispherical reflectance is rho. For real Spectralon k
-is above 1: a comprehensive model from goniometer data (IEEE TGRS 2024, doi 10.1109/TGRS.2024.3361392) has a
-diffuse part that falls with the zenith angle z in radians by 0.091 z^1.85, which k = 1.15 follows within 1 % to 60
-degrees; `u_minnaert` has to cover its lobes, forward and back. Figures of a goniometer's certificate for the tile
-belong into the description.
+Minnaert's law (Astrophysical Journal 93, 1941): f = rho (k + 1) / (2 pi) (cos_i cos_o)^(k - 1). It is reciprocal.
+k = 1 gives Lambert's law, and for light along the normal the hemispherical reflectance is rho. For real Spectralon
+k is above 1. A comprehensive model from goniometer data (IEEE TGRS 2024, doi 10.1109/TGRS.2024.3361392) has a
+diffuse part that falls with the zenith angle z in radians by 0.091 z^1.85. k = 1.15 follows this within 1 % up to
+60 degrees. `u_minnaert` must cover its forward and backward lobes. If the tile has a goniometer's certificate,
+write its figures into the description.
 
-A certificate states a reflectance in some geometry. rho follows from it by the law itself: light at the angle i
-gives rho cos_i^(k - 1) over the hemisphere, so 8/h is rho cos(8 deg)^(k - 1); 0/45 over a perfect diffuser is
-rho (k + 1) / 2 cos(45 deg)^(k - 1). So k changes rho where the certificate's figure is held.
+A certificate states a reflectance in some geometry. rho follows from it by the law itself. Light at the angle i
+gives rho cos_i^(k - 1) over the hemisphere, so 8/h is rho cos(8 deg)^(k - 1). 0/45 over a perfect diffuser is rho
+(k + 1) / 2 cos(45 deg)^(k - 1). So if the certificate's figure is held, k changes rho.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from coupole.plan.base_model import Pose
 
 
 class Tile(Described):
-    """A white tile and its pose; its white face is z = 0 of its frame, with the origin in the centre."""
+    """A white tile and its pose. Its white face is z = 0 of its frame, and the origin is in the centre."""
 
     schema_version: Literal[1] = 1
     name: str = "Spectralon SRS-99"
     reflectance: Annotated[float, Field(gt=0, le=1.05)] = 0.99
-    """Reflectance in `geometry`. Both are left out where `artefact` has a certified `reflectance`."""
+    """Reflectance in `geometry`. Leave both out if `artefact` has a certified `reflectance`."""
     u_reflectance: Annotated[float, Field(ge=0)] = 0.005
     geometry: Geometry = "0/h"
     """Light and view of `reflectance`: 0/h is hemispherical, for light along the normal."""
@@ -42,9 +42,9 @@ class Tile(Described):
     """Width of the rim that is not used."""
     support_from_tile: Pose = Pose(translation_mm=(0.0, 0.0, 10.0))
     u_tilt_deg: Annotated[float, Field(gt=0)] = 0.1
-    """Standard uncertainty of the tilt of the tile's normal in the pose above, about each of two axes."""
+    """Standard uncertainty of the direction of the tile's normal in the pose above, about each of two axes."""
     u_height_mm: Annotated[float, Field(gt=0)] = 0.5
-    """Standard uncertainty of the white face's place along its normal; shifts within the face do not change the
+    """Standard uncertainty of the white face's place along its normal. Shifts within the face do not change the
     image."""
 
     @model_validator(mode="after")
@@ -56,8 +56,9 @@ class Tile(Described):
         return self
 
     def of_channel(self, channel: str, light: LightSpectrum | None = None) -> Tile:
-        """The tile as a channel of the camera sees it under this light, with its certificate's mean there;
-        the same tile without a certified reflectance. Raises InputError for a band without certified values."""
+        """Return the tile as a channel of the camera sees it under this light, with its certificate's mean there.
+        Without a certified reflectance it is the same tile. Raises InputError for a band without certified
+        values."""
         if self.artefact is None or self.artefact.reflectance is None:
             return self
         value, u = self.artefact.reflectance.in_channel(channel, light)
@@ -65,7 +66,7 @@ class Tile(Described):
         return self.model_copy(update=changes)
 
     def hemispherical(self, minnaert: float) -> float:
-        """rho for light along the normal, if this is Minnaert's k."""
+        """Return rho for light along the normal, for this k of Minnaert's law."""
         match self.geometry:
             case "0/h":
                 return self.reflectance
@@ -75,7 +76,7 @@ class Tile(Described):
                 return float(self.reflectance / (0.5 * (minnaert + 1.0) * np.sqrt(0.5) ** (minnaert - 1.0)))
 
     def brdf(self, cos_in: Floats, cos_out: Floats, *, minnaert: float | None = None) -> Floats:
-        """f in 1/sr, for cosines of incidence and observation above 0."""
+        """Return f in 1/sr, for cosines of incidence and observation above 0."""
         k = self.minnaert if minnaert is None else minnaert
         cos_product = np.maximum(cos_in * cos_out, 1e-12)
         value: Floats = self.hemispherical(k) * (k + 1.0) / (2.0 * np.pi) * cos_product ** (k - 1.0)
@@ -83,5 +84,5 @@ class Tile(Described):
 
 
 def read_tile(path: Path) -> Tile:
-    """A tile's description (YAML). Raises InputError with all problems."""
+    """Read a tile's description (YAML). Raises InputError with all problems."""
     return read_described(path, Tile)

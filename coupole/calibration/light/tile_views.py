@@ -14,16 +14,16 @@ from coupole.calibration.rotations import Floats
 
 _DEAD_SIGMA = 5.0
 _DEAD_SHARE = 0.01
-"""Share of the median LED's power: a signal below it counts as dark."""
+"""Share of the median LED's power. A smaller signal counts as dark."""
 _SHADED = 0.03
-"""Relative departure of a part of the tile, beyond noise, that counts as shadow."""
+"""Relative departure of a part of the tile, beyond noise. A larger one counts as shadow."""
 _SHADED_SIGMA = 6.0
 _LOWEST_COSINE = 0.05
-"""Least cosine of incidence on the tile: the signal of LEDs within 3 degrees of its horizon depends mostly on its
-tilt."""
+"""Least cosine of incidence on the tile. For LEDs within 3 degrees of its horizon, the signal depends mostly on
+the tile's tilt."""
 _STEP, _STEP_MM = 1e-4, 0.05
 OF_PLACE = 3
-"""Figures of each place of the tile: two tilts, its height."""
+"""Number of figures of each place of the tile: two tilts and its height."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class TileView:
     leds: NDArray[np.int64]
     """[n] ids."""
     signal: Floats
-    """[n, m] DN/s over the flat field, of one channel; NaN where nothing was seen."""
+    """[n, m] DN/s over the flat field, of one channel; NaN where there was no signal."""
     u_signal: Floats
-    """[n, m] of each, from noise."""
+    """[n, m] uncertainty of each signal from noise."""
     saturation_mask: NDArray[np.bool_]
     """[n] True where pixels of the tile were saturated."""
 
@@ -70,7 +70,7 @@ class Row:
     view: int
     led: int
     value: float
-    """S / h, before the logarithm: the power if the tile's pose is as described."""
+    """S / h, before the logarithm. It is the power if the tile's pose is as described."""
     u: float
     """Standard uncertainty of the value, from noise."""
     design: Floats
@@ -90,9 +90,9 @@ def transfer(
     emission: Emission = "lambertian",
     side_mm: float = LED_SIDE_MM,
 ) -> tuple[Floats, Floats]:
-    """h [n, m] = f E/Phi of each patch under each LED, and the cosine of incidence [n, m].
+    """Return h [n, m] = f E/Phi of each patch under each LED, and the cosine of incidence [n, m].
 
-    A patch is defined by the pixels that see it: at another height of the tile they see another part of it.
+    The pixels that see a patch define it. At another height of the tile, they see another part of it.
     """
     x, y = np.radians(np.zeros(2) if tilt_deg is None else tilt_deg)
     normal = view.base_from_tile[:3, :3] @ np.array([np.sin(y), -np.sin(x) * np.cos(y), np.cos(x) * np.cos(y)])
@@ -121,10 +121,10 @@ def rows_of(
     figures: int = 5,
     remarks: list[str],
 ) -> tuple[list[Row], set[int]]:
-    """Observations of view `number`, and the LEDs that are lit in it although their frames cannot be used.
+    """Return observations of view `number`, and the LEDs that are lit in it although their frames cannot be used.
 
-    `figures` are shared by all LEDs: two tilts and the height for each place of the tile, of which the view's is
-    number `place`, ln reflectance, Minnaert's k. Views that cannot be used are added to `remarks`.
+    All LEDs share `figures`: two tilts and the height for each place of the tile, ln reflectance, and Minnaert's
+    k. The view's place has the number `place`. Views that cannot be used are added to `remarks`.
     """
     centres, normals = positions.of(view.leds)
     h, cos_in = transfer(view, centres, normals, tile, emission=emission, side_mm=side_mm)
@@ -156,8 +156,8 @@ def rows_of(
 def _slopes(
     view: TileView, centres: Floats, normals: Floats, tile: Tile, emission: Emission, side_mm: float
 ) -> tuple[Floats, Floats]:
-    """Derivatives of ln h by the tile's two tilts and its height [n, 3], and by ln reflectance and Minnaert's k
-    [n, 2]; central differences."""
+    """Return derivatives of ln h by the tile's two tilts and its height [n, 3], and by ln reflectance and
+    Minnaert's k [n, 2], as central differences."""
 
     def log_h(tilt_deg: Floats | None = None, height_mm: float = 0.0, minnaert: float | None = None) -> Floats:
         h, _ = transfer(
@@ -184,7 +184,7 @@ def _slopes(
 def arrays_of(
     rows: Sequence[Row], ids: NDArray[np.int64], flash_noise: float
 ) -> tuple[Floats, Floats, NDArray[np.intp], NDArray[np.intp], Floats]:
-    """Logarithms, weights, number of the LED, number of the view, derivatives."""
+    """Return logarithms, weights, number of the LED, number of the view, and derivatives."""
     value = np.array([row.value for row in rows])
     u = np.array([row.u for row in rows])
     positive = np.maximum(value, 1e-300)
@@ -202,7 +202,7 @@ def without_dark(
     lit_elsewhere: set[int],
     remarks: list[str],
 ) -> tuple[list[Row], NDArray[np.bool_]]:
-    """Rows in which the tile is lit, and a mask [n] of dead LEDs, which are dark in all their views."""
+    """Return rows in which the tile is lit, and a mask [n] of dead LEDs. Dead LEDs are dark in all their views."""
     bright = float(np.median([row.value for row in rows]))
 
     def lit(row: Row) -> bool:
@@ -223,6 +223,6 @@ def without_dark(
 
 
 def list_of(ids: Sequence[int] | NDArray[np.int64]) -> str:
-    """The first of them by number, as text."""
+    """Return the first of them by number, as text."""
     numbers = ", ".join(f"{int(led)}" for led in list(ids)[:8])
     return f"LED {numbers}" + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")

@@ -1,4 +1,4 @@
-"""Pose of a scanned object in the robot's base, by the scanner's retro-reflective targets.
+"""Pose of a scanned object in the base frame, from the scanner's retro-reflective targets.
 
 ::
 

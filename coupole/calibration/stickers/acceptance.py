@@ -10,4 +10,5 @@ MESH = (
     Allowed("residual_px", "residual of stickers", 0.5, "px"),
     Allowed("robot_ratio", "robot's noise, estimated over stated value", 3.0),
 )
-"""`place_mm`: standard uncertainty of its place in the base (seed 003: 100 um)."""
+"""`place_mm` is the standard uncertainty of the place of the worst sticker in the base frame (seed 003: 100
+um)."""

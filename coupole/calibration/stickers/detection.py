@@ -1,11 +1,11 @@
 """The scanner's stickers in an image: bright disks with black borders, and the images of their centres.
 
-Candidates are bright components of about the right size; the rim of each is then located on rays from its middle,
-where the signal is halfway between the levels of disk and border on that ray, so that uneven light does not shift
-it. Rim points are converted to directions before the ellipse is fitted: without the lens's distortion the image of
-a disk is an exact ellipse. The image of the disk's centre is not the ellipse's middle. It follows from the two
-disks in space that have this ellipse as their image (`circle_poses`); several views together show which of the two
-it is (`calibration.stickers.points`).
+Candidates are bright components of about the right size. The rim of each is then located on rays from its middle,
+where the signal is halfway between the levels of disk and border on this ray. So uneven light does not shift the
+rim. Rim points are converted to directions before the ellipse is fitted, because without the lens's distortion the
+image of a disk is an exact ellipse. The image of the disk's centre is not the ellipse's middle. It follows from
+the two disks in space that have this ellipse as their image (`circle_poses`). Several views together show which of
+the two disks is real (`calibration.stickers.points`).
 """
 
 from __future__ import annotations
@@ -22,16 +22,18 @@ from coupole.calibration.rotations import Floats
 
 LEAST_RADIUS_PX = 4.0
 LEAST_AXES_RATIO = 0.25
-"""Seen at more than 75 degrees from its normal, a disk's printed rim is not distinguished from its edge."""
+"""Least ratio of the axes. At more than 75 degrees from its normal, a disk's printed rim cannot be distinguished
+from its edge."""
 LEAST_CONTRAST = 0.25
-"""Least contrast between disk and border, over the disk's signal: a border is black."""
+"""Least contrast between disk and border, over the disk's signal. A border is black."""
 _RAYS = 96
 _INSIDE, _OUTSIDE = 0.65, 1.35
-"""Radii at which disk and border are sampled, over the disk's radius; the border ends at 1.67."""
+"""Radii at which disk and border are sampled, over the disk's radius. The border ends at 1.67."""
 _LEAST_RIM = 0.8
-"""Least share of the rays with a rim on the ellipse."""
+"""Least share of the rays that find a rim on the ellipse."""
 _FAR_SIGMA, _WORST_RIM = 3.5, 0.06
-"""A rim with a roughness above this share of the radius is not that of a printed disk."""
+"""Bound of outliers, and greatest roughness of the rim as a share of the radius. A rougher rim is not that of a
+printed disk."""
 _LEAST_SIGMA_PX = 0.02
 
 
@@ -40,22 +42,22 @@ class Sticker:
     """One disk in one image."""
 
     middle: Floats
-    """[2] of the ellipse in the image, px."""
+    """[2] middle of the ellipse in the image, px."""
     centres: Floats
     """[2, 2] image of the disk's centre, for each of the two possible disks."""
     normals: Floats
-    """[2, 3] of these disks, camera frame, towards the camera."""
+    """[2, 3] normals of these disks, camera frame, towards the camera."""
     covariance: Floats
     """[2, 2] of the middle, px^2."""
     radius_px: float
     """Longer radius of the ellipse."""
     distance_mm: float
-    """Distance of the disk, by its size."""
+    """Distance of the disk, from its size."""
 
 
 @dataclass(frozen=True)
 class Ellipse:
-    """Points x with |shape (x - centre)| = 1."""
+    """All points x with |shape (x - centre)| = 1."""
 
     centre: Floats
     shape: Floats
@@ -73,8 +75,8 @@ def find_stickers(
     diameter_mm: float = 6.0,
     depth_mm: tuple[float, float] = (200.0, 900.0),
 ) -> list[Sticker]:
-    """Stickers in one colour's plane [H, W] (`grey_image.plane`), dark subtracted, whose disks have `diameter_mm`
-    and lie within this range of depth."""
+    """Find stickers in one colour's plane [H, W] (`grey_image.plane`), with dark subtracted. Their disks have
+    `diameter_mm` and lie within this range of depth."""
     import cv2
 
     largest = lens.fx * diameter_mm / depth_mm[0] / 2
@@ -103,10 +105,10 @@ def find_stickers(
 
 
 def circle_poses(ellipse: Ellipse, radius_mm: float) -> tuple[Floats, Floats]:
-    """Centres [2, 3] (mm) and normals [2, 3] of the two circles in space whose image is an ellipse in normalised
-    coordinates, in front of the camera and facing it.
+    """Return centres [2, 3] (mm) and normals [2, 3] of the two circles in space whose image is an ellipse in
+    normalised coordinates. The circles are in front of the camera and face it.
 
-    Chen, Wu, Wada, "Camera calibration with two arbitrary coplanar circles", ECCV 2004, eq. 5 to 10.
+    The source is Chen, Wu, Wada, "Camera calibration with two arbitrary coplanar circles", ECCV 2004, eq. 5 to 10.
     """
     square = ellipse.shape @ ellipse.shape
     cone = np.empty((3, 3))
@@ -129,8 +131,8 @@ def circle_poses(ellipse: Ellipse, radius_mm: float) -> tuple[Floats, Floats]:
 
 
 def fit_ellipse(points: Floats, floor: float = 0.0) -> Ellipse | None:
-    """The ellipse nearest to points [n, 2], by Gauss-Newton on distances to first order, outliers left out; None
-    if the points fit no ellipse. `floor` is a lower bound of the noise."""
+    """Fit the ellipse nearest to points [n, 2], by Gauss-Newton on distances to first order, without outliers.
+    None if the points fit no ellipse. `floor` is a lower bound of the noise."""
     keep = np.ones(len(points), np.bool_)
     centre = points.mean(axis=0)
     scatter = np.cov((points - centre).T)
@@ -175,7 +177,7 @@ def fit_ellipse(points: Floats, floor: float = 0.0) -> Ellipse | None:
 def _sticker(
     image: Floats, middle: Floats, radii: Floats, turn: float, lens: Intrinsics, diameter_mm: float
 ) -> Sticker | None:
-    """Locate the rim of a candidate and fit it; None unless it is a disk with a black border."""
+    """Locate the rim of a candidate and fit it. None if it is not a disk with a black border."""
     rim = _rim(image, middle, radii, turn)
     if rim is None:
         return None
@@ -202,8 +204,8 @@ def _sticker(
 
 
 def _rim(image: Floats, middle: Floats, radii: Floats, turn: float) -> Floats | None:
-    """Rim points [n, 2] along rays from the middle, where the signal is halfway between disk and border; None if
-    too many rays find none."""
+    """Return rim points [n, 2] along rays from the middle, where the signal is halfway between disk and border.
+    None if too many rays find no rim."""
     from scipy.ndimage import map_coordinates
 
     angle = 2 * np.pi * np.arange(_RAYS) / _RAYS

@@ -25,7 +25,7 @@ def draw_mesh(result: MeshFound, figure: Figure) -> None:
 
 
 def _draw_frame(ax: Axes, result: MeshFound) -> None:
-    """One frame, with the projected outline of the mesh and the projected stickers of the table."""
+    """Draw one frame, with the projected outline of the mesh and the projected stickers of the table."""
     from matplotlib.collections import LineCollection
 
     image = result.images.picture
@@ -54,7 +54,7 @@ def _draw_frame(ax: Axes, result: MeshFound) -> None:
 
 
 def _draw_uncertainty(ax: Axes, result: MeshFound) -> None:
-    """Uncertainty of each sticker's position in the base, drawn in the mesh's frame."""
+    """Draw the uncertainty of each sticker's position in the base frame, at its place in the mesh's frame."""
     place = result.scan.targets_mm
     dots = ax.scatter(place[:, 0], place[:, 1], c=1e3 * result.u_mm, s=40, cmap="viridis")
     is_missing = np.isin(result.scan.names, result.pose.missing)

@@ -1,14 +1,14 @@
-"""Pose of a scanned mesh in the robot's base, from its stickers in pictures of known pose.
+"""Pose of a scanned mesh in the base frame, from its stickers in pictures of known pose.
 
-The scanner's table has the stickers' positions in the mesh's frame, with the scanner's accuracy; pictures give
-them in the base, with that of camera, hand-eye and robot. Points are found in space and matched with the table by
-the triangles that they form. Then everything is adjusted together:
+The scanner's table has the stickers' positions in the mesh's frame, with the scanner's accuracy. Pictures give
+them in the base frame, with the accuracy of camera, hand-eye and robot. Points are found in space, and are matched
+with the table by the triangles that they form. Then everything is adjusted together:
 
     pixel = project((base_from_flange_i . E_i . flange_from_camera)^-1 . base_from_mesh . (q_j + d_j))
 
-with q_j the table's target, d_j its error, E_i the arm's error in view i. Lens, hand-eye and, if known, the zeros
-of the arm's axes are observed by a record whose error all views share. (Seed 003, section 4, "mesh to robot",
-where target and arm have no uncertainty.)
+Here q_j is the table's target, d_j its error, and E_i the arm's error in view i. A record observes lens, hand-eye
+and, if known, the zeros of the arm's axes; all views share its error. (The source is seed 003, section 4, "mesh to
+robot", where target and arm have no uncertainty.)
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Stated:
 
 @dataclass(frozen=True)
 class MeshPose:
-    """The result; the covariance [6, 6] is that of a step of `rotations.moved`: mm, then degrees."""
+    """The result. The covariance [6, 6] is that of a step of `rotations.moved_transforms`: mm, then degrees."""
 
     base_from_mesh: Floats
     covariance: Floats
@@ -75,7 +75,8 @@ class MeshPose:
     """[6] the group with the largest contribution to each variance."""
 
     def uncertainty_at(self, mesh_mm: Floats) -> float:
-        """Standard uncertainty of a mesh point's position in the base, mm: root of the sum of its variances."""
+        """Return the standard uncertainty of a mesh point's position in the base frame, mm: the root of the sum of
+        its variances."""
         turn = self.base_from_mesh[:3, :3]
         by_step = np.concatenate([np.eye(3), -turn @ skew(mesh_mm) * np.pi / 180], axis=1)
         return float(np.sqrt(np.trace(by_step @ self.covariance @ by_step.T)))
@@ -87,9 +88,9 @@ class _State:
     base_from_camera: Floats
     """[views, 4, 4]."""
     targets_mm: Floats
-    """[matched, 3] in the mesh's frame."""
+    """[matched, 3] targets in the mesh's frame."""
     shared_step: Floats
-    """[f + 6 + k] of lens, hand-eye and axes from their record."""
+    """[f + 6 + k] common step of lens, hand-eye and axes from their record."""
 
 
 def mesh_to_robot(
@@ -104,8 +105,8 @@ def mesh_to_robot(
 ) -> MeshPose:
     """Find a mesh by its targets [n, 3] (mesh frame) and views with detected stickers.
 
-    Without `prior` the views' poses have no error in common. Raises InputError if too few stickers are seen in
-    three views, or if their layout has no match or two.
+    Without `prior` the views' poses have no common error. Raises InputError if too few stickers are seen in three
+    views, or if their layout has no match or two matches.
     """
     pose_px = intrinsics.fx * (stated_noise.robot_mm / np.mean(depth_mm) + np.radians(stated_noise.robot_deg))
     tolerance_px = 4.0 * float(np.hypot(stated_noise.sticker_px, pose_px))
@@ -168,7 +169,7 @@ def _by_view(
 
 @dataclass(frozen=True)
 class _Problem:
-    """The observations, and how they depend on the state.
+    """The observations, and their dependence on the state.
 
     The columns are the mesh's step [6], a step [6] for each view, an offset [3] for each target, and the figures
     that all views share [f + 6 + k].
@@ -179,19 +180,19 @@ class _Problem:
     reported_poses: Floats
     """[v, 4, 4] base_from_camera."""
     targets_mm: Floats
-    """[t, 3] the table's, of the recognised targets."""
+    """[t, 3] positions of the recognised targets in the table."""
     observed_px: Floats
     """[n, 2] stickers in pictures, by target."""
     target_of: NDArray[np.intp]
     """[n] target of each sticker."""
     view_of: NDArray[np.intp]
-    """[n] and its view."""
+    """[n] view of each sticker."""
     lens: NDArray[np.intp]
     """[f] rows of the free lens parameters in `optics.NAMES`."""
     prior_whiten: Floats
-    """W [f + 6 + k, f + 6 + k] with W'W the inverse covariance of what views share."""
+    """W [f + 6 + k, f + 6 + k], where W'W is the inverse covariance of the figures that views share."""
     by_shared: Floats
-    """[v, 6, f + 6 + k] step of each reported pose for what views share."""
+    """[v, 6, f + 6 + k] step of each reported pose for the figures that views share."""
 
     @property
     def first_target(self) -> int:
@@ -230,7 +231,7 @@ class _Problem:
         return [Block(residuals[k], jacobian[k], columns[k], 0) for k in range(len(residuals))]
 
     def _sticker_columns(self) -> NDArray[np.intp]:
-        """[n, 6 + 3 + 6 + f] of mesh, target, view and lens."""
+        """Return [n, 6 + 3 + 6 + f], the columns of mesh, target, view and lens."""
         pose_columns, count = np.arange(6), len(self.target_of)
         return np.concatenate(
             [
@@ -243,7 +244,8 @@ class _Problem:
         )
 
     def _target_blocks(self, state: _State) -> list[Block]:
-        """Each target lies where the table has it, within the scanner's accuracy."""
+        """Return the blocks of the targets. Each target lies at its place in the table, within the scanner's
+        accuracy."""
         sigma_mm = self.stated_noise.scanner_mm
         blocks = []
         for row, at_mm in enumerate(state.targets_mm):
@@ -252,8 +254,8 @@ class _Problem:
         return blocks
 
     def _pose_blocks(self, state: _State) -> list[Block]:
-        """Each view's pose is the reported one, moved by what views share, within the arm's noise. The errors that
-        views share are zero within the covariance of their record.
+        """Return the blocks of the poses. Each view's pose is the reported one, moved by the errors that views
+        share, within the arm's noise. The shared errors are zero within the covariance of their record.
         """
         pose_sigma = np.array([self.stated_noise.robot_mm] * 3 + [np.radians(self.stated_noise.robot_deg)] * 3)
         shared_columns = self.first_shared + np.arange(len(self.prior_whiten))
@@ -277,7 +279,8 @@ def _adjust(
     stated_noise: Stated,
     prior: CameraPrior | None,
 ) -> Adjusted[_State]:
-    """Adjust the mesh's pose from `start` together with the views, the targets and what views share."""
+    """Adjust the mesh's pose from `start`, together with the views, the targets and the figures that views
+    share."""
     reported_poses = np.array([view.base_from_camera for view in views])
     groups = (
         Group(STICKERS, is_estimated=True, rejects=2),
@@ -316,8 +319,8 @@ def _adjust(
 
 
 def _by_shared(base_from_camera: Floats, prior: CameraPrior) -> Floats:
-    """[v, 6, f + 6 + k] derivative of each camera's pose: zero for the lens; for the hand-eye, its step rotated
-    with the flange; for the axes, the motion of the flange with the camera on it."""
+    """Return [v, 6, f + 6 + k], the derivative of each camera's pose. It is zero for the lens. For the hand-eye it
+    is its step, rotated with the flange. For the axes it is the motion of the flange with the camera on it."""
     turn, shift = prior.flange_from_camera[:3, :3], prior.flange_from_camera[:3, 3]
     base_from_flange = base_from_camera @ inverses(prior.flange_from_camera)
     first = len(prior.free)

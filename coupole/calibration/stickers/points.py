@@ -1,7 +1,8 @@
-"""Decides which of its two possible disks an ellipse is: the one whose normal all views of a sticker agree on.
+"""Decides which of two possible disks an ellipse shows: the disk with the normal on which all views of a sticker
+agree.
 
 In a single view a disk may be tilted to either side, and the images of the two centres differ by up to a fifth of
-a pixel for 6 mm at 0.35 m. In views from two sides only one normal agrees.
+a pixel for 6 mm at 0.35 m. If there are views from two sides, only one normal agrees in all of them.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from coupole.calibration.stickers.detection import Sticker
 def views_of(
     names: Sequence[str], base_from_camera: Floats, stickers: Sequence[Sequence[Sticker]]
 ) -> list[CameraView]:
-    """Views [v] with the middles of ellipses, which are accurate enough to match detections between views."""
+    """Return views [v] with the middles of ellipses. These are exact enough to match detections between views."""
     return [
         CameraView(name, pose, np.array([sticker.middle for sticker in view_stickers]).reshape(-1, 2))
         for name, pose, view_stickers in zip(names, base_from_camera, stickers, strict=True)
@@ -29,7 +30,8 @@ def views_of(
 def corrected_views(
     views: Sequence[CameraView], stickers: Sequence[Sequence[Sticker]], points: Sequence[SeenPoint]
 ) -> list[CameraView]:
-    """The views with all detections moved from the ellipses' middles to the images of the disks' centres."""
+    """Return the views with all detections moved from the ellipses' middles to the images of the disks'
+    centres."""
     pixels = [view.pixels.copy() for view in views]
     for point in points:
         normals = np.array(
@@ -45,7 +47,7 @@ def corrected_views(
 
 
 def _agreeing_normals(normals: Floats) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """Choose which of two normals [views, 2, 3] each view sees, so that they agree best."""
+    """Choose which of two normals [views, 2, 3] each view shows, so that the chosen normals agree best."""
     candidates = normals.reshape(-1, 3)
     cosines = np.einsum("ci,vki->cvk", candidates, normals)
     best = int(np.argmax(cosines.max(axis=2).sum(axis=1)))

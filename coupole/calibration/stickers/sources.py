@@ -1,4 +1,4 @@
-"""A scan as written by `coupole scan`, and the stickers in the images of a run."""
+"""A scan as `coupole scan` writes it, and the stickers in the images of a run."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Scan:
 
 @dataclass(frozen=True)
 class StickerImages:
-    """Stickers in all images, and one image to show."""
+    """Stickers in all images, and one image that is shown."""
 
     stickers: tuple[tuple[Sticker, ...], ...]
     names: tuple[str, ...]
@@ -42,11 +42,11 @@ class StickerImages:
     shown_number: int
     """Number of the image with most stickers."""
     picture: Floats
-    """[H, W] that image."""
+    """[H, W] the shown image."""
 
 
 def read_scan(folder: Path) -> Scan:
-    """Read a folder of `coupole scan`. Raises InputError with what is missing."""
+    """Read a folder of `coupole scan`. Raises InputError, which names the missing parts."""
     table, mesh = folder / TARGETS, folder / MESH
     for path in (mesh, table):
         if not path.is_file():

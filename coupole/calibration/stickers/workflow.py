@@ -1,4 +1,4 @@
-"""Make the record of the mesh's pose and the report's data from the stickers of a run and of a scan."""
+"""Makes the record of the mesh's pose, and the report's data, from the stickers of a run and of a scan."""
 
 from __future__ import annotations
 
@@ -49,17 +49,17 @@ _MOST_FACES = 1_000_000
 
 @dataclass(frozen=True)
 class MeshFound:
-    """The result and what the report draws."""
+    """The result, and the data that the report draws."""
 
     record: Record
     pose: MeshPose
     images: StickerImages
     camera_from_mesh: Floats
-    """4x4 at the image that is shown."""
+    """4x4 transform at the shown image."""
     lens: optics.Intrinsics
     scan: Scan
     u_mm: Floats
-    """[n] standard uncertainty of each target's place in the base."""
+    """[n] standard uncertainty of each target's place in the base frame."""
 
 
 def mesh_from(
@@ -120,7 +120,7 @@ def mesh_from(
 
 
 def _sigma_px(images: StickerImages) -> float:
-    """Typical noise of a sticker's centre along one axis, by the fits of their rims."""
+    """Return the typical noise of a sticker's centre along one axis, from the fits of their rims."""
     variances = [
         np.trace(sticker.covariance) / 2 for image_stickers in images.stickers for sticker in image_stickers
     ]
@@ -128,8 +128,8 @@ def _sigma_px(images: StickerImages) -> float:
 
 
 def outline_px(result: MeshFound, mesh: Path) -> Floats:
-    """Ends [n, 2, 2] (px) of the mesh's edges between triangles that face the shown image's camera and triangles
-    that do not: its contours."""
+    """Return the ends [n, 2, 2] (px) of the mesh's contours. A contour is an edge between a triangle that faces
+    the shown image's camera and one that does not."""
     import trimesh
 
     whole = trimesh.load_mesh(mesh, process=False)
@@ -146,7 +146,7 @@ def outline_px(result: MeshFound, mesh: Path) -> Floats:
 
 
 def projected_pixels(result: MeshFound, mesh_mm: Floats) -> Floats:
-    """Pixels [n, 2] of points [n, 3] of the mesh in the image that is shown; NaN for points behind the camera."""
+    """Return pixels [n, 2] of points [n, 3] of the mesh in the shown image; NaN for points behind the camera."""
     in_camera = mesh_mm @ result.camera_from_mesh[:3, :3].T + result.camera_from_mesh[:3, 3]
     pixels = np.full((len(mesh_mm), 2), np.nan)
     before = in_camera[:, 2] > 1.0
@@ -187,7 +187,7 @@ def _noise(pose: MeshPose, stated_noise: Stated) -> tuple[Noise, ...]:
 
 
 def _figures(pose: MeshPose, scan: Scan, u_mm: Floats) -> dict[str, float]:
-    """The figures that `acceptance.MESH` limits."""
+    """Return the figures that `acceptance.MESH` limits."""
     return {
         "place_mm": float(u_mm.max()),
         "missing": 1 - len(pose.recognised_names) / len(scan.names),

@@ -13,7 +13,7 @@ from coupole.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.camera.aravis.library import call, is_a, load
 
 _STALE_CONTROL_S = 4.0
-"""Time for which opening is retried: a camera drops a client 3 s after its last heartbeat."""
+"""Time for which opening is retried. A camera drops a client 3 s after its last heartbeat."""
 _RETRY_S = 0.25
 _PRIMARY_APPLICATION_IP = 0xA14
 """Bootstrap register of GigE Vision: address of the client that controls the camera."""
@@ -32,7 +32,7 @@ class Found:
 
 
 def discover() -> list[Found]:
-    """All cameras that answer within about a second; none if libaravis is not installed."""
+    """Return all cameras that answer within about a second; none if libaravis is not installed."""
     library = load()
     if library is None:
         return []
@@ -45,8 +45,9 @@ def discover() -> list[Found]:
 
 
 def name_of(device: str, address: str) -> str:
-    """The name by which libaravis opens a camera: an IP address unchanged; for a serial number, an Aravis id or
-    nothing, the camera that matches it. Raises DeviceLost if none matches, DeviceRefused if several do."""
+    """Return the name with which libaravis opens a camera. An IP address is unchanged. For a serial number, an
+    Aravis id or an empty text, it is the name of the matching camera. Raises DeviceLost if none matches, and
+    DeviceRefused if several match."""
     with contextlib.suppress(ValueError):
         return str(ipaddress.IPv4Address(address))
     cameras = discover()
@@ -63,7 +64,8 @@ def name_of(device: str, address: str) -> str:
 
 
 def open_controlled(library: Any, device: str, name: str) -> int:
-    """A handle of the camera with control of it; waits until the camera has dropped a client that died.
+    """Return a handle of the camera with control of it. This waits until the camera has dropped a client that
+    died.
 
     Raises DeviceLost if no camera answers to `name`, DeviceRefused if another client controls it.
     """

@@ -1,9 +1,9 @@
 """GigE Vision and USB3 Vision cameras over libaravis: `coupole.devices.Camera`.
 
-The camera is found by its address, serial number or Aravis id; the rig's `features` are checked, written and
-read back at opening, in their order. Frames are views of page-aligned buffers of the driver, not copied (packed
-and 8-bit formats are widened once). Counts that the camera does not provide are -1. The settings are listed in
-`docs/reference/camera-aravis.md`.
+The camera is found by its address, serial number or Aravis id. At opening, the rig's `features` are checked,
+written and read back, in their order. Frames are views of page-aligned buffers of the driver and are not copied
+(packed and 8-bit formats are widened once). Counts that the camera does not provide are -1. The settings are
+listed in `docs/reference/camera-aravis.md`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _PACKET_SOCKET_DISABLED = 1
 
 
 class AravisCamera:
-    """`coupole.devices.Camera`; see the module's text."""
+    """A camera over libaravis, as `coupole.devices.Camera`."""
 
     delivery_s = 1.0
 
@@ -162,7 +162,7 @@ class AravisCamera:
         self._armed.set()
 
     def _allocate(self, slots: int) -> None:
-        """Buffers of the camera's `PayloadSize`, which may be larger than the pixel format requires."""
+        """Allocate buffers of the camera's `PayloadSize`, which may be larger than the pixel format requires."""
         assert self._format is not None
         self._wire_format = pixel_format(self._features, self._name)
         payload_bytes = int(self._features.number("PayloadSize"))

@@ -25,14 +25,14 @@ class Features:
         self._lock = threading.RLock()  # libaravis evaluates feature formulas without a lock
 
     def has(self, name: str) -> bool:
-        """True if the camera has the feature and it can be used now."""
+        """True if the camera has the feature and the feature can be used now."""
         with self._lock:
             if not self._library.arv_device_get_feature(self._handle, name.encode()):
                 return False
             return bool(self._call("is_feature_available", name))
 
     def first_of(self, *names: str) -> str | None:
-        """The first of these features that the camera has."""
+        """Return the first of these features that the camera has."""
         return next((name for name in names if self.has(name)), None)
 
     def read_value(self, name: str) -> Value:

@@ -1,7 +1,7 @@
 """libaravis-0.8 over ctypes: prototypes of the functions used, and translation of its errors.
 
-All argument and result types are declared: a pointer passed as a C int would be cut to 32 bits. `call` is for
-functions whose last parameter is a `GError **`.
+All argument and result types are declared, because a pointer passed as a C int would be cut to 32 bits. `call` is
+for functions whose last parameter is a `GError **`.
 """
 
 from __future__ import annotations
@@ -118,9 +118,9 @@ HOW_TO_INSTALL = "Install it (Debian: apt install libaravis-0.8-0; else pip inst
 
 @functools.cache
 def load() -> Any:
-    """The library, which also exports GObject's functions; None if it is not installed.
+    """Return the library, which also exports GObject's functions; None if it is not installed.
 
-    Searched for among the system's libraries, then in the wheel `aravis-python`.
+    It is searched for among the system's libraries, then in the wheel `aravis-python`.
     """
     names = [ctypes.util.find_library("aravis-0.8"), "libaravis-0.8.so.0"]
     wheel = importlib.util.find_spec("aravis")
@@ -139,7 +139,7 @@ def load() -> Any:
 
 
 def require(device: str) -> Any:
-    """The library. Raises DeviceError, for `device`, if it is not installed."""
+    """Return the library. Raises DeviceError for `device` if it is not installed."""
     library = load()
     if library is None:
         raise DeviceError(

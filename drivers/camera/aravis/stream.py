@@ -1,7 +1,7 @@
 """The stream of one acquisition: buffers in the driver's own memory, from arming to disarming.
 
-All buffers are queued before the camera starts, and images are taken oldest first. An image that lost packets is
-counted and its buffer queued again; the gap in the frame ids shows the loss. Buffers that libaravis cleared or
+All buffers are queued before the camera starts, and images are taken oldest first. If an image lost packets, it is
+counted, and its buffer is queued again. The gap in the frame ids shows the loss. Buffers that libaravis cleared or
 aborted at start or end never held an image.
 """
 
@@ -25,19 +25,21 @@ from drivers.camera.aravis.library import call, is_a, set_property
 _SUCCESS, _CLEARED, _ABORTED = 0, 1, 7
 """ArvBufferStatus (arvbuffer.h)."""
 _FIXED_SOCKET_BUFFER, _SOCKET_BUFFER_BYTES = 0, 2**28
-"""ArvGvStreamSocketBuffer (arvgvstream.h), and a size above the kernel's limit (net.core.rmem_max). Aravis's
-default, the size of a frame, is too small for one, since the kernel counts the memory that packets occupy."""
+"""Value of ArvGvStreamSocketBuffer (arvgvstream.h), and a size above the kernel's limit (net.core.rmem_max).
+Aravis's default is the size of a frame. This is too small for a frame, because the kernel counts the memory that
+packets occupy."""
 _RECEIVERS = ("arv_gv_stream", "arv_uv_stream")
 _PRIORITY = 10
 _STRAYS_S = 0.02
-"""Time to wait before any buffer is queued, which discards stray traffic: until its filter is set, a packet socket
-receives all traffic of the interface, and libaravis takes it for parts of images."""
+"""Waiting time before any buffer is queued. It discards stray traffic: until its filter is set, a packet socket
+receives all traffic of the interface, and libaravis would take it for parts of images."""
 _SLICE_S = 0.05
 """Interval at which a waiting thread checks whether the stream was closed or the camera lost."""
 
 
 class Pool:
-    """Page-aligned memory for `slots` images of `payload_bytes` each; kept from one acquisition to the next."""
+    """Page-aligned memory for `slots` images of `payload_bytes` each. It is kept from one acquisition to the
+    next."""
 
     def __init__(self, slots: int, payload_bytes: int) -> None:
         self.slots, self.payload_bytes = slots, payload_bytes
@@ -50,10 +52,10 @@ class Pool:
         # ctypes releases the GIL; numpy would block the robot's thread.
         ctypes.memset(self._memory.ctypes.data, 0, len(self._memory))
         self.out = 0
-        """Number of slots that hold frames not yet released."""
+        """Number of slots with frames that are not released yet."""
 
     def fits(self, slots: int, payload_bytes: int) -> bool:
-        """True if it has these slots, and none is in use."""
+        """True if it has this many slots of this size, and none is in use."""
         return self.out == 0 and self.slots >= slots and self.payload_bytes == payload_bytes
 
     def slot(self, index: int) -> NDArray[np.uint8]:
@@ -82,7 +84,7 @@ class StreamStatistics:
     complete_images: int = 0
     """Images that arrived complete."""
     incomplete_images: int = 0
-    """Images that arrived with packets missing."""
+    """Images that arrived with missing packets."""
     skipped_ids: int = 0
     """Frame ids without a complete image, including those of `incomplete_images`."""
     underruns: int = 0
@@ -90,7 +92,7 @@ class StreamStatistics:
 
 
 class Stream:
-    """Runs from construction to `close()`. `give_back` and `close` may be called from any thread."""
+    """Runs from construction to `close()`. Any thread may call `give_back` and `close`."""
 
     def __init__(
         self, library: Any, device_handle: int, device: str, pool: Pool, *, frame_retention_us: int
@@ -117,9 +119,9 @@ class Stream:
             library.arv_stream_push_buffer(self._handle, library.arv_buffer_new(pool.payload_bytes, address))
 
     def next(self, timeout_s: float, first_id: int, last_id: int) -> Taken | None:
-        """The oldest complete image; None if none came in time, or the stream was closed.
+        """Return the oldest complete image; None if none came in time, or if the stream was closed.
 
-        `first_id` and `last_id` are the ends of the transport's frame ids. Waits for 0.05 s at most.
+        `first_id` and `last_id` are the ends of the transport's frame ids. It waits for 0.05 s at most.
         """
         end_s = time.monotonic() + min(timeout_s, _SLICE_S)
         while True:
@@ -137,7 +139,7 @@ class Stream:
                 return image
 
     def _evaluate(self, buffer: int, first_id: int, last_id: int) -> Taken | None:
-        """A complete image, or None after its buffer was queued again."""
+        """Return a complete image, or None after its buffer was queued again."""
         library = self._library
         status = library.arv_buffer_get_status(buffer)
         with self._lock:
@@ -171,7 +173,7 @@ class Stream:
                 self._library.arv_stream_push_buffer(self._handle, buffer)
 
     def statistics(self) -> StreamStatistics:
-        """Counts since the stream was made; after `close`, those at its end."""
+        """Counts since the stream was made. After `close` they are those at its end."""
         with self._lock:
             return self._final or self._count()
 
@@ -196,8 +198,8 @@ class Stream:
 
 
 def _prefer_receivers() -> None:
-    """Give libaravis's receiving threads real-time priority, if this process may: the packet ring holds 0.1 s,
-    and on a busy machine a thread may wait longer than that."""
+    """Give libaravis's receiving threads real-time priority, if this process may do this. The packet ring holds
+    0.1 s, and on a busy machine a thread may wait longer than that."""
     for task in Path("/proc/self/task").glob("*"):
         with contextlib.suppress(OSError):
             if (task / "comm").read_text().strip() in _RECEIVERS:

@@ -30,17 +30,18 @@ from drivers.camera.misuse import misuse_error
 from drivers.fair_lock import FairLock
 
 _A_LOOK_S = 1e-4
-"""Shortest time-out that harvesters accepts: with less it may not poll at all, as its clock has 0.2 us steps."""
+"""Shortest time-out that harvesters accepts. With a shorter one it may not poll at all, because its clock has
+steps of 0.2 us."""
 _NAP_S = 1e-3
 """Pause between polls for a frame: a blocking wait of genicam 1.6 would hold the GIL."""
 _SILENCE_S = 0.5
 """Time without frames after which the camera is queried: not every producer reports a lost camera."""
 _IN_HAND = 16
-"""Most frames in memory on their way to the disk."""
+"""Greatest number of frames in memory on their way to the disk."""
 
 
 class GenTLCamera:
-    """`coupole.devices.Camera`; see the module's text."""
+    """A camera of a GenTL producer, as `coupole.devices.Camera`."""
 
     delivery_s = 1.0
 
@@ -72,7 +73,8 @@ class GenTLCamera:
     # -- opening and closing ------------------------------------------------------------------------------
 
     def _stop_what_runs(self) -> None:
-        """A client that died may have left an acquisition running, and the features that it locks locked."""
+        """Stop a running acquisition and unlock the features that it locks; a client that died may have left
+        both."""
         with contextlib.suppress(DeviceRefused):
             self._features.write("AcquisitionStop", True)
         if self._features.has("TLParamsLocked"):
@@ -165,7 +167,7 @@ class GenTLCamera:
             time.sleep(_NAP_S)
 
     def _listen(self) -> None:
-        """Raises DeviceLost if no frame has come for long and the camera does not answer."""
+        """Raises DeviceLost if no frame has come for a long time and the camera does not answer."""
         if time.monotonic() > self._heard_s + _SILENCE_S:
             with self._lock:
                 if self._armed.is_set():
@@ -173,7 +175,8 @@ class GenTLCamera:
             self._heard_s = time.monotonic()
 
     def _fetch(self, slot: Slot) -> Frame | None:
-        """The oldest complete image, copied to `slot`; None, with the slot released, if there is none."""
+        """Return the oldest complete image, copied to `slot`. None if there is no image; the slot is then
+        released."""
         with self._lock, reporting(self._name, "an image"):
             buffer = self._acquirer.try_fetch(timeout=_A_LOOK_S, is_raw=True) if self._armed.is_set() else None
             if buffer is None:
@@ -203,7 +206,7 @@ class GenTLCamera:
             self._features.write("TriggerSoftware", True)
 
     def statistics(self) -> CameraStatistics:
-        """Counts of the present acquisition; while disarmed, of the last one."""
+        """Counts of the present acquisition; while disarmed, those of the last one."""
         if self._armed.is_set():
             with self._lock, reporting(self._name, "the camera's counters"):
                 self._last = self._statistics()

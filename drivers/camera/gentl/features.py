@@ -38,7 +38,7 @@ class Features:
         self._nodes, self._device = node_map, device
 
     def has(self, name: str) -> bool:
-        """True if the camera has the feature and it can be used now."""
+        """True if the camera has the feature and the feature can be used now."""
         try:
             return bool(self._nodes.has_node(name) and self._genapi.is_available(self._nodes.get_node(name).node))
         except self._errors as error:
@@ -52,7 +52,7 @@ class Features:
             self._raise_lost("the camera to answer", error)
 
     def first_of(self, *names: str) -> str | None:
-        """The first of these features that the camera has."""
+        """Return the first of these features that the camera has."""
         return next((name for name in names if self.has(name)), None)
 
     def read_value(self, name: str) -> Value:

@@ -19,9 +19,9 @@ _PLAIN_IMAGE = 1
 def copy_pixels(
     buffer: Any, memory: NDArray[np.uint8], expected_format: FrameFormat, wire: PixelFormat, device: str
 ) -> NDArray[np.uint16]:
-    """A buffer's image as 16-bit pixels [height_px, width_px] in `memory` [frame_bytes].
+    """Return a buffer's image as 16-bit pixels [height_px, width_px] in `memory` [frame_bytes].
 
-    Raises DeviceRefused for an image that differs from the format which `configure` returned.
+    Raises DeviceRefused if the image differs from the format that `configure` returned.
     """
     expectations = {
         "payload_type": _PLAIN_IMAGE,
@@ -51,8 +51,8 @@ def copy_pixels(
 
 
 def timestamp_ns(buffer: Any, camera: Any, device: str) -> int:
-    """Start of the exposure by the camera's clock, ns. Older producers give ticks, whose frequency `camera` gives.
-    Raises DeviceRefused if the producer gives neither."""
+    """Return the start of the exposure by the camera's clock, ns. Older producers give ticks; `camera` gives their
+    frequency. Raises DeviceRefused if the producer gives neither."""
     stamp_ns = optional_int(buffer, "timestamp_ns")
     if stamp_ns is not None:
         return stamp_ns

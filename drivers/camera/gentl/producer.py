@@ -13,12 +13,12 @@ from coupole.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.camera.gentl.settings import Settings
 
 _LOG = logging.getLogger("harvesters")
-"""Replaces harvesters' own logger, which prints errors that are raised here anyway."""
+"""Logger that replaces harvesters' own, which prints errors that are raised here anyway."""
 _LOG.addHandler(logging.NullHandler())
 
 
 def open_camera(settings: Settings) -> tuple[Any, Any, dict[str, str]]:
-    """Harvester, acquirer and description of the one camera that matches the settings."""
+    """Return harvester, acquirer and description of the one camera that matches the settings."""
     name = settings.device
     try:
         import genicam.gentl
@@ -66,7 +66,7 @@ def open_camera(settings: Settings) -> tuple[Any, Any, dict[str, str]]:
 
 
 def _raise_opening_error(producer: str) -> None:
-    """Raise the producer's error if it cannot be opened: harvesters hides it and finds no camera.
+    """Raise the producer's error if it cannot be opened, because harvesters hides the error and finds no camera.
 
     A producer can be open only once in a process (GenTL standard, GCInitLib).
     """
@@ -139,7 +139,7 @@ def optional_int(module: Any, attribute: str) -> int | None:
 
 
 def when_incomplete(count: Any) -> Any:
-    """`count` as a callback of harvesters."""
+    """Return `count` as a callback of harvesters."""
     from harvesters.core import Callback
 
     class Counting(Callback):  # type: ignore[misc,unused-ignore]  # harvesters has no types
@@ -172,10 +172,11 @@ class Gaps:
         self._last_id, self._incomplete_since = frame_id, 0
 
     def incomplete(self) -> None:
-        """An image arrived incomplete; its id will be a gap."""
+        """Note that an image arrived incomplete. Its id will be a gap."""
         self._incomplete_since += 1
 
     @property
     def missing(self) -> int:
-        """Images that did not arrive complete, from gaps in ids: none known before the first or after the last."""
+        """Number of images that did not arrive complete, from gaps in ids. Losses before the first or after the
+        last id are not known."""
         return self._skipped + self._incomplete_since

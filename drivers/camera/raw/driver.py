@@ -1,12 +1,12 @@
-"""A still camera whose RAW files a tethering program writes to a folder: `coupole.devices.Camera`.
+"""A still camera, as `coupole.devices.Camera`. A tethering program writes its RAW files to a folder.
 
-The box's edge (or a command) releases the shutter; the camera or its program writes CR2, NEF, ARW or DNG files;
-LibRaw (`rawpy`) decodes them. A file is taken as a frame once its size no longer changes.
+The box's edge (or a command) releases the shutter. The camera or its program writes CR2, NEF, ARW or DNG files,
+and LibRaw (`rawpy`) decodes them. A file counts as a frame once its size no longer changes.
 
-*Order and count are proven.* The frame id is the number in the file's name, which the camera increases with every
-picture and which wraps from 9999 to 1: a picture that never arrives leaves a gap. The timestamp is the Exif
-capture time with its fraction of a second. A file that arrives after a later one, a repeated number, a capture
-time that runs backwards, another camera, exposure or sensitivity: each ends the run with a message.
+*Order and count are proven.* The frame id is the number in the file's name. The camera increases it with every
+picture, and it wraps from 9999 to 1. So a picture that never arrives leaves a gap. The timestamp is the Exif
+capture time with its fraction of a second. The run ends with a message if a file arrives after a later one, a
+number is repeated, a capture time runs backwards, or camera, exposure or sensitivity differ.
 
 *Slow.* Marks are shifted by a sixteenth of a period (docs/decisions/0002), so the period must be 40 times the
 jitter of the timestamps: 0.4 s with hundredths of a second, 20 s with whole seconds.
@@ -38,11 +38,13 @@ from drivers.host_checks import folder_of_pictures, package
 _LOOK_S = 0.05
 """Interval between two looks into the folder."""
 _PERIOD_IN_JITTERS = 40
-"""A mark is shifted by 1/16 of a period; that must exceed twice the jitter, with some allowance for drift."""
+"""Least period, in jitters of the timestamps. A mark is shifted by 1/16 of a period, which must exceed twice the
+jitter, with some allowance for drift."""
 _IN_HAND = 4
-"""Most pictures in memory; the others wait as files."""
+"""Greatest number of pictures in memory. The others wait as files."""
 _NOMINAL_EXPOSURE = 0.1
-"""Allowed relative difference of nominal and true exposure: a camera set to 1/125 s exposes for 1/128 s."""
+"""Allowed relative difference between nominal and true exposure. A camera that is set to 1/125 s exposes for 1/128
+s."""
 _RELEASE_TIMEOUT_S = 30.0
 
 
@@ -58,20 +60,20 @@ class Settings(BaseModel):
     device: str = "camera"
     """The camera's name in messages."""
     sample: Path | None = None
-    """A RAW file of this camera, from which the frame format is read; None: the newest in the folder."""
+    """A RAW file of this camera, from which the frame format is read. None means the newest file in the folder."""
     suffixes: tuple[str, ...] = (".cr2", ".nef", ".arw", ".dng")
     last_number: Annotated[int, Field(ge=99)] = 9999
-    """The camera's highest file number; after it the camera counts from 1 again."""
+    """The camera's highest file number. After it the camera counts from 1 again."""
     release_command: tuple[str, ...] = ()
     """Program and arguments that release the shutter, for `trigger: software`."""
     shutter_jitter_us: Annotated[float, Field(ge=0)] = 5_000.0
     """Variation of the time from edge to exposure."""
     still_s: Annotated[float, Field(gt=0)] = 1.0
-    """A file whose size has not changed for this long is complete."""
+    """A file is complete if its size has not changed for this time."""
     patience_s: Annotated[float, Field(gt=0)] = 30.0
-    """Longest wait for a picture after a later one has arrived, before it counts as lost."""
+    """Longest wait for a picture after a later one has arrived. Then it counts as lost."""
     black_dn: Annotated[int, Field(ge=0)] | None = None
-    """Black level, DN; None: the value that LibRaw finds in the file."""
+    """Black level, DN. None means the value that LibRaw finds in the file."""
 
     def host_needs(self) -> list[HostNeed]:
         """Needs of this machine, for `coupole doctor`."""
@@ -79,7 +81,7 @@ class Settings(BaseModel):
 
 
 class RawFiles:
-    """`coupole.devices.Camera`; see the module's text."""
+    """A still camera, as `coupole.devices.Camera`."""
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
         self._settings, self._name = settings, settings.device
@@ -140,7 +142,7 @@ class RawFiles:
         return Identity(vendor, model, serial, firmware)
 
     def self_test(self) -> Mapping[str, str]:
-        """Data of the sample. Raises DeviceLost if the folder is gone."""
+        """Return data of the sample. Raises DeviceLost if the folder is gone."""
         files = self._order.files()
         return {
             "files": str(len(files)),
@@ -152,7 +154,7 @@ class RawFiles:
     # -- exposure -----------------------------------------------------------------------------------------
 
     def configure(self, exposure: Exposure) -> FrameFormat:
-        """The exposure is set on the camera by hand; each picture is checked for it."""
+        """Return the format. The exposure is set on the camera by hand, and each picture is checked for it."""
         if self._armed.is_set():
             raise misuse_error(self._name, "a disarmed camera", "configure() was called while it is armed")
         if exposure.gain_db:
@@ -179,7 +181,8 @@ class RawFiles:
     # -- acquisition --------------------------------------------------------------------------------------
 
     def arm(self, buffers: int) -> None:
-        """Files already in the folder do not belong to this burst. `buffers` is not used: files wait on disk."""
+        """Begin a burst. Files already in the folder do not belong to it. `buffers` is not used, because files
+        wait on the disk."""
         if self._format is None:
             raise misuse_error(self._name, "configure() before arm()", "no exposure is set")
         self.disarm()
@@ -203,7 +206,7 @@ class RawFiles:
             time.sleep(min(_LOOK_S, left_s))
 
     def _frame(self, path: Path, timeout_s: float) -> Frame | None:
-        """None if no memory became free in time: the file remains the next one."""
+        """Return the next frame. None if no memory became free in time; the file then remains the next one."""
         slot = self._pool.take(timeout_s)
         if slot is None:
             return None

@@ -1,7 +1,7 @@
 """Exif tags of a RAW file of a still camera (CR2, NEF, ARW, DNG): camera, capture time, exposure, sensitivity.
 
-All four are TIFF files whose first directory points to an Exif directory (Exif 2.32, JEITA CP-3451). tifffile
-reads both. LibRaw gives the capture time in whole seconds only, hence this module.
+All four are TIFF files. Their first directory points to an Exif directory (Exif 2.32, JEITA CP-3451), and tifffile
+reads both. This module exists because LibRaw gives the capture time only in whole seconds.
 """
 
 from __future__ import annotations
@@ -28,14 +28,15 @@ class Exif:
     taken_ns: int
     """Start of exposure, truncated to `resolution_us`."""
     resolution_us: int
-    """1,000,000 for a camera that records whole seconds only."""
+    """Resolution of the time. It is 1,000,000 for a camera that records only whole seconds."""
     exposure_us: float
     iso: int
-    """0 if the camera does not record it."""
+    """Sensitivity; 0 if the camera does not record it."""
 
 
 def read_exif(path: Path) -> Exif:
-    """Raises ValueError, naming what is missing, for a file of another kind or without capture time."""
+    """Read the tags. Raises ValueError, which names the missing part, for a file of another kind or without a
+    capture time."""
     main = _main_tags(path)
     if not isinstance(exif := main.get("ExifTag"), dict):
         raise ValueError("it has no Exif directory (tag 34665)")  # noqa: TRY004  # the file is wrong, not a call
@@ -54,7 +55,8 @@ def read_exif(path: Path) -> Exif:
 
 
 def _main_tags(path: Path) -> Mapping[str, Any]:
-    """Tags of the file's first directory by their tifffile names; `ExifTag` is a mapping of the same kind."""
+    """Return the tags of the file's first directory by their tifffile names. `ExifTag` is a mapping of the same
+    kind."""
     try:
         with tifffile.TiffFile(path) as file:
             return {tag.name: tag.value for tag in file.pages.first.tags}
@@ -82,7 +84,7 @@ def _exposure_us(exif: Mapping[str, Any]) -> float:
 
 
 def _iso(exif: Mapping[str, Any]) -> int:
-    """ISO sensitivity; the first of several. Raises ValueError if it is not a number."""
+    """Return the ISO sensitivity, the first if there are several. Raises ValueError if it is not a number."""
     match exif.get("ISOSpeedRatings", exif.get("PhotographicSensitivity", 0)):
         case int(iso) | (int(iso), *_):
             return iso

@@ -14,7 +14,7 @@ _NUMBER = re.compile(r"(\d+)$")
 
 
 def file_number(path: Path, device: str, last_number: int) -> int:
-    """The trailing digits of a file's name: 42 of `IMG_0042.CR2`. Raises DeviceFault if there are none."""
+    """Return the trailing digits of a file's name: 42 for `IMG_0042.CR2`. Raises DeviceFault if there are none."""
     digits = _NUMBER.search(path.stem)
     number = int(digits[1]) if digits else 0
     if not 1 <= number <= last_number:
@@ -33,7 +33,7 @@ class _Seen:
 
     size: int
     first_s: float
-    """Machine time at which it was first seen."""
+    """Machine time at which the file was found."""
     still_s: float
     """Machine time of the last change of its size."""
 
@@ -49,10 +49,10 @@ class Order:
         self._waiting: dict[Path, _Seen] = {}
         self._last: int | None = None
         self.counted = self.taken = 0
-        """Numbers passed since `begin`, and files taken."""
+        """Number of file numbers passed since `begin`, and number of files taken."""
 
     def files(self) -> list[Path]:
-        """All RAW files of the folder. Raises DeviceLost if it cannot be read."""
+        """Return all RAW files of the folder. Raises DeviceLost if it cannot be read."""
         try:
             return [path for path in self._folder.iterdir() if path.suffix.lower() in self._suffixes]
         except OSError as error:
@@ -64,7 +64,7 @@ class Order:
             ) from error
 
     def begin(self) -> None:
-        """Files already present are not of this burst; the newest of them gives the number that comes next."""
+        """Begin a burst. Files already present do not belong to it; the newest of them gives the next number."""
         files = self.files()
         self._old, self._taken, self._waiting = frozenset(files), set(), {}
         newest = max(files, key=lambda path: path.stat().st_mtime_ns, default=None)
@@ -101,9 +101,9 @@ class Order:
         return (first - 2) % self._last_number + 1
 
     def next(self, still_s: float, patience_s: float) -> Path | None:
-        """The next file, once its size has not changed for `still_s`; None if there is none yet.
+        """Return the next file, once its size has not changed for `still_s`; None if there is none yet.
 
-        A missing number is skipped once a later file has waited for `patience_s`. Raises DeviceFault for a file
+        A missing number is skipped after a later file has waited for `patience_s`. Raises DeviceFault for a file
         that arrives after a later one, and for two files with one number.
         """
         self._look()
@@ -140,7 +140,7 @@ class Order:
         self._waiting = sightings
 
     def take(self, path: Path) -> None:
-        """Mark `path`, which `next` has returned, as taken."""
+        """Mark `path`, which `next` returned, as taken."""
         self.counted += self._steps(path)
         self.taken += 1
         self._last = self._number(path)

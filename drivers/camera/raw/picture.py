@@ -13,7 +13,7 @@ from drivers.camera.raw.exif import Exif, read_exif
 
 _PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 _EVEN_BLACK = 1e-3
-"""Black levels of the four Bayer cells count as equal within this fraction of the white level."""
+"""Black levels of the four Bayer cells count as equal if they differ by at most this share of the white level."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def decode(path: Path, black_dn: int | None = None) -> tuple[NDArray[np.uint16],
 
 
 def _black_dn(levels: list[int], white_dn: int) -> int:
-    """One black level for the four cells. Raises ValueError if they differ too much."""
+    """Return one black level for the four cells. Raises ValueError if they differ too much."""
     if max(levels) - min(levels) > _EVEN_BLACK * white_dn:
         raise ValueError(f"its cells have different black levels, {levels}: give `black_dn` in the rig")
     return round(sum(levels) / len(levels))

@@ -1,7 +1,7 @@
 """One open xiAPI camera: parameters by name, images into the driver's memory.
 
-Calls are serialised in the order of request, from any thread: the header does not say that a camera's handle may
-be used by two threads at once. A thread that waits for an image lets the others in between.
+Calls from all threads are serialised in the order of request, because the header does not say that two threads may
+use a camera's handle at once. A thread that waits for an image lets others call in between.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class XiDevice:
         self._check(code, f"`{parameter}` to take {value}")
 
     def set_if_present(self, parameter: str, value: Value) -> None:
-        """Set a parameter that only some models have."""
+        """Set a parameter that only some models have, if this model has it."""
         if self.has(parameter):
             self.set(parameter, value)
 
@@ -157,14 +157,15 @@ class XiDevice:
             self.acquiring = True
 
     def stop(self) -> None:
-        """Does nothing if no acquisition runs."""
+        """Stop the acquisition. Does nothing if none runs."""
         with self._lock:
             if self.acquiring:
                 self.acquiring = False
                 self._check(self._library.xiStopAcquisition(self._handle), "the acquisition to stop")
 
     def image(self, address: int, size: int, timeout_s: float) -> Image | None:
-        """The oldest image, its pixels at `address`; None if none came in time or no acquisition runs."""
+        """Return the oldest image, with its pixels at `address`. None if no image came in time, or if no
+        acquisition runs."""
         image = Image(size=ctypes.sizeof(Image), bp=address, bp_size=size)
         with self._lock:
             if not self.acquiring:

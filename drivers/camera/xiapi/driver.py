@@ -5,11 +5,11 @@ docs/how-to/cb120-camera.md lists what must be checked on the real one.
 
 *Buffers.* The transport carries 12-bit packed pixels; xiAPI unpacks them, in one pass over the image, into
 page-aligned memory of the driver (XI_RAW16, XI_BP_SAFE, XI_IMG.bp). The driver copies nothing, and pixels are
-valid until `release()`. The policy XI_BP_UNSAFE avoids that pass, but gives access to xiAPI's own ring, which "may
-be overwritten by device" (xiApi.h) while it is read; it is not used.
+valid until `release()`. The policy XI_BP_UNSAFE would avoid this pass. It is not used, because it gives access to
+xiAPI's own ring, which "may be overwritten by device" (xiApi.h) while it is read.
 
 *Queue.* Images wait in xiAPI's queue, oldest first, until a buffer of the driver is free. When the queue is full,
-xiAPI drops images and counts them; each leaves a gap in `acq_nframe`, the frame id.
+xiAPI drops images and counts them. Each dropped image leaves a gap in `acq_nframe`, the frame id.
 """
 
 from __future__ import annotations
@@ -52,17 +52,17 @@ from drivers.camera.xiapi.settings import Region, Settings
 from drivers.camera.xiapi.state import AT_OPENING, FRAME_TRIGGER, State
 
 _SLICE_S = 0.05
-"""Longest wait for an image in one call, which is also the longest wait of other calls."""
+"""Longest wait for an image in one call. Other calls may have to wait this long."""
 _LOOK_S = 1.0
-"""Interval at which the presence of a camera that sends no image is checked."""
+"""Interval of checks whether a camera that sends no image is still there."""
 _IN_HAND = 16
-"""Most frames in memory on their way to the disk."""
+"""Greatest number of frames in memory on their way to the disk."""
 _KIB = 1024
 _COUNTERS = range(6)
 
 
 class XiCamera:
-    """`coupole.devices.Camera`; see the module's text."""
+    """A XIMEA camera, as `coupole.devices.Camera`."""
 
     id_modulus = (0, 2**32 - 1)
     delivery_s = 1.0
@@ -117,7 +117,7 @@ class XiCamera:
         state.note("width", "height", "offsetX", "offsetY", "image_black_level", "framerate")
 
     def _set_region(self, region: Region) -> None:
-        """Offsets are set to zero first, because offset and size limit each other."""
+        """Set the region. Offsets are set to zero first, because offset and size limit each other."""
         for parameter, value in (
             ("offsetX", 0),
             ("offsetY", 0),
@@ -129,7 +129,7 @@ class XiCamera:
             self._device.set(parameter, value)
 
     def _measure_readout_us(self) -> int:
-        """The sensor's shortest period: one over the largest frame rate at the shortest exposure."""
+        """Return the sensor's shortest period: one over the largest frame rate at the shortest exposure."""
         self._device.set("exposure", math.ceil(self._device.bounds("exposure")[0]))
         rate_hz = self._device.bounds("framerate")[1]
         if not 0 < rate_hz < math.inf:
@@ -256,7 +256,7 @@ class XiCamera:
         self._armed.set()
 
     def _queue(self, images: int, image_bytes: int) -> int:
-        """Have xiAPI queue `images` images, or as many as it can; returns the number.
+        """Let xiAPI queue `images` images, or as many as it can. Returns the number.
 
         Memory is requested for unpacked pixels, which is enough for packed ones too.
         """
@@ -297,7 +297,7 @@ class XiCamera:
         return self._frame(image, slot)
 
     def _frame(self, image: Image, slot: Slot) -> Frame:
-        """Raises DeviceRefused for an image that differs from the format which `configure` returned."""
+        """Raises DeviceRefused if the image differs from the format that `configure` returned."""
         assert self._format is not None
         frame_format = self._format
         actual_format = (image.height, image.width, image.frm)
@@ -378,7 +378,7 @@ class XiCamera:
 
 
 def _pixels(memory: NDArray[np.uint8], frame_format: FrameFormat, padding_bytes: int) -> NDArray[np.uint16]:
-    """[height_px, width_px] in place; padding at the ends of rows is removed first."""
+    """Return [height_px, width_px] in place. Padding at the ends of rows is removed first."""
     height, width_bytes = frame_format.height_px, 2 * frame_format.width_px
     if padding_bytes:
         rows = memory[: height * (width_bytes + padding_bytes)].reshape(height, width_bytes + padding_bytes)

@@ -1,7 +1,8 @@
 """XIMEA's C library libm3api: the structures, constants and functions that the driver uses.
 
-Source: xiApi.h of XIMEA's software package as published with the `xiapi-sys` bindings, and `xidefs.py` of the
-package ximea-py 4.27.13; both lay XI_IMG out alike (288 bytes on 64-bit machines). DWORD has 32 bits.
+The sources are xiApi.h of XIMEA's software package, as published with the `xiapi-sys` bindings, and `xidefs.py` of
+the package ximea-py 4.27.13. Both have the same layout of XI_IMG (288 bytes on 64-bit machines). DWORD has 32
+bits.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ BUFFERS_SAFE = 1  # XI_BP
 OPEN_BY_SERIAL = 1  # XI_OPEN_BY
 
 BAYER_PATTERNS = {0: "MONO", 1: "RGGB", 4: "BGGR", 5: "GRBG", 6: "GBRG"}
-"""XI_COLOR_FILTER_ARRAY; the supported ones."""
+"""Supported values of XI_COLOR_FILTER_ARRAY."""
 
 TRANSPORT_SKIPPED, API_SKIPPED, TRANSFERRED, MISSED_OVERLAP, MISSED_BUFFER_FULL, BUFFER_OVERFLOWS = range(6)
 """XI_COUNTER_SELECTOR."""
 
 OK, TIMEOUT, LOCKED = 0, 10, 57
 ABSENT = frozenset({12, 26, 100, 106, 107, 119})
-"""Error codes: the camera has no such parameter, or not at present."""
+"""Error codes: the camera does not have this parameter, or does not have it at present."""
 GONE = frozenset({1, 2, 3, 45, 46, 49, 55, 56})
 """Error codes: the camera does not answer, was reset, or stopped by itself."""
 
@@ -125,11 +126,11 @@ _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "xiGetParamFloat": (_HANDLE, _TEXT, ctypes.POINTER(_F32)),
     "xiGetParamString": (_HANDLE, _TEXT, ctypes.c_void_p, _U32),
 }
-"""Arguments; each function returns an XI_RET. ctypes releases the GIL during a call."""
+"""Arguments of the functions. Each function returns an XI_RET. ctypes releases the GIL during a call."""
 
 
 def load(name: str, device: str) -> Any:
-    """The library with its functions declared. Raises DeviceLost if it is not installed."""
+    """Return the library with its functions declared. Raises DeviceLost if it is not installed."""
     try:
         library = ctypes.CDLL(name)
         for function, arguments in _FUNCTIONS.items():

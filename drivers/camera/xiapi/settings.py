@@ -12,7 +12,7 @@ from drivers.host_checks import huge_pages, library
 
 
 class Region(BaseModel):
-    """Part of the sensor, in pixels; even offsets keep the Bayer pattern."""
+    """Part of the sensor, in pixels. Even offsets keep the Bayer pattern."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -30,38 +30,39 @@ class Settings(BaseModel):
     device: str = "camera"
     """The camera's name in messages."""
     serial: str = ""
-    """Serial number as printed on the camera; empty: the only camera connected."""
+    """Serial number as printed on the camera. Empty means the only connected camera."""
     library: str = LIBRARY
     """Name or path of libm3api."""
     region: Region | None = None
-    """None: the whole sensor."""
+    """Part of the sensor that is read. None means the whole sensor."""
     bit_depth: Literal[8, 10, 12] = 12
     packed: bool = True
-    """Pixels of 10 and 12 bits are packed: 12 megapixels of 12 bits are 18.9 MB instead of 25.2 MB."""
+    """True: pixels of 10 and 12 bits are packed. 12 megapixels of 12 bits are then 18.9 MB instead of 25.2 MB."""
     trigger_input: Annotated[int, Field(ge=1, le=12)] = 1
     """`gpi_selector` of the input for the box's cable."""
     trigger_edge: Literal["rising", "falling"] = "rising"
     ready_output: Annotated[int, Field(ge=1, le=12)] | None = None
-    """`gpo_selector` of the output that signals to the box when the camera is ready for an edge."""
+    """`gpo_selector` of the output that tells the box when the camera is ready for an edge."""
     ready_inverted: bool = False
-    """The line is low while the camera is ready."""
+    """True if the line is low while the camera is ready."""
     black_dn: Annotated[int, Field(ge=0)] | None = None
-    """Black level, DN; None: the camera's `image_black_level`."""
+    """Black level, DN. None means the camera's `image_black_level`."""
     readout_us: Annotated[int, Field(gt=0)] | None = None
-    """Least time between frames; None: from the largest `framerate` at the shortest exposure."""
+    """Least time between frames. None means from the largest `framerate` at the shortest exposure."""
     exposure_gap_us: Annotated[int, Field(ge=0)] = 100
     """Least time from the end of one exposure to the start of the next."""
     timestamps: Literal["seconds", "4ns"] = "seconds"
-    """Timestamp fields of an image: seconds and microseconds, by xiApi.h; or one 64-bit count of 4 ns in both
-    fields, by XIMEA's Rust bindings for the xiB series."""
+    """Form of the timestamp fields of an image. `seconds`: seconds and microseconds, as in xiApi.h. `4ns`: one
+    64-bit count of 4 ns in both fields, as in XIMEA's Rust bindings for the xiB series."""
     timestamp_jitter_us: Annotated[float, Field(gt=0)] = 20.0
-    """Largest deviation of the camera's timestamps from the edges; to be measured."""
+    """Largest deviation of the camera's timestamps from the edges. It must be measured."""
     buffers: Annotated[int, Field(ge=2)] = 16
-    """Least number of images queued."""
+    """Least number of queued images."""
     parameters: dict[str, int | float | str] = Field(default_factory=dict)
-    """Further xiAPI parameters, set at opening in this order. The driver's own table (`state`) leaves them out."""
+    """Further xiAPI parameters, set at opening in this order. The driver's own table (`state`) does not set
+    them."""
     leave: tuple[str, ...] = ()
-    """Parameters of the driver's own table that stay as they are in the camera."""
+    """Parameters of the driver's own table that stay unchanged in the camera."""
 
     def host_needs(self) -> list[HostNeed]:
         """Needs of this machine, for `coupole doctor`."""

@@ -1,6 +1,8 @@
-"""The state that a XIMEA camera must be in, whatever it was left in: as `genicam_state`, by xiAPI's names.
+"""The state that a XIMEA camera must have, whatever its former state was. It is like `genicam_state`, with xiAPI's
+names.
 
-Parameters that the camera lacks are left out; one that it has and that does not take the value is an error.
+Parameters that the camera lacks are left out. If the camera has a parameter that does not take the value, this is
+an error.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ _GAIN_AS_A_WHOLE, _GAIN_STAGES = 0, (1, 2)
 
 @dataclass(frozen=True)
 class Line:
-    """One line of the table: `parameter` gets `value`, for each value of `selector` from 0 to `last`."""
+    """One line of the table: `parameter` is set to `value`, for each value of `selector` from 0 to `last`."""
 
     parameter: str
     value: int | float
@@ -69,15 +71,16 @@ FRAME_TRIGGER = (
 
 
 class State:
-    """Sets parameters of an open camera and keeps what was read back.
+    """Sets parameters of an open camera, and keeps the values that were read back.
 
-    `rigs`: parameters that are the rig's, whose lines are not used. Methods raise DeviceRefused or DeviceLost.
+    `rigs` are parameters that belong to the rig; their lines are not used. Methods raise DeviceRefused or
+    DeviceLost.
     """
 
     def __init__(self, device: XiDevice, rigs: Collection[str]) -> None:
         self._device, self._rigs = device, frozenset(rigs)
         self.held: dict[str, str] = {}
-        """Values as read back, by parameter or parameter[value of its selector]."""
+        """Values that were read back, by parameter or parameter[value of its selector]."""
 
     def apply(self, lines: Collection[Line]) -> None:
         """Set the parameters of these lines, in their order."""
@@ -105,7 +108,7 @@ class State:
             self.set(parameter, value, entry)
 
     def set(self, parameter: str, value: int | float, entry: str = "") -> None:
-        """Set a parameter, unless it holds the value already; raises DeviceRefused if it then holds another."""
+        """Set a parameter, unless it has the value already. Raises DeviceRefused if it then has another value."""
         if self._present_value(parameter, value) != value:
             self._device.set(parameter, value)
         read_back = self._present_value(parameter, value)
@@ -122,13 +125,13 @@ class State:
         return self._device.number(parameter) if isinstance(value, float) else self._device.whole(parameter)
 
     def note(self, *parameters: str) -> None:
-        """Keep what these parameters hold, where the camera has them."""
+        """Keep the values of these parameters, if the camera has them."""
         for parameter in parameters:
             if self._device.has(parameter):
                 self.held[parameter] = f"{self._device.number(parameter):g}"
 
     def use_whole_sensor(self) -> None:
-        """Read out one region, as large as it can be, with the present binning."""
+        """Read out one region of the largest size, with the present binning."""
         for offset, size in (("offsetX", "width"), ("offsetY", "height")):
             if offset not in self._rigs:
                 self.set(offset, 0)
@@ -136,7 +139,7 @@ class State:
                 self.set(size, int(self._device.bounds(size)[1]))
 
     def free_other_inputs(self, trigger_input: int) -> None:
-        """Inputs other than that of the box trigger nothing."""
+        """Let inputs other than that of the box trigger nothing."""
         if {"gpi_selector", "gpi_mode"} & self._rigs:
             return
         low, high = self._device.bounds("gpi_selector")
@@ -145,7 +148,7 @@ class State:
                 self.set("gpi_mode", _GPI_OFF, str(number))
 
     def neutralise_gains(self) -> None:
-        """Analogue and digital gain 0 dB each, or their least; then the gain as a whole is selected."""
+        """Set analogue and digital gain to 0 dB each, or their least. Then select the gain as a whole."""
         if {"gain", "gain_selector"} & self._rigs or not self._device.has("gain_selector"):
             return
         for entry in _GAIN_STAGES:

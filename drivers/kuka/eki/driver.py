@@ -37,7 +37,7 @@ from drivers.kuka.eki.watch import Tolerances, Watch
 from drivers.kuka.eki.wire import Command, Six, Status
 
 _SAME_POSE_MM, _SAME_ROTATION = 1.0, 0.005
-"""Largest allowed difference between the controller's flange pose and that computed from its axes."""
+"""Largest allowed difference between the controller's flange pose and the pose computed from its axes."""
 _BEAT_EVERY_S = ATTENTION_S / 4.0
 _T1_SLOWER = 10.0
 """Largest factor by which motions take longer in T1 (for time-outs)."""
@@ -47,9 +47,9 @@ class KukaEki:
     """See `coupole.devices.Robot`. After a fault it refuses to move: close it and open it again."""
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
-        """Connect and have the controller begin a session; the arm does not move.
+        """Connect, and let the controller begin a session. The arm does not move.
 
-        Raises DeviceLost without connection, DeviceTimeout without answer, DeviceFault if the controller
+        Raises DeviceLost without a connection, DeviceTimeout without an answer, DeviceFault if the controller
         reports a fault.
         """
         self.settings = settings
@@ -58,7 +58,7 @@ class KukaEki:
         self._message_time = MessageTime(clock)
         self._number = 0
         self._sending = threading.Lock()
-        """Held while a command is numbered and sent: `stop` may come from any thread."""
+        """Held while a command is numbered and sent, because any thread may call `stop`."""
         self._stops = 0
         self._motion_s = 0.0
         self._attention = Attention()
@@ -153,7 +153,7 @@ class KukaEki:
         return self.measured()
 
     def measured(self) -> ArmState:
-        """State in the last status. Raises DeviceLost if the link is lost."""
+        """Return the state in the last status. Raises DeviceLost if the link is lost."""
         self._look()
         with self._link.changed:
             if self._watch.link_lost:
@@ -172,7 +172,7 @@ class KukaEki:
     def stop(self) -> None:
         """Brake and wait until the arm is at rest; raises DeviceTimeout if it does not come to rest.
 
-        With a lost link it returns at once: the controller has then stopped the arm itself.
+        If the link is lost, it returns at once, because the controller has then stopped the arm itself.
         """
         watch = self._watch
         if watch.link_lost:
@@ -184,8 +184,9 @@ class KukaEki:
         self._wait(lambda: not watch.moving, 2.0 * self._stop_s() + 1.0, "the arm at rest", faults=False)
 
     def stopping_deg(self) -> NDArray[np.float64]:
-        """See `farthest_stop_deg`. The controller's program reads commands at least once per status period; a
-        second period allows for the network and for the interruption of the robot program."""
+        """Largest further turn of each axis after a stop (`farthest_stop_deg`). The controller's program reads
+        commands at least once per status period. A second period allows for the network and for the interruption
+        of the robot program."""
         settings, arm = self.settings, self.arm
         delay_s = 2.0 * settings.status_ms / 1e3
         return farthest_stop_deg(arm.velocity_deg_s, arm.acceleration_deg_s2[0], settings.jerk_deg_s3, delay_s)
@@ -211,7 +212,7 @@ class KukaEki:
             self._link.close()
 
     def _begin_session(self) -> None:
-        """Send a first STOP; its answers carry this session's number, so older statuses are recognised."""
+        """Send a first STOP. Its answers have this session's number, so that older statuses are recognised."""
         with self._sending:
             self._order(wire.STOP, None)
         watch = self._watch
@@ -245,7 +246,7 @@ class KukaEki:
         self._send(verb, target_deg, percent)
 
     def _look(self) -> None:
-        """The motion was checked: tell the controller, often enough."""
+        """Tell the controller, often enough, that the motion was checked."""
         due = time.monotonic() - self._sent_s > _BEAT_EVERY_S
         if self._attention.look() is None or not due or not self._watch.moving:
             return
@@ -259,7 +260,7 @@ class KukaEki:
         self._link.send(self._command(verb, target_deg, percent))
 
     def _command(self, verb: int, target_deg: Six | None = None, percent: int | None = None) -> Command:
-        """The next command; `_sending` must be held."""
+        """Return the next command; `_sending` must be held."""
         self._number += 1
         self._sent_s = time.monotonic()
         settings, status = self.settings, self._watch.status
@@ -296,8 +297,8 @@ class KukaEki:
             )
 
     def _wait(self, is_done: Callable[[], bool], limit_s: float, expectation: str, *, faults: bool = True) -> None:
-        """Wait until `is_done`. Raises a fault once the arm is at rest, or DeviceTimeout when more than `limit_s`
-        of the controller's time have passed since it took the last command."""
+        """Wait until `is_done`. Raises a fault once the arm is at rest. Raises DeviceTimeout when more than
+        `limit_s` of the controller's time have passed since it took the last command."""
         watch = self._watch
 
         def outcome() -> str:
@@ -319,7 +320,8 @@ class KukaEki:
             )
 
     def _compare_pose(self, status: Status) -> str:
-        """Text for the self-test; raises DeviceError if the controller has another arm model or tool set."""
+        """Return text for the self-test. Raises DeviceError if the controller has another arm model or another
+        tool."""
         if status.pose is None:
             return "the controller reports none"
         x, y, z, *abc_deg = status.pose
@@ -351,12 +353,12 @@ class KukaEki:
 
 
 def _slower(status: Status) -> float:
-    """Factor by which the controller slows motions down (override, T1)."""
+    """Return the factor by which the controller slows motions down (override, T1)."""
     return 100.0 / status.override_percent * (_T1_SLOWER if status.t1 else 1.0)
 
 
 def _condition(status: Status) -> ArmCondition:
-    """Return the arm's condition, from the only fault that the controller's program reports: the most serious."""
+    """Return the arm's condition, from the most serious fault; the controller's program reports only this one."""
     mode = "T1" if status.t1 else "automatic or T2"
     brakes_released = status.fault not in (wire.EMERGENCY_STOP, wire.DRIVES_OFF)
     return ArmCondition(mode, emergency_stop=status.fault == wire.EMERGENCY_STOP, brakes_released=brakes_released)

@@ -21,17 +21,16 @@ Outcome = TypeVar("Outcome")
 _LOOK_S = 0.05
 """Interval at which silence is checked, and at which connecting is retried."""
 _UNREAD_BYTES = 16384
-"""Receive buffer: at most half a second of unread statuses, so that none is read late. A controller that sends
-faster than it is read (a simulated world that runs faster than real time) is slowed down by TCP flow control."""
+"""Receive buffer. It holds at most half a second of unread statuses, so that none is read late. If a controller
+sends faster than this (a simulated world that runs faster than real time), TCP flow control slows it down."""
 
 
 def connect(
     address: str, controller_is: Literal["server", "client"], controller: str, timeout_s: float
 ) -> tuple[socket.socket, int]:
-    """An open connection, and the number of strangers who were turned away; retries for `timeout_s` of machine
-    time.
+    """Return an open connection, and the number of refused strangers. It retries for `timeout_s` of machine time.
 
-    If the controller is the client and `controller` is not empty, only clients at this address are let in.
+    If the controller is the client and `controller` is not empty, only clients at this address are accepted.
     Raises OSError.
     """
     host, port = address.rsplit(":", 1)
@@ -95,16 +94,16 @@ class Link:
             self._lose(f"link lost: a command could not be sent ({error})")
 
     def beat(self, command: Command) -> None:
-        """Send a command only if it can be sent at once: whoever watches the arm must not wait."""
+        """Send a command only if it can be sent at once, because the supervisor of the arm must not wait."""
         if select.select([], [self._link], [], 0)[1]:
             self.send(command)
 
     def wait_for(self, outcome: Callable[[], Outcome], patience_s: float | None = None) -> Outcome:
         """Call `outcome` after every status and every `LOOK_S`, until it returns a true value; return this value.
 
-        After `patience_s` of machine time it returns whatever `outcome` gives then. Without `patience_s` only a
-        lost link ends the wait for a silent controller, by latching a fault: `outcome` must check the watch's
-        fault.
+        After `patience_s` of machine time it returns the value that `outcome` then gives. Without `patience_s`,
+        only a lost link ends the wait for a silent controller. A lost link latches a fault, so `outcome` must
+        check the watch's fault.
         """
         give_up_s = math.inf if patience_s is None else time.monotonic() + patience_s
         with self.changed:

@@ -1,7 +1,8 @@
-"""Evaluates a controller's statuses over time: is the arm settled, off its target, or the session in a fault.
+"""Evaluates a controller's statuses over time: whether the arm is settled or off its target, and whether the
+session is in a fault.
 
-All times are the controller's own, taken from the statuses; so a host that reads them late does not change the
-result. Uses neither socket nor thread.
+All times are the controller's own, taken from the statuses. So a host that reads them late does not change the
+result. This module uses neither socket nor thread.
 """
 
 from __future__ import annotations
@@ -37,45 +38,45 @@ class Watch:
     def __init__(self, session: int, tolerances: Tolerances) -> None:
         self.session = session
         self.status: Status | None = None
-        """The last one of this session."""
+        """The last status of this session."""
         self.statuses = self.foreign = self.max_gap_ms = 0
         """Statuses of this session and of others; longest time between two of this session (controller time)."""
         self.fault: Fault | None = None
         self.link_lost = False
-        """No further status will come, whatever the first fault was."""
+        """True if no further status will come, whatever the first fault was."""
         self.order = 0
         """Number of the last STOP or MOVE."""
         self.taken_ms: int | None = None
-        """Controller time of the first status that acknowledges the last command of any kind."""
+        """Controller time of the first status that acknowledges the last command, of any kind."""
         self.settled_cycles = 0
         self.speed_deg_s = 0.0
         self._tolerances = tolerances
         self._rest_deg: Six | None = None
-        """Axes at which the arm must be when the order is done; None: wherever it comes to rest."""
+        """Axes at which the arm must be when the order is done. None means wherever it comes to rest."""
         self._asked = self._astray_cycles = 0
 
     @property
     def has_lapsed(self) -> bool:
-        """The last order was ended by the controller, because nobody watched it."""
+        """True if the controller ended the last order because nobody watched it."""
         return self.status is not None and self.status.lapsed == self.order != 0
 
     @property
     def moving(self) -> bool:
-        """True while an order is pending or the axes turn; after a fault only the axes count."""
+        """True while an order is pending or the axes turn. After a fault only the axes count."""
         if self.status is None:
             return False
         waiting = self.fault is None and self.status.done != self.order
         return waiting or self.status.moving or self.speed_deg_s > self._tolerances.settle_deg_s
 
     def note_order(self, number: int, target_deg: Six | None) -> None:
-        """A STOP (without target) or a MOVE is about to be sent."""
+        """Note that a STOP (without a target) or a MOVE is about to be sent."""
         self.order = number
         self._rest_deg = target_deg
         self.note_command(number)
 
     def note_command(self, number: int) -> None:
-        """Note that a command of any kind is about to be sent: only statuses after the controller has taken it
-        count."""
+        """Note that a command of any kind is about to be sent. From now on, only statuses after the controller has
+        taken it count."""
         self._asked, self.taken_ms = number, None
         self.settled_cycles = self._astray_cycles = 0
 

@@ -1,8 +1,8 @@
 """The XML messages that `KukaEki` and the controller exchange over EthernetKRL (EKI), and their parser.
 
-Every element has a path, as in EKI's configuration; `tools/make_kuka_files.py` writes the controller's files
-from the same tables. Each message carries all of its elements: EKI keeps one queue per element, and a message
-that lacked one would leave the queues out of step. Angles are degrees, lengths millimetres.
+Every element has a path, as in EKI's configuration; `tools/make_kuka_files.py` writes the controller's files from
+the same tables. Each message has all of its elements. EKI keeps one queue per element, so a message without one of
+them would leave the queues out of step. Angles are degrees, lengths millimetres.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ Six = tuple[float, float, float, float, float, float]
 
 ROOT = "Coupole"
 STOP, MOVE, ASK, BEAT = range(4)
-"""Verbs of a command: brake to rest; move the axes point to point; only acknowledge; whoever watches the motion
-has looked at it."""
+"""Verbs of a command: brake to rest; move the axes point to point; only acknowledge; report that the supervisor of
+the motion has looked at it."""
 BEAT_MS = round(1e3 * ATTENTION_S)
-"""A motion without a command for this long, of the controller's time, ends (`coupole.supervision`)."""
+"""A motion ends if there is no command for this time, in the controller's time (`coupole.supervision`)."""
 
 _AXES = tuple((f"Axes/@A{axis}", "REAL") for axis in range(1, 7))
 COMMAND_ELEMENTS: tuple[tuple[str, str], ...] = (
@@ -32,7 +32,7 @@ COMMAND_ELEMENTS: tuple[tuple[str, str], ...] = (
     ("Command/@Acceleration", "INT"),
     *_AXES,
 )
-"""Elements from the host: path below the root, and type. Velocity and acceleration are percent of $VEL_AXIS,
+"""Elements from the host: path below the root, and type. Velocity and acceleration are percents of $VEL_AXIS and
 $ACC_AXIS."""
 STATUS_ELEMENTS: tuple[tuple[str, str], ...] = (
     ("Status/@Session", "INT"),
@@ -64,7 +64,7 @@ FAULTS = {
 
 _OPEN, _CLOSE = f"<{ROOT}".encode(), f"</{ROOT}>".encode()
 _LONGEST_BYTES = 16384
-"""EKI's own limit of an uninterpreted message (BUFFSIZE)."""
+"""EKI's own limit for an uninterpreted message (BUFFSIZE)."""
 
 
 class Command(NamedTuple):
@@ -83,7 +83,8 @@ class Status:
     """State of the controller when it sent this message."""
 
     session: int
-    """Session of the last command taken, echoed, so that answers to another session are recognised."""
+    """Session of the last command taken. The controller returns it, so that answers to another session are
+    recognised."""
     taken: int
     """Number of the last command taken."""
     done: int
@@ -94,15 +95,15 @@ class Status:
     """The controller's own clock ($ROB_TIMER)."""
     override_percent: int
     t1: bool
-    """True in T1, where the controller slows every motion down."""
+    """True in T1. There the controller slows every motion down."""
     lapsed: int
-    """Number of the last MOVE that was ended because no command came; 0 if none was."""
+    """Number of the last MOVE that ended because no command came; 0 if there was none."""
     model: str
     serial: int
     joints_deg: Six
     """Measured axes."""
     pose: Six | None
-    """Measured flange in base: X, Y, Z mm, A, B, C deg; None where the controller has none."""
+    """Measured flange in the base frame: X, Y, Z mm, A, B, C deg; None if the controller has no such pose."""
 
 
 def command_xml(command: Command) -> bytes:
@@ -116,7 +117,7 @@ def command_xml(command: Command) -> bytes:
 
 
 class StatusReader:
-    """Finds statuses in a stream of bytes that arrives in pieces of any size."""
+    """Finds statuses in a stream of bytes, which may arrive in pieces of any size."""
 
     def __init__(self) -> None:
         self.malformed = 0
@@ -124,7 +125,7 @@ class StatusReader:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Status]:
-        """The statuses completed by these bytes, in order."""
+        """Return the statuses that these bytes complete, in order."""
         *messages, self._rest = (self._rest + data).split(_CLOSE)
         if len(self._rest) > _LONGEST_BYTES:
             self.malformed += 1

@@ -1,7 +1,7 @@
-"""KUKA arms over RobotSensorInterface: the driver corrects the axes or the pose in every cycle.
+"""KUKA arms over RobotSensorInterface. The driver corrects the axes or the pose in every cycle.
 
-The driver is imported when it is asked for: `loop`, the process that answers, has this package too, and must begin
-soon and with little.
+The driver is imported only on use. The answering process, `loop`, also imports this package, and must start
+quickly and with few modules.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
-"""The invariant of every answer, whatever packets came in:
+"""The invariant of every answer, whichever packets came in:
 
-    From one answer to the next, the place to which the corrections lead moves by no more than the highest speed
-    times the cycle. Where the commanded axes advance, this step differs from the one before by no more than the
-    highest acceleration times the cycle squared; the only other change is to no step at all.
+    From one answer to the next, the place to which the corrections lead moves by at most the highest speed times
+    the cycle. If the commanded axes advance, this step differs from the previous one by at most the highest
+    acceleration times the cycle squared. The only other allowed change is to no step at all.
 
-A place is the axes, or the flange's pose. The trajectory obeys this by construction; here it is checked on what is
-about to be sent, from the sent numbers alone, so that no mistake before it can reach the arm. Limits of the pose
-follow from those of the axes: no point of the arm moves faster than its reach times the sum of all axis speeds.
+A place is the axes, or the flange's pose. The trajectory obeys this by construction. Here it is checked again on
+the answer that is about to be sent, from the sent numbers alone. So no earlier mistake can reach the arm. Limits
+of the pose follow from those of the axes: no point of the arm moves faster than its reach times the sum of all
+axis speeds.
 """
 
 from __future__ import annotations
@@ -18,15 +19,16 @@ from drivers.kuka.rsi.pose import Geometry
 Six = tuple[float, ...]
 
 _ROUNDING = 1e-5
-"""Numbers on the wire have six decimals; a step and its change take up to four of them."""
+"""Allowance for rounding. Numbers on the wire have six decimals; a step and its change contain up to four of
+them."""
 _SLACK = 1.001
 _POSE_SLACK = 2.0
-"""Slack factor for the change of a pose's step: angles A, B, C of a turn differ from its rotation vector in second
-order."""
+"""Factor of allowance for the change of a pose's step: the angles A, B, C of a turn differ from its rotation
+vector in second order."""
 
 
 class StepBounds:
-    """See the module; `step` is six numbers, degrees of the axes, or mm and degrees of the flange."""
+    """Checks the invariant. `step` is six numbers: degrees of the axes, or mm and degrees of the flange."""
 
     def __init__(
         self, corrects: str, cycle_s: float, velocity_deg_s: Six, acceleration_deg_s2: Six, geometry: Geometry
@@ -43,11 +45,11 @@ class StepBounds:
         """The step of the last cycle in which the axes advanced."""
 
     def at_rest(self) -> None:
-        """The arm has halted: the next advance begins from rest."""
+        """Note that the arm has halted. The next advance begins from rest."""
         self._last = (0.0,) * 6
 
     def violation(self, step: Six, *, advances: bool) -> str:
-        """Return why an answer that makes this step must not be sent, or ""."""
+        """Return why an answer with this step must not be sent, or ""."""
         for number, (length, farthest) in enumerate(zip(step, self.farthest, strict=True), start=1):
             if not abs(length) <= farthest:
                 return f"correction {number} would step by {length:.4f} in one cycle, {farthest:.4f} is the limit"
@@ -62,11 +64,11 @@ class StepBounds:
 
 
 def follow_bounds(corrects: str, follow_deg: float, geometry: Geometry) -> Six:
-    """Return how far a place may be from another, if each axis is within `follow_deg`."""
+    """Return the greatest allowed distance of a place from another, if each axis is within `follow_deg`."""
     return (follow_deg,) * 6 if corrects == "axes" else _pose_bounds(6.0 * radians(follow_deg), geometry)
 
 
 def _pose_bounds(turn: float, geometry: Geometry) -> Six:
-    """Largest step of a pose while all axes together turn by `turn` radians."""
+    """Return the largest step of a pose while all axes together turn by `turn` radians."""
     reach_mm = geometry.a1_mm + abs(geometry.b_mm) + geometry.c2_mm + hypot(geometry.a2_mm, geometry.c3_mm)
     return ((reach_mm + geometry.c4_mm) * turn + _ROUNDING,) * 3 + (degrees(turn) + _ROUNDING,) * 3

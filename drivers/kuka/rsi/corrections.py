@@ -1,7 +1,7 @@
-"""The corrections in an answer: from where the controller is to the commanded axes.
+"""The corrections in an answer: from the controller's present place to the commanded axes.
 
-Absolute corrections count from the start of the session. Relative ones are summed by the controller, so the
-reference is the sum of those that it has applied, as rounded on the wire: an increment that arrived too late is
+Absolute corrections count from the start of the session. The controller sums relative corrections. So their
+reference is the sum of those that it has applied, as rounded on the wire. An increment that arrived too late is
 included in the next one, and rounding errors do not accumulate.
 """
 
@@ -20,12 +20,12 @@ DECIMALS = 6
 NAMES = {"axes": ("A1", "A2", "A3", "A4", "A5", "A6"), "pose": ("X", "Y", "Z", "A", "B", "C")}
 """Attributes of a correction, for axes and for the pose."""
 TAGS = {"axes": "AKorr", "pose": "RKorr"}
-"""The element that carries the correction, unless the rig names another (`correction_tag`)."""
+"""The element that contains the correction, unless the rig names another (`correction_tag`)."""
 _NOTHING: Six = (0.0,) * 6
 
 
 class Corrections:
-    """See the module. A `place` is the arm's position: its axes, or the flange's pose."""
+    """Computes corrections. A `place` is the arm's position: its axes, or the flange's pose."""
 
     def __init__(self, corrects: str, mode: str, geometry: Geometry) -> None:
         self._relative = mode == "relative"
@@ -39,7 +39,7 @@ class Corrections:
         self._from: Any = None
         """The place from which the next correction counts."""
         self._last = self._applied = _NOTHING
-        """The last correction sent, and the last that the controller is known to have applied."""
+        """The last correction that was sent, and the last that the controller is known to have applied."""
         self.led_to: Any = None
         """The place to which the last correction leads."""
 
@@ -49,26 +49,25 @@ class Corrections:
         self._last = self._applied = _NOTHING
 
     def note_applied(self) -> None:
-        """The controller has applied the last correction."""
+        """Note that the controller has applied the last correction."""
         self._applied = self._last
         if self._relative:
             self._from = self._moved(self._from, self._last)
             self._last = _NOTHING
 
     def to(self, commanded_deg: Six) -> Six:
-        """The correction that leads to `commanded_deg`."""
+        """Return the correction that leads to `commanded_deg`."""
         values = self.between(self._from, self.place(commanded_deg))
         self._last = tuple(round(value, DECIMALS) for value in values)
         return self._last
 
     def hold(self) -> Six:
-        """The correction that causes no further motion."""
+        """Return the correction that causes no further motion."""
         self._last = _NOTHING if self._relative else self._applied
         return self._last
 
     def step(self, values: Six) -> Six:
-        """Return the step from the place to which the last answer led to that of an answer with these
-        corrections."""
+        """Return the step from the place of the last answer to the place of an answer with these corrections."""
         before, self.led_to = self.led_to, self._moved(self._from, values)
         return values if self._relative else self.between(before, self.led_to)
 

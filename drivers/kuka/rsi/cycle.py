@@ -1,10 +1,10 @@
-"""The controller's cycle, measured: by the arrival of its packets, and by its IPOC.
+"""The controller's cycle, measured by the arrival of its packets and by its IPOC.
 
-Every packet advances the commanded axes by one cycle of `cycle_ms`. On a controller that runs at 4 ms, a driver
-set to 12 ms would therefore drive the arm three times as fast as it computes. So the cycle is measured before the
-first motion, and as long as packets come. The arrival on the machine's clock decides. The IPOC is a second
-witness: it counts the cycle in ms on real controllers, and 1 in some simulators, where it says nothing. A
-simulated world that waits for answers, or runs at another pace than the machine's clock, declares its cycle
+Every packet advances the commanded axes by one cycle of `cycle_ms`. If the controller runs at 4 ms and the driver
+is set to 12 ms, the arm therefore moves three times as fast as the driver computes. So the cycle is measured
+before the first motion, and as long as packets come. The arrival on the machine's clock decides. The IPOC is a
+second witness. On real controllers it counts the cycle in ms; in some simulators it counts 1, and says nothing. A
+simulated world that waits for answers, or runs at another speed than the machine's clock, declares its cycle
 instead.
 """
 
@@ -13,25 +13,26 @@ from __future__ import annotations
 from collections import Counter
 
 WINDOW = 100
-"""Cycles over which arrivals are averaged."""
+"""Number of cycles over which arrivals are averaged."""
 _DECLARED_WINDOW = 10
-"""Cycles after which a declared cycle counts as witnessed by the IPOC."""
+"""Number of cycles after which the IPOC confirms a declared cycle."""
 _FASTEST, _SLOWEST = 0.85, 1.7
-"""Allowed ratio of the measured cycle to the set one. A machine that is busy for 60 ms at the beginning of a
-window shortens a cycle of 4 ms by 15 %; 1.7 is midway between equal and threefold."""
+"""Allowed ratio of the measured cycle to the set one. If a machine is busy for 60 ms at the beginning of a window,
+a cycle of 4 ms seems 15 % shorter. 1.7 is midway between equal and threefold."""
 _WRONG_WINDOWS = 2
-"""Windows in a row that prove a mismatch, so that one moment in which the machine was busy does not."""
+"""Number of consecutive windows that prove a mismatch. So a single moment in which the machine was busy proves
+nothing."""
 
 
 class CycleMeter:
-    """See the module. Feed it every packet that continues the session, once."""
+    """Measures the cycle. Feed it every packet that continues the session, once."""
 
     def __init__(self, cycle_s: float, declared_s: float | None) -> None:
-        """`declared_s`: the cycle that a simulated world declares; None: arrivals are measured."""
+        """`declared_s` is the cycle that a simulated world declares. None: arrivals are measured."""
         self.measured_ns = 0
         """Mean of the last window, or the declared cycle; 0 before it is known."""
         self.ipoc_step = 0
-        """Step of the IPOC from packet to packet, by the first window; 0 before its end."""
+        """Step of the IPOC from packet to packet, from the first window; 0 before its end."""
         self._cycle_ms = 1e3 * cycle_s
         self._declared_ms = 1e3 * declared_s if declared_s else None
         self._advances: Counter[int] = Counter()
@@ -41,8 +42,8 @@ class CycleMeter:
         """Time per cycle between the packets of the window."""
 
     def packet(self, now_ns: int, advance: int, cycles: int) -> str:
-        """A packet came whose IPOC is `advance` higher than the last one's, `cycles` cycles later. Returns why the
-        cycle is not the one that was set, or "" while nothing proves that."""
+        """Note a packet whose IPOC is `advance` higher than the last one's, `cycles` cycles later. Return why the
+        cycle is not the one that was set, or "" while nothing proves this."""
         if self._begun_ns is None:
             self._begun_ns = self._last_ns = now_ns
             return ""
@@ -82,6 +83,7 @@ class CycleMeter:
         return f"{source} {cycle_ms:.2f} ms and its IPOC counts {step} a packet; `cycle_ms` is {self._cycle_ms:g}"
 
     def _step(self) -> int:
-        """The step of the IPOC: the smallest advance that is no exception. Lost packets make larger ones."""
+        """Return the step of the IPOC: the smallest advance that is not an exception. Lost packets cause larger
+        advances."""
         often = [advance for advance, count in self._advances.items() if 5 * count >= self._advances.total()]
         return min(often or self._advances)

@@ -50,7 +50,7 @@ _SESSION_ANSWERS = 10
 """Number of answers after which a session counts as established."""
 _POLL_S = 0.004
 _LOST = (shared_state.LINK_LOST, shared_state.RESTARTED)
-"""Faults after which the controller has no session with this driver any more."""
+"""Faults after which the controller no longer has a session with this driver."""
 _LEAVE_S = 2.0
 """Longest time that the loop needs to end once the arm is at rest."""
 
@@ -59,9 +59,9 @@ class KukaRsi:
     """See `coupole.devices.Robot`. After a fault it refuses to move: close it and open it again."""
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
-        """Wait for the controller's packets; they are answered with zero correction until `move_to`.
+        """Wait for the controller's packets. They are answered with zero correction until `move_to`.
 
-        Raises DeviceRefused without the right to real-time priority, DeviceLost if the port cannot be bound,
+        Raises DeviceRefused if the right to real-time priority is missing, DeviceLost if the port cannot be bound,
         DeviceTimeout if no session begins in time.
         """
         _refuse_normal_priority(settings)
@@ -70,7 +70,7 @@ class KukaRsi:
         self._clock = clock
         self._command = shared_state.Command()
         self._sending = threading.Lock()
-        """Held while a command is numbered and written: `stop` may come from any thread."""
+        """Held while a command is numbered and written, because any thread may call `stop`."""
         self._stops = 0
         self._motion_s = 0.0
         self._target_deg: shared_state.Six = (0.0,) * 6
@@ -79,7 +79,7 @@ class KukaRsi:
         self._attention, self._silence = Attention(), Silence()
         self._hung = ""
         self._lapses = 0
-        """Lapses that the loop had counted when the last motion began."""
+        """Number of lapses that the loop had counted when the last motion began."""
         self._process, self._block = _spawn(settings, self.arm)
         try:
             self._wait_for_session()
@@ -156,7 +156,7 @@ class KukaRsi:
     def stop(self) -> None:
         """Brake and wait until the arm is at rest; raises DeviceTimeout if it does not come to rest.
 
-        With a lost link it returns at once: the controller has then stopped the arm itself.
+        If the link is lost, it returns at once, because the controller has then stopped the arm itself.
         """
         if self._process.poll() is not None:
             return
@@ -226,8 +226,8 @@ class KukaRsi:
         self._block.write_command(self._command)
 
     def _state(self) -> shared_state.State:
-        """The loop's latest state; raises DeviceLost if the loop has ended or does not run: the controller then
-        ends the motion by itself."""
+        """Return the loop's latest state. Raises DeviceLost if the loop has ended or does not run; the controller
+        then ends the motion by itself."""
         if looked_ns := self._attention.look():
             self._block.write_looked(looked_ns)
         try:
@@ -246,7 +246,7 @@ class KukaRsi:
         )
 
     def _end(self) -> None:
-        """End the process, frozen or not: it must not answer a session of which it has lost count."""
+        """End the process, even if it is frozen. It must not answer a session of which it has lost count."""
         self._process.kill()
         self._process.wait()
 
@@ -312,8 +312,8 @@ class KukaRsi:
 
 
 def _refuse_normal_priority(settings: Settings) -> None:
-    """Raises DeviceRefused where a controller on the network would be answered at normal priority, and nobody has
-    taken that upon themselves."""
+    """Raises DeviceRefused if a controller on the network would be answered at normal priority, and nobody has
+    taken responsibility for this."""
     if only_here(settings.listen) or settings.without_realtime_by or may_be_realtime():
         return
     raise DeviceRefused(

@@ -1,9 +1,9 @@
-"""Measurement of how soon this machine answers an RSI controller: real process of the driver, controller on
+"""Measures how soon this machine answers an RSI controller, with the driver's real process and a controller on
 loopback.
 
 This process acts as the controller: it sends a packet in every cycle and measures the time until the answer. The
-arm rests meanwhile, which costs the answering process a little less than a motion; what decides is when the
-machine lets it run.
+arm rests meanwhile, so the answering process has a little less work than in a motion. The time at which the
+machine lets the process run is decisive.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from drivers.kuka.rsi.driver import KukaRsi
 from drivers.kuka.rsi.settings import Settings
 
 _ABOVE_THE_LOOP = 30
-"""Priority of the measuring side: it must not be what is late."""
+"""Priority of the measuring side. It is higher, so that the measuring side is not late itself."""
 _IPOC = re.compile(rb"<IPOC>(\d+)</IPOC>")
 _AXES = b'<AIPos A1="0.0000" A2="-90.0000" A3="90.0000" A4="0.0000" A5="90.0000" A6="0.0000"/>'
 _TOLD_EVERY_S = 0.25
 
 
 class Jitter(NamedTuple):
-    """Latencies of answers in us, those that were late counted as one cycle."""
+    """Latencies of answers in us. Late answers count as one cycle."""
 
     cycle_ms: int
     answers: int
@@ -46,7 +46,8 @@ class Jitter(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """No answer was late: the controller's counter of late answers allows few in a whole session."""
+        """True if no answer was late, because the controller's counter of late answers allows only few in a whole
+        session."""
         return self.late_share == 0.0
 
 
@@ -55,7 +56,7 @@ class StandInController:
 
     def __init__(self, port: int, cycle_s: float) -> None:
         self.latencies_us: list[float] = []
-        """Latency of each packet; infinity where the answer was late."""
+        """Latency of each packet; infinity if the answer was late."""
         self._cycle_s = cycle_s
         self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._link.connect(("127.0.0.1", port))
@@ -98,8 +99,8 @@ class StandInController:
 
 @contextmanager
 def answering_session(settings: Settings) -> Iterator[tuple[StandInController, bool]]:
-    """The driver's process in a session with a controller here, and True if it runs under SCHED_FIFO. Address,
-    controller and limits of lateness replace those of the settings for this session.
+    """Give the driver's process in a session with a controller here, and True if it runs under SCHED_FIFO.
+    Address, controller and limits of lateness replace those of the settings for this session.
     """
     port = free_port()
     here = {"listen": f"127.0.0.1:{port}", "controller": "", "delay_limit": 10**9, "link_timeout_s": 1e6}
@@ -127,7 +128,7 @@ def answering_session(settings: Settings) -> Iterator[tuple[StandInController, b
 
 @contextmanager
 def above_the_loop() -> Iterator[None]:
-    """The measuring thread before all others, where that is permitted; its children have normal priority."""
+    """Let the measuring thread run before all others, if this is permitted. Its children have normal priority."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_ABOVE_THE_LOOP))
@@ -141,7 +142,7 @@ def above_the_loop() -> Iterator[None]:
 
 
 def measure_jitter(settings: Settings, seconds: float, tell: Callable[[float], object] = lambda _: None) -> Jitter:
-    """Ask for so long, in the settings' cycle; `tell` is called with the seconds that are done.
+    """Send packets for this time, in the settings' cycle. `tell` is called with the seconds that are done.
 
     Raises DeviceError if the answering process cannot be started.
     """

@@ -1,4 +1,5 @@
-"""Limits of corrections, checked before a motion begins: beyond them the controller would stop RSI on the path."""
+"""Limits of corrections. They are checked before a motion begins, because beyond them the controller would stop
+RSI on the path."""
 
 from __future__ import annotations
 
@@ -9,19 +10,21 @@ from coupole.kinematics import Arm, forward
 from drivers.kuka.rsi.settings import Settings
 
 _STEP_DEG = 2.0
-"""Largest axis step between two checked points of a path; between them a line bulges by about a millimetre."""
+"""Largest axis step between two checked points of a path. Between such points a line bulges by about a
+millimetre."""
 _STARTS = 9
-"""Checked starting points between the commanded axes and the last target, for a target given in motion."""
+"""Number of checked starting points between the commanded axes and the last target, for a target that is given
+during a motion."""
 
 
 def correction_violations(
     settings: Settings, arm: Arm, start_deg: ArrayLike, on_the_way_deg: ArrayLike, target_deg: ArrayLike
 ) -> str:
-    """Return why a motion, straight in joint space, to `target_deg` [6] is not possible, as text for messages;
-    else "".
+    """Return why a straight motion in joint space to `target_deg` [6] is not possible, as text for messages;
+    otherwise "".
 
-    `start_deg` [6]: axes where RSI was started. `on_the_way_deg` [1 or 2, 6]: where the motion starts: one point,
-    or any point between two.
+    `start_deg` [6] are the axes where RSI was started. `on_the_way_deg` [1 or 2, 6] is the start of the motion:
+    one point, or any point between two.
     """
     start, target = np.asarray(start_deg, dtype=np.float64), np.asarray(target_deg, dtype=np.float64)
     if settings.corrects == "axes":
@@ -68,8 +71,8 @@ def _too_far(settings: Settings, arm: Arm, start_deg: NDArray[np.float64], paths
 
 
 def _singular(settings: Settings, paths_deg: NDArray[np.float64]) -> str:
-    """Near a singularity a pose does not determine the axes, or needs unlimited axis speeds; beyond it the
-    controller may choose other axes than those planned."""
+    """Return why paths come too near to a singularity. There a pose does not determine the axes, or needs
+    unlimited axis speeds. Beyond it the controller may choose other axes than the planned ones."""
     arm, margin_deg = settings.wrist, settings.singularity_margin_deg
     theta = arm.theta(paths_deg)
     upper, fore = theta[:, 1], theta[:, 1] + theta[:, 2]

@@ -2,7 +2,8 @@
 
     python -m drivers.kuka.rsi.loop SOCKET_FD BLOCK_FD PARENT_PID CONFIG_JSON
 
-It imports little and has no other task, because it must answer within the cycle; see `rsi_session`.
+It imports little and has no other task, because it must answer within the cycle. `rsi_session` computes the
+answers.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from drivers.kuka.rsi.rsi_session import Config, RsiSession
 _TICK_S = 0.05
 """Interval at which the loop checks its parent process, and the link while no packet comes."""
 _END_PROGRAM_S = 0.5
-"""Once the axes are at rest, longest wait for the packet that is answered with the end of the program."""
+"""Once the axes are at rest, longest wait for the packet whose answer ends the program."""
 _ENDED_S = 0.1
 """A controller that is silent for this long after that answer has ended its program."""
 _MOST_STOP_ANSWERS = 50
-"""A controller that goes on after so many has no stop element in its configuration."""
+"""A controller that goes on after so many answers has no stop element in its configuration."""
 
 
 def serve(link: socket.socket, shared_block: shared_state.Block, parent_pid: int, config: Config) -> None:
@@ -84,8 +85,8 @@ def serve(link: socket.socket, shared_block: shared_state.Block, parent_pid: int
 
 class Leaving:
     """The end of a session: the axes brake on their path, then the controller's program is ended. While packets
-    come, braking takes the time that the limits demand, however the parent ended; it is counted in packets, since
-    the controller's cycles are the time of the motion."""
+    come, braking takes the time that the limits need, however the parent ended. This time is counted in packets,
+    because the controller's cycles are the time of the motion."""
 
     def __init__(self, session: RsiSession, config: Config) -> None:
         self.begun = self.done = False
@@ -105,7 +106,7 @@ class Leaving:
         self.begun, self._first_packet = True, self._session.packets
 
     def look(self, now_ns: int) -> None:
-        """Determine whether the end is reached; called after every packet, and at times without one."""
+        """Check whether the end is reached. It is called after every packet, and from time to time without one."""
         session = self._session
         if session.packets != self._packets:
             self._packets, self._heard_ns = session.packets, now_ns

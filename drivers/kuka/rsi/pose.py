@@ -1,4 +1,4 @@
-"""The flange's pose in plain Python: fast enough for every cycle, in a process that does not import numpy.
+"""The flange's pose in plain Python. It is fast enough for every cycle, in a process that does not import numpy.
 
 Millimetres and degrees, in the base frame. A correction of the pose is six numbers X, Y, Z, A, B, C: the
 translation is added in base coordinates, the rotation Rz(A) Ry(B) Rx(C) is applied from the left, in base axes:
@@ -65,7 +65,7 @@ def flange_pose(arm: Geometry, joints_deg: Six) -> Pose:
 
 
 def correction(before: Pose, after: Pose) -> Six:
-    """X, Y, Z in mm and A, B, C in degrees that lead from `before` to `after`; where B is +-90, C is 0."""
+    """Return X, Y, Z in mm and A, B, C in degrees that lead from `before` to `after`. If B is +-90, C is 0."""
     r = _product(after.rotation, _transpose(before.rotation))
     cos_b = hypot(r[0], r[3])
     b = atan2(-r[6], cos_b)

@@ -1,4 +1,4 @@
-"""The right to answer before all other processes, which keeps answers in time on a busy machine."""
+"""The right to answer before all other processes. It keeps answers in time on a busy machine."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import sys
 import threading
 
 PRIORITY = 20
-"""Priority under SCHED_FIFO, of 1 to 99; threads of the network in the kernel have 50."""
+"""Priority under SCHED_FIFO, from 1 to 99. The kernel's network threads have 50."""
 
 
 def become_realtime() -> bool:
-    """True if this thread now runs under SCHED_FIFO; False without the right: it has normal priority."""
+    """True if this thread now runs under SCHED_FIFO. False without the right; it then has normal priority."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except OSError:
@@ -20,7 +20,7 @@ def become_realtime() -> bool:
 
 
 def may_be_realtime() -> bool:
-    """Tell whether a process that this one starts may run under SCHED_FIFO, by trying it in a thread that ends."""
+    """Tell whether a process that this one starts may run under SCHED_FIFO. A short-lived thread tries it."""
     outcomes: list[bool] = []
     thread = threading.Thread(target=lambda: outcomes.append(become_realtime()))
     thread.start()

@@ -1,13 +1,13 @@
 """State of one RSI session: the commanded axes, and the answer to every packet.
 
-Each packet advances the commanded axes by one cycle of a jerk-limited trajectory and is answered with their
-corrections. So the motion follows the controller's cycles, also in a simulated world that pauses or runs fast.
+Each packet advances the commanded axes by one cycle of a jerk-limited trajectory, and is answered with their
+corrections. So the motion follows the controller's cycles, even in a simulated world that pauses or runs fast.
 
 Corrections count from where RSI was started (`drivers.kuka.rsi.corrections`). Therefore only a program that saw
-the session begin may answer: in a session in progress, a first answer of zero would be a jump back to its start.
-For the same reason a session keeps its start for as long as this program runs: a packet that does not continue it
-is not answered, and when RSI was restarted, the driver has to be opened again. `drivers.kuka.rsi.bounds` and
-`witness` state what holds for every answer; both are asked where answers are formed.
+the session begin may answer. In a session in progress, a first answer of zero would be a jump back to its start.
+For the same reason a session keeps its start for as long as this program runs. A packet that does not continue the
+session is not answered, and after a restart of RSI the driver must be opened again. `drivers.kuka.rsi.bounds` and
+`witness` state the invariants of every answer; both are checked when an answer is formed.
 """
 
 from __future__ import annotations
@@ -25,31 +25,31 @@ from drivers.kuka.rsi.wire import Packet, answer_template, controller_type, pack
 from drivers.kuka.rsi.witness import ArmWitness
 
 _GAP_STEPS = 25
-"""A jump of the IPOC by more than this many steps does not continue the session: it comes from an old packet, from
-a new session, or after an outage long enough for one."""
+"""A jump of the IPOC by more than this many steps does not continue the session. Such a packet is old, belongs to
+a new session, or comes after an outage that was long enough for a new session."""
 _LONGEST_STEP = 12
-"""Largest step of the IPOC that is believed before it is known: the longest cycle in ms."""
+"""Largest step of the IPOC that is accepted before the step is known: the longest cycle in ms."""
 _ANOTHER_RUN = 2
-"""Packets in a row that continue one another, but not the session, after which the session is over."""
+"""The session is over after this many consecutive packets that continue one another, but not the session."""
 _REMEMBERED = 250
-"""Packets that are known again when the network brings them a second time; more than are in a second."""
+"""Number of packets that are recognised if the network delivers them a second time. It is more than come in a
+second."""
 _LAST_WORDS = 5
-"""Packets that are still answered once the commanded axes are at rest after a fault."""
+"""Number of packets that are still answered after a fault, once the commanded axes are at rest."""
 _HALTED_PACKETS = 5
-"""Cycles in a row without leading the arm on, after which the arm has halted: answers were late, or the arm is not
+"""The arm has halted after this many consecutive cycles without an advance. Answers were late, or the arm is not
 where it was led."""
 _QUIET_NS = 500_000_000
-"""Silence after which a packet without delay counter counts as the first of a session."""
+"""After this silence, a packet without a delay counter counts as the first of a session."""
 
 _SESSION_ENDS = (shared_state.LINK_LOST, shared_state.RESTARTED, shared_state.OUT_OF_BOUNDS)
-"""Faults after which nothing is answered, since the controller may have begun a new session, or no answer is
-right."""
+"""Faults after which nothing is answered, because the controller may have begun a new session, or because no
+answer is right."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """Settings that the driver passes to the loop; the fields are described in
-    `drivers.kuka.rsi.settings.Settings`."""
+    """Settings that the driver passes to the loop. `drivers.kuka.rsi.settings.Settings` describes the fields."""
 
     cycle_s: float
     declared_cycle_s: float | None
@@ -88,7 +88,7 @@ class RsiSession:
         self.lapses = 0
         """Motions that ended because nobody watched them."""
         self.stop_answers = self.program_ended = 0
-        """Answers that end the controller's program; 1 once it has ended on one of them."""
+        """Number of answers that end the controller's program; 1 once the program has ended on one of them."""
         self.settled_cycles = self._astray_cycles = self._late_before = self._held_in_row = 0
         limits = config.velocity_deg_s, config.acceleration_deg_s2, config.jerk_deg_s3
         self.motion = Motion(config.cycle_s, limits)
@@ -111,7 +111,7 @@ class RsiSession:
         """True if the session's first packet had a delay counter."""
         self._controller = b""
         self._start_deg: tuple[float, ...] | None = None
-        """The measured axes at the start of the session, to which corrections refer; None before it."""
+        """The measured axes at the start of the session, to which corrections refer; None before the session."""
         self._measured_deg: tuple[float, ...] = (0.0,) * 6
         self._velocity_deg_s: tuple[float, ...] = (0.0,) * 6
         self._ipoc = self._ipoc_step = self._astray_ipoc = self._astray_run = 0
@@ -124,7 +124,7 @@ class RsiSession:
         self._remembered: deque[int] = deque(maxlen=_REMEMBERED)
         """Hashes of the last packets of the session."""
         self.behind = False
-        """True if the last packet came after a silence that nothing explains yet."""
+        """True if the last packet came after a silence that is not explained yet."""
 
     def obey(self, command: shared_state.Command) -> None:
         """Take a command. After a fault, motion commands are ignored."""
@@ -143,13 +143,14 @@ class RsiSession:
         self.motion.stop()
 
     def attend(self, silent_ns: int) -> None:
-        """Brake on the path if nobody has looked at a motion for too long; `silent_ns` since the last look."""
+        """Brake on the path if nobody has looked at a motion for too long. `silent_ns` is the time since the last
+        look."""
         if silent_ns > self._config.attention_s * 1e9 and self.motion.pursues:
             self.lapses += 1
             self.motion.stop()
 
     def answer(self, data: bytes, now_ns: int) -> bytes | None:
-        """The answer to a packet, or None if it must not be answered."""
+        """Return the answer to a packet, or None if the packet must not be answered."""
         packet = self._parse(data)
         if packet is None or (packet.delay is None and (self._config.mode == "relative" or self._counts_delay)):
             self.malformed += 1
@@ -203,8 +204,8 @@ class RsiSession:
         return self._last_answer
 
     def _proves(self, packet: Packet, now_ns: int) -> bool:
-        """Tell whether this packet's corrections still count from the session's start, as far as can be seen; else
-        nothing is answered."""
+        """Tell whether this packet's corrections still count from the session's start, as far as this can be seen.
+        Otherwise nothing is answered."""
         self.behind = False
         if reason := self._witness.break_reason(packet, now_ns):
             self.fail(shared_state.RESTARTED, reason)
@@ -213,9 +214,9 @@ class RsiSession:
         return not reason and not self.behind
 
     def _answer_to(self, packet: Packet, now_ns: int, *, advances: bool, was_at_rest: bool) -> bytes | None:
-        """The answer, or None if it would break the bounds: the controller then ends the session by itself. Once
-        the arm is at rest after a fault, its corrections cause no further motion. `was_at_rest`: the axes were at
-        rest in the answer before."""
+        """Return the answer, or None if it would break the bounds; the controller then ends the session by itself.
+        Once the arm is at rest after a fault, its corrections cause no further motion. `was_at_rest` says that the
+        axes were at rest in the previous answer."""
         holds = self.motion.phase == shared_state.STANDING and self.fault != shared_state.NO_FAULT
         values = self._corrections.hold() if holds else self._corrections.to(self.motion.commanded_deg)
         violation = self._bounds.violation(self._corrections.step(values), advances=advances and not holds)
@@ -228,8 +229,8 @@ class RsiSession:
 
     def _silent(self) -> bool:
         """Tell whether the driver does not answer any more. After a fault it ends the session in this way, so that
-        no old correction reaches a new session: at once if a new one may have begun, else when the commanded axes,
-        and so the arm, are at rest."""
+        no old correction reaches a new session. It is silent at once if a new session may have begun, otherwise
+        when the commanded axes, and so the arm, are at rest."""
         if self.fault != shared_state.NO_FAULT and self.motion.phase == shared_state.STANDING:
             self._last_words -= 1
         return self._session_over or self._last_words < 0
@@ -243,8 +244,8 @@ class RsiSession:
             )
 
     def fail(self, fault: int, text: str) -> None:
-        """Latch the first fault and bring the commanded axes to rest: along their path while the arm follows
-        them, else at once where they are, so that the arm is not pushed further."""
+        """Latch the first fault, and bring the commanded axes to rest. If the arm follows them, they brake along
+        their path. Otherwise they stop at once, so that the arm is not pushed further."""
         if self.fault == shared_state.NO_FAULT:
             self.fault, self.fault_text = fault, text.encode()
         self._session_over |= fault in _SESSION_ENDS
@@ -289,7 +290,7 @@ class RsiSession:
         return packet.delay == 0 if packet.delay is not None else quiet_ns > _QUIET_NS
 
     def _begin_session(self, packet: Packet, controller: bytes) -> None:
-        """Begin the session; called once in the life of this object."""
+        """Begin the session. This is called only once for each object."""
         config = self._config
         self._controller, self._counts_delay = controller, packet.delay is not None
         # Only a simulated controller may say how long its cycle is.
@@ -301,7 +302,8 @@ class RsiSession:
         self.motion.stand_at(packet.joints_deg)
 
     def _new_witness(self, *, is_simulated: bool) -> ArmWitness:
-        """`is_simulated`: the world waits for answers, or for its machine; the clock says nothing of silences."""
+        """Return a new witness. `is_simulated` says that the world waits for answers or for its machine, so that
+        the clock says nothing about silences."""
         config = self._config
         return ArmWitness(
             self._corrections.place,
@@ -315,8 +317,8 @@ class RsiSession:
         )
 
     def _in_sequence(self, ipoc: int, advance: int, packet_hash: int) -> bool:
-        """True for a packet that continues the session. Others, twice, old or of another session, change nothing;
-        a run of others ends the session. `packet_hash`: the packet's hash."""
+        """True for a packet that continues the session. Packets that come twice, are old or belong to another
+        session change nothing; a series of such packets ends the session. `packet_hash` is the packet's hash."""
         step = self._cycle.ipoc_step
         if step:
             continues = 0 < advance <= _GAP_STEPS * step and advance % step == 0
@@ -333,7 +335,8 @@ class RsiSession:
         return continues
 
     def _astray(self, ipoc: int, advance: int, step: int) -> None:
-        """A packet with an IPOC of the past, or too far ahead: perhaps one old packet, perhaps a new session."""
+        """Handle a packet whose IPOC is in the past or too far ahead. It may be one old packet, or a new
+        session."""
         self.astray += 1
         apart = ipoc - self._astray_ipoc
         self._astray_run = self._astray_run + 1 if 0 < apart <= _GAP_STEPS * step else 1

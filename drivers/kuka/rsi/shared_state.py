@@ -1,7 +1,7 @@
 """The memory shared by `KukaRsi` and the process that answers the controller.
 
-Two records, each with one writer: `Command` from the driver, `State` from the loop. A sequence number before
-the record is odd while it is being written (a seqlock), so neither side ever waits for the other.
+There are two records, each with one writer: `Command` from the driver, `State` from the loop. A sequence number
+before the record is odd while the record is being written (a seqlock). So neither side ever waits for the other.
 Angles are degrees, times nanoseconds of the machine's monotonic clock.
 """
 
@@ -50,17 +50,17 @@ class State(NamedTuple):
     refused: int = 0
     """Packets left unanswered because they belong to an RSI session that another program began."""
     foreign: int = 0
-    """Packets from other senders than the session's, or than the controller set in the rig; they are ignored."""
+    """Packets from other senders than the session's, or than the controller set in the rig. They are ignored."""
     astray: int = 0
-    """Packets of the controller's address that do not continue the session; they are not answered."""
+    """Packets from the controller's address that do not continue the session. They are not answered."""
     late: int = 0
-    """Total rise of the controller's delay counter: answers that came too late or not at all."""
+    """Total increase of the controller's delay counter, which counts answers that came too late or not at all."""
     delay: int = 0
     """The controller's delay counter in the last packet."""
     max_gap_ns: int = 0
     """Longest time between two packets."""
     cycle_ns: int = 0
-    """The controller's cycle, as measured, or as a simulated world declares it; 0 before it is known."""
+    """The controller's cycle, as measured or as declared by a simulated world; 0 before it is known."""
     program_ended: int = 0
     """1 if the controller ended its program on the stop element of an answer."""
     realtime: int = 0
@@ -102,19 +102,21 @@ class Block:
         return Command(number, verb, tuple(target), speed)
 
     def command_number(self) -> int:
-        """The number alone, which is quick: 8 aligned bytes, so never torn."""
+        """Return only the number, which is fast: it has 8 aligned bytes, so it is never torn."""
         number: int = _SEQUENCE.unpack_from(self._memory, _COMMAND_AT + _SEQUENCE.size)[0]
         return number
 
     def write_looked(self, ns: int) -> None:
-        """The driver's beat: when whoever watches the motion last looked. 8 aligned bytes, written at once."""
+        """Write the driver's beat: the time when the supervisor of the motion last looked. It has 8 aligned bytes,
+        written at once."""
         self._memory[_LOOKED_AT : _LOOKED_AT + _SEQUENCE.size] = _SEQUENCE.pack(ns)
 
     def looked_ns(self) -> int:
         return self._read_word(_LOOKED_AT)
 
     def write_ran(self, ns: int) -> None:
-        """The loop's beat: when it last ran. It does so at least every 50 ms, whether packets come or not."""
+        """Write the loop's beat: the time when the loop last ran. The loop runs at least every 50 ms, even if no
+        packets come."""
         self._memory[_RAN_AT : _RAN_AT + _SEQUENCE.size] = _SEQUENCE.pack(ns)
 
     def ran_ns(self) -> int:

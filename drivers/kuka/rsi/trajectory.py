@@ -1,4 +1,4 @@
-"""The commanded axes: a jerk-limited motion from rest to rest, one cycle at a time."""
+"""The commanded axes: a jerk-limited motion from rest to rest, computed one cycle at a time."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.shared_state import Six
 
 _LEAST_MOTION_DEG = 1e-6
-"""Shorter motions, below the resolution of the wire, are not made: along them the limits would be endless."""
+"""Motions shorter than this, which is below the resolution of the wire, are not made. Their limits along the line
+would be infinite."""
 
 
 class Motion:
     """The commanded axes: at rest, moving to a target or braking, always within the limits.
 
-    Motions are straight in joint space: one jerk-limited profile along the line, as fast as the axis that limits
-    it allows. (Six axes synchronised by ruckig leave the line by up to 5 degrees in one move of six.) Braking
-    also stays on the line; a target given during a motion is approached after the arm has come to rest.
+    Motions are straight in joint space: one jerk-limited profile along the line, as fast as the slowest axis
+    allows. (Six axes synchronised by ruckig leave the line by up to 5 degrees in one move of six.) Braking also
+    stays on the line. If a target is given during a motion, the arm first comes to rest.
     """
 
     def __init__(self, cycle_s: float, limits: tuple[Six, Six, Six]) -> None:
@@ -32,7 +33,7 @@ class Motion:
         self._output: Any = ruckig.OutputParameter(1)
         self._start_deg: Six = (0.0,) * 6
         self._line_deg: Six = (0.0,) * 6
-        """Line from start to target; the profile's position goes from 0 to 1 of it."""
+        """Line from start to target. The profile's position on it goes from 0 to 1."""
         self._next_target_deg: Six | None = None
         self._next_speed = 1.0
 
@@ -47,12 +48,13 @@ class Motion:
         self._next_target_deg = None
 
     def note_halt(self) -> None:
-        """The arm has halted although its axes were commanded to move: continue from rest."""
+        """Note that the arm has halted although its axes were commanded to move. The motion continues from
+        rest."""
         self.velocity_deg_s = (0.0,) * 6
         self._input.current_velocity = self._input.current_acceleration = [0.0]
 
     def move_to(self, target_deg: Six, speed: float = 1.0) -> None:
-        """`speed`: share of the axes' highest speeds."""
+        """Move to a target. `speed` is the share of the axes' highest speeds."""
         if self.phase != shared_state.STANDING:
             self.stop()
             self._next_target_deg, self._next_speed = target_deg, speed
@@ -83,7 +85,7 @@ class Motion:
         self.phase = phase
 
     def step(self) -> bool:
-        """Advance one cycle; False if the trajectory could not be computed: the axes are then at rest."""
+        """Advance one cycle. False if the trajectory could not be computed; the axes are then at rest."""
         if self.phase == shared_state.STANDING:
             return True
         try:

@@ -1,4 +1,4 @@
-"""KUKA RSI's packets: reads those of the controller, and forms the answers.
+"""Reads the packets of KUKA's RSI controller, and forms the answers.
 
 The names of elements are set in the controller's RSI configuration, so they are parameters here.
 """
@@ -19,9 +19,9 @@ class Packet(NamedTuple):
 
 
 _LARGEST_DELAY, _LARGEST_IPOC = 2**31 - 1, 2**63 - 1
-"""Largest numbers of the controller's types; a larger one is no number of a controller."""
+"""Largest numbers of the controller's types. A larger number cannot come from a controller."""
 _LARGEST_DEG = 1e4
-"""No axis turns 27 times."""
+"""Largest angle: no axis turns 27 times."""
 
 
 _ATTRIBUTE = re.compile(rb"""([A-Za-z_]\w*)\s*=\s*["']\s*([^"']*?)\s*["']""")
@@ -29,7 +29,8 @@ _TYPE = re.compile(rb"""<Rob\b[^>]*?\bTYPE\s*=\s*["']([^"']*)["']""", re.IGNOREC
 
 
 def packet_parser(measured_tag: str, delay_tag: str) -> Callable[[bytes], Packet | None]:
-    """A parser of the controller's packets: elements and attributes in any order, unknown ones ignored.
+    """Return a parser of the controller's packets. Elements and attributes may have any order; unknown ones are
+    ignored.
 
     It returns None if IPOC or an axis is missing, or if one of them, or the delay counter, is not a possible
     number.
@@ -79,8 +80,8 @@ def controller_type(packet: bytes) -> bytes:
 
 
 def answer_template(sen_type: str, correction_tag: str, names: tuple[str, ...], stop: str = "") -> bytes:
-    """An answer with places for six corrections (floats) and the IPOC (bytes), for `%`; `stop` is the element that
-    ends the program, or not."""
+    """Return an answer with places for six corrections (floats) and the IPOC (bytes), for `%`. `stop` is the
+    element that does or does not end the program."""
     values = " ".join(f'{name}="%.6f"' for name in names)
     return f'<Sen Type="{sen_type}"><EStr></EStr><{correction_tag} {values}/>{stop}<IPOC>%b</IPOC></Sen>'.encode()
 

@@ -1,18 +1,19 @@
-"""The invariant of every answer to the arm itself, whoever lost count:
+"""The invariant of every answer with respect to the arm itself, even if one side has lost count:
 
-    An answer starts from the arm. It is sent only if the controller's own packet proves that corrections still
-    count from where this session counts them, and if it leads to no place farther from the axes that this packet
-    reports than the arm lags behind, plus one cycle's step.
+    An answer starts from the arm. It is sent on two conditions. The controller's own packet must prove that
+    corrections still count from this session's start. And the distance from the axes that this packet reports to
+    the answer's place must be at most the lag of the arm plus one cycle's step.
 
-*Proves*: since the last packet that was answered, every cycle of the controller's IPOC that was not answered
-stands in its counter of late answers, and that counter has not fallen; and a silence on the machine's clock is one
-by the IPOC too. A controller that starts RSI anew takes some cycles for it, counts none of them, and begins its
-counter at 0: the old corrections would then lead as far from the arm as it had moved.
+*Proves* means: since the last answered packet, the controller's counter of late answers contains every cycle of
+its IPOC that was not answered, and the counter has not decreased; and a silence on the machine's clock is also a
+silence by the IPOC. A controller that restarts RSI needs some cycles for it, counts none of them, and begins its
+counter at 0. The old corrections would then lead as far from the arm as it had moved.
 
-*Lags behind*: the arm is between the places to which the answers led within the last `follow_lag_s`, give or
-take `follow_deg`. Where it is not, no answer leads farther away from it.
+*Lag* means: the arm is between the places to which the answers led within the last `follow_lag_s`, within
+`follow_deg`. If it is not there, no answer leads farther away from it.
 
-Nothing here is counted by `rsi_session`: the witness keeps the last answered packet, and where answers led.
+`rsi_session` counts nothing of this. The witness itself keeps the last answered packet and the places of the
+answers.
 """
 
 from __future__ import annotations
@@ -27,16 +28,18 @@ from drivers.kuka.rsi.wire import Packet
 Six = tuple[float, ...]
 
 _PATIENT_PACKETS = 5
-"""Packets that are left unanswered until the IPOC has caught up with a silence: this machine may be busy."""
+"""Number of packets that are left unanswered until the IPOC has caught up with a silence, because this machine may
+be busy."""
 _SURE = 10
-"""Answers after which the smallest step of the IPOC is its step: a packet may be lost on the network."""
+"""Number of answers after which the smallest step of the IPOC counts as its step, because a packet may be lost on
+the network."""
 _ROUNDING = 2e-5
 """Numbers on the wire have six decimals."""
 _NOWHERE: Six = (0.0,) * 6
 
 
 class ArmWitness:
-    """See the module. A `place` is the arm's position: its axes, or the flange's pose."""
+    """Checks the invariant. A `place` is the arm's position: its axes, or the flange's pose."""
 
     def __init__(
         self,
@@ -50,9 +53,10 @@ class ArmWitness:
         counts_in_a_row: bool,
         unaccounted_s: float,
     ) -> None:
-        """`place_at` gives the place at reported axes, `between` what leads from one place to another; `follow`
-        and `step` are how far the arm may be from where it was led, and one cycle's step. `counts_in_a_row`: the
-        counter of late answers falls to 0 at one in time. `unaccounted_s`: see the module; 0: never."""
+        """`place_at` gives the place at reported axes; `between` gives the correction from one place to another.
+        `follow` is the allowed distance of the arm from the place to which it was led, `step` is one cycle's step.
+        `counts_in_a_row` says that an answer in time sets the counter of late answers to 0. `unaccounted_s` is the
+        silence that ends the session; 0: never."""
         self._reported, self._between = place_at, between
         self._follow = follow
         self._follow_and_step: Six = tuple(map(float.__add__, follow, step))
@@ -64,8 +68,8 @@ class ArmWitness:
         self._last_ns = self._step = self._answered = self._waits = 0
 
     def break_reason(self, packet: Packet, now_ns: int) -> str:
-        """Return why, by this packet, corrections may no longer count from where they did; "" if it proves that
-        they do."""
+        """Return why, by this packet, corrections may no longer count from the session's start; "" if it proves
+        that they do."""
         last = self._last
         if last is None:
             return ""
@@ -101,8 +105,8 @@ class ArmWitness:
         return ""
 
     def waits(self, packet: Packet, now_ns: int) -> bool:
-        """True for a packet after a silence that its IPOC has not accounted for yet. It is left unanswered: if
-        this machine was busy, its answer would be late, and the packets behind it account for the silence."""
+        """True for a packet after a silence that its IPOC has not counted yet. It is left unanswered: if this
+        machine was busy, the answer would be late, and the next packets account for the silence."""
         last = self._last
         if last is None or not self._unaccounted_s or not self._step:
             return False
@@ -113,12 +117,12 @@ class ArmWitness:
         return True
 
     def strays(self, joints_deg: Six) -> bool:
-        """True if the arm is not where it was led: it must not be led on."""
+        """True if the arm is not where it was led. It must not be led on."""
         return bool(self._led) and any(self._beyond(self._reported(joints_deg), self._led[-1], self._follow))
 
     def violation(self, packet: Packet, place: Any, now_ns: int) -> str:
-        """Return why an answer to `packet` that leads to `place` must not be sent; else "", and the answer is
-        taken as sent."""
+        """Return why an answer to `packet` that leads to `place` must not be sent. Otherwise return "", and the
+        answer counts as sent."""
         if why := self.break_reason(packet, now_ns):
             return why
         arm = self._reported(packet.joints_deg)
@@ -139,7 +143,7 @@ class ArmWitness:
         return ""
 
     def _beyond(self, arm: Any, place: Any, within: Six) -> list[bool]:
-        """Tell, for each number of a place, whether the arm is neither there nor where it lags behind."""
+        """Tell for each number of a place whether the arm is neither there nor within its lag."""
         off = self._between(arm, place)
         behind = self._between(self._led[0], self._led[-1]) if self._led else _NOWHERE
         return [not abs(away) <= limit + abs(lag) for away, lag, limit in zip(off, behind, within, strict=True)]

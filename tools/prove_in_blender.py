@@ -43,6 +43,7 @@ from rich.console import Console
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests/runs")]
 
+from export_models import Lit, Materials, lab_differences, principled_bsdf  # noqa: E402
 from relief_cells import detailed_result  # noqa: E402
 
 from coupole.errors import InputError  # noqa: E402
@@ -54,7 +55,6 @@ from coupole.reflectance.new_light.light_kinds import DistantLight  # noqa: E402
 from coupole.reflectance.new_light.pictured_surface import FreeCamera  # noqa: E402
 from coupole.reflectance.run_relighting import RelitScene, Texels, scene_from  # noqa: E402
 from coupole.reflectance.run_result import RunResult  # noqa: E402
-from export_models import Lit, Materials, lab_differences, principled_bsdf  # noqa: E402
 from smallest import add_smallest  # noqa: E402
 
 HOME = ROOT / ".tools/blender"

@@ -206,8 +206,7 @@ class TextLineBox:
         return flash is not None and not flash.end_event.is_set() and not flash.deadline.has_expired
 
     def end_flash(self) -> StepRecord:
-        """End the flash now, if its time has not ended it. `on_us` lasts from the command to the box's
-        confirmation."""
+        """End the flash now, if its time has not ended it. `on_us` ends at the box's confirmation."""
         flash = self._flash
         if flash is None:
             self._refuse("a flash to end", "none was begun", "This is a fault of the program that drives the box.")

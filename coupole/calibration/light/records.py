@@ -292,8 +292,7 @@ def _one_scene(frames: LightFrames) -> list[LightFrame]:
 
 
 def _sample(shape: tuple[int, ...], pattern: str, channel: str) -> NDArray[np.bool_]:
-    """Return a mask [H, W] of a sample of a channel's pixels, in whole rows, so that neighbours stay
-    neighbours."""
+    """Return a mask [H, W] of a sample of a channel's pixels, in whole rows, which keeps neighbours."""
     mask = channel_mask((shape[0], shape[1]), pattern, channel)
     step = max(1, round(float(mask.sum()) / _MOST_PIXELS))
     rows = (np.arange(shape[0]) // 2) % step == 0

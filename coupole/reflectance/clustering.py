@@ -1,8 +1,8 @@
 """Clusters of triangles that look alike, and one material for each cluster from all its samples (seed 003, section
 7: 1,000 materials for 400,000 triangles).
 
-Each sample is turned into the frame of its own triangle, in which z is the fitted normal. The mesh's normals,
-which are wrong by degrees, would blur the pooled samples.
+Each sample is turned into the frame of its own triangle, in which z is the fitted normal. Without this, normals
+that are wrong by degrees would blur the pooled samples.
 """
 
 from __future__ import annotations

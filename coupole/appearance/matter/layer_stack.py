@@ -48,7 +48,7 @@ class Binder:
 
     @property
     def cosines(self) -> Array:
-        """[angles, 1] cosines, inside, of light from air at `layered.COSINES`."""
+        """[angles, 1] cosines, inside the binder, of light that comes from air at `layered.COSINES`."""
         sine2 = (1.0 - layered.COSINES**2) / self.index**2
         return np.asarray(np.sqrt(1.0 - sine2))[:, None]
 

@@ -87,8 +87,7 @@ def sheet(films: Sequence[thin_film.Film], body_index: float) -> Sheet:
 def coat(smooth: Sheet, roughness: float) -> Coat:
     """Return the sheet on a rough surface, in facets of GGX `roughness`.
 
-    At each angle the rough sheet transmits the same share of the light that it does not reflect as the smooth
-    sheet.
+    At each angle, the rough and the smooth sheet transmit the same share of the light that they do not reflect.
     """
     remainder = 1.0 - _facets(roughness) @ smooth.reflectance
     entering = remainder * smooth.transmittance / np.maximum(1.0 - smooth.reflectance, 1e-12)

@@ -99,7 +99,8 @@ def level_of(field: Field, share: float, points_mm: Array, normals: Array) -> fl
 def divide_triangles(
     corners_mm: Array, normals: Array, field: Field, level_mm: float, finest_mm: float, share: float | None = None
 ) -> Divided:
-    """Halve triangles at their longest edges where the level may cross them, until edges have `finest_mm`.
+    """Halve triangles at their longest edges where the level may cross them, until edges are at most `finest_mm`
+    long.
 
     With a `share`, the level is moved a little so that this share of the area is below it. Raises InputError for
     more than `MOST_TRIANGLES`.

@@ -32,7 +32,7 @@ _WITHIN = {1: 3.84, 2: 5.99, 3: 7.81}
 
 @dataclass(frozen=True)
 class ChannelFinding:
-    """Classes that are possible by the channels."""
+    """Classes that agree with the channels."""
 
     candidates: tuple[Candidate, ...]
     """Nearest reference of each class, best first; probabilities among the library's classes."""

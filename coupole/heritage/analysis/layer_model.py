@@ -98,8 +98,8 @@ def grain_ratio(first: tuple[Array, Array], second: tuple[Array, Array]) -> Grai
     each.
 
     Grains larger than the wavelength scatter by their cross-sections, so S per volume of pigment is proportional
-    to 1/d. The papers say that K and S depend on the grains, and give no formula. This one is valid for grains
-    above about 2 um. Raises InputError if no band is known well for both grindings.
+    to 1/d. The papers say that K and S depend on the grains, and give no formula. The formula here is valid for
+    grains above about 2 um. Raises InputError if no band is known well for both grindings.
     """
     (s1, u1), (s2, u2) = first, second
     relative = np.hypot(u1 / s1, u2 / s2)

@@ -25,8 +25,8 @@ _SAME = 1e-4
 _WIDEST_GAP_NM = 20.0
 _VIOLET_NM = 460.0
 _RISE_BEYOND, _RISE_BY = 0.1, 0.005
-"""Limits of the rise over 20 nm: for the logarithm of reflectance, beyond the rise of the references; for
-reflectance."""
+"""Limits of the rise over 20 nm. The first is for the logarithm of reflectance, beyond the rise of the references;
+the second is for reflectance."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ NEIGHBOURS = 24
 _TERMS, _PLANE_TERMS = 6, 3
 _FREEDOM_ALONE = NEIGHBOURS - _TERMS
 FREEDOM = 3 * _FREEDOM_ALONE
-"""Degrees of freedom of a scatter. They are few, because neighbouring fits share most of their points."""
+"""Degrees of freedom of a scatter. Neighbouring fits share most of their points, which limits this number."""
 _BATCH = 50_000
 _MOST_BESIDE = 0.6
 """Largest distance of the neighbours' middle from the place, over their extent. If it is larger, the place is at a

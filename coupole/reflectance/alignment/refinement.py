@@ -1,7 +1,7 @@
-"""Adjustment of poses, lens and mesh to the disagreement of views; records and scan limit the steps.
+"""Adjustment of poses, lens and mesh that reduces the disagreement of views; records and scan limit the steps.
 
-A match names a block of one view and the block of a second view that shows the same spot. The geometry predicts
-the spot where the first view's ray meets the surface. If the first camera takes a step a and the surface moves by
+A match names a block of one view and the block of a second view that shows the same spot. By the geometry, the
+spot lies where the first view's ray meets the surface. If the first camera takes a step a and the surface moves by
 s along its normal n, that place moves by dP, with J dP = -(d block / d a) a and n dP = s, where J = d block / d
 place of the first camera. Each match has its own variance. The adjustment estimates one factor on all these
 variances; gross errors are rejected (`calibration.adjustment`).
@@ -56,7 +56,7 @@ class Refined:
     before: Matches
     after: Matches
     noise_factor: float
-    """Noise of the matches, as a multiple of the noise that noise and texture alone would leave."""
+    """Scatter of the matches, as a multiple of the scatter that noise and texture alone would leave."""
     rejected_count: int
     """Number of matches that the last adjustment rejected."""
 

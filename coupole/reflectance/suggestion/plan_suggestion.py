@@ -43,7 +43,7 @@ LONGER = 8
 _SATURATED_SHARE = 1e-3
 """Share of samples that may be brighter than the range of the shorter exposure."""
 _FULL = 0.85
-"""Share of the camera's range that the brightest other samples reach."""
+"""Share of the camera's range that the brightest of the remaining samples reach."""
 _ROUNDS = 8
 _TRIAL_VIEWS = 3
 _ENDLESS = StorageFacts(free_bytes=1 << 60)

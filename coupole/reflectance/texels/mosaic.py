@@ -1,4 +1,4 @@
-"""Colours between the pixels of a Bayer pattern, from the own channel of single pixels.
+"""Colours between the pixels of a Bayer pattern, from the one channel that each pixel measures.
 
 Detail of surfaces is mostly lightness, which is alike in all channels and is present in each pixel. Colours change
 less from pixel to pixel. So the deviation of a missing channel is the deviation of the pixel's own channel from

@@ -10,7 +10,7 @@ bright as the brightest hundredth, as in `tests/runs/test_texel_maps.py`; compar
 the importers of OBJ and USD leave out is then linked by hand, and compared once more. Blender does not read
 MaterialX's documents.
 
-Blender's Principled BSDF is another model than the fit. It is written anew in `export_models.py`, held to a sphere
+Blender's Principled BSDF is another model than the fit. It is written anew in `tests/export_readers/lit_models.py`, held to a sphere
 of Blender's own, and put on the pixels of our picture: so a table tells what the model makes (`ours - model`) and
 what is left for file and importer (`model - Blender`). Last, the green of the normal map is turned round, which
 must be seen.
@@ -43,7 +43,7 @@ from rich.console import Console
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests/runs")]
 
-from export_models import Lit, Materials, lab_differences, principled_bsdf  # noqa: E402
+from export_readers.lit_models import Lit, Materials, lab_differences, principled_bsdf  # noqa: E402
 from relief_cells import detailed_result  # noqa: E402
 
 from coupole.errors import InputError  # noqa: E402

@@ -173,6 +173,8 @@ HEADING = "Examples:"
 
 def add_examples(command: Any, name: str) -> None:
     """End the help of a command, and of the steps that it has, with its examples."""
+    if name not in EXAMPLES:
+        raise LookupError(f"coupole/commands/examples.py: expected two examples of `coupole {name}` in EXAMPLES")
     command.epilog = "\n\n".join([HEADING, *(f"coupole {example}" for example in EXAMPLES[name])])
     for step in getattr(command, "commands", {}).values():
         add_examples(step, f"{name} {step.name}")

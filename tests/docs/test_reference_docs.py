@@ -6,11 +6,13 @@ import importlib
 import inspect
 import re
 from types import ModuleType
+from typing import get_args
 
 import pytest
 from places import REPO
 from pydantic import BaseModel
 
+from coupole.appearance.render.materials import coatings, measured_material, plain, weathering
 from coupole.exchange.formats import FORMATS, Writer
 from coupole.heritage.restoration import parts_file, restoration_file
 from coupole.heritage.restoration.restoration_file import Stage
@@ -41,6 +43,25 @@ def test_the_reference_names_every_key(module: ModuleType, page: str) -> None:
     ]
     keys = {f"{model.__name__}.{key}" for model in models for key in model.model_fields}
     assert sorted(key for key in keys if not re.search(rf"\b{key.split('.')[1]}\b", text)) == []
+
+
+@pytest.mark.parametrize("module", [plain, coatings, measured_material, weathering])
+def test_the_page_of_scenes_names_every_key_of_a_material(module: ModuleType) -> None:
+    text = (REFERENCE / "scene.md").read_text(encoding="utf-8")
+    models = [
+        model
+        for _, model in inspect.getmembers(module, inspect.isclass)
+        if issubclass(model, BaseModel) and model.__module__ == module.__name__
+    ]
+    keys = {key for model in models for key in model.model_fields}
+    kinds = {kind for model in models if "kind" in model.model_fields for kind in _kinds(model)}
+    assert kinds
+    assert sorted(key for key in keys if not re.search(rf"\b{key}\b", text)) == []
+    assert sorted(kind for kind in kinds if f"`{kind}`" not in text) == []
+
+
+def _kinds(model: type[BaseModel]) -> tuple[str, ...]:
+    return get_args(model.model_fields["kind"].annotation)
 
 
 def test_the_reference_names_every_key_of_parts_and_restorations() -> None:

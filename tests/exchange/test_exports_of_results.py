@@ -22,7 +22,7 @@ from export_readers.lit_models import lit_pixels, relative_errors, true_light
 from lazily import lazily
 from relight_cases import BASE_FROM_SUPPORT, Coat, moved, unit, waves, write_result
 
-from coupole.exchange.formats import Source, formats_of
+from coupole.exchange.formats import FORMATS, Source, formats_of
 from coupole.exchange.of_results import adaptive_table
 from coupole.exchange.of_results.adaptive_table import encode_adaptive
 from coupole.exchange.of_results.bsdf import encode as encode_bsdf
@@ -324,7 +324,7 @@ def test_a_merl_table_is_read_as_its_reader_does() -> None:
         (("--to", "ply", "--fit", "sh"), f"expected {' or '.join(MATERIALS)}"),
         (
             ("--to", "ply", "--views", "top"),
-            "--views: is for --to dng, tiff, lp, dome, relight",
+            f"--views: is for --to {', '.join(name for name, one in FORMATS.items() if 'views' in one.options)}",
         ),
         (("--to", "ply", "--linear"), "--linear: is for --to tiff; found --to ply"),
         (("--to", "gltf", "--refined", "there"), "--refined: is for --to colmap"),

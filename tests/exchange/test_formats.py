@@ -37,11 +37,14 @@ def test_completion_and_help_have_every_format() -> None:
 
 
 def test_a_format_that_the_source_does_not_have_is_refused_with_those_that_it_has() -> None:
+    of_pictures, of_frames = formats_of(Source.PICTURES), formats_of(Source.RUN, Writer.FRAMES)
+    assert {"ptm", "iiif"} < {*of_pictures}
+    assert {"dng", "tiff"} <= {*of_frames}
     with pytest.raises(
-        InputError, match=r"one of relight, ptm, rti, iiif for a result of pictures; found ply; ply is "
+        InputError, match=rf"one of {', '.join(of_pictures)} for a result of pictures; found ply; ply is "
     ):
         format_named("ply", Source.PICTURES)
-    with pytest.raises(InputError, match=r"one of dng, tiff for a run; found lp$"):
+    with pytest.raises(InputError, match=rf"one of {', '.join(of_frames)} for a run; found lp$"):
         format_named("lp", Source.RUN, Writer.FRAMES)
     assert formats_of(Source.RESULT)[-1] == "rocrate"
 

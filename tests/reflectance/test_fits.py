@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -30,13 +31,14 @@ from coupole.reflectance.fits import (
     ViewFit,
     fitted_together,
 )
+from coupole.reflectance.ggx import UNKNOWNS
 from coupole.reflectance.result_pages import ablation_page
 from coupole.reflectance.run_fits import predict_samples
 from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.run_result_files import begin_slices
 from coupole.reflectance.slice_basis import BASES, HARMONICS, fewer
 from coupole.reflectance.slice_fit import fit_slices, slice_values
-from coupole.reflectance.triangle_fit import model_values
+from coupole.reflectance.triangle_fit import FEWEST, model_values
 
 LOW = ViewFit("low", "harmonics of few degrees", "#000000", "low")
 
@@ -106,6 +108,32 @@ def test_a_material_of_another_form_states_its_own_uncertainty(result: RunResult
     materials = run_fits._materials_block(job, GGX, 1, block)
     lambert = Lambert("lambert", "", "", fits_normals=False)
     assert run_fits._uncertain_block(job, lambert, 1, (block, materials)) == (materials, stated)
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_a_material_fit_says_what_it_does_not_know(result: RunResult, name: str) -> None:
+    """Triangles without samples, and with too few of them: a result of runs has both."""
+    fit, samples = MATERIALS[name], result.samples(slice(0, 12))
+    values = samples.values.copy()
+    values[0] = np.nan
+    values[1, FEWEST - 1 :] = np.nan
+    samples, used = replace(samples, values=values), np.ones(values.shape[1], np.bool_)
+    materials = fit.fit(samples, used, 30.0, 1)
+    uncertainty = fit.uncertainty(samples, used, materials, 30.0, samples.centres_mm.mean(axis=0), 1)
+    known = np.isfinite(materials.alpha)
+    assert not known[:2].any()
+    assert known[2:].all()
+    assert (materials.alpha[2:] > 0.0).all()
+    assert uncertainty.covariance.shape == (12, UNKNOWNS, UNKNOWNS)
+    for array in (
+        materials.kd,
+        materials.ks,
+        uncertainty.covariance,
+        uncertainty.u_kd,
+        fit.values(samples, materials),
+    ):
+        assert np.isnan(array[:2]).all()
+        assert np.isfinite(array[2:]).all()
 
 
 def test_a_name_that_no_fit_has_is_no_ggx_fit(result: RunResult) -> None:

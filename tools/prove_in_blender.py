@@ -10,10 +10,10 @@ bright as the brightest hundredth, as in `tests/runs/test_texel_maps.py`; compar
 the importers of OBJ and USD leave out is then linked by hand, and compared once more. Blender does not read
 MaterialX's documents.
 
-Blender's Principled BSDF is another model than the fit. It is written anew in `tests/export_readers/lit_models.py`, held to a sphere
-of Blender's own, and put on the pixels of our picture: so a table tells what the model makes (`ours - model`) and
-what is left for file and importer (`model - Blender`). Last, the green of the normal map is turned round, which
-must be seen.
+Blender's Principled BSDF is another model than the fit. It is written anew in
+`tests/export_readers/lit_models.py`, held to a sphere of Blender's own, and put on the pixels of our picture: so a
+table tells what the model makes (`ours - model`) and what is left for file and importer (`model - Blender`). Last,
+the green of the normal map is turned round, which must be seen.
 
 `--install` makes an environment with the package bpy 5.0.1 under `.tools/blender` (1 GB; it needs Python 3.11), of
 a wheel if one is named. `--blender` names another Python that has the package. Exits with 1 if glTF, or one of

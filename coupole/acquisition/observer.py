@@ -146,8 +146,8 @@ class Control:
         return self.hold_pending.is_set()
 
     def await_word(self) -> None:
-        """Wait until it is known why this process did not run for a while, if it did not. Call this before an arm
-        that stands is moved again."""
+        """Wait until the reason is known if this process did not run for a while. Call this before an arm that
+        stands is moved again."""
         if self.session is not None:
             self.session.await_word()
             return

@@ -97,7 +97,7 @@ def of_white(size_px: tuple[int, int], pixels: Floats) -> Floats:
 
 
 def _between(pixels: NDArray[np.intp], block_px: int, count: int) -> tuple[NDArray[np.intp], Floats]:
-    """Return the block before each pixel, and the share of the block behind it."""
+    """Return the block before each pixel, and the interpolation weight of the next block."""
     place = np.clip((pixels + 0.5) / block_px - 0.5, 0.0, count - 1.0)
     first = np.floor(place).astype(np.intp)
     return first, place - first

@@ -40,7 +40,7 @@ _HALTED_PACKETS = 5
 """The arm has halted after this many consecutive cycles without an advance. Answers were late, or the arm is not
 where it was led."""
 _QUIET_NS = 500_000_000
-"""After this silence, a packet without a delay counter counts as the first of a session."""
+"""A packet without a delay counter counts as the first of a session after this silence."""
 
 _SESSION_ENDS = (shared_state.LINK_LOST, shared_state.RESTARTED, shared_state.OUT_OF_BOUNDS)
 """Faults after which nothing is answered, because the controller may have begun a new session, or because no

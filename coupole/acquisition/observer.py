@@ -98,7 +98,7 @@ class Control:
 
     def let_go_on(self) -> None:
         """End a pause when a person asks for it. This does not end a hold before all is safe and the session
-        stands: the session has not said yet what happened, and without a pause it could not stand later."""
+        stands. Before that, the session has not said what happened, and it needs the pause in order to stand."""
         if not self.coming_to_stand:
             self.pause.clear()
 

@@ -1,7 +1,7 @@
 """SCPI in the box's firmware: messages from a byte stream, commands by name, an error queue.
 
-No input can make this raise: an error becomes an entry of the error queue (SCPI-1999 volume 2, chapter 21) and a
-bit of the event status register (IEEE 488.2, chapter 11).
+No input makes this raise an exception. Each error becomes an entry of the error queue (SCPI-1999 volume 2, chapter
+21) and a bit of the event status register (IEEE 488.2, chapter 11).
 """
 
 from __future__ import annotations

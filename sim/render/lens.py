@@ -5,8 +5,8 @@ Distortion is the Brown-Conrady model in OpenCV's order and sign (k1, k2, p1, p2
     x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-Lenses that are strangers to calibration (`sim.strangers`) have OpenCV's seven further terms: k4, k5, k6 divide the
-radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6, s1 to s4 add s1 r^2 + s2 r^4 to x and s3 r^2 + s4 r^4 to y.
+Lenses that are strangers to calibration (`sim.strangers`) have OpenCV's seven further terms: k4, k5 and k6 divide
+the radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6; s1 to s4 add s1 r^2 + s2 r^4 to x and s3 r^2 + s4 r^4 to y.
 
 The renderer needs the inverse, once per lens and for every pixel. It tests triangles along the true ray of each
 pixel. So edges of long triangles are curved in the picture, as they should be.

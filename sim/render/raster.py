@@ -249,8 +249,8 @@ def _move_corners(v, lens):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def _fill_triangle(v, box, member, lens, shift, rooks, top, nearest):  # type: ignore[no-untyped-def]
     """Z-buffer one triangle of camera coordinates, which lies within `box`, into a band of rows from `top` on. The
-    high bits of a pixel's value are its nearness, a positive float32 whose bits increase with it; the low bits are
-    the member's number, counted down so that the first of equals is the greatest."""
+    high bits of a pixel's value are its nearness, a positive float32 whose bits increase with it. The low bits are
+    the member's number, counted down, so that the first of equals is the greatest."""
     first_col, last_col = np.int64(box[0]), np.int64(box[1])
     first_row, last_row = max(np.int64(box[2]), top), min(np.int64(box[3]), top + len(nearest) - 1)
     a0, b0, c0 = _cross(v, 1, 2)

@@ -1,9 +1,10 @@
 """A reflectance of any form as a table for the renderer, in the angles of Rusinkiewicz, A new change of variables
 for efficient BRDF representation (1998).
 
-Axes are the angle theta_h of the half vector to the normal, dense near 0 where lobes are narrow, the angle theta_d
-of the light to the half vector, and the azimuth phi_d of the light about it. Reciprocity and the mirror symmetry
-of isotropic surfaces leave 0 to 90 degrees of phi_d. Values between the nodes are interpolated linearly.
+The table has three axes. theta_h is the angle between half vector and normal; its nodes are dense near 0, where
+lobes are narrow. theta_d is the angle between light and half vector. phi_d is the azimuth of the light about the
+half vector. Reciprocity and the mirror symmetry of isotropic surfaces leave 0 to 90 degrees of phi_d. Values
+between the nodes are interpolated linearly.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The simulated cell: one process, one reactor, and the stand-ins that share its state.
 
-`python -m sim.world.world` reads its configuration as one JSON line from standard input, prints its endpoints as
-one JSON line and serves until standard input closes (its parent has ended), a signal comes or it is told to stop.
+`python -m sim.world.world` reads its configuration as one JSON line from standard input, and prints its endpoints
+as one JSON line. It serves until standard input closes (because its parent has ended), a signal comes, or a client
+tells it to stop.
 """
 
 from __future__ import annotations

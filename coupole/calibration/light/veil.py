@@ -3,7 +3,7 @@
 A pixel shows its own light and a veil: sum over k of a_k (K_k * own)(x). K_0 is the same everywhere (the mean of
 the picture). The others are normal distributions of decreasing width, `WIDTHS` times the picture's width. Each has
 the sum 1 in the plane. Light from beyond the picture's edge is not known, and counts as zero. ISO 9358 measures
-the same figure as one number, the veiling glare index; Talvala et al. (SIGGRAPH 2007) and McCann and Rizzi (2007)
+the same figure as one number, the veiling glare index. Talvala et al. (SIGGRAPH 2007) and McCann and Rizzi (2007)
 show that the part which does not depend on the scene is smooth. So the veil is computed on blocks of pixels, far
 larger than any blur.
 """

@@ -132,8 +132,8 @@ def indirect_lux(
     arm_mm: NDArray[np.float64],
     bounces: int,
 ) -> NDArray[np.float32]:
-    """Return [sides, 3], lux of light that has met 1 to `bounces` - 1 surfaces. `arm_mm` are capsules in its
-    way."""
+    """Return [sides, 3], lux of light that comes from other surfaces: it has met at least 1 and at most `bounces`
+    - 1 of them. `arm_mm` are capsules in its way."""
     direct = irradiance(emitter, between.points_mm, between.normals, emission)
     lit = np.repeat(direct.astype(np.float32)[:, None], 3, axis=1)
     rows = np.arange(len(lit), dtype=np.int32)

@@ -6,13 +6,13 @@ when the beats end. The supervising thread itself gives a beat, when it has look
 never gives the beat, because it would live on beside a hung thread. The chain, from the arm backwards:
 
 ======================  =====================================  ======================  ==========================
-moves or shines         beaten by                              silent for at most      then
+part                    gets its beats from                    silent for at most      then
 ======================  =====================================  ======================  ==========================
 KUKA's RSI              each answer of the answering process   one cycle               the arm holds; after the
                                                                                        delay limit RSI stops
 the answering process   the thread that called `move_to`, by   `ATTENTION_S`           the axes brake on their
-(RSI), ur-rtde's        `measured` or `wait_settled`                                   path; a new motion is to
-process (UR)                                                                           be asked for
+(RSI), ur-rtde's        `measured` or `wait_settled`                                   path; a new motion must
+process (UR)                                                                           be requested
 KUKA's EKI program      the same thread, by a command BEAT     `ATTENTION_S`           the same, in the program
 UR's program            ur-rtde's process, by RTDE's watchdog  the rig's `watchdog_s`  the program ends, the
                                                                                        controller brakes

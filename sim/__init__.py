@@ -1,1 +1,1 @@
-"""Stand-ins for LED box, robot and camera at the other end of their wires, in one simulated world."""
+"""Stand-ins for LED box, robot and camera, at the other ends of their wires, in one simulated world."""

@@ -1,8 +1,8 @@
 """Alignments of the camera's clock with the light box's clock: which step each frame falls on under each of them.
 
 The compiled kernels of `coupole.acquisition.frame_matching`, whose docstring has the fault model, the terms and
-the proof. Times are int64 nanoseconds, frames counted from the first frame and steps from the first step that sent
-an edge; `view` and `steps_out` are int64 [frames]: the row of a step, or one of the codes below.
+the proof. Times are int64 nanoseconds. Frames are counted from the first frame, steps from the first step that
+sent an edge. `view` and `steps_out` are int64 [frames]: the row of a step, or one of the codes below.
 """
 
 from __future__ import annotations

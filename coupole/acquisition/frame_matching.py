@@ -42,7 +42,7 @@ UNLABELLED = -1
 
 @dataclass(frozen=True)
 class FaultModel:
-    """The faults that may occur in a burst without a wrong label (see the module's docstring)."""
+    """The faults that a burst may have without giving a wrong label (see the module's docstring)."""
 
     jitter_us: float = 100.0
     drift_ppm: float = 100.0

@@ -36,7 +36,7 @@ _SETTLES = 2.0
 
 
 class NotedDevice:
-    """A device whose calls are noted. Otherwise it is the same device."""
+    """A device whose calls are noted. In all else it behaves like the device itself."""
 
     def __init__(self, device: Any, kind: str, rig: Rig, made_safe: threading.Event) -> None:
         """`made_safe` is set before the lights are switched off and the arm is stopped at the end."""

@@ -98,7 +98,7 @@ class Control:
 
     def let_go_on(self) -> None:
         """End a pause when a person asks for it. This does not end a hold before all is safe and the session
-        stands: the session has not said yet what happened, and without a pause it could not stand later."""
+        stands. Before that, the session has not said what happened, and it needs the pause in order to stand."""
         if not self.coming_to_stand:
             self.pause.clear()
 
@@ -146,8 +146,8 @@ class Control:
         return self.hold_pending.is_set()
 
     def await_word(self) -> None:
-        """Wait until it is known why this process did not run for a while, if it did not. Call this before an arm
-        that stands is moved again."""
+        """Wait until the reason is known if this process did not run for a while. Call this before an arm that
+        stands is moved again."""
         if self.session is not None:
             self.session.await_word()
             return

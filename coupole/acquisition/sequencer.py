@@ -1,7 +1,7 @@
 """Runs a schedule: moves the arm, fires bursts, takes unproven shots again.
 
-Only this module, the arm supervisor and the burst runner command devices, always in the same order: arm at rest
-and measured, camera armed, lights; and the reverse order at the end. On every exit the devices are made safe
+Only this module, the arm supervisor and the burst runner command devices. The order is always the same: arm at
+rest and measured, camera armed, lights. At the end it is reversed. On every exit the devices are made safe
 (`coupole.acquisition.opened_cell`) before anything is written.
 """
 

@@ -119,9 +119,9 @@ def drop_signals() -> Iterator[None]:
 
 @contextmanager
 def obeyed_by(control: Control, act: Act, *, is_watched: bool = True) -> Iterator[None]:
-    """A signal that ends the session sets `control.stop` and calls `act` at once, in another thread; SIGUSR1
-    pauses the session or continues it; Ctrl-Z calls `act`, stops the process, and holds the session. `act` begins
-    to make the cell safe. It returns its `Safeguard`s, and sentences on devices that are perhaps not safe.
+    """Obey signals. A signal that ends the session sets `control.stop` and calls `act` at once, in another thread.
+    SIGUSR1 pauses the session or continues it. Ctrl-Z calls `act`, stops the process, and holds the session. `act`
+    begins to make the cell safe. It returns its `Safeguard`s, and sentences on devices that are perhaps not safe.
 
     Without `is_watched` another process watches the arm and the lamps. A freeze of this process then causes no
     hold.

@@ -6,9 +6,9 @@ normal matrix is summed block by block, so the full Jacobian is never built. Aft
 group is estimated from its residuals and its redundancy (Foerstner, Photogrammetric Engineering 1979; the iterated
 estimate is REML). The adjustment is repeated until the estimates no longer change.
 
-Two more results follow from the normal matrix: the contribution of each group to each parameter's variance (from C
-= C N C, where N is the sum over the groups), and the effective degrees of freedom of each standard uncertainty
-(Welch-Satterthwaite, GUM annex G.4).
+Two more results follow from the normal matrix. One is the contribution of each group to each parameter's variance
+(from C = C N C, where N is the sum over the groups). The other is the effective degrees of freedom of each
+standard uncertainty (Welch-Satterthwaite, GUM annex G.4).
 """
 
 from __future__ import annotations

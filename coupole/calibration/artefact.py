@@ -169,7 +169,7 @@ class Artefact(Model):
 
     name: Words
     serial: Words
-    """Serial number. A check refuses artefacts with a number that is in the records that it checks."""
+    """Serial number. A check refuses an artefact if its number is in one of the checked records."""
     certificate: Certificate | None = None
     temperature_c: Celsius = 20.0
     """Temperature for which the certified figures hold."""

@@ -109,7 +109,7 @@ def plane(frame: NDArray[Any], pattern: str, channel: Channel = "green") -> NDAr
 
     `pattern` has the names of the four pixels at the frame's top left, row by row; `MONO` has one channel. The
     value is a mean over the channel's pixels with the weights 1 2 1 in both directions. The weights of green
-    pixels always sum to 8, those of red and blue to 4, and are symmetric about each pixel, so the image is not
+    pixels always sum to 8, those of red and blue to 4. They are symmetric about each pixel, so the image is not
     shifted.
     """
     import cv2

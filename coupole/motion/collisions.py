@@ -233,9 +233,9 @@ class CellBodies:
         return kind == TOOL or not self._has_meshes
 
     def _required_mm(self, keep_mm: float, reach: Floats) -> float:
-        """Return the clearance of a pair: the rig's clearance, but at least the pair's possible approach under the
-        largest path deviation. `deviation_at_rest_mm` multiplies each axis' deviation by `reach_mm`; the pair
-        moves by the deviation times its own reach."""
+        """Return the clearance of a pair: the rig's clearance, but at least the distance by which the largest path
+        deviation can bring the pair closer. `deviation_at_rest_mm` multiplies each axis' deviation by `reach_mm`;
+        the pair moves by the deviation times its own reach."""
         share = np.divide(reach, self.reach_mm, out=np.zeros(6), where=self.reach_mm > 0.0)
         return max(keep_mm, self._keep.path_tolerance_mm * float(share.max()))
 

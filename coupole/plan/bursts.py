@@ -123,8 +123,9 @@ def burst_timing(
 ) -> BurstTiming:
     """Return the shortest times of a step that camera, LEDs and the given pace allow.
 
-    The LED is on for its rise, the exposure and a margin; the period is the longest of the camera's readout, the
-    exposure plus the sensor's gap, the LED's on-time plus a dark gap, and the limits of disk and heat.
+    The LED is on for its rise, the exposure and a margin. The period is the longest of these times: the camera's
+    readout, the exposure plus the sensor's gap, the LED's on-time plus a dark gap, and the limits of disk and
+    heat.
     """
     on_us = rise_us + exposure_us + EXPOSURE_MARGIN_US
     if not hardware:

@@ -158,8 +158,8 @@ class Chooser(Protocol):
 
 def bound_of(whole: Sequence[Burst], frames_of_light: int, again: Collection[int]) -> tuple[Burst, ...]:
     """Return the bound of a view whose bursts are chosen from `whole` (shortest exposure first). It has the
-    longest `frames_of_light` bursts with all LEDs, the longest two once more with the LEDs `again`, and marks and
-    dark frames for all further bursts that a view may have."""
+    longest `frames_of_light` bursts with all LEDs, and the longest two once more with the LEDs `again`. It also
+    has marks and dark frames for all further bursts that a view may have."""
     in_first = [burst for burst in whole if burst.repeat == 0]
     longest = in_first[-1]
     bursts = in_first[-frames_of_light:]

@@ -49,7 +49,7 @@ _WORDS = {
     "any_controller_by": "the first sender is taken for the controller",
     "without_realtime_by": "the arm may be answered at normal priority",
 }
-"""Settings of drivers that hold a person's name."""
+"""Settings whose value is the name of a person, with the permission that this person gives."""
 
 
 def described_arm(rig: Rig) -> ArmDescription | None:

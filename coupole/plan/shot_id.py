@@ -6,7 +6,7 @@
     top/led0417/e1/r2       the same light, second exposure, third time (the first repeat is not written)
     top/panel2/e0           flat panel 2
     top/dark3/e0            a dark frame or dark mark
-    top/led0417-watch3/e0   LED 417 as a sentinel, for the fourth time: it tells what changes, and is no shot
+    top/led0417-watch3/e0   LED 417 as a sentinel, for the fourth time: it shows changes, and is not a shot
     top/panel2-mark4/e0     a mark of a panel's burst: the panel shines there too, so it is not dark
 """
 

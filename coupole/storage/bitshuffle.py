@@ -58,9 +58,9 @@ def tile_shape(height_px: int, width_px: int) -> tuple[int, int]:
     """Return rows and columns of a tile. It has at most 256 x 512 pixels. All tiles have one size, with the least
     excess beyond the frame's edges.
 
-    Measured on frames of 4096 x 3072, from the disk: a window of 256 x 256 through all frames is read four times
-    faster than from tiles as wide as the frame (twice as fast if it lies across edges). A whole frame is read
-    equally fast.
+    This was measured on frames of 4096 x 3072, from the disk. A window of 256 x 256 through all frames is read
+    four times faster than from tiles as wide as the frame (twice as fast if it lies across edges). A whole frame
+    is read equally fast.
     """
 
     def share(size_px: int, most_px: int) -> int:

@@ -2,7 +2,7 @@
 
 ::
 
-    RESULT/beside/          only until the result is whole
+    RESULT/beside/          only until the result is complete
       samples.json          frames that the samples of each view were taken from; synced
       progress.json         progress, for people: written again and again, never synced
       lock                  locked by the process at work

@@ -105,7 +105,7 @@ class Status:
     """Light that the object may receive in its life, at the begin of the last session; None: no budget, or not
     known."""
     stopped_pid: int | None = None
-    """The process that has the run, if that process is stopped (Ctrl-Z, SIGSTOP)."""
+    """The process that uses the run, if it is stopped (Ctrl-Z, SIGSTOP); otherwise None."""
     go_on: str = ""
     """The command line that takes the remaining frames; empty if there are none, or while the run is in use."""
     before_that: str = ""

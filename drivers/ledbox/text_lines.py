@@ -36,7 +36,7 @@ _BOX_PATIENCE = 1.5
 _LOOK_S = 0.001
 """Machine time between two readings of the rig's clock during a flash."""
 _ENDED_AT_ONCE = 5
-"""Number of threads that may switch the lights off at the same time. Each ends the exchanges of the others."""
+"""Threads that may switch the lights off at the same time. Each ends the exchanges of the others."""
 _ENDINGS = {"lf": "\n", "crlf": "\r\n", "cr": "\r"}
 _FIELDS: dict[str, tuple[frozenset[str], frozenset[str]]] = {
     "on": (frozenset({"led"}), frozenset({"led", "on_ms"})),
@@ -200,8 +200,7 @@ class TextLineBox:
                 raise
 
     def lit(self) -> bool:
-        """False once the flash's time is over, even if the thread that ends it is late, because the box may have
-        ended it by itself."""
+        """False once the flash's time is over, because the box may have ended it before this driver's thread."""
         flash = self._flash
         return flash is not None and not flash.end_event.is_set() and not flash.deadline.has_expired
 

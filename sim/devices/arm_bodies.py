@@ -1,6 +1,6 @@
 """Parts of arm and tool that block light: capsules in the base frame.
 
-A separate and coarser model than the controller's own, computed with `kuka_kinematics` and `ur_arm`.
+This model is separate from the controller's own and coarser. It is computed with `kuka_kinematics` and `ur_arm`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ NONE: Capsules = np.empty((0, 7))
 
 
 class ToolBody(BaseModel):
-    """A capsule of what the flange carries, in the flange frame."""
+    """A capsule on the flange, in the flange frame."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -43,7 +43,7 @@ class ToolBody(BaseModel):
 
 
 def tool_capsules(base_from_flange: Transform, tool: Sequence[ToolBody]) -> Capsules:
-    """Capsules of the tool alone."""
+    """Return the capsules of the tool alone."""
     ends = np.array([[body.from_mm, body.to_mm] for body in tool]).reshape(-1, 2, 3)
     ends_in_base = ends @ base_from_flange[:3, :3].T + base_from_flange[:3, 3]
     return np.column_stack([ends_in_base.reshape(-1, 6), [body.radius_mm for body in tool]])

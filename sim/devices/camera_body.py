@@ -1,8 +1,8 @@
 """Parts common to all simulated cameras: trigger input, sensor timing, clock, counters.
 
-An edge that comes while the sensor is ready begins an exposure; one that comes too early is counted and ignored.
-Each exposure has a number, a frame id and a time on the camera's own clock. It is rendered on a worker thread and
-passed to the camera's *wire* in order, not before its readout has ended.
+An edge that comes while the sensor is ready begins an exposure. An edge that comes too early is counted and
+ignored. Each exposure has a number, a frame id and a time on the camera's own clock. It is rendered on a worker
+thread. It is passed to the camera's *wire* in order, but only after its readout has ended.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Exposed:
     """Light, pose and timing of one exposure, for the renderer."""
 
     seconds_of_led: dict[int, float]
-    """LED number to seconds at its tabulated flux: an LED with 10 % more flux counts 10 % longer."""
+    """Seconds at the tabulated flux by LED number. An LED with 10 % more flux counts 10 % longer."""
     panels: list[int]
     exposure_s: float
     gain: float
@@ -55,20 +55,22 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     render_every: Annotated[int, Field(ge=0)] = 1
-    """Every n-th frame is rendered, the others are left as they are; 0: none (dry runs)."""
+    """Every n-th frame is rendered; the others stay unchanged. 0: no frame is rendered (dry runs)."""
     render_once: bool = False
-    """Each slot is rendered when it is first used, and keeps that picture: for tests of speed."""
+    """True: each slot is rendered only when it is first used, and keeps that picture. This is for tests of
+    speed."""
     samples_per_side: Annotated[int, Field(ge=1, le=8)] = 1
-    """Rays through each pixel, k x k: for targets whose corners are located to a fraction of a pixel."""
+    """Rays through each pixel, k x k. Use several for targets whose corners are located to a fraction of a
+    pixel."""
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2, k3 of the true lens (Brown-Conrady, OpenCV's order), to be found by calibration."""
+    """k1, k2, p1, p2, k3 of the true lens (Brown-Conrady, OpenCV's order). A calibration has to find them."""
     blur: bool | None = None
-    """True if defocus and diffraction blur pictures; None: only if each pixel is shaded."""
+    """True if defocus and diffraction blur pictures. None: only if each pixel is shaded."""
     rim_radius: Annotated[float, Field(gt=0)] = 3.0
     rim_shift: Annotated[float, Field(ge=0)] = 4.0
     """Mechanical vignetting, as in `sim.optics.objective.Objective`."""
     lateral_colour: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Relative change of magnification in red, green and blue; only with `blur`."""
+    """Relative change of magnification in red, green and blue. It is used only with `blur`."""
     sensor: SensorModel = SensorModel()
     """The sensor's properties; Bayer pattern, bit depth and black level come from the rig."""
     sensor_temperature_c: float = 25.0
@@ -103,17 +105,17 @@ class Wire(Protocol):
         ...
 
     def pixels(self, slot: int) -> NDArray[np.uint16]:
-        """The slot's frame memory [h, w]."""
+        """Return the slot's frame memory [h, w]."""
         ...
 
     def send(self, shot: Shot) -> bool:
-        """Send a frame; False if that is not possible yet: `CameraBody.deliver` must then be called later."""
+        """Send a frame. False if this is not possible yet; `CameraBody.deliver` must then be called later."""
         ...
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Surroundings that the world provides to a camera: sensor timing, light, pose, scene."""
+    """The surroundings of a camera, which the world provides: sensor timing, light, pose, scene."""
 
     readout_us: float
     exposure_gap_us: float
@@ -131,19 +133,19 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class Triggering:
-    """Settings by which the camera takes triggers; the default is an exposure at each edge."""
+    """Settings by which the camera takes triggers. By default each edge starts an exposure."""
 
     delay_ns: int = 0
     divider: int = 1
     """Number n: only each n-th edge triggers."""
     latches: bool = False
-    """An early edge is remembered, and exposes as soon as the sensor is ready."""
+    """True: the camera remembers an early edge, and exposes as soon as the sensor is ready."""
     least_period_ns: int = 0
-    """Least time from one exposure's start to the next; 0: what the sensor needs."""
+    """Least time from one exposure's start to the next. 0: the time that the sensor needs."""
     most_frames: int = 0
-    """Number of exposures after which the acquisition is over; 0: never."""
+    """Number of exposures after which the acquisition ends; 0: never."""
     edges_to_start: int = 0
-    """First edges of a session, which start the acquisition and expose nothing."""
+    """Number of first edges of a session that start the acquisition and cause no exposure."""
 
 
 class CameraBody:
@@ -219,7 +221,7 @@ class CameraBody:
         return self.armed and self._reactor.now_ns >= self._next_start_ns()
 
     def _next_start_ns(self) -> int:
-        """The next exposure must not end before the last frame is read out."""
+        """Return the earliest start of the next exposure. It must not end before the last frame is read out."""
         return max(self._ready_ns, self._readout_until_ns - self.exposure_ns)
 
     def expose(self, t_ns: int) -> None:
@@ -287,8 +289,8 @@ class CameraBody:
         self._reactor.at(shot.deliver_ns, lambda: self._wait_for(working, session))
 
     def _wait_for(self, working: Future[None], session: int) -> None:
-        """Pause world time until a picture that is due is rendered, so that this machine's speed has no effect on
-        the simulated camera."""
+        """Pause world time until a picture that is due is rendered. So this machine's speed has no effect on the
+        simulated camera."""
         if session == self._session:
             wait([working], _RENDER_PATIENCE_S)
             self.deliver()
@@ -299,7 +301,7 @@ class CameraBody:
         self._reactor.call_threadsafe(self.deliver)
 
     def deliver(self) -> None:
-        """Pass finished frames to the wire, in order, not before their readout has ended."""
+        """Pass finished frames to the wire in order, each only after its readout has ended."""
         while self._pending and self._pending[0].ready:
             shot = self._pending[0]
             if shot.deliver_ns > self._reactor.now_ns:
@@ -321,7 +323,7 @@ class CameraBody:
         self.armed = True
 
     def disarm(self) -> None:
-        """End the session: pending frames are discarded, rendering has ended on return."""
+        """End the session. Pending frames are discarded, and rendering has ended on return."""
         self.armed = False
         self._session += 1
         self._workers.submit(lambda: None).result()

@@ -1,5 +1,4 @@
-"""Effects of a camera's own settings on the picture on its way out: region, binning, mirroring, look-up table,
-..."""
+"""Effects of a camera's own settings on the outgoing picture: region, binning, mirroring, look-up table, ..."""
 
 from __future__ import annotations
 
@@ -11,13 +10,13 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class PictureSettings:
-    """Settings of a camera with a Bayer pattern GBRG; the defaults change nothing but the region."""
+    """Settings of a camera with a Bayer pattern GBRG; the defaults change only the region."""
 
     left_px: int
     top_px: int
     width_px: int
     height_px: int
-    """The region is counted in pixels of the binned, decimated image."""
+    """Height of the region, counted in pixels of the binned, decimated image."""
     binning: tuple[int, int] = (1, 1)
     decimation: tuple[int, int] = (1, 1)
     """Across and down."""
@@ -25,7 +24,7 @@ class PictureSettings:
     """Left to right, and top to bottom."""
     gamma: float = 1.0
     inverts: bool = False
-    """The look-up table is in use; this camera's inverts."""
+    """True if the look-up table is in use. The table of this camera inverts the image."""
     balance: tuple[float, float] = (1.0, 1.0)
     """Factors on red and blue pixels."""
     test_pattern: bool = False
@@ -33,7 +32,7 @@ class PictureSettings:
 
 
 def read_out(frame: NDArray[np.uint16], settings: PictureSettings, white_dn: int) -> NDArray[np.uint16]:
-    """The image that leaves the camera, [height_px, width_px], from that of the sensor [h, w]."""
+    """Return the image that leaves the camera, [height_px, width_px], for the sensor's image [h, w]."""
     image = frame
     if settings.test_pattern:
         image = np.broadcast_to(np.arange(frame.shape[1], dtype=np.uint16), frame.shape)

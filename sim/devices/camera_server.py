@@ -1,4 +1,5 @@
-"""A simulated camera without a network: its frames are in a ring of page-aligned slots, shared with the host.
+"""A simulated camera without a network. Its frames are in a ring of page-aligned slots, which it shares with the
+host.
 
 Clients are notified of frames over a Unix socket and return the slots. `memory_camera` is the driver at the other
 end; the sensor is in `sim.devices.camera_body`.
@@ -66,7 +67,8 @@ _COMMAND: TypeAdapter[_Configure | _Arm | _Plain] = TypeAdapter(
 
 
 def _receive_message(client: socket.socket, size: int) -> bytes:
-    """The next message; empty if the client is gone. (Killed with unread messages, it resets the connection.)"""
+    """Return the next message; empty if the client is gone. (A client that is killed with unread messages resets
+    the connection.)"""
     try:
         return client.recv(size)
     except ConnectionResetError:
@@ -110,8 +112,8 @@ class CameraServer:
     # -- the wire (see sim.devices.camera_body.Wire) --------------------------------------------------------------
 
     def claim(self) -> int | None:
-        """A slot. If none is free the world pauses until the host returns one, so that the host's load has no
-        effect on the simulated camera."""
+        """Return a slot. If no slot is free, the world pauses until the host returns one. So the host's load has
+        no effect on the simulated camera."""
         patience_end = time.monotonic() + _HOST_PATIENCE_S
         while not self._free and self._stream is not None and time.monotonic() < patience_end:
             self._body.deliver()
@@ -146,7 +148,7 @@ class CameraServer:
         self._reactor.add_reader(client, lambda: self._welcome(client))
 
     def _welcome(self, client: socket.socket) -> None:
-        """A new client has said what it wants."""
+        """Handle the first message of a new client."""
         self._reactor.remove_reader(client)
         purpose = _receive_message(client, 64)
         if purpose == b"control" and self._control is None:
@@ -175,7 +177,7 @@ class CameraServer:
             self._drop_control()
 
     def _answer(self, data: bytes) -> dict[str, Any]:
-        """Do what the client asks for; what is no command is answered with an error."""
+        """Obey the client's command. Data that are not a command are answered with an error."""
         try:
             command = _COMMAND.validate_json(data)
         except ValidationError as error:
@@ -271,7 +273,7 @@ class CameraServer:
             self._stream = None
 
     def _drop_control(self) -> None:
-        """The client is gone: disarm."""
+        """Disarm the camera, because the client is gone."""
         self._end_session()
         self._drop_stream()
         if self._control is not None:
@@ -280,7 +282,7 @@ class CameraServer:
             self._control = None
 
     def unplug(self) -> None:
-        """Unplug the cable: the client is dropped, and no other can connect."""
+        """Unplug the cable: the client is dropped, and no other client can connect."""
         self._drop_control()
         self._reactor.remove_reader(self._listener)
         self._listener.close()

@@ -14,7 +14,7 @@ from sim.world.reactor import Reactor
 
 
 def _kind(settings: Any) -> str:
-    """Kind of stand-in that these settings are for; shared memory by default."""
+    """Return the kind of stand-in that these settings are for; shared memory by default."""
     return str(settings.get("kind", "memory") if isinstance(settings, dict) else settings.kind)
 
 
@@ -64,7 +64,7 @@ def build(
     frame_format: dict[str, Any],
     surroundings: Surroundings,
 ) -> tuple[CameraStandIn, dict[str, Any]]:
-    """The stand-in, and the driver settings with which a client reaches it.
+    """Return the stand-in, and the driver settings with which a client reaches it.
 
     `frame_format` has the fields of `coupole.devices.FrameFormat`.
     """

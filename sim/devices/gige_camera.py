@@ -1,9 +1,10 @@
-"""The simulated GigE Vision camera on loopback: sensor and trigger input here, control and stream in a process.
+"""The simulated GigE Vision camera on loopback. Sensor and trigger input are here; control and stream are in
+another process.
 
-That process (`gige_server`) speaks GVCP and GVSP with any client and holds the registers, which both can read;
-it may die, as a camera does, without harm to the world. Exposure, trigger and picture are simulated here
-(`camera_body`, `camera_picture`). Registers that clients wrote are polled: at every edge, and every few
-milliseconds of world time. While the link is busy, the world pauses.
+That process (`gige_server`) speaks GVCP and GVSP with any client, and holds the registers, which both processes
+can read. It may die, as a camera may, without harm to the world. Exposure, trigger and picture are simulated here
+(`camera_body`, `camera_picture`). Written registers are polled at every edge, and every few milliseconds of world
+time. While the link is busy, the world pauses.
 """
 
 from __future__ import annotations
@@ -51,14 +52,14 @@ class Settings(camera_body.Settings):
 
     kind: Literal["gige"] = "gige"
     address: str = "127.0.0.1"
-    """An address of the loopback interface. GigE Vision fixes the port (3956), so each has one camera."""
+    """An address of the loopback interface. Each camera needs its own: the port (3956) is fixed."""
     serial: Annotated[str, Field(pattern=r"^[\w-]{1,15}$")] = "SIM-1"
     first_frame_id: Annotated[int, Field(ge=1, le=65535)] = 65_401
-    """Near the last id, so that frame ids wrap in every longer run."""
+    """First frame id. It is near the last id, so that frame ids wrap in every longer run."""
     lost_packets: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Fraction of stream packets that are lost on the wire."""
     link_mb_per_s: Annotated[float, Field(gt=0)] = 1_000.0
-    """Rate of the wire in machine time; the world pauses for it."""
+    """Rate of the wire in machine time. The world pauses while the wire is busy."""
     temperature_c: float = 41.5
 
 
@@ -99,7 +100,7 @@ class GigeCamera:
     # -- power --------------------------------------------------------------------------------------------
 
     def _power_on(self, memory_fd: int) -> subprocess.Popen[bytes]:
-        """Start the camera's process. Raises DeviceRefused if its address cannot be had."""
+        """Start the camera's process. Raises DeviceRefused if its address is not available."""
         settings = self._settings
         own_socket, process_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         start = gige_server.Start(
@@ -264,7 +265,7 @@ class GigeCamera:
             self._show_counters()
 
     def _exposure(self) -> tuple[int, float]:
-        """Exposure time in ns, and gain as a factor; automatic ones are twice what is set."""
+        """Return the exposure time in ns, and the gain as a factor. Automatic values are twice the set ones."""
         registers = self._registers
         exposure_ns = round(registers.real(reg.EXPOSURE_US) * 1e3)
         exposure_ns *= 1 + bool(registers.integer(reg.EXPOSURE_AUTO))
@@ -304,7 +305,7 @@ class GigeCamera:
     # -- the wire (see sim.devices.camera_body.Wire) --------------------------------------------------------------
 
     def claim(self) -> int | None:
-        """A slot. If none is free the world pauses until the link has taken a frame."""
+        """Return a slot. If no slot is free, the world pauses until the link has taken a frame."""
         patience_end_s = time.monotonic() + _PATIENCE_S
         while not self._free and self._body.armed and time.monotonic() < patience_end_s:
             self._body.deliver()
@@ -315,7 +316,7 @@ class GigeCamera:
         return self._frames[slot]
 
     def send(self, shot: Shot) -> bool:
-        """Encode a frame and hand it to the camera's process, as soon as that has room for an image."""
+        """Encode a frame, and pass it to the camera's process as soon as that has room for an image."""
         patience_end_s = time.monotonic() + _PATIENCE_S
         while not self._free_on_wire:
             self._look()

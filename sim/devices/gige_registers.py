@@ -1,7 +1,8 @@
-"""Registers of the simulated GigE Vision camera: where they are, and which values a client may write.
+"""Registers of the simulated GigE Vision camera: their addresses, and the values that a client may write.
 
-Clients read and write them over the wire, in the camera's own process (`gige_server`); the world reads them in
-shared memory and writes its own there. No register is written from both sides. Needs only the standard library.
+Clients read and write them over the wire, in the camera's own process (`gige_server`). The world reads them in
+shared memory, and writes its own registers there. No register is written from both sides. This module needs only
+the standard library.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ SESSION = 0x1150
 EXPOSURE_MODE, EXPOSURE_AUTO, GAIN_AUTO, GAIN_SELECTOR = 0x1154, 0x1158, 0x115C, 0x1160
 GAMMA_ENABLE, LUT_ENABLE, BALANCE_SELECTOR, LINE_INVERTER = 0x1164, 0x1168, 0x116C, 0x1170
 TRIGGER_SELECTOR, TRIGGER_MODE, TRIGGER_SOURCE = 0x1180, 0x1184, 0x118C
-"""Mode and source are two registers each: those of AcquisitionStart, then those of FrameStart."""
+"""Mode and source are two registers each: one for AcquisitionStart, one for FrameStart."""
 TRIGGER_ACTIVATION, TRIGGER_OVERLAP, TRIGGER_DIVIDER, TRIGGER_SOFTWARE = 0x1194, 0x1198, 0x119C, 0x11A0
 TRIGGERS = 0x11A4
 """Counts software triggers."""
@@ -119,16 +120,16 @@ class Writable:
     high: float
     step: int = 0
     size: int = 4
-    """8: a float."""
+    """Size in bytes; 8 is a float."""
     is_locked: bool = False
-    """Not while the camera acquires."""
+    """True if clients may not write it while the camera acquires."""
     most: Callable[[Registers], float] | None = None
     """Upper limit that depends on other registers."""
     among: frozenset[int] = frozenset()
-    """All values that there are; empty: all between `low` and `high`."""
+    """All allowed values; empty: all values between `low` and `high`."""
 
     def allows(self, number: float, registers: Registers) -> bool:
-        """False for a number out of the limits, and for what is no number."""
+        """Return False for a number out of the limits, and for a value that is not a number."""
         high = self.high if self.most is None else min(self.high, self.most(registers))
         if not self.low <= number <= high or (self.among and number not in self.among):
             return False
@@ -200,7 +201,8 @@ WRITABLE: dict[int, Writable] = {
 
 
 def refusal(registers: Registers, address: int, data: bytes) -> int:
-    """Status with which the camera refuses `data` for the register at `address`; DONE if it takes them."""
+    """Return the status with which the camera refuses `data` for the register at `address`; DONE if it accepts
+    them."""
     if address % 4 or len(data) % 4:
         return BAD_ALIGNMENT
     if not 0 <= address <= REGISTER_BYTES - len(data):

@@ -1,11 +1,12 @@
 """The network end of the simulated GigE Vision camera, in a process of its own: control (GVCP) and stream (GVSP).
 
 `python -S -m sim.devices.gige_server` with one argument, the JSON form of `Start`. Registers and images are in
-memory shared with the world, which tells over a socket what to send; this process answers clients at any time,
-also while the world pauses. It refuses what is out of the camera's limits with the protocol's status codes
-(GigE Vision 1.2: chapters 16 and 18, GVCP; 22 to 24, GVSP). Needs only the standard library, to start quickly.
+memory shared with the world, which tells over a socket what to send. This process answers clients at any time,
+even while the world pauses. It refuses values out of the camera's limits with the protocol's status codes (GigE
+Vision 1.2: chapters 16 and 18, GVCP; 22 to 24, GVSP). It needs only the standard library, so that it starts
+quickly.
 
-If this process ends, the world has lost its camera and nothing else.
+If this process ends, the world loses only its camera.
 """
 
 from __future__ import annotations
@@ -26,16 +27,16 @@ from sim.devices import gige_registers as reg
 from sim.devices.gige_registers import Registers
 
 PORT = 3956
-"""Fixed by GigE Vision."""
+"""Port that GigE Vision fixes."""
 BROADCASTS = ("255.255.255.255", "127.255.255.255")
 """Addresses at which clients look for cameras."""
 SEND = struct.Struct("<BIIQQ6I")
-"""Order of the world to send an image: what it does, slot, session, frame id, timestamp ns, width, height, left,
-top, pixel format, bytes."""
+"""Message of the world to send an image: verb, slot, session, frame id, timestamp ns, width, height, left, top,
+pixel format, bytes."""
 LOSE_PACKETS, LOSE_CONTROL = struct.Struct("<Bd"), struct.Struct("<B")
 DOES_SEND, DOES_LOSE_PACKETS, DOES_LOSE_CONTROL = 1, 2, 3
 SENT = struct.Struct("<I")
-"""Camera to world: the slot that may be used again."""
+"""Message from camera to world: the slot that may be used again."""
 
 _KEY = 0x42
 _HEADER = struct.Struct(">BBHHH")
@@ -47,7 +48,7 @@ _DISCOVERY_BYTES, _MOST_BYTES = 0xF8, 576
 _LEADER, _TRAILER, _PAYLOAD = 1, 2, 3
 _IMAGE = 1
 _HEADERS_BYTES = 20 + 8 + 8
-"""IP, UDP and GVSP headers, which count to the packet's size."""
+"""Bytes of the IP, UDP and GVSP headers, which are part of the packet's size."""
 _LISTEN_S = 0.1
 
 
@@ -144,7 +145,7 @@ class GigeServer:
     # -- control ------------------------------------------------------------------------------------------
 
     def _answer(self, port: socket.socket) -> None:
-        """One datagram of a client. Data that are not a command are ignored."""
+        """Answer one datagram of a client. Data that are not a command are ignored."""
         data, client = port.recvfrom(2048)
         if len(data) < _HEADER.size or data[0] != _KEY:
             return
@@ -161,7 +162,7 @@ class GigeServer:
                 self._ports[0].sendto(head + answer, client)
 
     def _obey(self, command: int, content: bytes, client: tuple[str, int]) -> tuple[int, bytes]:
-        """Status and content of the acknowledgement."""
+        """Return status and content of the acknowledgement."""
         if command == _DISCOVERY:
             return reg.DONE, self._registers.read_bytes(0, _DISCOVERY_BYTES)
         if command == _READ_REGISTERS and content and len(content) % 4 == 0:
@@ -238,8 +239,8 @@ class GigeServer:
         self._registers.set_integer(reg.SESSION, self._sessions if on else 0)
 
     def _fit_image(self) -> None:
-        """A side of the image that reaches beyond what the sensor gives is set to all that it gives; a smaller one
-        stays as it is.
+        """Set a side of the image to the whole side if it reaches beyond the sensor's image. A smaller side stays
+        unchanged.
         """
         registers = self._registers
         for size, offset, most, step in (
@@ -251,13 +252,13 @@ class GigeServer:
                 registers.set_integer(size, most - most % step)
 
     def _watch_controller(self) -> None:
-        """Drop a client that has been silent for the heartbeat's time."""
+        """Drop a client that was silent for the heartbeat's time."""
         limit_s = self._registers.integer(reg.HEARTBEAT_MS) / 1e3
         if self._controller is not None and time.monotonic() > self._heard_s + limit_s:
             self._release()
 
     def _release(self) -> None:
-        """Stop the camera when it has no client; its settings stay."""
+        """Stop the camera when it has no client. Its settings stay."""
         self._controller = None
         for address in (reg.CONTROL_PRIVILEGE, reg.ACQUISITION, reg.HOST_PORT):
             self._registers.set_integer(address, 0)
@@ -270,7 +271,7 @@ class GigeServer:
         return (self._registers.integer(reg.PACKET_SIZE) & 0xFFFF) - _HEADERS_BYTES
 
     def _send(self, image: _Image) -> None:
-        """Send an image, unless its acquisition has ended; then its slot is free."""
+        """Send an image, unless its acquisition has ended; its slot is then free."""
         if image.session == self._registers.integer(reg.SESSION):
             leader = struct.pack(
                 ">HHQIIIIIHH",

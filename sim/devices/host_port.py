@@ -7,19 +7,21 @@ import secrets
 import socket
 
 _PORTS = range(20_000, 32_000)
-"""Below those that the system hands out by itself: nobody gets one by chance before the driver binds it."""
+"""Ports below those that the system assigns by itself. So no program gets one by chance before the driver binds
+it."""
 
 
 class HostPort:
     """An address to which the arm of one world only sends, until it is closed or its process ends.
 
-    The host binds the port itself, so no world can. Two arms that sent to one port would both reach whichever host
-    is there: it moves the arm that it hears first, and its own camera looks from where its own arm stands. So the
-    port is claimed by the name of a socket (unix(7), abstract), which the kernel gives to one process at a time.
+    The host binds the port itself, so no world can bind it. If two arms sent to one port, both would reach the
+    same host. The host would move the arm that it hears first, but its camera would look from its own arm. So the
+    port is claimed by the name of a socket (unix(7), abstract), which the kernel gives to only one process at a
+    time.
     """
 
     def __init__(self, address: str) -> None:
-        """`host:port`; port 0 stands for a free one. Raises OSError (EADDRINUSE) if another world has this one."""
+        """`host:port`; port 0 means a free one. Raises OSError (EADDRINUSE) if another world has this port."""
         self._host, port = address.rsplit(":", 1)
         while not (claim := self._claim(int(port) or secrets.choice(_PORTS), probe=port == "0")):
             if port != "0":
@@ -34,7 +36,7 @@ class HostPort:
         self._socket.close()
 
     def _claim(self, port: int, *, probe: bool) -> tuple[socket.socket, int] | None:
-        """None if another world has it, or, if `probe`, any other program."""
+        """Claim the port. None if another world has it, or, with `probe`, if any other program has it."""
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
             claim.bind(f"\0coupole-arm-sends-to-{port}")

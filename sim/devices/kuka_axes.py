@@ -19,15 +19,15 @@ from sim.devices.kuka_settings import Box, Settings, Sphere, Workspace
 
 _NOWHERE: tuple[float, ...] = (0.0,) * 6
 _TOLERANCE_DEG = 2e-6
-"""Corrections have six decimals."""
+"""Tolerance, because corrections have six decimals."""
 _STILL_DEG = 1e-5
-"""Vibration below this counts as none: packets have four decimals."""
+"""Vibration below this counts as none, because packets have four decimals."""
 
 Axes6 = tuple[float, ...]
 
 
 class Axes:
-    """See the module. Call `follow`, `brake` or `stay` once per cycle; times are world time."""
+    """The axes of one controller. Call `follow`, `brake` or `stay` once per cycle; times are world time."""
 
     def __init__(self, settings: Settings, now_ns: int) -> None:
         self.commanded_deg: Axes6 = settings.start_joints_deg
@@ -60,14 +60,15 @@ class Axes:
         return tuple(map(float.__add__, self.commanded_deg, away_deg))
 
     def settled_since_ns(self, now_ns: int) -> int | None:
-        """World time since which the arm is still; None while it moves or vibrates."""
+        """World time since which the arm has been still; None while it moves or vibrates."""
         if self._stood_ns is None or self._swinging(now_ns):
             return None
         swings_s = self._swings_s if any(self._swing_deg) else 0.0
         return self._stood_ns + round(swings_s * 1e9)
 
     def follow(self, target_deg: Axes6, now_ns: int) -> str:
-        """Move to the target in this cycle. If the controller would stop, nothing moves: returns the reason."""
+        """Move to the target in this cycle. If the controller would stop, nothing moves, and the reason is
+        returned."""
         wanted_deg = tuple(map(float.__sub__, target_deg, self.commanded_deg))
         step_deg, fault = self._within_dynamics(wanted_deg)
         if step_deg != wanted_deg:
@@ -79,11 +80,12 @@ class Axes:
         return fault
 
     def stay(self, now_ns: int) -> None:
-        """One cycle at rest."""
+        """Make one cycle at rest."""
         self._go(self.commanded_deg, _NOWHERE, now_ns)
 
     def brake(self, now_ns: int) -> bool:
-        """One cycle of the controller's own stop; True once the axes are at rest and the brakes closed."""
+        """Make one cycle of the controller's own stop. True once the axes are at rest and the brakes are
+        closed."""
         change_deg = self._settings.brake_deg_s2 * (self._settings.cycle_ms / 1e3) ** 2
         step_deg = tuple(math.copysign(max(0.0, abs(s) - change_deg), s) for s in self._step_deg)
         self._go(tuple(map(float.__add__, self.commanded_deg, step_deg)), step_deg, now_ns)

@@ -3,11 +3,11 @@
 In every cycle of world time it applies the client's last answer and sends the axes. It stops as the real one does
 on: limits of axes and corrections, corrections that are too fast, poses without solution, workspaces, late
 answers, a silent client, an emergency stop. Then the brakes close, and the arm stays where it is until the RSI
-program is restarted. An answer with the stop element ends the program without a fault. `tell` gets each
-refusal with its reason, because the client itself only sees that packets stop.
+program is restarted. An answer with the stop element ends the program without a fault. `tell` gets each refusal
+with its reason, because the client itself sees only that packets stop.
 
-In lock-step the world waits for each answer, so a client on a busy machine is never late; late answers are then
-produced only by the fault script (`late`).
+In lock-step the world waits for each answer, so a client on a busy machine is never late. Then only the fault
+script (`late`) causes late answers.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ALIKE = ("corrects", "mode", "sen_type", "measured_tag", "correction_tag", "stop
 """Settings that must be equal at both ends of the wire; the driver's settings have the same names."""
 _FIRST_IPOC = 4208163634
 _SEND_AGAIN_S = 0.05
-"""Lock-step: an unanswered packet is sent again after this machine time."""
+"""An unanswered packet is sent again after this machine time, if the world runs in lock-step."""
 
 
 class _Does(Enum):
@@ -46,7 +46,7 @@ class _Does(Enum):
 
 
 class KukaController:
-    """See the module. All methods must be called on the reactor's thread."""
+    """One controller. All methods must be called on the reactor's thread."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class KukaController:
         tell: Callable[[str], None] = untold,
         stranger: ArmStranger = NO_STRANGER,
     ) -> None:
-        """`tell` gets a line for everything that is refused."""
+        """`tell` gets a line for every refusal."""
         self.fault = ""
         """Reason why RSI stopped; empty while it runs or waits for a client."""
         self.ended_programs = 0
@@ -174,7 +174,8 @@ class KukaController:
         self._timer = self._reactor.at(self._reactor.now_ns + self._cycle_ns, self._cycle)
 
     def _sends(self) -> bool:
-        """True if packets are sent: after a lost link only from `_changes_ns` on, after an E-stop until then."""
+        """True if packets are sent. After a lost link they are sent only from `_changes_ns` on, after an E-stop
+        until then."""
         ending = self._does is _Does.REST or (self._does is _Does.BRAKE and self._after_braking is _Does.REST)
         return ending == (self._reactor.now_ns < self._changes_ns)
 
@@ -202,7 +203,7 @@ class KukaController:
             self._end_program()
 
     def _take_answer(self) -> tuple[float, ...] | None:
-        """The corrections that answer the last packet; None if they are late or the client has left."""
+        """Return the corrections that answer the last packet; None if they are late or the client has left."""
         expected_ipoc = self._ipoc - self._ipoc_step
         while True:
             try:
@@ -235,15 +236,15 @@ class KukaController:
                 return answer.values
 
     def _patience_s(self) -> float:
-        """Machine time left for an answer. In real time it is one cycle from its packet on, also when the world is
-        late and runs several cycles in a row."""
+        """Machine time left for an answer. In real time it is one cycle from the answer's packet on, even if the
+        world is late and runs several cycles in a row."""
         settings = self._settings
         cycle_s = settings.cycle_ms / 1e3 / self._reactor.clock.speed
         allowed_s = settings.answer_limit_s if settings.lock_step else cycle_s
         return max(0.0, self._sent_s + allowed_s - time.monotonic())
 
     def _look_for_client(self) -> None:
-        """Any answer to a packet of the present RSI program run begins a session."""
+        """Begin a session at any answer to a packet of the present run of the RSI program."""
         if self._axes.brakes_closed:
             self._release_axes()  # the program was restarted
         answer = None
@@ -272,7 +273,8 @@ class KukaController:
         self._brake(then, seconds)
 
     def _end_program(self) -> None:
-        """The client has ended the program: no fault. The stand-in starts it again, in place of a person."""
+        """End the program without a fault, as the client asked. The stand-in then restarts it, in place of a
+        person."""
         self.ended_programs += 1
         self._brake(_Does.WAIT, self._settings.restart_s)
 

@@ -46,8 +46,8 @@ class Corrections:
         return axis_names
 
     def take(self, values: Axes6 | None) -> tuple[Axes6, str]:
-        """Target axes after one cycle's correction, and the reason if RSI stops instead. `values` is None if none
-        came in time (HOLDON)."""
+        """Return the target axes after one cycle's correction, and the reason if RSI stops instead. `values` is
+        None if no correction came in time (HOLDON)."""
         if values is None:
             values = self._last if self._holds else _NOTHING
         self._last = values

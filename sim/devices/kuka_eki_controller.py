@@ -1,8 +1,8 @@
 """The stand-in for a KUKA controller with the EthernetKRL programs of `configs/kuka/eki`: XML over TCP.
 
-Like them it has two parts: one takes commands and sends statuses at a steady rate, also while the robot program is
-in a fault; the other runs point-to-point motions, and brakes when a new command comes. The axes are computed from
-world time, not in steps, so they are exact at any world speed.
+Like these programs it has two parts. One takes commands and sends statuses at a steady rate, even while the robot
+program is in a fault. The other runs point-to-point motions, and brakes when a new command comes. The axes are
+computed from world time, not in steps, so they are exact at any world speed.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ class Settings(BaseModel):
 
     kind: Literal["eki"] = "eki"
     address: str = Field(default="127.0.0.1:0", pattern=r"^[^:]+:\d+$")
-    """host:port to listen at, or to connect to; port 0: any free port, see `KukaEkiController.address`."""
+    """host:port to listen at, or to connect to. Port 0 means any free port; see `KukaEkiController.address`."""
     controller_is: Literal["server", "client"] = "server"
     status_ms: int = Field(default=20, ge=4)
     beat_s: float = Field(default=0.1, gt=0)
-    """A motion without a command for this long ends. Counted on the machine's clock: whoever watches lives by that
-    one, and a world may run faster."""
+    """A motion ends if no command comes for this time. It is counted on the machine's clock, because the
+    supervisor uses that clock, and a world may run faster."""
     ping_s: float = Field(default=0.2, gt=0)
     """World time after which the controller detects a dead link, and brakes."""
     write_limit_s: float = Field(default=2.0, gt=0)
@@ -69,7 +69,7 @@ class Settings(BaseModel):
 
 
 class KukaEkiController:
-    """See the module. All methods must be called on the reactor's thread."""
+    """One controller. All methods must be called on the reactor's thread."""
 
     def __init__(self, reactor: Reactor, settings: Settings, stranger: ArmStranger = NO_STRANGER) -> None:
         self.fault = ""
@@ -98,7 +98,7 @@ class KukaEkiController:
         self._heard_s = 0.0
         """Machine time of the last command."""
         self._watched = self._lapsed = 0
-        """Number of the MOVE that is under way, and of the last one that ended because no command came."""
+        """Number of the present MOVE, and of the last one that ended because no command came."""
         self._target: tuple[tuple[float, ...], float] | None = None
         """Axes and speed (fraction of the highest) of the motion to begin once the axes are at rest."""
         self._client: socket.socket | None = None
@@ -106,7 +106,7 @@ class KukaEkiController:
         self._unsent = b""
         """The rest of a status that did not fit into the send buffer."""
         self._left_behind = False
-        """The client has not read for as long as the world waits for it."""
+        """True if the client has not read for as long as the world waits for it."""
         self._cut = False
         """True while `lose_link` blocks all communication."""
         self._healing: Timer | None = None
@@ -145,7 +145,7 @@ class KukaEkiController:
         self.fault = ""
 
     def lose_link(self, seconds: float) -> None:
-        """Block all communication for `seconds`; the axes brake, then the controller accepts a connection."""
+        """Block all communication for `seconds`. The axes brake, then the controller accepts a connection."""
         self._unlisten()
         self._reactor.after(self._settings.ping_s, self._abandon)
         if self._healing is not None:
@@ -227,7 +227,7 @@ class KukaEkiController:
             self._drop()
 
     def _drop(self) -> None:
-        """The client has left, or sends something else than commands."""
+        """Drop the client: it has left, or sends data that are not commands."""
         self._hang_up()
         self._abandon()
         if self._listener is None:
@@ -286,8 +286,8 @@ class KukaEkiController:
         self._timer = self._reactor.after(self._settings.status_ms / 1e3, self._cycle)
 
     def _send(self, status: bytes) -> None:
-        """A client that has not read for `write_limit_s` does not hold up the world any more. Until it reads it
-        misses statuses; each status that it gets is complete.
+        """Send a status. A client that has not read for `write_limit_s` no longer delays the world. Until it
+        reads, it misses statuses; each status that it gets is complete.
         """
         assert self._client is not None
         self._unsent = self._unsent or status
@@ -335,7 +335,7 @@ class KukaEkiController:
             self._stand()
 
     def _stand(self) -> None:
-        """The axes have come to rest."""
+        """Note that the axes have come to rest."""
         self._end = None
         self._motion = standing(self._motion.joints_deg(self._motion.duration_s))
         if self.settled_since_ns is None:

@@ -12,7 +12,7 @@ _LONGEST_MESSAGE_BYTES = 4096
 
 
 class Messages:
-    """Splits a stream of documents: they become children of one that never ends."""
+    """Splits a stream of documents, which become children of a document that never ends."""
 
     def __init__(self) -> None:
         self._parser = _new_parser()
@@ -21,7 +21,8 @@ class Messages:
         self._open_bytes = 0
 
     def messages(self, data: bytes) -> list[ElementTree.Element]:
-        """Messages that `data` complete. Raises ParseError for what is no XML, ValueError for an endless one."""
+        """Return the messages that `data` complete. Raises ParseError for data that are not XML, ValueError for an
+        endless message."""
         self._parser.feed(data)
         elements = [
             element for event, element in self._parser.read_events() if event == "end" and element.tag == "Coupole"
@@ -39,7 +40,7 @@ def _new_parser() -> Any:
 
 @dataclass(frozen=True)
 class Command:
-    """One message, its numbers within the limits of the controller's program."""
+    """One message. Its numbers are within the limits of the controller's program."""
 
     session: int
     number: int
@@ -50,7 +51,7 @@ class Command:
 
     @staticmethod
     def of(message: ElementTree.Element) -> Command:
-        """Raises KeyError for a message that lacks something, ValueError for a number out of its limits."""
+        """Read a message. Raises KeyError if it lacks an element, ValueError for a number out of its limits."""
         values = {f"{child.tag}/{name}": value for child in message for name, value in child.items()}
         largest = 2**31 - 1
         asks = values["Command/Verb"] in (str(ASK), str(BEAT))

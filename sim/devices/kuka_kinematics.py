@@ -78,7 +78,7 @@ class PoseErrors:
     absolute_mm: float
     absolute_deg: float
     stranger: ArmStranger = NO_STRANGER
-    """Errors that depend on where the arm is and from where it came."""
+    """Errors that depend on the arm's present and previous place."""
 
     def base_error_mm(self) -> NDArray[np.float64]:
         """[3]."""
@@ -91,8 +91,8 @@ class PoseErrors:
     def true_flange_pose(
         self, joints_deg: Sequence[float], stop: int, came_from_deg: Sequence[float] | None = None
     ) -> Transform:
-        """True `base_from_flange` at the reported angles, in the arm's stop number `stop`; `came_from_deg` are
-        those from which it came, None: these."""
+        """Return the true `base_from_flange` at the reported angles, in the arm's stop number `stop`.
+        `came_from_deg` are the previous angles; None: the same angles."""
         error_deg = self.axis_zero_error_deg()
         if self.stranger != NO_STRANGER:
             flange, origins_mm, axes = _chain(joints_deg)

@@ -1,4 +1,4 @@
-"""Point-to-point motion as planned by a robot controller: synchronised axes, limited acceleration and jerk.
+"""Point-to-point motion as a robot controller plans it: synchronised axes, limited acceleration and jerk.
 
 The axes move on a straight line in joint space, along which a path parameter runs from 0 to 1. Its speed,
 acceleration and jerk are limited by the most restrictive axis. Written independently of the library that
@@ -16,7 +16,7 @@ State = tuple[float, float, float]
 
 
 _LEAST_MOTION_DEG = 1e-6
-"""Motions below this, a controller's resolution, are not made."""
+"""Least motion that is made; it is a controller's resolution."""
 
 
 @dataclass(frozen=True)

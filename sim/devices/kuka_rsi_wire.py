@@ -24,20 +24,20 @@ class Answer(NamedTuple):
     values: tuple[float, ...]
     """Six corrections, degrees or millimetres; a missing one is 0."""
     stops: bool = False
-    """The program is to end."""
+    """True if the program is to end."""
     remark: str = ""
-    """Remark about what the client may not have meant; empty if all is as configured."""
+    """Remark about a possible mistake of the client; empty if all is as configured."""
 
 
 class Unread(NamedTuple):
-    """Something that is no answer to this controller."""
+    """Data that are not an answer to this controller."""
 
     reason: str
     details: str
 
 
 def answer_reader(settings: Settings) -> Callable[[bytes], Answer | Unread]:
-    """A parser of answers."""
+    """Return a parser of answers."""
     tag = re.escape(settings.correction_tag or TAGS[settings.corrects]).encode()
     names = [name.encode() for name in VALUE_NAMES[settings.corrects]]
     begins = re.compile(rb'<Sen\b[^>]*\bType="%s"' % re.escape(settings.sen_type).encode())
@@ -68,7 +68,7 @@ def answer_reader(settings: Settings) -> Callable[[bytes], Answer | Unread]:
 
 
 def _finite(texts: Iterable[bytes]) -> tuple[float, ...]:
-    """Raises ValueError for what is no number, or none that an axis can have."""
+    """Return the numbers. Raises ValueError for text that is not a number, or that no axis can have."""
     numbers = tuple(map(float, texts))
     if not all(map(math.isfinite, numbers)):
         raise ValueError(numbers)
@@ -76,7 +76,7 @@ def _finite(texts: Iterable[bytes]) -> tuple[float, ...]:
 
 
 class PacketWriter:
-    """Forms packets; the part with the axes is formatted again only when they have moved."""
+    """Forms packets. The part with the axes is formatted again only when they have moved."""
 
     def __init__(self, settings: Settings) -> None:
         axes = " ".join(f'A{axis}="%.4f"' for axis in range(1, 7))

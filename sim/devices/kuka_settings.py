@@ -40,7 +40,7 @@ Workspace = Annotated[Box | Sphere, Field(discriminator="kind")]
 
 class Limits(_Model):
     """Objects of the RSI context that limit corrections, counted from where RSI was started. AXISCORR and POSCORR
-    clamp without a message, the monitors stop RSI. The defaults are those of `configs/kuka/rsi/context.md`."""
+    clamp without a message; the monitors stop RSI. The defaults are those of `configs/kuka/rsi/context.md`."""
 
     axis_clamp_deg: Six = (341.0, 236.0, 277.0, 371.0, 241.0, 701.0)
     axis_monitor_deg: Six = (340.0, 235.0, 276.0, 370.0, 240.0, 700.0)
@@ -59,34 +59,34 @@ class Settings(_Model):
     sends_to: str = Field(default="127.0.0.1:49152", pattern=r"^[^:]+:\d+$")
     cycle_ms: Literal[4, 12] = 4
     ipoc_step: int = Field(default=0, ge=0)
-    """Increment of the IPOC; 0: the cycle in ms, as on real controllers."""
+    """Increment of the IPOC. 0 means the cycle in ms, as on real controllers."""
     sen_type: str = "ImFree"
     """SENTYPE: answers of another type are ignored."""
     measured_tag: str = Field(default="AIPos", pattern=_TAG)
     delay_tag: str = Field(default="Delay", pattern=_TAG + "|^$")
-    """Empty: the counter of late answers is not sent."""
+    """Name of the counter of late answers. Empty means that it is not sent."""
     correction_tag: str = Field(default="", pattern=_TAG + "|^$")
-    """Empty: AKorr for axes, RKorr for the pose."""
+    """Element of the corrections. Empty means AKorr for axes, RKorr for the pose."""
     stop_tag: str = Field(default="Stop", pattern=_TAG + "|^$")
-    """The element that ends the RSI program; empty: none does."""
+    """The element that ends the RSI program. Empty means that there is none."""
     sends_pose: bool = False
     """Packets also carry RIst, the flange's pose."""
 
     corrects: Literal["axes", "pose"] = "axes"
     mode: Literal["absolute", "relative"] = "absolute"
     hold_on: bool | None = None
-    """HOLDON of the corrections: in a cycle without answer the last one is kept, else zero is applied. None
-    selects the right one for the mode: on for absolute, off for relative.
+    """HOLDON of the corrections: in a cycle without an answer, the last correction is kept, otherwise zero is
+    applied. None selects the right value for the mode: on for absolute, off for relative.
     """
     limits: Limits = Limits()
 
     lock_step: bool = True
     answer_limit_s: float = Field(default=2.0, gt=0)
-    """Lock-step: longest pause of the world, in machine time, for an answer, before the client counts as gone."""
+    """Longest pause of the world for an answer in lock-step, in machine time. Then the client counts as gone."""
     delay_limit: int = Field(default=100, ge=1)
-    """Late answers at which RSI stops with KSS29002."""
+    """Number of late answers at which RSI stops with KSS29002."""
     delay_counts: Literal["cumulative", "consecutive"] = "cumulative"
-    """Way of counting late answers; which of the two applies to real controllers is not known."""
+    """Way of counting late answers. It is not known which of the two real controllers use."""
     packets_after_estop_s: float = Field(default=0.5, ge=0)
     restart_s: float = Field(default=1.0, gt=0)
     """World time from a lost link until the RSI program runs and sends again."""
@@ -96,13 +96,13 @@ class Settings(_Model):
     """Deceleration of the axes when the controller itself stops them."""
     acceleration_limit_deg_s2: float | None = Field(default=None, gt=0)
     jerk_limit_deg_s3: float | None = Field(default=None, gt=0)
-    """Limits to what corrections demand; None: none. The limits of real controllers are not published."""
+    """Limits of the corrections' demands; None: no limit. The limits of real controllers are not published."""
     on_excess: Literal["fault", "clamp"] = "fault"
-    """Beyond those two limits, either RSI stops or the axes are limited and lag behind. Too high a speed always
+    """Reaction beyond those two limits: RSI stops, or the axes are limited and lag behind. Too high a speed always
     stops RSI."""
     workspaces: tuple[Workspace, ...] = ()
     vibration_deg: float = Field(default=0.0, ge=0)
-    """Initial amplitude of the damped vibration, after a stop, of every axis that moved."""
+    """Initial amplitude of the damped vibration of every moved axis after a stop."""
     vibration_hz: float = Field(default=12.0, gt=0)
     vibration_decay_s: float = Field(default=0.15, gt=0)
 

@@ -14,7 +14,7 @@ from sim.world.reactor import Reactor
 
 
 def main(speed: float) -> None:
-    """Serve one box at `speed` times real time; its light and its edges have no receiver."""
+    """Serve one box at `speed` times real time. Nothing receives its light and its edges."""
     with tempfile.TemporaryDirectory() as folder:
         clock_path = Path(folder) / "clock"
         reactor = Reactor(ClockWriter(clock_path, speed))

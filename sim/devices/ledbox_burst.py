@@ -1,7 +1,7 @@
 """One run of a table: light, edges and log, timed by the box's own quartz.
 
-Step k lights its LED at t_on(k), sends its edge at t_on(k) + trigger_delay, darkens the LED at t_on(k) + on,
-and t_on(k + 1) = t_on(k) + period. All of it is scheduled ahead in world time, so the load of the machine does not
+Step k lights its LED at t_on(k), sends its edge at t_on(k) + trigger_delay, darkens the LED at t_on(k) + on, and
+t_on(k + 1) = t_on(k) + period. Everything is scheduled ahead in world time, so the load of the machine does not
 affect it. The pure functions and two small states used (quartz, boards) follow below.
 """
 
@@ -89,7 +89,7 @@ class Burst:
         return bytes(self.log[first * _LOG_RECORD.size : (first + count) * _LOG_RECORD.size])
 
     def abort(self) -> None:
-        """Darken the LED at once and end the burst; the present step gets no record."""
+        """Darken the LED at once and end the burst. The present step gets no record."""
         if self.state == "RUN":
             self._end("ABORTED")
 
@@ -179,7 +179,7 @@ class Quartz:
         return round((box_ns - self._offset_ns) / self._rate)
 
     def edge_lateness_ns(self) -> float:
-        """Half-normal, rms `edge_jitter_us`: an edge may be late, never early."""
+        """Lateness of an edge, half-normal with the rms `edge_jitter_us`: an edge may be late, never early."""
         return abs(self._random.gauss(0.0, self._jitter_ns))
 
 
@@ -230,13 +230,14 @@ class Boards:
         self._since_ns[board] = now_ns
 
     def set_temperature(self, board: int, celsius: float, now_ns: int) -> None:
-        """A board is heated by something other than light."""
+        """Set a board's temperature, as if something other than light had heated it."""
         self._excess_k[board] = celsius - self._ambient_c
         self._since_ns[board] = now_ns
         self.tripped = self.tripped or celsius > self.limit_c
 
     def hottest(self, now_ns: int) -> tuple[int, float]:
-        """Number and temperature of the hottest board; clears `tripped` when that is within the limit."""
+        """Return number and temperature of the hottest board. `tripped` is cleared if the temperature is within
+        the limit."""
         board = max(range(len(self)), key=lambda one: self.temperature_c(one, now_ns))
         celsius = self.temperature_c(board, now_ns)
         self.tripped = celsius > self.limit_c

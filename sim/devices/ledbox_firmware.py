@@ -33,7 +33,7 @@ from sim.world.reactor import Reactor, Timer
 
 _PANELS = (1, 2, 3, 4)
 _OVER_LIMIT_K = 5.0
-"""Excess over its limit to which the fault `over_temperature` sets a board."""
+"""Temperature above the board's limit that the fault `over_temperature` sets."""
 
 
 class Settings(BaseModel):
@@ -43,7 +43,7 @@ class Settings(BaseModel):
 
     kind: Literal["scpi"] = "scpi"
     baud: int = Field(default=115200, ge=0)
-    """Rate of the serial line in world time; 0: not limited."""
+    """Rate of the serial line in world time; 0: no limit."""
     led_count: int = Field(default=1080, ge=1, le=65535)
     leds_per_board: int = Field(default=6, ge=1)
     """Board of an LED: led // leds_per_board."""
@@ -57,14 +57,15 @@ class Settings(BaseModel):
     """Rms lateness of trigger edges."""
     seed: int = 1
     protocol: Literal["1.0", "1.1"] = "1.1"
-    """1.0: the box knows neither device clear nor tables in blocks, nor the question for this version."""
+    """Version of the protocol. In 1.0 the box does not know device clear, tables in blocks, and the question for
+    this version."""
     led_current_ma: int = Field(default=700, ge=0, le=65535)
     led_power_w: float = Field(default=15.0, ge=0)
     heat_k_per_j: float = Field(default=0.02, ge=0)
     thermal_time_constant_s: float = Field(default=240.0, gt=0)
     ambient_c: float = 22.0
     warm_k: float = Field(default=0.0, ge=0)
-    """Excess of the boards' temperature over ambient at power-on, as after a long run: they cool."""
+    """Excess of the boards' temperature over ambient at power-on, as after a long run. The boards then cool."""
     board_limit_c: float = 75.0
     block_timeout_s: float = Field(default=2.0, gt=0)
     """An incomplete block is discarded after this time without further bytes."""
@@ -127,7 +128,7 @@ class LedBoxFirmware:
 
     @property
     def edge_count(self) -> int:
-        """Number of edges since power-on, which is the number of the next one."""
+        """Number of edges since power-on; it is also the number of the next edge."""
         return self._edge_count
 
     def drop_edge(self, n: int) -> None:
@@ -139,7 +140,7 @@ class LedBoxFirmware:
         self._doubled_edges[n] = delay_us
 
     def mute(self, seconds: float | None = None) -> None:
-        """The box neither receives nor answers, for ever or for `seconds`; a burst continues."""
+        """Neither receive nor answer, for ever or for `seconds`. A burst continues."""
         if seconds is None:
             self._link.mute()
         else:
@@ -174,7 +175,7 @@ class LedBoxFirmware:
             self._check_block()
 
     def _device_clear(self) -> None:
-        """Everything dark at once; the incomplete message and the unsent responses are forgotten."""
+        """Make everything dark at once, and forget the incomplete message and the unsent responses."""
         self._abort()
         self._scpi.clear()
         self._link.drop_output()
@@ -363,7 +364,7 @@ class LedBoxFirmware:
             self._on_panel(panel, on, self._reactor.now_ns)
 
     def _watch(self) -> None:
-        """Check the watchdog; its one timer is set to the earliest possible trip."""
+        """Check the watchdog. Its one timer is set to the earliest time at which it may trip."""
         if self._watchdog_timer is not None:
             self._watchdog_timer.cancel()
             self._watchdog_timer = None

@@ -15,7 +15,7 @@ from sim.world.reactor import Reactor
 
 
 def _kind(settings: Any) -> str:
-    """Kind of stand-in that these settings are for; the SCPI box by default."""
+    """Return the kind of stand-in that these settings are for; the SCPI box by default."""
     return str(settings.get("kind", "scpi") if isinstance(settings, dict) else settings.kind)
 
 
@@ -36,7 +36,7 @@ class LedBoxStandIn(Protocol):
     def temperature_of_led_c(self, led: int) -> float: ...
 
     def mute(self, seconds: float | None = None) -> None:
-        """The box neither receives nor answers, for ever or for `seconds`."""
+        """Neither receive nor answer, for ever or for `seconds`."""
         ...
 
     def unplug(self) -> None:
@@ -80,8 +80,8 @@ def build(
     on_light: Callable[[int, int, int], None],
     on_edge_counted: Callable[[int], None],
 ) -> LedBoxStandIn:
-    """The stand-in, connected to the trigger cable and to the lighting; faults that wait for an edge are told the
-    number of each by `on_edge_counted(number)`."""
+    """Return the stand-in, connected to the trigger cable and to the lighting. `on_edge_counted(number)` tells the
+    number of each edge to faults that wait for an edge."""
     match settings:
         case ledbox_firmware.Settings():
             box = ledbox_firmware.LedBoxFirmware(

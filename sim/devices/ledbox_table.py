@@ -1,4 +1,4 @@
-"""The limits of the box's table, as checked by the firmware: a table is accepted or rejected as a whole."""
+"""The limits of the box's table, which the firmware checks. A table is accepted or rejected as a whole."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ REST_PER_ON = 2
 
 
 def read_table(before: NDArray[np.void], payload: bytes, led_count: int, edge_width_us: int) -> NDArray[np.void]:
-    """The records `before` (STEP [n]) and those of an uploaded block; raises ScpiError for one out of limits."""
+    """Return the records `before` (STEP [n]) and those of an uploaded block. Raises ScpiError for a record out of
+    limits."""
     if len(payload) % STEP.itemsize:
         raise ScpiError(-161, f"{len(payload)} bytes are not a multiple of {STEP.itemsize}")
     table = np.concatenate([before, np.frombuffer(payload, STEP)])
@@ -40,7 +41,7 @@ def read_table(before: NDArray[np.void], payload: bytes, led_count: int, edge_wi
 
 
 def check_table(table: NDArray[np.void], led_count: int, edge_width_us: int) -> None:
-    """Raise ScpiError -222, naming the first record out of limits and what is wrong with it."""
+    """Raise ScpiError -222, which names the first record out of limits and its fault."""
     led, flags = table["led"], table["flags"]
     on_us, delay_us, period_us = (
         table[name].astype(np.int64) for name in ("on_us", "trigger_delay_us", "period_us")
@@ -77,7 +78,7 @@ def check_table(table: NDArray[np.void], led_count: int, edge_width_us: int) -> 
 def _cooling_fault(
     led: NDArray[np.uint16], on_us: NDArray[np.int64], period_us: NDArray[np.int64]
 ) -> tuple[int, str] | None:
-    """The first record that lights an LED before its minimum off time is over, with the reason."""
+    """Return the first record that lights an LED before its least off time is over, with the reason."""
     t_on_us = np.cumsum(period_us) - period_us
     order = np.argsort(led, kind="stable")
     before, after = order[:-1], order[1:]

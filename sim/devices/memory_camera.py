@@ -1,6 +1,7 @@
 """Driver of the simulated camera without a network: frames are in memory shared with the world.
 
-For machines without libaravis, and for rates above those of loopback. Other end: `sim.devices.camera_server`.
+It is for machines without libaravis, and for rates above those of loopback. The other end is
+`sim.devices.camera_server`.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ _STEPS = 30
 _REACH_MM = 1000.0
 """Scales millimetres against radians."""
 _REACHED = 1e-10
-"""A tenth of a nanometre, or a few billionths of a degree."""
+"""Error at which the pose is reached: a tenth of a nanometre, or a few billionths of a degree."""
 _DAMPING = 1e-10
 _LONGEST_STEP = 0.2
 _TINY = 1e-12
@@ -30,8 +30,8 @@ def joints_near(
     """The joint angles that reach the pose from `joints_deg`, or None if the iteration does not converge.
 
     Damped Newton steps: Nakamura, Hanafusa, "Inverse Kinematic Solutions with Singularity Robustness" (1986).
-    Limits are not checked. A controller that follows a pose does likewise, from the present axes: near a
-    singularity they may turn fast, or have no solution.
+    Limits are not checked. A controller that follows a pose works in the same way, from the present axes. Near a
+    singularity the axes may turn fast, or have no solution.
     """
     angles = np.radians(np.asarray(joints_deg, dtype=np.float64))
     for _ in range(_STEPS):

@@ -1,8 +1,8 @@
 """A serial port without a wire: a pseudo-terminal, read by the world at the rate of a serial line.
 
 A pseudo-terminal carries no BREAK: the kernel drops it. But in packet mode (tty_ioctl(2), TIOCPKT) it tells the
-master, ahead of all bytes, that the client has discarded its output (tcflush(3), TCOFLUSH). A host does that
-before a BREAK, so that the BREAK does not wait for what is unsent; here it stands for the BREAK.
+master, ahead of all bytes, that the client has discarded its output (tcflush(3), TCOFLUSH). A host discards its
+output before a BREAK, so that the BREAK does not wait for unsent bytes. Here this discarding represents the BREAK.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from sim.world.reactor import Reactor, Timer
 _PIECE_BYTES, _PIECE_S = 64, 0.006
 """Bytes are transferred in pieces of at most this size and duration, at least one byte."""
 _UNPACED_BYTES = 4096
-"""... or of this, if the rate is not limited."""
+"""Largest piece if the rate is not limited."""
 _MOST_UNREAD_BYTES = 2**20
-"""Largest output buffer: what a client that does not read misses is lost."""
+"""Largest output buffer. If a client does not read, further output is lost."""
 _RETRY_S = 0.001
 _BITS_PER_BYTE = 10
 
@@ -57,7 +57,8 @@ class PtyPort:
         self._output.clear()
 
     def send(self, data: bytes) -> bool:
-        """Queue bytes for the client; False if the client has left too many unread, and these are lost."""
+        """Queue bytes for the client. False if the client has left too many bytes unread; the new ones are then
+        lost."""
         if self._received is None:
             return True
         if len(self._output) + len(data) > _MOST_UNREAD_BYTES:
@@ -98,7 +99,7 @@ class PtyPort:
             self._reading = False
 
     def _read_piece(self) -> None:
-        """Read a piece from the terminal; it is passed on at the time at which its last bit would have arrived."""
+        """Read a piece from the terminal. It is passed on at the time at which its last bit would have arrived."""
         try:
             packet = os.read(self._master, 1 + self._piece_bytes)
         except BlockingIOError:
@@ -133,7 +134,8 @@ class PtyPort:
         return callback
 
     def _write(self) -> None:
-        """Write what the terminal accepts of a piece; call again when the bits of the next one have passed."""
+        """Write the part of a piece that the terminal accepts. Call it again when the bits of the next piece have
+        passed."""
         try:
             byte_count = os.write(self._master, self._output[: self._piece_bytes])
         except BlockingIOError:

@@ -1,7 +1,6 @@
-"""Refusals of a stand-in, told to a person: an outside client would otherwise see silence only.
+"""Refusals of a stand-in, which are told to a person, because an outside client would otherwise see only silence.
 
-A client that is wrong is wrong in every cycle, so the same reason is told again only after a while, with its
-count.
+A mistake of a client occurs in every cycle. So the same reason is told again only after a while, with its count.
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ class Refusals:
     def __init__(self, device: str, tell: Callable[[str], None]) -> None:
         self._device, self._tell = device, tell
         self._since: dict[str, tuple[float, int]] = {}
-        """Time at which each reason was last told, s, and number of times that it has occurred since."""
+        """Time at which each reason was last told, s, and the number of times that it has occurred since."""
 
     def note_refusal(self, reason: str, details: str = "") -> None:
-        """`reason` is equal for equal mistakes; `details` are those of this occurrence."""
+        """Count a refusal. `reason` is equal for equal mistakes; `details` belong to this occurrence."""
         now_s = time.monotonic()
         told_s, count = self._since.get(reason, (-_AGAIN_S, 0))
         if now_s - told_s < _AGAIN_S:

@@ -15,7 +15,7 @@ from sim.world.reactor import Reactor
 
 
 def _kind(settings: Any) -> str:
-    """Kind of stand-in that these settings are for; RSI by default."""
+    """Return the kind of stand-in that these settings are for; RSI by default."""
     return str(settings.get("kind", "rsi") if isinstance(settings, dict) else settings.kind)
 
 
@@ -67,8 +67,8 @@ def impossible(fault: faults.Fault, settings: RobotSettings) -> str:
 def build(
     reactor: Reactor, settings: RobotSettings, tell: Callable[[str], None], stranger: ArmStranger
 ) -> tuple[RobotStandIn, dict[str, Any]]:
-    """The stand-in, and the driver settings with which a client reaches it. `tell` gets a line for every
-    correction that is refused; `stranger` are errors of a KUKA's axes."""
+    """Return the stand-in, and the driver settings with which a client reaches it. `tell` gets a line for every
+    refused correction. `stranger` are errors of a KUKA's axes."""
     match settings:
         case kuka_controller.Settings():
             alike = {name: getattr(settings, name) for name in kuka_controller.ALIKE}

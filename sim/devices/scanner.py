@@ -1,4 +1,4 @@
-"""A hand-held laser scanner of a thing of the world: the files that it exports, in its own frame, with noise.
+"""A hand-held laser scanner that scans a thing of the world. It exports files in its own frame, with noise.
 
 The files contain nothing else of the world. `scanner_from_thing` gives the true position of the scanner's frame,
 for tests of a calibration.

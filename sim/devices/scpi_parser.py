@@ -1,7 +1,7 @@
 """SCPI in the box's firmware: messages from a byte stream, commands by name, an error queue.
 
-No input can make this raise: an error becomes an entry of the error queue (SCPI-1999 volume 2, chapter 21) and a
-bit of the event status register (IEEE 488.2, chapter 11).
+No input makes this raise an exception. Each error becomes an entry of the error queue (SCPI-1999 volume 2, chapter
+21) and a bit of the event status register (IEEE 488.2, chapter 11).
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class Interpreter:
         return (self._execute(message) for message in self._splitter.feed(data))
 
     def clear(self) -> None:
-        """Device clear (IEEE 488.2, 5.8): forget the incomplete message; error queue and event status stay."""
+        """Clear the device (IEEE 488.2, 5.8): forget the incomplete message. Error queue and event status stay."""
         self._splitter.reset()
 
     def drop_block(self) -> None:
@@ -135,7 +135,8 @@ class Interpreter:
         return b";".join(replies) + b"\n" if replies else b""
 
     def _resolve(self, header: str, path: str) -> tuple[str, Command, tuple[int, ...]]:
-        """Path for the next header, command, suffix. A header without leading `:` continues the one before."""
+        """Return the path for the next header, the command, and the suffix. A header without a leading `:`
+        continues the previous one."""
         if header.startswith("*"):
             full = header
         else:
@@ -187,7 +188,7 @@ def integer(argument: Argument, low: int, high: int) -> int:
 
 
 def keyword(argument: Argument, *patterns: str) -> str:
-    """The pattern among `patterns` (capitals are the short form) that the parameter matches."""
+    """Return the pattern among `patterns` (capitals are the short form) that the parameter matches."""
     for pattern in patterns:
         if argument in _spellings(pattern):
             return pattern

@@ -1,8 +1,8 @@
 """The firmware of a home-built dome, on the world's clock: one line of text in, one line out.
 
-It is the sketch of docs/how-to/home-built-dome.md: `LED <n> ON [<ms>]` (ended by the box after that time),
-`LED <n> OFF`, `ALL OFF`, `ID`; the answer is `OK`, the identity, or `ERR` and the reason. Like such boxes it has
-no clock, log or watchdog, and may light several LEDs at once.
+It is the sketch of docs/how-to/home-built-dome.md. Its commands are `LED <n> ON [<ms>]` (the box ends the light
+after this time), `LED <n> OFF`, `ALL OFF` and `ID`. The answer is `OK`, the identity, or `ERR` and the reason.
+Like such boxes, it has no clock, log or watchdog, and may light several LEDs at once.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Settings(BaseModel):
     first_led: int = Field(default=0, ge=0)
     """The box's number for LED 0."""
     answers: bool = True
-    """True if the box answers; else it answers only the query for its identity."""
+    """True if the box answers. Otherwise it answers only the query for its identity."""
     serial_number: str = "SIM-0002"
     ambient_c: float = 22.0
     """Temperature of the LEDs, which are not heated."""
@@ -67,8 +67,8 @@ class TextBox:
     # Faults for the fault script.
 
     def mute(self, seconds: float | None = None) -> None:
-        """The box neither receives nor answers, for ever or for `seconds`; lit LEDs stay lit until they are due.
-        Data that arrive meanwhile are lost.
+        """Neither receive nor answer, for ever or for `seconds`. Lit LEDs stay lit until they are due. Data that
+        arrive meanwhile are lost.
         """
         if seconds is None:
             self._link.mute()
@@ -80,7 +80,7 @@ class TextBox:
         self._link.close()
 
     def stick_led(self, led: int) -> None:
-        """Make an LED stick: once it is lit, it cannot be switched off. Its transistor has failed short."""
+        """Make an LED stick, as if its transistor had failed short: once it is lit, it cannot be switched off."""
         self._stuck_leds.add(led)
 
     def temperature_of_led_c(self, led: int) -> float:
@@ -130,7 +130,7 @@ class TextBox:
         return f"ERR what? {line}"
 
     def _led(self, number: str) -> int | None:
-        """LED number from the box's own; None if the box has no such LED."""
+        """Return the LED number for the box's own number; None if the box has no such LED."""
         led = int(number) - self._settings.first_led if number.isdecimal() else -1
         return led if 0 <= led < self._settings.led_count else None
 

@@ -140,8 +140,8 @@ def movel(
     acceleration_m_s2: float,
     t_ns: int,
 ) -> Motion | None:
-    """Return a motion from rest to rest, with the tool on a straight line and turning at a constant rate about one
-    axis, as URScript's movel; None if the arm cannot follow. For a pure rotation, radians count as metres."""
+    """Return a motion from rest to rest, as URScript's movel. The tool moves on a straight line, and turns at a
+    constant rate about one axis. None if the arm cannot follow. For a pure rotation, radians count as metres."""
     start = flange_pose(model, start_deg) @ flange_from_tool
     line_mm = base_from_tool[:3, 3] - start[:3, 3]
     turned_rad = np.array(rotation_vector(start[:3, :3].T @ base_from_tool[:3, :3]))

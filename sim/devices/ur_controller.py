@@ -1,9 +1,9 @@
 """The stand-in for a UR arm and its controller, at the other end of ur-rtde: RTDE, dashboard, script upload.
 
-It does what ur-rtde's uploaded program does (`ur_script`), moves its arm with trapezoidal speed profiles, and
-stops as the real one does on: emergency stop, protective stop, a silent watchdog. The ports are UR's own, 30003,
-30004 and 29999, since ur-rtde cannot use others; so each stand-in needs its own address in 127.0.0.0/8. ur-rtde
-works in real time only: with a world speed other than 1, this stand-in raises InputError.
+It does the work of ur-rtde's uploaded program (`ur_script`), and moves its arm with trapezoidal speed profiles. It
+stops like the real one on an emergency stop, a protective stop, or a silent watchdog. The ports are UR's own,
+30003, 30004 and 29999, because ur-rtde cannot use others. So each stand-in needs its own address in 127.0.0.0/8.
+ur-rtde works only in real time. So with a world speed other than 1, this stand-in raises InputError.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Settings(BaseModel):
 
 
 class UrController:
-    """See the module. All methods must be called on the reactor's thread."""
+    """One controller. All methods must be called on the reactor's thread."""
 
     def __init__(self, reactor: Reactor, settings: Settings) -> None:
         """Raises InputError in a world that does not run in real time."""
@@ -173,7 +173,7 @@ class UrController:
             port.close()
 
     def start_movej(self, target_deg: Six, speed_deg_s: float, acceleration_deg_s2: float) -> None:
-        """Called by the program, like the next two."""
+        """Start movej. The program calls this, and the next two methods."""
         now_ns = self._reactor.now_ns
         self._start(movej(self._commanded_deg, target_deg, speed_deg_s, acceleration_deg_s2, now_ns))
 
@@ -247,7 +247,7 @@ class UrController:
         self._heard_ns = self._reactor.now_ns
 
     def _take_program(self, connection: Connection) -> None:
-        """A program is complete with its last line, an unindented `end`."""
+        """Take a program, which is complete with its last line, an unindented `end`."""
         if _END_OF_PROGRAM.search(connection.inbox):
             connection.inbox.clear()
             if self._runtime is not _Runtime.STOPPED:
@@ -264,7 +264,7 @@ class UrController:
             connection.send(self._dashboard_answer(line.decode(errors="replace").strip()).encode() + b"\n")
 
     def _dashboard_answer(self, question: str) -> str:
-        """Answers as in Universal Robots, "Dashboard Server e-Series"."""
+        """Answer as in Universal Robots, "Dashboard Server e-Series"."""
         if question == "stop":
             self._end_program("stopped over the dashboard", _Runtime.STOPPED)
             return "Stopped"

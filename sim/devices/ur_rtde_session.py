@@ -23,7 +23,7 @@ class Line(Protocol):
 
 
 class RtdeSession:
-    """See the module. `on_inputs` receives registers when the client writes them."""
+    """One client's session. `on_inputs` receives registers when the client writes them."""
 
     def __init__(self, line: Line, on_inputs: Callable[[dict[str, Value]], None]) -> None:
         self.line = line
@@ -86,6 +86,7 @@ def _names(payload: bytes) -> list[str]:
 
 
 def _recipe(number: int, names: list[str]) -> bytes:
-    """Recipe id and types; id 0, which is invalid, if a variable does not exist. Raises ValueError above 255."""
+    """Return recipe id and types. Id 0, which is invalid, means that a variable does not exist. Raises ValueError
+    above 255."""
     types = [wire.variable_type(name) for name in names]
     return bytes([0 if wire.NOT_FOUND in types else number]) + ",".join(types).encode()

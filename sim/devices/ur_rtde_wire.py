@@ -88,7 +88,8 @@ def variable_type(name: str) -> str:
 
 
 def pack(names: Sequence[str], values: Mapping[str, Value]) -> bytes:
-    """The values of a recipe's variables; what has none, as a register never written, is 0."""
+    """Return the bytes of a recipe's variables. A variable without a value, such as a register that was never
+    written, is 0."""
     return b"".join(_pack_one(name, values[name]) if name in values else _zero(name) for name in names)
 
 

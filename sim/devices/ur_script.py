@@ -1,4 +1,4 @@
-"""Reaction to registers of the program that ur-rtde uploads, modelled on that program (ur-rtde 1.6).
+"""Reacts to registers as the program does that ur-rtde uploads (modelled on ur-rtde 1.6).
 
 The client writes a command number to input_int_register_0 and its arguments to others; the program answers in
 output_int_register_0: 1 ready, 2 done. Then the client writes 0, and the program is ready again.
@@ -17,7 +17,7 @@ _NONE, _MOVEJ, _MOVEL, _STOPJ, _SET_WATCHDOG, _GET_TCP_OFFSET, _END = 0, 1, 3, 3
 _READY, _DONE = 1, 2
 _ASYNC_RUNNING = 0x8000
 _FULL_TURN_RAD = 2.0 * math.pi
-"""Joint limit; larger than any coordinate of the tool in m or rad, too."""
+"""Joint limit. It is also larger than any coordinate of the tool in m or rad."""
 
 
 class Arm(Protocol):

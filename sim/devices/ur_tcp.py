@@ -8,7 +8,7 @@ from collections.abc import Callable
 from sim.world.reactor import Reactor
 
 _MOST_BYTES = 2**20
-"""Largest unfinished input of a client, which is then disconnected."""
+"""Largest unfinished input of a client. A client with more is disconnected."""
 
 
 class Connection:
@@ -18,7 +18,7 @@ class Connection:
         self.inbox = bytearray()
         self.link = link
         self.gone = False
-        """The client has left, or accepts no more bytes."""
+        """True if the client has left, or accepts no more bytes."""
 
     def send(self, data: bytes) -> None:
         if self.gone:
@@ -48,7 +48,7 @@ class TcpPort:
         reactor.add_reader(self._listener, self._accept)
 
     def mute(self) -> None:
-        """Answer no client from now on; present connections never recover, and are not told."""
+        """Answer no client from now on. Present connections never recover, and are not told."""
         if self._listens:
             self._reactor.remove_reader(self._listener)
             self._listens = False
@@ -71,7 +71,7 @@ class TcpPort:
         self._connections = []
 
     def close(self) -> None:
-        """Close all sockets; the reactor must not run any more."""
+        """Close all sockets. The reactor must not run any more."""
         for connection in (*self._connections, *self._muted):
             connection.link.close()
         self._listener.close()

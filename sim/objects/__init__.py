@@ -1,4 +1,4 @@
-"""Virtual objects: small generators of `sim.scene.surface.Surface`, mm, in the object's own frame, z up.
+"""Virtual objects: small generators of `sim.scene.surface.Surface`, in mm, in the object's own frame, with z up.
 
 Bodies stand on z = 0 above the origin; `plane` and `fabric` are sheets.
 The same arguments give the same triangles.

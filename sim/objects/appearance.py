@@ -1,4 +1,4 @@
-"""Materials of virtual objects: spectra of `appearance.matter` as seen by the camera under the dome's LEDs.
+"""Materials of virtual objects: spectra of `appearance.matter`, as the camera sees them under the dome's LEDs.
 
 Each material is reduced to a diffuse reflectance, a reflectance at normal incidence and a roughness per channel
 (`sim.scene.surface.Material`). White is a perfect diffuser: Spectralon itself has 0.99.
@@ -35,7 +35,7 @@ with little change over the visible. The roughness is a polished ball's (assumed
 STONE = Material("stone", (0.62, 0.55, 0.42))
 """Warm limestone (assumed); the demonstration object's."""
 RETROREFLECTIVE = Material("retro-reflective film", (0.90, 0.90, 0.90))
-"""Its appearance under light from other directions than the camera's: a white diffuser (assumed)."""
+"""Retro-reflective film as it looks under light that does not come from the camera: a white diffuser (assumed)."""
 
 
 def rgb(spectral: ArrayLike) -> Rgb:
@@ -47,7 +47,8 @@ def rgb(spectral: ArrayLike) -> Rgb:
 def paint(
     name: str, *, thickness_mm: float = np.inf, ground: ArrayLike = 0.0, scattering_per_mm: float = 30.0
 ) -> Material:
-    """A shape of `typical` in a glossy binder, as a layer over a ground of reflectance `ground` [81] inside it.
+    """Return a pigment of `typical` in a glossy binder, as a layer over a ground of reflectance `ground` [81]
+    inside it.
 
     Kubelka-Munk with Saunderson. `scattering_per_mm` is S, the same at all wavelengths: 30 hides a ground
     at about 0.1 mm (assumed).

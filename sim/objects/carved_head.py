@@ -13,7 +13,7 @@ from sim.objects.implicit_solid import Array, Form, ball, height_above_plane, mi
 TURN_DEG = (-5.0, 16.0, 3.0)
 """Pitch (down), yaw (towards +x) and roll of the head."""
 DEEPEST = -0.9
-"""Plane behind which nothing of the head is seen."""
+"""Plane behind which no part of the head is seen."""
 _HIGHEST = 1.35
 _SKULL, _SKULL_RADII = (0.0, 0.22, -0.15), (0.74, 0.84, 0.86)
 _EYE, _EYE_RADIUS, _EYE_HALF_WIDTH = (0.268, -0.020, 0.490), 0.165, 0.142
@@ -30,7 +30,8 @@ _LOCKS = (
 
 
 def head_height(x: Array, y: Array) -> Array:
-    """Height [...] of the turned head above places [...] of its plane, in its unit; `DEEPEST` beside it."""
+    """Return the height [...] of the turned head above places [...] of its plane, in its unit; `DEEPEST` beside
+    it."""
     turn = Rotation.from_euler("xyz", [-TURN_DEG[0], TURN_DEG[1], -TURN_DEG[2]], degrees=True).as_matrix()
     return height_above_plane([*_face(), *_eyes(), *_mouth(), *_hair()], x, y, turn, _HIGHEST, DEEPEST)
 
@@ -107,7 +108,7 @@ def _hair() -> list[Form]:
 
 
 def _curl(x: float, y: float, z: float, radius: float) -> Form:
-    """A ball with a spiral groove, whose hand is that of its side."""
+    """Return a ball with a spiral groove; the groove's hand is that of the ball's side."""
     return ball((x, y, z), radius, 0.02, groove=(0.32 * radius, 2.2, 1.0 if x > 0.0 else -1.0))
 
 

@@ -24,7 +24,7 @@ def smooth_step(t: Array) -> Array:
 
 
 def half_round(offset: Array) -> Array:
-    """Height of a half circle of radius 1 over the offset from its axis; 0 beside it."""
+    """Return the height of a half circle of radius 1 over the offset from its axis; 0 beside it."""
     return np.sqrt(np.maximum(0.0, 1.0 - offset**2))
 
 
@@ -42,7 +42,8 @@ def noise(x: Array, y: Array, period_mm: float, seed: int) -> Array:
 
 
 def distance_to_line(x: Array, y: Array, points: Sequence[Place]) -> tuple[Array, Array]:
-    """Distance [...] of places to a line through `points`, and where its nearest point is, 0 to 1 of the line."""
+    """Return the distance [...] of places to a line through `points`, and the place of its nearest point, 0 to 1
+    along the line."""
     nearest, along = np.full(x.shape, np.inf), np.zeros(x.shape)
     pieces = len(points) - 1
     for piece, ((ax, ay), (bx, by)) in enumerate(pairwise(points)):

@@ -1,7 +1,8 @@
-"""A colour chart of 24 patches, with spectra that are drawn, not measured: those of no maker's chart.
+"""A colour chart of 24 patches. Its spectra are drawn, not measured; they belong to no maker's chart.
 
-Each is a floor, edges (steps as of yellows, oranges, reds) and bands (as of blues and greens) over wavelength; the
-last row is nearly grey. `configs/charts/drawn-24.txt` lists the same spectra for `coupole calibrate colour`.
+Each spectrum is a floor, edges (steps as in yellows, oranges, reds) and bands (as in blues and greens) over
+wavelength. The last row is nearly grey. `configs/charts/drawn-24.txt` lists the same spectra for `coupole
+calibrate colour`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ class Drawn:
 
     floor: float
     edges: tuple[tuple[float, float, float], ...] = ()
-    """height, wavelength of half height in nm, width in nm: reflects above; below if the height is negative."""
+    """Height, wavelength of half height in nm, width in nm. It reflects above this wavelength, or below if the
+    height is negative."""
     bands: tuple[tuple[float, float, float], ...] = ()
     """height, centre in nm, standard deviation in nm."""
 
@@ -75,8 +77,8 @@ DRAWN = {
 
 
 def colour_chart() -> Surface:
-    """A plate standing on z = 0 whose face is at z = `THICKNESS_MM`: matt patches on black. The origin is below
-    the middle of the patches; x runs along the rows, y up."""
+    """Return a plate that stands on z = 0, with its face at z = `THICKNESS_MM`: matt patches on black. The origin
+    is below the middle of the patches; x runs along the rows, y up."""
     width_mm = COLUMNS * PITCH_MM + 2.0 * MARGIN_MM
     depth_mm = ROWS * PITCH_MM + 2.0 * MARGIN_MM
     cells = (round(width_mm / _CELL_MM), round(depth_mm / _CELL_MM))

@@ -26,8 +26,8 @@ def fabric(
 ) -> Surface:
     """A flat sheet in z = 0 about the origin, in plain weave: threads are visible in normals and tint.
 
-    Threads are `thread_mm` wide. A thread is resolved by about six triangles across: 1.2 mm at 200,000 triangles
-    on 60 mm have nine.
+    Threads are `thread_mm` wide. About six triangles across resolve a thread: a thread of 1.2 mm at 200,000
+    triangles on 60 mm has nine.
     """
     columns, rows = cells_for(triangles, width_mm, depth_mm)
     corners = rectangle(width_mm, depth_mm, columns, rows)
@@ -40,8 +40,9 @@ def fabric(
 def weave(places_mm: Array, thread_mm: float) -> tuple[Array, Array]:
     """Normals [n, 3] and shade [n], 0 to 1, of plain weave at places [n, 2].
 
-    Where column and row of a thread add up to an even number the warp (along y) is on top, else the weft (along
-    x). Across a thread the normal varies as on a flattened cylinder, along it as on a wave of two threads' length.
+    If column and row of a thread add up to an even number, the warp (along y) is on top, otherwise the weft (along
+    x). Across a thread the normal varies as on a flattened cylinder. Along a thread it varies as on a wave of two
+    threads' length.
     """
     cell = np.floor(places_mm / thread_mm)
     within = 2.0 * (places_mm / thread_mm - cell) - 1.0

@@ -1,8 +1,8 @@
 """Sculpture from implicit solids: round cones and ellipsoids, joined and cut smoothly, as a height above a plane.
 
-A solid is a list of forms in order. Each is added to, or cut from, what the forms before it make, with a smooth
-transition of a given width (the polynomial smooth minimum of Quilez, after Blinn, A generalization of algebraic
-surface drawing, 1982). Lengths are in units of the sculptor's choice.
+A solid is a list of forms in order. Each form is added to the solid of the earlier forms, or cut from it. The
+transition is smooth and has a given width (the polynomial smooth minimum of Quilez, after Blinn, A generalization
+of algebraic surface drawing, 1982). Lengths are in any unit.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ Array = NDArray[np.float64]
 Point = tuple[float, float, float]
 
 _STEPS, _CAUTION = 200, 0.7
-"""Most steps of a ray, and the share of the distance that a step takes: blended distances are bounds only."""
+"""Greatest number of steps of a ray, and the share of the distance that a step takes, because blended distances
+are only bounds."""
 _NEAR = 5e-5
 """Distance to the surface at which a ray has met it."""
 
@@ -96,10 +97,7 @@ def _trace(table, places, plane_to_solid, top, bottom, heights):  # type: ignore
 
 @numba.njit(cache=True, nogil=True)
 def _forms_near_ray(table, foot, along, near_rows):  # type: ignore[no-untyped-def]
-    """Write the rows of those forms that can shape the solid where the ray is; their number.
-
-    Further from a form's bounding ball than its transition, the form changes nothing.
-    """
+    """Write the rows of those forms that can shape the solid on the ray; return their number."""
     count = 0
     for row in range(len(table)):
         form = table[row]

@@ -1,7 +1,8 @@
-"""Materials that are measured, or exported, as files: of MERL's, RGL's and ALTA's formats.
+"""Materials from files, measured or exported, in MERL's, RGL's and ALTA's formats.
 
-Red, green and blue of a file are taken as those of the simulated camera; spectra are seen by it under its LEDs.
-The renderer's materials are isotropic: others count with their mean over turns of the surface.
+Red, green and blue of a file are used as those of the simulated camera. Spectra are converted to the camera's
+channels under its LEDs. The renderer's materials are isotropic; an anisotropic material is replaced by its mean
+over turns of the surface.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ def bsdf_material(path: Path) -> Material:
 
 @cache
 def alta_material(paths: tuple[Path, ...]) -> Material:
-    """One file of one channel, which is grey, or of three; or one file for each of red, green and blue. Raises
-    InputError for other files, and for samples between which nothing can be interpolated."""
+    """Read one file of one channel, which is grey, or of three channels; or one file for each of red, green and
+    blue. Raises InputError for other files, and for samples that cannot be interpolated."""
     parts = [interpolated_brdf(read_alta(path)) for path in paths]
 
     def whole(wi: Array, wo: Array) -> Array:
@@ -67,7 +68,8 @@ def _scene_material(name: str, reflectance: Brdf) -> Material:
 
 
 def _weights_of(wavelengths_nm: Array) -> Array:
-    """[3, n] of spectra at these wavelengths, linear between them, as the camera sees them under its LEDs."""
+    """Return [3, n] weights of spectra at these wavelengths, linear between them, as the camera sees them under
+    its LEDs."""
     between = np.stack(
         [np.interp(WAVELENGTHS_NM, wavelengths_nm, unit_vector) for unit_vector in np.eye(len(wavelengths_nm))]
     )

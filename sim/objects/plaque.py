@@ -1,8 +1,9 @@
 """The showpiece: a carved and coloured plaque, as the true surface that simulated frames show.
 
-It has what the seeds treat: stone, blue paint with losses, gold leaf over red bole that is worn where it stands
-out, black lacquer with a drawing of gold powder, woven cloth, and an inscription of strokes 0.3 mm wide. The mesh
-that a plan names is a scan of it (`tools/make_plaque_scan.py`), without anything that is finer than its triangles.
+It has the materials of the seeds: stone; blue paint with losses; gold leaf over red bole, which is worn on raised
+places; black lacquer with a drawing of gold powder; woven cloth; and an inscription with strokes 0.3 mm wide. The
+mesh that a plan names is a scan of the plaque (`tools/make_plaque_scan.py`). It has no detail that is finer than
+its triangles.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _GRAIN_MM = 0.22
 """Size of the grains of powder, or of small heaps of them."""
 _WEAR_MM, _WEAR_SEED, _LOSS_SEED, _POWDER_SEED, _STONE_SEED = 1.2, 21, 22, 23, 24
 _WORN_TO_BOLE, _WORN_TO_STONE, _LOST = 0.70, 1.35, 1.15
-"""Thresholds of wear and loss, as numbers of standard deviations, or nearly so."""
+"""Thresholds of wear and loss, approximately as numbers of standard deviations."""
 
 
 @cache
@@ -133,7 +134,8 @@ def _in_roundel(x: Array, y: Array) -> NDArray[np.int64]:
 
 
 def _grains(x: Array, y: Array) -> Array:
-    """Even random values [n], 0 to 1, alike within a grain of powder: gold lies where they are below its share."""
+    """Return even random values [n], 0 to 1, equal within a grain of powder. A place has gold if its value is
+    below the share of gold."""
     from scipy.special import ndtr
 
     return np.asarray(ndtr(noise(x, y, _GRAIN_MM, _POWDER_SEED) / NOISE_SPREAD))
@@ -149,7 +151,7 @@ def _star(x: Array, y: Array) -> NDArray[np.bool_]:
 
 
 def _wear(height: Array, step_mm: float) -> Array:
-    """Wear [cells] of a grid of heights: by how much a place stands out of its surroundings, and chance."""
+    """Return the wear [cells] of a grid of heights: the height of a place above its surroundings, and chance."""
     from scipy.ndimage import gaussian_filter
 
     out_mm = height - gaussian_filter(height, _WEAR_MM / step_mm, mode="nearest")

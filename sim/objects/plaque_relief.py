@@ -1,4 +1,4 @@
-"""The carved surface of the plaque: heights over its back, and what belongs to what, at places in mm.
+"""The carved surface of the plaque: heights over its back, and the parts to which places in mm belong.
 
 Frame: z up, back at z = 0, origin below the middle; x and y as in `PLAQUE_MM`. A frame of eggs and darts encloses
 three bays over a band with an inscription: a panel of lacquer, a roundel with a head, and a strip of cloth.
@@ -25,7 +25,7 @@ ROPE_MM = 2.0
 HEAD = (0.5, 8.5, 14.5)
 """Middle of the head, and its unit (`sim.objects.carved_head`), mm."""
 HEAD_DEPTH, HEAD_SINKS = 0.82, -0.30
-"""Factor of the head's depth, as in a relief, and the depth of the head that lies in the field."""
+"""Factor of the head's depth, as in a relief, and the part of the head's depth that lies in the field."""
 NIMBUS = (0.5, 11.0, 21.0)
 """Middle and radius, mm."""
 LACQUER_MM, CLOTH_MM = (-49.2, -33.2, -25.2, 35.2), (35.0, 47.6, -23.0, 36.0)
@@ -260,7 +260,8 @@ def _frame(x: Array, y: Array) -> Array:
 
 
 def _along_edge(x: Array, y: Array) -> Array:
-    """Place along the nearest edge, from its middle; patterns of it are whole at the corners."""
+    """Return the place along the nearest edge, from its middle. Patterns of this place are complete at the
+    corners."""
     beside = 0.5 * PLAQUE_MM[0] - np.abs(x) < 0.5 * PLAQUE_MM[1] - np.abs(y)
     return np.where(beside, y, x) + 1000.0 * _EGG_MM + np.where(beside, 0.5 * _EGG_MM, 0.0)
 

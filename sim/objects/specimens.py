@@ -1,5 +1,5 @@
-"""Materials that are no sum of Lambert and GGX, with spectra of `appearance.matter`: for the closed loop of
-reflectance. Each is a reflectance of both directions, reduced to the camera's channels in a table.
+"""Materials that are not a sum of Lambert and GGX, with spectra of `appearance.matter`, for the closed loop of
+reflectance. Each is a reflectance that depends on both directions. A table has it for the camera's channels.
 
 All figures are assumed. Materials are isotropic: cloth is the mean over its threads' directions.
 """
@@ -25,7 +25,8 @@ from sim.scene.brdf_table import tabulate
 from sim.scene.surface import Material
 
 _THREAD_PLACES, _THREAD_TURNS = 8, 6
-"""Normals of the weave along each side of its cell, and turns of the cloth, of which the mean is taken."""
+"""Number of normals of the weave along each side of its cell, and number of turns of the cloth. Their mean is
+used."""
 _THREAD_LOBE = 0.3
 """Width of a thread's gloss, rad."""
 _RED_LACQUER = Face(np.asarray((1.0 - 0.04) * (1.0 - 0.6)), np.asarray(0.6), np.zeros(()))
@@ -33,8 +34,8 @@ _RED_LACQUER = Face(np.asarray((1.0 - 0.04) * (1.0 - 0.6)), np.asarray(0.6), np.
 
 
 def tabulated_finish() -> Brdf:
-    """A metallic paint as seed 002 measures one: a table about the mirror direction, of Beckmann facets on a body
-    of rough diffuse grains."""
+    """Return a metallic paint as seed 002 measures one: a table about the mirror direction, with Beckmann facets
+    on a body of rough diffuse grains."""
     grains = typical.reflectance("dull_yellow_shape").values
 
     def paint_brdf(wi: Array, wo: Array) -> Array:
@@ -58,8 +59,9 @@ def makie_ground() -> Brdf:
 
 
 def four_flux_varnish() -> Brdf:
-    """A turbid varnish on blue under a glossy face (seed 000, section 3.4). Directional light crosses the layer
-    at its refracted angle; what leaves has the angles of what enters, so that it is reciprocal."""
+    """A turbid varnish on blue under a glossy face (seed 000, section 3.4). Directional light crosses the layer at
+    its refracted angle. Outgoing light has the same angles as incoming light, so that the material is
+    reciprocal."""
     index, rough = indices.BINDER, 0.3
     blue = typical.reflectance("blue_one_peak_shape").values
     cosines = np.linspace(0.02, 1.0, 50)
@@ -84,10 +86,10 @@ def four_flux_varnish() -> Brdf:
 
 
 def woven_cloth() -> Brdf:
-    """Linen whose threads are finer than a pixel: the mean over their normals (`fabric.weave`), each rough and
-    with some gloss; threads that face away from light or eye are dark, the others hide each other by the share of
-    their area that is too much (Ashikhmin, Premoze and Shirley, A microfacet-based BRDF generator, 2000). The
-    cloth is turned to all sides."""
+    """Return linen whose threads are finer than a pixel. It is the mean over the threads' normals
+    (`fabric.weave`), each rough and with some gloss. Threads that face away from light or eye are dark. The others
+    hide each other by the excess of their area (Ashikhmin, Premoze and Shirley, A microfacet-based BRDF generator,
+    2000). The result is the mean over all turns of the cloth."""
     places = (np.arange(_THREAD_PLACES) + 0.5) / _THREAD_PLACES
     grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
     normals, shade = weave(grid, 1.0)
@@ -130,9 +132,9 @@ SPECIMENS: dict[str, Callable[[], Brdf]] = {
 
 @cache
 def specimen(name: str) -> Material:
-    """One of `SPECIMENS` as a material of the simulated scene; its diffuse reflectance, which only light from
-    surface to surface meets, is the share of light that it reflects at 45 degrees. Raises InputError for another
-    name."""
+    """Return one of `SPECIMENS` as a material of the simulated scene. Its diffuse reflectance is the share of
+    light that it reflects at 45 degrees; it is used only for light from surface to surface. Raises InputError for
+    another name."""
     if name not in SPECIMENS:
         raise InputError(f"specimen: expected one of {', '.join(SPECIMENS)}; found {name!r}; choose one of them")
     specimen_brdf = SPECIMENS[name]()

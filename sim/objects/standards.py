@@ -93,9 +93,9 @@ def sticker_poses(
 ) -> Array:
     """[count, 4, 4] object_from_sticker, mm: the origin is the sticker's centre, z points away from the surface.
 
-    Places are drawn uniformly over the surface. Accepted are those that face up or sideways, where the surface
-    under the border is within a layer of `gap_mm` and extends to the border on all sides, and that are half a
-    border away from other stickers. A sticker rests on the highest point under it. `where` [triangles] selects the
+    Places are drawn uniformly over the surface. A place is accepted if it faces up or sideways, if the surface
+    under the border is within a layer of `gap_mm` and extends to the border on all sides, and if other stickers
+    are at least half a border away. A sticker rests on the highest point under it. `where` [triangles] selects the
     triangles on which centres may lie.
 
     Raises:

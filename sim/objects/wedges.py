@@ -46,7 +46,7 @@ def paint_wedge(
 
 
 def _panel(fields: Sequence[Sequence[Material]], step_mm: float, row_mm: float) -> Surface:
-    """Rows of fields along y, steps along x."""
+    """Return a panel of fields. Its rows follow each other along y, and its steps along x."""
     panel = stepped_panel(len(fields), len(fields[0]), step_mm, row_mm)
     materials = [material for row in fields for material in row]
     parts = [of_material(corners, material) for corners, material in zip(panel.fields, materials, strict=True)]

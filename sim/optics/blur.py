@@ -25,11 +25,12 @@ _ROWS, _COLUMNS = 64, 256
 def through(
     objective: Objective, image: Image, disk_px: Image, channels: NDArray[np.int64], *, pixel_pitch_um: float
 ) -> Image:
-    """[h, w] of `image` [h, w, 3] (mean electrons in all channels) with lateral colour, defocus and diffraction,
-    after the Bayer filter: `channels` [2, 2] as of `SensorModel.channels`.
+    """Return [h, w] for an `image` [h, w, 3] (mean electrons in all channels) with lateral colour, defocus and
+    diffraction, after the Bayer filter. `channels` [2, 2] are those of `SensorModel.channels`.
 
     `disk_px` [h, w] is the standard deviation of the blur by defocus (`defocus_blur_px`). Each pixel is blurred by
-    the curve of its own depth: right on surfaces, wrong at the edge of an unsharp object in front of a sharp one.
+    the curve of its own depth. This is right on surfaces, but wrong at the edge of an unsharp object in front of a
+    sharp one.
     """
     out = np.empty(image.shape[:2], np.float32)
     for channel in np.unique(channels):
@@ -40,14 +41,14 @@ def through(
 
 
 def defocus_blur_px(objective: Objective, depth_mm: Image, pixel_pitch_um: float) -> Image:
-    """Standard deviation per axis, pixels, of the blur by defocus at depths along the optical axis: a quarter of
-    the disk's diameter. Where nothing is seen, at an infinite depth, it is that of 1 km."""
+    """Return the standard deviation per axis, pixels, of the blur by defocus at depths along the optical axis. It
+    is a quarter of the disk's diameter. At an infinite depth, where nothing is seen, it is that of 1 km."""
     return np.asarray(0.25 * defocus_px(objective, np.minimum(depth_mm, 1e6), pixel_pitch_um), np.float32)
 
 
 def _blur(image: Image, sigma_px: Image, more_px: float, cell_mask: NDArray[np.bool_], out: Image) -> None:
-    """Fill the pixels of `out` whose place in the Bayer cell is `cell_mask` [2, 2]; the blur's variance is that of
-    `sigma_px` [h, w] and of `more_px` together."""
+    """Fill the pixels of `out` at the places `cell_mask` [2, 2] of the Bayer cell. The blur's variance is the sum
+    of those of `sigma_px` [h, w] and `more_px`."""
     low, high = (float(np.hypot(edge, more_px)) for edge in (sigma_px.min(), sigma_px.max()))
     layers = _layers(max(low, _SHARP_PX), high) if high > _SHARP_PX else []
     if low <= _SHARP_PX:
@@ -129,7 +130,7 @@ def _blur_tiles(image, sigma, more, variances, curves, lengths, cell_mask, out):
 
 @numba.njit(cache=True, nogil=True)
 def _layers_between(sigma, more, variances):  # type: ignore[no-untyped-def]
-    """First and last of the layers that variances of `sigma`^2 + `more` need."""
+    """Return first and last of the layers that the variances `sigma`^2 + `more` need."""
     low, high = np.float32(np.inf), np.float32(0.0)
     for row in range(sigma.shape[0]):
         for col in range(sigma.shape[1]):
@@ -144,8 +145,8 @@ def _layers_between(sigma, more, variances):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _mix(pixels, layer, sigma, more, before, variance):  # type: ignore[no-untyped-def]
-    """Bring pixels, so far of the variance `before` at most (below 0: of none), towards a layer of `variance`, as
-    far as their own goes."""
+    """Bring pixels towards a layer of `variance`, as far as their own variance needs. So far they have at most the
+    variance `before` (below 0: none)."""
     for k in range(len(pixels)):
         share = np.float32(1.0)
         if before >= 0.0:
@@ -158,7 +159,7 @@ def _mix(pixels, layer, sigma, more, before, variance):  # type: ignore[no-untyp
 
 @numba.njit(cache=True, nogil=True)
 def _copy(image, top, left_px, source):  # type: ignore[no-untyped-def]
-    """Fill `source` from the image, continued by reflection, and return its greatest value."""
+    """Fill `source` from the image, which is continued by reflection; return its greatest value."""
     height, width = image.shape
     brightest = np.float32(0.0)
     for y in range(source.shape[0]):
@@ -172,7 +173,7 @@ def _copy(image, top, left_px, source):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _mirrored_index(place, count):  # type: ignore[no-untyped-def]
-    """Index in an axis of `count` that is continued by reflection, edges doubled."""
+    """Return the index in an axis of `count` that is continued by reflection, with doubled edges."""
     if 0 <= place < count:
         return place
     place %= 2 * count
@@ -181,8 +182,8 @@ def _mirrored_index(place, count):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _down(source, row, curve, length, sums, halves):  # type: ignore[no-untyped-def]
-    """Weighted sums of the rows around one; `halves` get the even and the odd columns, so that `_along` finds in
-    sequence what it needs."""
+    """Compute weighted sums of the rows around one row. `halves` get the even and the odd columns, so that
+    `_along` reads its values in sequence."""
     for x in range(len(sums)):
         sums[x] = curve[0] * source[row, x]
     for step in range(1, length + 1):

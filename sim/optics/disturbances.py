@@ -1,7 +1,8 @@
 """Disturbances of a measurement that frames show: lamps, drifting LEDs, bumps, smudges, gain, hands.
 
-The world keeps them in a `Disturber`. Each exposure takes along what disturbs it (`Disturbance`): a picture that
-is rendered later is still that of its moment. This code shares nothing with the code that looks for disturbances.
+The world keeps them in a `Disturber`. Each exposure has its own copy of them (`Disturbance`), so a picture that is
+rendered later is still the picture of its moment. This code shares nothing with the code that looks for
+disturbances.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from sim.world import faults as script
 Electrons = NDArray[np.float32]
 Millimetres = tuple[float, float, float]
 _VEIL = 0.3
-"""Share of the light that a smudge takes away which it spreads evenly over its place."""
+"""Share of a smudge's lost light that the smudge spreads evenly over its place."""
 _SOFT = 0.15
 """Width of the edge of a thing in the field, out of focus, as a share of its radius."""
 
@@ -30,7 +31,7 @@ class Spot:
     y: float
     radius: float
     share: float
-    """Transmission of a smudge in its middle; brightness of a thing over the mean of the picture."""
+    """Transmission of a smudge in its middle, or brightness of a thing over the mean of the picture."""
 
     def radius_share(self, shape: tuple[int, int]) -> Electrons:
         """[h, w] distance of each pixel from the middle over the radius."""
@@ -57,11 +58,11 @@ class Disturbance:
 
     @property
     def covers(self) -> bool:
-        """True if something lies in the way of the light."""
+        """True if something is in the way of the light."""
         return bool(self.smudges or self.things)
 
     def cover_up(self, mean_e: Electrons) -> Electrons:
-        """Mean electrons [h, w] behind what lies in the way."""
+        """Return mean electrons [h, w] behind the things in the way."""
         level = np.float32(mean_e.mean())
         for smudge in self.smudges:
             loss = np.float32(1.0 - smudge.share) * np.exp(-0.5 * (2.0 * smudge.radius_share(mean_e.shape)) ** 2)
@@ -74,7 +75,8 @@ class Disturbance:
 
 CALM = Disturbance()
 OF_EACH_KIND = Disturbance(lamp_lux=1.0, smudges=(Spot(0.5, 0.5, 0.1, 0.9),))
-"""Disturbance whose code calm pictures may not need: it is to be compiled before the first frame is due."""
+"""A disturbance with one of each kind, which compiles their code before the first frame is due. Calm pictures may
+not need this code."""
 Disturbing = (
     script.RoomLamp
     | script.Warming
@@ -96,7 +98,7 @@ class Disturber:
         self._dim: dict[int, float] = {}
 
     def happen(self, fault: Disturbing, now_ns: int) -> None:
-        """A fault happens now."""
+        """Let a fault happen now."""
         lasting = self._lasting
         match fault:
             case script.RoomLamp():
@@ -118,7 +120,7 @@ class Disturber:
                 self._dim[fault.led] = 1.0 - fault.loss
 
     def at(self, now_ns: int) -> Disturbance:
-        """Return what disturbs an exposure at that time."""
+        """Return the disturbance of an exposure at that time."""
         things = []
         for since_ns, hand in self._hands:
             age_s = (now_ns - since_ns) * 1e-9
@@ -128,7 +130,7 @@ class Disturber:
         return replace(self._lasting, things=tuple(things)) if things else self._lasting
 
     def flux(self, led: int, now_ns: int) -> float:
-        """Flux of an LED over that without disturbances."""
+        """Return the flux of an LED over its flux without disturbances."""
         factor = self._dim.get(led, 1.0)
         for since_ns, warming in self._warming:
             factor *= max(0.0, 1.0 + warming.per_s * max(0.0, (now_ns - since_ns) * 1e-9))

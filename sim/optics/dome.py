@@ -1,4 +1,4 @@
-"""The dome as built: its boards deviate slightly from the LED table, and wires may be swapped.
+"""The dome as it was built: its boards deviate slightly from the LED table, and wires may be swapped.
 
 The controller has the table; frames are lit by the LEDs given here. This is the truth for the LED calibration.
 """
@@ -36,7 +36,8 @@ class DomeErrors:
 
 
 def as_built(table: Leds, errors: DomeErrors) -> Leds:
-    """The LEDs at their true positions; ids and fluxes are the table's, but swapped LEDs exchange fluxes."""
+    """Return the LEDs at their true positions. Ids and fluxes are the table's, but swapped LEDs exchange
+    fluxes."""
     if not (errors.board_shift_mm or errors.board_turn_deg or errors.led_shift_mm or errors.swapped):
         return table
     from scipy.spatial.transform import Rotation

@@ -1,9 +1,10 @@
 """Veiling glare of lens and camera: light of the whole picture that is scattered over each pixel.
 
-Three parts: haze, the same everywhere (light that lens barrel and sensor's window throw back and forth); a lobe
-about each point that falls by a power of the distance (scratches, dust and coatings of the glass); a ghost, the
-picture turned about its middle and unsharp (light that goes from the sensor to a face of the lens and back). Light
-from beyond the picture's edge makes none. Nothing of this is shared with the calibration that looks for it.
+It has three parts. Haze is the same everywhere (light that lens barrel and sensor's window reflect back and
+forth). A lobe about each point falls by a power of the distance (scratches, dust and coatings of the glass). A
+ghost is the picture turned about its middle, and unsharp (light that goes from the sensor to a face of the lens
+and back). Light from beyond the picture's edge causes no glare. The calibration that looks for glare shares
+nothing of this.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ class Glare(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     share: tuple[Share, Share, Share] = (0.01, 0.01, 0.01)
-    """Light of a black point in the middle of a wholly white picture over the white: red, green, blue."""
+    """Light of a black point in the middle of a completely white picture, over the white: red, green, blue."""
     haze: Part = 0.4
-    """Share of it that is the same everywhere."""
+    """Share of the glare that is the same everywhere."""
     ghost: Part = 0.05
-    """Share of it that is a turned picture; the rest is the lobe."""
+    """Share of the glare that is a turned picture. The rest is the lobe."""
     core: Annotated[float, Field(gt=0, le=1)] = 0.05
     """Radius of the lobe's middle, over the picture's width."""
     falls_by: Annotated[float, Field(ge=2, le=5)] = 3.0
@@ -49,7 +50,7 @@ class Glare(BaseModel):
         return self
 
     def over(self, mean_e: Electrons, channels: NDArray[np.int64]) -> Electrons:
-        """[h, w] electrons with their glare; `channels` [2, 2] as of `SensorModel.channels`."""
+        """Return [h, w] electrons with their glare. `channels` [2, 2] are those of `SensorModel.channels`."""
         out = mean_e.copy()
         for channel in np.unique(channels):
             veil = self.share[channel] * self.scattered_light(mean_e, channels == channel)
@@ -58,12 +59,13 @@ class Glare(BaseModel):
         return out
 
     def of_white(self, size_px: tuple[int, int], channel: int = 1) -> Floats:
-        """[h, w] what a black point at each pixel has of the white around it, in a wholly white picture."""
+        """Return [h, w], the glare of a black point at each pixel in a completely white picture, as a share of
+        white."""
         white = np.ones((size_px[1], size_px[0]), np.float32)
         return np.asarray(self.share[channel] * self.scattered_light(white, np.ones((2, 2), np.bool_)), np.float64)
 
     def scattered_light(self, mean_e: Electrons, cell_mask: NDArray[np.bool_]) -> Electrons:
-        """[h, w] scattered light of the pixels at some places of the Bayer cell, for a share of 1."""
+        """Return [h, w], scattered light of the pixels at some places of the Bayer cell, for a share of 1."""
         import cv2
 
         height, width = mean_e.shape
@@ -107,7 +109,7 @@ def _square_distances(shape: tuple[int, int]) -> Floats:
 
 
 def _at_the_middle(kernel: Floats, shape: tuple[int, int]) -> float:
-    """Sum of a kernel over the cells of a picture, seen from its middle."""
+    """Return the sum of a kernel over the cells of a picture, as seen from its middle."""
     white = np.ones(shape)
     return float(_convolve(white, np.fft.rfft2(kernel))[shape[0] // 2, shape[1] // 2])
 

@@ -1,8 +1,8 @@
 """Lamps in the picture: the image of a lit LED or panel itself.
 
 Every lamp is a rectangle that radiates by the cosine law, so its luminance is the same in all directions in front
-of it. It is behind all else: where anything is seen, the lamp is hidden. Out of focus, its rectangle is convolved
-with the disk of confusion of its own distance.
+of it. It is behind everything else: where anything else is seen, the lamp is hidden. Out of focus, its rectangle
+is convolved with the disk of confusion of its own distance.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def glow(
 ) -> Glow | None:
     """The image of a lamp, or None if the camera does not see it.
 
-    `empty` [h, w] is the fraction of each pixel that sees nothing else; `blur` is objective and pixel pitch in um,
-    None for a picture that is sharp at all distances; `unevenness` is that of `sim.optics.panels.Panel`.
+    `empty` [h, w] is the fraction of each pixel that sees nothing else. `blur` is objective and pixel pitch in um;
+    None for a picture that is sharp at all distances. `unevenness` is that of `sim.optics.panels.Panel`.
     """
     towards = base_from_camera[:3, 3] - emitter.centre_mm
     distance_mm = float(np.linalg.norm(towards))
@@ -84,7 +84,8 @@ def glow(
 
 
 def _box(seen_mm: NDArray[np.float64], through: Sight, margin_px: float) -> tuple[slice, slice] | None:
-    """Pixels that a polygon in the camera's frame may cover; all of them if part of it is behind the camera."""
+    """Return the pixels that a polygon in the camera frame may cover; all pixels if part of it is behind the
+    camera."""
     lens = through.lens
     height, width = lens.height_px, lens.width_px
     if (seen_mm[:, 2] < _NEAR_MM).any():
@@ -103,7 +104,8 @@ def _box(seen_mm: NDArray[np.float64], through: Sight, margin_px: float) -> tupl
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _cover(coverage, edges, top, left_px, focal, centre_x, centre_y, shift):  # type: ignore[no-untyped-def]
-    """Fraction of each pixel whose rays are on the inner side of all planes through camera centre and edge.
+    """Compute the fraction of each pixel whose rays are on the inner side of all planes through camera centre and
+    edge.
 
     Within a pixel rays are linear in position, so the fraction is the area of a square cut by straight lines.
     """

@@ -29,7 +29,8 @@ class LedModel:
 
     seed: int = 1
     flux_spread: float = 0.04
-    """Standard deviation of the logarithm of an LED's flux over its tabulated one: bins are about 10 % wide."""
+    """Standard deviation of the logarithm of the ratio of an LED's flux to its tabulated flux. Makers' bins are
+    about 10 % wide."""
     pump_spread_nm: float = 2.5
     """Standard deviation of the pump chip's peak wavelength."""
     flux_per_k: float = -0.003
@@ -76,7 +77,8 @@ class Flashes:
         self._model = model
         self._count = 0
         self.unsteady: dict[int, float] = {}
-        """LEDs with a loose contact: relative standard deviation from flash to flash, added to the model's."""
+        """LEDs with a loose contact: relative standard deviation from flash to flash, in addition to the
+        model's."""
 
     def flux(self, led: int, temperature_c: float) -> float:
         """Flux of the LED's next flash over its tabulated flux."""

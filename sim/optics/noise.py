@@ -51,8 +51,8 @@ INVERSE_NORMAL = _inverse_normal()
 
 
 def _small_means() -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
-    """Probability of fewer than n counts [128, 72] for means in steps of 1/8, in units of 2^-32; and the count
-    from which to search [128, 256], by a word's upper 8 bits."""
+    """Return the probability of fewer than n counts [128, 72] for means in steps of 1/8, in units of 2^-32. Also
+    return the count at which the search begins [128, 256], by a word's upper 8 bits."""
     means = np.arange(int(POISSON_EXACT_BELOW) * _MEANS_PER_ELECTRON)[:, None] / _MEANS_PER_ELECTRON
     factors = np.concatenate([np.exp(-means), means / np.arange(1, _COUNTS - 1)], axis=1)
     fewer = np.cumsum(np.cumprod(factors, axis=1), axis=1) * 2.0**32
@@ -109,9 +109,10 @@ def poisson_quantile(mean, z):  # type: ignore[no-untyped-def]
 def poisson_exact(mean, word, cumulative, start):  # type: ignore[no-untyped-def]
     """Poisson count from 32 random bits, for means below 16: the sum of two counts, each by inversion.
 
-    The first has the next lower mean of the tables, `SMALL_MEANS` and `SMALL_STARTS`. The position of the word
-    between two of its steps is a random number too: it draws the second, for the remainder of the mean, which is
-    nearly always 0. A loop from 0 with the mean itself is four times slower, as its length is unpredictable.
+    The mean of the first count is the next lower mean in the tables `SMALL_MEANS` and `SMALL_STARTS`. The position
+    of the word between two of its steps is a random number too. It draws the second count, for the remainder of
+    the mean; this count is nearly always 0. A loop from 0 with the mean itself is four times slower, because its
+    length is unpredictable.
     """
     row = np.int32(mean * np.float32(_MEANS_PER_ELECTRON))
     count = np.int32(start[row, word >> np.uint32(24)])

@@ -1,7 +1,7 @@
 """Effects of the simulated lens apart from its geometry (`sim.render.lens`): loss, vignetting, blur.
 
-A thin lens of focal length f and f-number N, focused at s from its principal plane: the image distance is
-f s/(s - f), the magnification m = f/(s - f).
+The lens is a thin lens of focal length f and f-number N, focused at s from its principal plane. The image distance
+is f s/(s - f), and the magnification is m = f/(s - f).
 """
 
 from __future__ import annotations

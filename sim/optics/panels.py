@@ -31,8 +31,8 @@ class Panel(BaseModel):
 
 
 def whole(panel: Panel, base_from_support: Transform, lux: float) -> Emitter:
-    """The panel in the base frame as if it were uniform: the flux is pi times area times luminance of its centre.
-    It gives `lux` on a horizontal surface at the support's centre."""
+    """Return the panel in the base frame as if it were uniform. The flux is pi times the area times the luminance
+    of its centre. It gives `lux` on a horizontal surface at the support's centre."""
     one_lumen = _one_lumen(panel, base_from_support)
     lux_of_one_lumen = sum(
         float(irradiance(piece, base_from_support[:3, 3], base_from_support[:3, 2])[0])

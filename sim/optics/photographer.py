@@ -62,13 +62,13 @@ class Look:
     radiance: dict[int, Radiance] = field(default_factory=dict)
     """Radiance of the sites, by LED, or by minus the number of a panel."""
     around: Neighbourhood | None = None
-    """Neighbourhood in which interreflection is interpolated, once it is needed."""
+    """Neighbourhood in which interreflection is interpolated; it is computed when it is needed."""
     disk_px: NDArray[np.float32] | None = None
-    """Blur by defocus, once it is needed."""
+    """Blur by defocus; it is computed when it is needed."""
     glows: dict[int, Glow | None] = field(default_factory=dict)
     """Images of lamps, by the same numbers."""
     through: Sight | None = None
-    """The lens of this pose, if it is not that of all."""
+    """The lens of this pose, if it differs from the common lens."""
 
     @cached_property
     def empty(self) -> NDArray[np.float32]:
@@ -82,7 +82,7 @@ class Look:
 
 
 class Photographer:
-    """Holds the scene, its shadows and the last look at it; `render` is called from one worker thread."""
+    """Holds the scene, its shadows and the last look at it. Only one worker thread calls `render`."""
 
     def __init__(self, scene: SceneConfig, camera: CameraConfig, settings: Settings) -> None:
         base_from_support = np.array(scene.base_from_support)
@@ -96,7 +96,7 @@ class Photographer:
         self._emission = scene.emission
         table = read_leds(scene.leds)
         self.leds: Leds = as_built(table, settings.dome)
-        """The LEDs where they really are; the controller has the table."""
+        """The LEDs at their true places; the controller has the table."""
         self._led_model = settings.leds
         dies = settings.strangers.light.tilted_normals(self.leds.normals, self.leds.ids)
         self._emitters = _emitters(replace(self.leds, normals=dies))
@@ -212,7 +212,7 @@ class Photographer:
         self._strangers.sensor.add_tails(out, exposure.number, self.sensor.white_dn)
 
     def _blurred_electrons(self, look: Look, sharp: NDArray[np.float32]) -> NDArray[np.float32]:
-        """[h, w] electrons after the Bayer filter, from those [h, w, 3] of a perfect lens."""
+        """Return [h, w] electrons after the Bayer filter, for the electrons [h, w, 3] of a perfect lens."""
         if self._strangers.lens.coma_px:
             sharp = self._strangers.lens.with_coma(sharp)
         channels = self.sensor.channels()
@@ -244,7 +244,7 @@ class Photographer:
         return radiance, 1.0
 
     def _look_from(self, base_from_flange: Transform, arm_mm: Capsules = NONE) -> Look:
-        """Rasterise from a flange pose, unless it is still the last one."""
+        """Rasterise from a flange pose, unless it is the same as the last one."""
         base_from_camera = base_from_flange @ self.flange_from_camera
         look = self._look
         if look is None or np.abs(base_from_camera - look.base_from_camera).max() > _POSE_TOLERANCE:
@@ -310,7 +310,7 @@ class Photographer:
         return radiance
 
     def _add_indirect(self, radiance: Radiance, look: Look, emitter: Emitter, emission: str) -> None:
-        """Add what interreflection makes of a light, if it is on."""
+        """Add the interreflection of a light, if interreflection is on."""
         between, config = self._exchange, self._interreflection
         if between is None or config is None or len(radiance) == 0:
             return
@@ -363,7 +363,7 @@ class Photographer:
 
 
 def _remembered_radiance(look: Look, light: int, compute: Callable[[], Radiance]) -> Radiance:
-    """The radiance under a light, computed once per pose as long as memory suffices."""
+    """Return the radiance under a light. It is computed once per pose as long as memory suffices."""
     if light in look.radiance:
         return look.radiance[light]
     radiance = compute()

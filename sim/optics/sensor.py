@@ -75,7 +75,7 @@ def expose(
 
     `site` [h k, w k] holds, for k x k samples of each pixel, a row of `radiance` [sites, 3], or -1 for nothing;
     the pixel takes their mean. Radiance times `falloff` [h, w] times `electrons_per_radiance` is the mean number
-    of electrons of a pixel with response 1. `exposure_s` and `temperature_c` set dark current and ambient light,
+    of electrons of a pixel with response 1. `exposure_s` and `temperature_c` set dark current and ambient light;
     `gain` divides the electrons per DN. `more_e` [h, w] are mean electrons of other light, such as that of lamps
     in the picture.
 
@@ -229,8 +229,8 @@ def _develop(  # type: ignore[no-untyped-def]
     small_means,
     small_starts,
 ):
-    """Shot noise, full well, readout and ADC. The loops over a row are separate, so that all but that of the dim
-    pixels are vectorised; arrays passed in tuples would halve the speed."""
+    """Apply shot noise, full well, readout and ADC. The loops over a row are separate, so that all but that of the
+    dim pixels are vectorised. Arrays in tuples would halve the speed."""
     height, width = out.shape
     dark_s, full_well, read_e, row_e, dn_per_e, black, white = readout
     for row in numba.prange(height):

@@ -1,6 +1,6 @@
 """Shadows of moving bodies: capsules between the lights and the sites of a view.
 
-Tested exactly, one segment from each site to the light's centre: for a few bodies this is faster than building a
+One segment from each site to the light's centre is tested exactly. For a few bodies this is faster than building a
 new tree for each pose.
 """
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _CHUNK = 256
-"""Sites that are tested together for what may hide the light from any of them."""
+"""Number of sites for which the bodies that may hide the light are found together."""
 
 
 def cast(
@@ -22,8 +22,8 @@ def cast(
 ) -> None:
     """Set `radiance` [n, 3] to 0 where a capsule of [m, 7] (two ends, radius) hides the light from a point [n, 3].
 
-    Neighbours in the list should be neighbours in space: each few hundred are tested against the capsules near
-    them.
+    Neighbours in the list should be neighbours in space, because groups of a few hundred are tested against the
+    capsules near them.
     """
     if len(points_mm) > 0 and len(capsules_mm) > 0:
         _cast(radiance, points_mm, capsules_mm, light_mm)
@@ -39,7 +39,8 @@ def warm_up() -> None:
 def distance_mm(a, b, c, d):  # type: ignore[no-untyped-def]
     """Distance of the segments a b and c d (Ericson, Real-Time Collision Detection, 5.1.9).
 
-    Lines that are parallel to 1e-6 rad count as parallel: up to a millionth of their length too far.
+    Lines that are parallel within 1e-6 rad count as parallel. The distance is then too large by up to a millionth
+    of their length.
     """
     along, across, between = b - a, d - c, a - c
     aa, cc, f = along @ along, across @ across, across @ between
@@ -80,7 +81,8 @@ def _cast(radiance, points, capsules, light):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _near(points, capsules, light):  # type: ignore[no-untyped-def]
-    """Numbers of the capsules that may hide the light from any of a few points, by a ball around these."""
+    """Return the numbers of the capsules that may hide the light from any of a few points, found by a ball around
+    these points."""
     middle, reach = np.empty(3), 0.0
     for k in range(3):
         low, high = np.float64(points[:, k].min()), np.float64(points[:, k].max())

@@ -1,7 +1,8 @@
-"""The view from one camera pose: what each pixel sees, and the sites at which light on it is computed.
+"""The view from one camera pose: the surface at each pixel, and the sites at which the light on it is computed.
 
-Shaded `flat`, the sites are the centroids of the triangles seen: one radiance for each triangle. Shaded by
-`pixel`, each pixel has its own: for each triangle that its rays meet, the mean of the points where they do.
+With `flat` shading, the sites are the centroids of the visible triangles, so each triangle has one radiance. With
+shading by `pixel`, each pixel has its own sites. For each triangle that its rays meet, the site is the mean of the
+points where they meet it.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ class View:
     """[seen] row of the scene's materials."""
 
     def depth_mm(self, base_from_camera: Transform, samples: int) -> NDArray[np.float32]:
-        """[h, w] depth along the optical axis of what the ray in the middle of each pixel's `samples` x `samples`
-        sees; infinite where it sees nothing."""
+        """Return [h, w], the depth along the optical axis of the surface that the ray in the middle of each
+        pixel's `samples` x `samples` meets; infinite if it meets nothing."""
         axis, eye = base_from_camera[:3, 2], base_from_camera[:3, 3]
         depths = np.append(self.points_mm @ axis.astype(np.float32) - np.float32(eye @ axis), np.float32(np.inf))
         of_pixel: NDArray[np.float32] = depths[self.site[samples // 2 :: samples, samples // 2 :: samples]]

@@ -26,8 +26,8 @@ _PACKET = 16
 _CHUNK = 4096
 _COHERENT, _ALL_FEATURES = 1 << 16, 0xFFFFFFFF
 _ARGUMENTS = np.array([_ALL_FEATURES << 32 | _COHERENT, 0, 0, 0, 0, 0], np.uint64)
-"""RTCOccludedArguments: flags, features; no context, filter or function. Rays from neighbouring triangles to one
-light are coherent: they traverse the tree alike."""
+"""RTCOccludedArguments: flags and features; no context, filter or function. Rays from neighbouring triangles to
+one light are coherent, which means that they take similar ways through the tree."""
 _SCATTERED = np.array([_ALL_FEATURES << 32, 0, 0, 0, 0, 0], np.uint64)
 """RTCIntersectArguments, for rays in all directions."""
 _HIT_ROWS = 9
@@ -120,14 +120,14 @@ class Obstacles:
     ) -> None:
         """Set `radiance` [n, 3] to 0 where an obstacle is between a light's centre and a point [n, 3].
 
-        Each is on a triangle of flat unit normal `normals[triangle[i]]`, which faces the light wherever there is
-        radiance."""
+        Each point is on a triangle with the flat unit normal `normals[triangle[i]]`. The normal faces the light
+        wherever there is radiance."""
         address, scene = self._library.occluded, np.uint64(self._scene)
         _cast(address, scene, points_mm, triangle, normals, light_mm, radiance, _ARGUMENTS)
 
     def first_met(self, origins_mm: NDArray[np.float32], ways: NDArray[np.float32]) -> NDArray[np.int32]:
-        """[n] side of a triangle, as in `trace`, that rays from points [n, 3] in directions [n, 3] meet first, or
-        -1."""
+        """Return [n], the side of a triangle, as in `trace`, that rays from points [n, 3] in directions [n, 3]
+        meet first, or -1."""
         sides = np.empty(len(origins_mm), np.int32)
         address, scene = self._library.intersect, np.uint64(self._scene)
         _meet(address, scene, self.corners_mm, origins_mm, ways, sides, _SCATTERED)
@@ -140,8 +140,8 @@ class Obstacles:
 
 
 def _packet_call(_context, _address, _valid, _scene, _rays, _arguments):  # type: ignore[no-untyped-def]
-    """`rtcOccluded16` or `rtcIntersect16` (valid, scene, rays, arguments), its address as argument: such code can
-    be cached."""
+    """`rtcOccluded16` or `rtcIntersect16` (valid, scene, rays, arguments). Its address is an argument, so that
+    this code can be cached."""
 
     def generate(context, builder, _signature, values):  # type: ignore[no-untyped-def]
         word = ir.IntType(64)
@@ -275,8 +275,9 @@ def _meet(intersect, scene, corners, origins, ways, hit_triangles, arguments):  
 
 @numba.njit(cache=True, nogil=True)
 def _packet():  # type: ignore[no-untyped-def]
-    """Memory of one RTCRayHit16, aligned to 64 bytes: 12 rows of 16 for the rays (org xyz, tnear, dir xyz, time,
-    tfar, mask, id, flags) and those of the hits, as float32 and as uint32; and the 16 lanes' valid mask."""
+    """Return the memory of one RTCRayHit16, aligned to 64 bytes. It has 12 rows of 16 for the rays (org xyz,
+    tnear, dir xyz, time, tfar, mask, id, flags) and the rows of the hits, as float32 and as uint32. Also return
+    the valid mask of the 16 lanes."""
     rows = 12 + _HIT_ROWS
     memory = np.zeros((rows + 1) * _PACKET + 16, np.float32)
     skip = np.int64((-np.int64(memory.ctypes.data) // 4) % 16)

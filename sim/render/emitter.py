@@ -1,8 +1,8 @@
 """Irradiance from a square Lambertian emitter at a point.
 
-E = Phi / (2 pi A) sum over the edges of the part above the receiver's horizon of angle_i (edge_i's normal . n)
-(Lambert 1760; seed 003, Eq. 2, where `paper` multiplies by the emitter's cosine once more). Lengths are in mm,
-except that E / Phi is per m^2.
+E is Phi / (2 pi A) times a sum over the edges of the part above the receiver's horizon. The term of edge i is
+angle_i (edge_i's normal . n). The formula is Lambert's (1760) and seed 003's, Eq. 2; there `paper` multiplies by
+the emitter's cosine once more. Lengths are in mm, except that E / Phi is per m^2.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 LED_SIDE_MM = 7.0
 FAR_SIDES = 36.0
-"""Distance in sides from which 2 x 2 Gauss points differ from the polygon by less than 1e-6 if all of the emitter
-is above the horizon (measured in tests/sim/render/test_emitter.py)."""
+"""Distance in sides. From this distance on, 2 x 2 Gauss points differ from the polygon by less than 1e-6 if the
+whole emitter is above the horizon (measured in tests/sim/render/test_emitter.py)."""
 _GAUSS = 1.0 / np.sqrt(3.0)
 
 

@@ -1,7 +1,7 @@
 """Detail of the surface at each site, finer than the mesh: texture, and normals turned by the slope of bumps.
 
-With the height h along the normal n of a surface, the normal of the bumpy surface is n - grad h without its part
-along n, made a unit vector (Blinn, Simulation of wrinkled surfaces, 1978, to first order in h).
+Let h be the height along the normal n of a surface. The normal of the bumpy surface is n minus the part of grad h
+across n, scaled to a unit vector (Blinn, Simulation of wrinkled surfaces, 1978, to first order in h).
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
 """Interreflection: light that meets two or more surfaces, from patch to patch (radiosity by final gathering).
 
-The scene's triangles are grouped into patches of like normal. From points on both sides of each patch, rays in a
-cosine distribution determine once which sides of patches it sees. Then, for each light, the irradiance of all
-patches is gathered bounce by bounce: a side receives the mean over its rays of what the others reflect.
+The scene's triangles are grouped into patches of like normal. Rays from points on both sides of each patch, in a
+cosine distribution, find once which sides of other patches it sees. Then, for each light, the irradiance of all
+patches is gathered bounce by bounce. A side receives the mean over its rays of the light that the others reflect.
 
-All surfaces reflect this light as if they were diffuse, with their diffuse reflectance and that along the normal:
-right for matt surfaces, an approximation for glossy ones, and wrong in direction for mirrors. Concave places finer
-than patches, normals for shading and detail finer than the mesh are left out.
+All surfaces reflect this light as if they were diffuse, with the sum of their diffuse reflectance and their
+reflectance along the normal. This is right for matt surfaces, an approximation for glossy ones, and wrong in
+direction for mirrors. Concave places finer than patches, normals for shading and detail finer than the mesh are
+left out.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from sim.scene.scene import Scene
 POINTS = 2
 """Points on each side of a patch where its light is computed."""
 PATCHES_OF_A_MATERIAL = 1000
-"""Their size follows from the area of all triangles of a material divided by this number."""
+"""The size of patches follows from the area of all triangles of a material divided by this number."""
 _NEIGHBOURS = 8
 _LEAST_WEIGHT = 1e-6
 _CELL_BITS, _OFFSET_CELLS = 16, 1 << 15
@@ -131,7 +132,8 @@ def indirect_lux(
     arm_mm: NDArray[np.float64],
     bounces: int,
 ) -> NDArray[np.float32]:
-    """[sides, 3] lux by light that has met 1 to `bounces` - 1 surfaces; `arm_mm` are capsules in its way."""
+    """Return [sides, 3], lux of light that comes from other surfaces: it has met at least 1 and at most `bounces`
+    - 1 of them. `arm_mm` are capsules in its way."""
     direct = irradiance(emitter, between.points_mm, between.normals, emission)
     lit = np.repeat(direct.astype(np.float32)[:, None], 3, axis=1)
     rows = np.arange(len(lit), dtype=np.int32)
@@ -154,8 +156,8 @@ def add_indirect(
     albedo: NDArray[np.float32],
     triangle: NDArray[np.int32],
 ) -> None:
-    """Add to `radiance` [sites, 3] what irradiances of the sides of patches, `lux` [sides, 3], make of sites of
-    `albedo` [sites, 3] on the view's triangles [sites]."""
+    """Add to `radiance` [sites, 3] the radiance that the irradiances `lux` [sides, 3] of patches' sides cause at
+    sites. The sites have `albedo` [sites, 3] and lie on the view's triangles [sites]."""
     of_triangle = np.empty((len(around.sides), 3), np.float32)
     _interpolate(around.sides, around.weights, lux, of_triangle)
     _add(radiance, of_triangle, albedo, triangle)
@@ -252,8 +254,9 @@ def _place(corners, chosen_triangles, points, normals):  # type: ignore[no-untyp
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _aim(points, normals, first, rays, origins, ways):  # type: ignore[no-untyped-def]
-    """Rays from points, which are numbered from `first` on, in a cosine distribution: evenly over a disk, lifted
-    to the hemisphere. The points of a side share a Fibonacci spiral, which is turned by an angle of its own."""
+    """Make rays from points, which are numbered from `first` on, in a cosine distribution. They are spread evenly
+    over a disk, and projected up onto the hemisphere. The points of a side share a Fibonacci spiral, which is
+    turned by an angle of its own."""
     total, golden = rays * POINTS, np.pi * (3.0 - np.sqrt(5.0))
     for p in numba.prange(len(points)):
         nx, ny, nz = np.float64(normals[p, 0]), np.float64(normals[p, 1]), np.float64(normals[p, 2])
@@ -297,7 +300,7 @@ def _gather_light(seen_sides, sent_light, received_light):  # type: ignore[no-un
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _weigh(corners, sides, normals, patch, neighbours, centres, facing, cells, side_numbers, weights):  # type: ignore[no-untyped-def]
-    """A smooth bump two patches wide, times how much the normals agree."""
+    """Compute the weights: a smooth bump two patches wide, times the agreement of the normals."""
     for chunk in numba.prange(-(-len(sides) // _CHUNK)):
         centroid, normal = np.empty(3), np.empty(3)
         for i in range(chunk * _CHUNK, min(len(sides), (chunk + 1) * _CHUNK)):

@@ -5,11 +5,11 @@ Distortion is the Brown-Conrady model in OpenCV's order and sign (k1, k2, p1, p2
     x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-Lenses that are strangers to calibration (`sim.strangers`) have OpenCV's seven further terms: k4, k5, k6 divide the
-radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6, s1 to s4 add s1 r^2 + s2 r^4 to x and s3 r^2 + s4 r^4 to y.
+Lenses that are strangers to calibration (`sim.strangers`) have OpenCV's seven further terms: k4, k5 and k6 divide
+the radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6; s1 to s4 add s1 r^2 + s2 r^4 to x and s3 r^2 + s4 r^4 to y.
 
-The renderer needs the inverse, once per lens and for every pixel: it tests triangles along the true ray of each
-pixel, so that edges of long triangles are curved in the picture, as they should be.
+The renderer needs the inverse, once per lens and for every pixel. It tests triangles along the true ray of each
+pixel. So edges of long triangles are curved in the picture, as they should be.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ Distortion = tuple[float, ...]
 """k1, k2, p1, p2, k3, or these and k4, k5, k6, s1, s2, s3, s4."""
 NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 LANES = 8
-"""Pixels of a row that the rasteriser tests at once; tables by column are longer than the image by this number."""
+"""Number of pixels of a row that the rasteriser tests at once. Tables by column are longer than the image by this
+number."""
 _PROBES = 65
 _MARGIN = 1.25
 """Safety factor on the steepest slope found between probes."""
@@ -86,9 +87,10 @@ class Lens:
 
 
 def rook_shifts_px(samples: int, count: int) -> NDArray[np.float64]:
-    """[count] shifts of the rays of a supersampled pixel: those of row r move by the r-th value to the right,
-    those of column c by the c-th upwards. So the grid of a pixel's rays is rotated, no two share a row or column,
-    and an edge along the rows is resolved in `samples`^2 steps instead of `samples`. Zeros for one sample.
+    """Return [count] shifts of the rays of a supersampled pixel. Rays of row r move by the r-th value to the
+    right, rays of column c by the c-th value upwards. So the grid of a pixel's rays is rotated, and no two rays
+    share a row or column. An edge along the rows is then resolved in `samples`^2 steps instead of `samples`. The
+    shifts are zeros for one sample.
     """
     return (np.arange(count) % samples + 0.5) / samples - 0.5
 
@@ -102,7 +104,7 @@ class Sight:
     """[2, h, w + LANES] correction of x and y of a pixel's position that undoes distortion, in units of the focal
     length (beyond the image: any number); None without distortion."""
     shift_slope: float
-    """Upper bound of the change of distortion's part of `shift` from one pixel to the next in its row."""
+    """Upper bound of the change of `shift` by distortion from one pixel to the next in its row."""
     reach: tuple[float, float]
     """Upper bound of a pixel's distance from the axis, in x and y, in units of the focal length."""
     bend_slope: float

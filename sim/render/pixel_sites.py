@@ -1,9 +1,9 @@
 """Sites at which the rays of each pixel meet the surface: one for each pixel and triangle that it sees.
 
-A pixel's k x k rays that meet one triangle share a site, the mean of their points on it: light on a triangle
-varies little within a pixel, while its edges are resolved by all rays.
+The rays of a pixel (k x k) that meet one triangle share a site, which is the mean of their points on it. Light on
+a triangle varies little within a pixel, and all rays resolve the triangle's edges.
 
-Sites are numbered block by block of 4 x 4 pixels, in rows of blocks: shadow rays of 16 neighbours in both
+Sites are numbered block by block of 4 x 4 pixels, in rows of blocks. So the shadow rays of 16 neighbours in both
 directions take nearly the same way through the tree (a quarter faster than along rows).
 """
 
@@ -27,7 +27,7 @@ def pixel_sites(
     sight: Sight,
     base_from_camera: Transform,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Points [sites, 3] in the base frame, mm, and the row of each one's triangle [sites].
+    """Return points [sites, 3] in the base frame, mm, and the row of the triangle of each point [sites].
 
     `triangle` [h k, w k], the row seen by each ray or -1, is replaced by the rows of the sites. `centroids_mm` and
     `normals` [seen, 3] give the triangles' planes.
@@ -69,7 +69,7 @@ def _is_first(triangle, k, row, col):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _count(triangle, k, counts):  # type: ignore[no-untyped-def]
-    """Number of sites of each row of blocks, in the place after it."""
+    """Count the sites of each row of blocks; the number is written to the place after the row's own."""
     height, width = triangle.shape
     for line in numba.prange(len(counts) - 1):
         count = 0

@@ -2,10 +2,10 @@
 
 L = f E with f = diffuse / pi + D G F / (4 n.l n.v): Lambert and GGX with Smith's separable G (Walter et al. 2007,
 Eqs. 33 and 34) and Schlick's F, as in `surface.Material`, or f from a material's table. E is that of the whole
-square emitter; f is evaluated towards its centre if it is a table's or the lobe is wide, towards four Gauss points
-weighted by their light if the roughness is below `FINE_ROUGHNESS`. Below about 0.01, where the lobe is as narrow
-as the emitter's angular size (0.4 deg at 1 m), four points are too few. A side whose plane has the emitter's
-centre behind it is dark.
+square emitter. If f comes from a table, or if the lobe is wide, f is evaluated towards the emitter's centre. If
+the roughness is below `FINE_ROUGHNESS`, f is evaluated towards four Gauss points, weighted by their light. Below
+about 0.01, where the lobe is as narrow as the emitter's angular size (0.4 deg at 1 m), four points are too few. A
+side is dark if the emitter's centre is behind its plane.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def led_radiance(
     places: NDArray[np.int32] | None = None,
     reached_bits: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.float32]:
-    """[sites, 3] lm/(m^2 sr), red green blue. `reached_bits` are the bits of `Shadows.reached`, `places` the
-    indices; without them nothing is in the light's way.
+    """[sites, 3] lm/(m^2 sr), red green blue. `reached_bits` are the bits of `Shadows.reached_bits`, `places` the
+    indices. Without them nothing is in the light's way.
 
     `paper` applies the emitter's cosine, towards the site, twice (seed 003, Eq. 2).
     """
@@ -130,7 +130,7 @@ def _shade(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _shade_by_table(px, py, pz, tx, ty, tz, nx, ny, nz, eye, table, lux, out):  # type: ignore[no-untyped-def]
-    """Write into `out` [3] what a material's table makes of `lux` from (tx, ty, tz)."""
+    """Write into `out` [3] the radiance from a material's table for `lux` from (tx, ty, tz)."""
     vx, vy, vz = eye[0] - px, eye[1] - py, eye[2] - pz
     far, away = np.sqrt(tx * tx + ty * ty + tz * tz), np.sqrt(vx * vx + vy * vy + vz * vz)
     vx, vy, vz = vx / away, vy / away, vz / away
@@ -143,7 +143,8 @@ def _shade_by_table(px, py, pz, tx, ty, tz, nx, ny, nz, eye, table, lux, out):  
 
 @numba.njit(cache=True, nogil=True)
 def _add_gloss(px, py, pz, tx, ty, tz, nx, ny, nz, eye, surface, led, shares, lux, out):  # type: ignore[no-untyped-def]
-    """Add to `out` [3] what the specular part of `surface`, a row of the scene's materials, makes of `lux`."""
+    """Add to `out` [3] the radiance of the specular part of `surface`, a row of the scene's materials, for
+    `lux`."""
     vx, vy, vz, alpha = eye[0] - px, eye[1] - py, eye[2] - pz, surface[6]
     distance = np.sqrt(vx * vx + vy * vy + vz * vz)
     vx, vy, vz = vx / distance, vy / distance, vz / distance

@@ -5,10 +5,10 @@ d (v0 x v1) have the sign of v0 (v1 x v2), and then 1/z is their sum over that v
 triangles that extend behind the camera need no clipping, and two triangles with a common edge leave no crack: the
 edge's products are the same numbers with opposite signs.
 
-The image is divided into bands of rows. Each band processes the triangles that reach it in order and keeps the
-nearest, the first of equals: the result does not depend on the number of threads. Nearness and triangle number are
-packed into one integer, so that the nearest is a maximum, and eight pixels of a row are tested at once by a loop
-without branches.
+The image is divided into bands of rows. Each band processes the triangles that reach it in order, and keeps the
+nearest, or the first of equally near ones. So the result does not depend on the number of threads. Nearness and
+triangle number are packed into one integer, so that the nearest triangle is a maximum. A loop without branches
+tests eight pixels of a row at once.
 """
 
 from __future__ import annotations
@@ -26,22 +26,23 @@ _BAND_ROWS = 32
 _LAST = np.int64(0xFFFFFFFF)
 _CHUNK = 16384
 _WIDE = 32
-"""Number of columns above which it is faster to find first which part of a row is between the edges."""
+"""Number of columns above which it is faster to find first the part of a row that is between the edges."""
 _SMALL = 8
 """Size limit of small triangles (columns and rows). With distortion their corners are moved; for larger ones, each
 pixel's ray is moved."""
 _STRIDE = 8
-"""Bands are processed in this stride, so that every thread's part is spread over the image."""
+"""Stride in which bands are processed, so that every thread's part is spread over the image."""
 
 
 def visible_triangles(
     corners_mm: NDArray[np.float32], sight: Sight, base_from_camera: Transform
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return what each pixel's centre sees [h, w], a row of the second array or -1; and the triangles seen [seen].
+    """Return for each pixel's centre [h, w] the visible triangle, as a row of the second array or -1; and the
+    visible triangles [seen].
 
     `corners_mm` [n, 3, 3] are in the base frame. The result is exact in float64 without distortion, and for large
     triangles with distortion; edges of small ones are right to 3e-4 pixel. Both sides are visible. Triangles are
-    listed in the order of their first pixel by rows and columns: neighbours in the image are then close together
+    listed in the order of their first pixel by rows and columns. Neighbours in the image are then close together
     in every table of visible triangles, which makes gathers three times faster.
     """
     lens = sight.lens
@@ -101,7 +102,8 @@ def _to_camera(corners, t, m, v):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _box(v, lens, width, height):  # type: ignore[no-untyped-def]
-    """First and last column and row of the distorted image that a triangle of camera coordinates may reach."""
+    """Return first and last column and row of the distorted image that a triangle may reach. Its corners are in
+    the camera frame."""
     x0, x1, y0, y1 = np.inf, -np.inf, np.inf, -np.inf
     for k in range(3):
         n = (k + 1) % 3
@@ -202,7 +204,8 @@ def _fill_bands(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _merge(firsts, bounds, firsts_in_band, number_of_triangle):  # type: ignore[no-untyped-def]
-    """All triangles seen, once each, in the order of bands; `firsts` gets their numbers in this list instead."""
+    """Return all visible triangles, once each, in the order of bands. `firsts` gets their numbers in this list
+    instead."""
     triangles = np.empty(firsts_in_band.sum(), np.int32)
     count = 0
     for band in range(len(firsts_in_band)):
@@ -246,8 +249,8 @@ def _move_corners(v, lens):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def _fill_triangle(v, box, member, lens, shift, rooks, top, nearest):  # type: ignore[no-untyped-def]
     """Z-buffer one triangle of camera coordinates, which lies within `box`, into a band of rows from `top` on. The
-    high bits of a pixel's value are its nearness, a positive float32 whose bits increase with it; the low bits are
-    the member's number, counted down so that the first of equals is the greatest."""
+    high bits of a pixel's value are its nearness, a positive float32 whose bits increase with it. The low bits are
+    the member's number, counted down, so that the first of equals is the greatest."""
     first_col, last_col = np.int64(box[0]), np.int64(box[1])
     first_row, last_row = max(np.int64(box[2]), top), min(np.int64(box[3]), top + len(nearest) - 1)
     a0, b0, c0 = _cross(v, 1, 2)

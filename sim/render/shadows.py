@@ -1,8 +1,8 @@
 """Table of the LEDs that reach each triangle, kept from view to view.
 
-LEDs, support and object are fixed in the base frame, so whether an LED reaches a side of a triangle holds for
-every view. One ray is traced from the triangle's centroid, raised by `embree.OFFSET_MM`, to the emitter's centre:
-shadows are hard and follow triangles' edges. Moving bodies: `sim.render.arm_shadow`.
+LEDs, support and object are fixed in the base frame. So the answer whether an LED reaches a side of a triangle
+holds for every view. One ray is traced from the triangle's centroid, raised by `embree.OFFSET_MM`, to the
+emitter's centre. So shadows are hard and follow triangles' edges. For moving bodies see `sim.render.arm_shadow`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ _Bits = NDArray[np.uint8]
 class Shadows:
     """Table of bits [LED, side of a triangle], filled as views and LEDs require.
 
-    Sides get their places in it when a view first shows them. Bits beyond `memory_bytes` are not kept: first the
-    sides of earlier views, then LEDs that come late.
+    Sides get their places in the table when a view first shows them. Bits beyond `memory_bytes` are not kept:
+    first sides of earlier views are dropped, then LEDs that come late.
     """
 
     def __init__(self, obstacles: Obstacles, leds_mm: NDArray[np.float64], memory_bytes: int) -> None:

@@ -1,9 +1,10 @@
 """A reflectance of any form as a table for the renderer, in the angles of Rusinkiewicz, A new change of variables
 for efficient BRDF representation (1998).
 
-Axes are the angle theta_h of the half vector to the normal, dense near 0 where lobes are narrow, the angle theta_d
-of the light to the half vector, and the azimuth phi_d of the light about it. Reciprocity and the mirror symmetry
-of isotropic surfaces leave 0 to 90 degrees of phi_d. Values between the nodes are interpolated linearly.
+The table has three axes. theta_h is the angle between half vector and normal; its nodes are dense near 0, where
+lobes are narrow. theta_d is the angle between light and half vector. phi_d is the azimuth of the light about the
+half vector. Reciprocity and the mirror symmetry of isotropic surfaces leave 0 to 90 degrees of phi_d. Values
+between the nodes are interpolated linearly.
 """
 
 from __future__ import annotations
@@ -17,14 +18,15 @@ from coupole.appearance.matter.brdf import Brdf
 NODES = (80, 48, 12)
 """Number of nodes of theta_h, theta_d and phi_d."""
 _LOWEST_Z = 2e-3
-"""Nodes below the horizon take the value just above it, for interpolation."""
+"""Least height of a direction above the horizon. Nodes below the horizon take the value there, for
+interpolation."""
 _CHUNK = 8
 """Angles theta_h that are evaluated together."""
 
 
 def tabulate(brdf: Brdf, weights: NDArray[np.float64]) -> NDArray[np.float32]:
-    """[theta_h, theta_d, phi_d, 3] per steradian, of a reciprocal and isotropic `brdf` as seen by a camera of
-    spectral `weights` [3, bands], each row summing to 1."""
+    """Return [theta_h, theta_d, phi_d, 3] per steradian for a reciprocal and isotropic `brdf`. A camera with the
+    spectral `weights` [3, bands] sees it; each row of weights sums to 1."""
     theta_h = 0.5 * np.pi * np.linspace(0.0, 1.0, NODES[0]) ** 2
     theta_d, phi_d = (0.5 * np.pi * np.linspace(0.0, 1.0, n) for n in NODES[1:])
     parts = []
@@ -41,7 +43,8 @@ def tabulate(brdf: Brdf, weights: NDArray[np.float64]) -> NDArray[np.float32]:
 def _directions(
     theta_h: NDArray[np.float64], theta_d: NDArray[np.float64], phi_d: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Light and view [..., 3] of angles: turned about y by theta_h, from where the half vector is the normal."""
+    """Return light and view [..., 3] for angles. They are turned about y by theta_h from the place where the half
+    vector is the normal."""
     x, y, z = np.sin(theta_d) * np.cos(phi_d), np.sin(theta_d) * np.sin(phi_d), np.cos(theta_d)
 
     def turned_about_y(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -52,7 +55,7 @@ def _directions(
 
 
 def _lift_above_horizon(way: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Directions [..., 3] at least at the least height above the horizon."""
+    """Return the directions [..., 3], raised to the least height above the horizon."""
     z = np.maximum(way[..., 2], _LOWEST_Z)
     shrink = np.sqrt(1.0 - z**2) / np.maximum(np.hypot(way[..., 0], way[..., 1]), 1e-12)
     return np.stack([way[..., 0] * shrink, way[..., 1] * shrink, z], axis=-1)

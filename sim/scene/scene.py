@@ -31,12 +31,12 @@ _CHUNK = 1 << 18
 
 @dataclass(frozen=True)
 class Waves:
-    """The waves of `Layer.waves` of all materials, in the base frame."""
+    """The waves from `Layer.waves` of all materials, in the base frame."""
 
     table: NDArray[np.float64]
     """[waves, 6]."""
     first: NDArray[np.int64]
-    """[materials + 1] the first wave of each material, and the number of all."""
+    """[materials + 1] the first wave of each material, and at the end the number of all waves."""
 
 
 @dataclass(frozen=True)

@@ -16,15 +16,15 @@ class Layer(BaseModel):
     """Detail of a surface that is finer than its triangles: a field of waves through space, cut by the surface.
 
     They are `WAVES` plane waves of one period, in evenly distributed directions with random phases. Their mean
-    scales the diffuse reflectance (a texture). Their sum is also a height, whose slope turns the normals: bumps,
-    or, with a long period, normals that deviate from the mesh. Heights cast no shadows.
+    scales the diffuse reflectance (a texture). Their sum is also a height. Its slope turns the normals, which
+    gives bumps, or, with a long period, normals that deviate from the mesh. Heights cast no shadows.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     WAVES: ClassVar[int] = 8
 
     period_mm: Annotated[float, Field(gt=0)]
-    """The finest on the surface: waves that meet it at an angle are longer there."""
+    """The finest period on the surface. Waves that meet the surface at an angle are longer there."""
     texture: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Greatest relative change of the diffuse reflectance; its root mean square is a quarter of it."""
     slope_deg: Annotated[float, Field(ge=0, le=45)] = 0.0
@@ -54,8 +54,9 @@ class Layer(BaseModel):
 class Material:
     """Lambert and GGX with Schlick's Fresnel, per channel of the camera after normalisation by Spectralon.
 
-    f = diffuse / pi + D G F / (4 n.l n.v), with F = f0 + (1 - f0)(1 - h.v)^5; without the specular part if the
-    roughness is 0. With a table f is what that gives, and `diffuse` counts for light from surface to surface.
+    f = diffuse / pi + D G F / (4 n.l n.v), with F = f0 + (1 - f0)(1 - h.v)^5. If the roughness is 0, there is no
+    specular part. With a table, f comes from the table, and `diffuse` counts only for light from surface to
+    surface.
     """
 
     name: str
@@ -66,7 +67,7 @@ class Material:
     roughness: float = 0.0
     """GGX alpha (Walter et al. 2007)."""
     detail: tuple[Layer, ...] = ()
-    """Finer than triangles; only seen where each pixel is shaded."""
+    """Detail that is finer than triangles. It is seen only if each pixel is shaded."""
     table: NDArray[np.float32] | None = None
     """[theta_h, theta_d, phi_d, 3] as in `sim.scene.brdf_table`, for materials of any other form."""
 

@@ -160,7 +160,7 @@ Thing = Annotated[CharucoBoard | Sphere | Sample, Field(discriminator="kind")]
 
 
 class Disturbance(Protocol):
-    """Change of a thing's surface that its description does not know."""
+    """Change of a thing's surface that its description does not contain."""
 
     def disturbed_surface(self, kind: str, surface: Surface) -> Surface: ...
 

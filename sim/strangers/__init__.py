@@ -1,7 +1,7 @@
-"""Causes for which no calibration has a term: they disturb the simulated cell. Modules are named by what is
-disturbed.
+"""Causes for which no calibration has a term. They disturb the simulated cell. Modules are named after the
+disturbed part.
 
-Each is off until the rig switches it on (`world.settings.strangers`). None of them is known to any calibration.
+Each is off until the rig switches it on (`world.settings.strangers`). No calibration knows of them.
 """
 
 from __future__ import annotations

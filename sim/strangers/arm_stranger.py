@@ -1,6 +1,6 @@
-"""An arm that errs by where it is and from where it came: backlash, sag, a ripple of its gears.
+"""An arm whose errors depend on its present and previous place: backlash, sag, a ripple of its gears.
 
-All act on the angles: the true ones are those that the controller reports, and these errors.
+All errors act on the angles: a true angle is the reported angle plus these errors.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ class ArmStranger(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     backlash_deg: Six = _NONE
-    """Play of each axis: it stops half of it short, on the side from which it came."""
+    """Play of each axis. The axis stops short by half of it, on the side from which it came."""
     sag_deg_per_nm: Six = _NONE
-    """Compliance of each axis under the weight of what it carries."""
+    """Compliance of each axis under the weight of the parts that it carries."""
     down: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Direction of gravity in the arm's base: along z for an arm that hangs upside down."""
     ripple_deg: Six = _NONE
     """Amplitude of a periodic error of each axis's gear."""
     ripple_periods: Six = (80.0, 100.0, 80.0, 50.0, 50.0, 50.0)
-    """Per turn of the axis."""
+    """Number of periods per turn of the axis."""
     ripple_phase_deg: Six = _NONE
 
     def errors_deg(

@@ -1,9 +1,9 @@
 """A lens that Brown's model does not describe: rational and thin-prism terms, a decentred stop, a focus group that
 slides, coma.
 
-The stop decides through which point of the lens the chief rays pass. Shifted by e from the lens's axis, it moves
-the projection centre by e (which only the hand-eye sees), and the principal point by e/s of the focal length, s
-the focus distance; distortion stays centred on the lens's axis.
+The stop determines the point of the lens through which the chief rays pass. If the stop is shifted by e from the
+lens's axis, the projection centre moves by e (which only the hand-eye calibration sees). The principal point moves
+by e/s of the focal length, where s is the focus distance. Distortion stays centred on the lens's axis.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class LensStranger(BaseModel):
     stop_shift_mm: tuple[float, float] = (0.0, 0.0)
     """Shift of the entrance pupil from the lens's axis, along the image's x and y."""
     breathing: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0
-    """Relative change of the image distance from a camera that looks straight down to one that looks sideways: the
-    focus group slides by its weight, with the cosine of the angle."""
+    """Relative change of the image distance from a camera that looks straight down to one that looks sideways. The
+    focus group slides by its weight, in proportion to the cosine of the angle."""
     coma_px: Annotated[float, Field(ge=0)] = 0.0
     """Length at the image's corners of the one-sided blur, which grows with the square of the distance from the
     centre."""

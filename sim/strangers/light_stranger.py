@@ -1,4 +1,4 @@
-"""LEDs that are no Lambertian squares: a measured lobe, tilted dies, a primary lens."""
+"""LEDs that are not Lambertian squares: a measured lobe, tilted dies, a primary lens."""
 
 from __future__ import annotations
 
@@ -24,14 +24,15 @@ class LightStranger(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     lobe: tuple[tuple[float, float], ...] = ()
-    """Pairs of angle from the die's normal, deg, and luminous intensity in any unit, as measured by a goniometer;
-    straight between them, nothing beyond the last. The flux stays the table's. Empty: the cosine."""
+    """Pairs of angle from the die's normal, deg, and luminous intensity in any unit, as a goniometer measures
+    them. Intensity is linear between them, and zero beyond the last. The flux stays the table's. Empty: the
+    cosine."""
     die_tilt_deg: Annotated[float, Field(ge=0, le=30)] = 0.0
-    """Standard deviation of each die's turn about two axes of its board: its position stays."""
+    """Standard deviation of each die's turn about two axes of its board. The die's position stays."""
     seed: int = 1
     primary_lens_mm: float = 0.0
-    """Shift of the die's image by the lens on it, across its normal and towards whoever looks at it, over the sine
-    of the angle to the normal."""
+    """Shift of the die's image by the lens on it, across the die's normal and towards the viewer, over the sine of
+    the angle to the normal."""
 
     @field_validator("lobe")
     @classmethod
@@ -60,7 +61,8 @@ class LightStranger(BaseModel):
         return np.asarray(self.intensity(np.degrees(np.arccos(cosine))) / cosine, np.float32)
 
     def intensity(self, angle_deg: Floats) -> Floats:
-        """Relative to pi times the flux: the cosine without a lobe, and of the same flux with it."""
+        """Return the intensity relative to pi times the flux: the cosine without a lobe, otherwise the lobe with
+        the same flux."""
         if not self.lobe:
             return np.asarray(np.cos(np.radians(angle_deg)))
         at_deg, relative_intensity = np.array(self.lobe).T
@@ -70,7 +72,7 @@ class LightStranger(BaseModel):
         return np.asarray(np.interp(angle_deg, at_deg, relative_intensity, right=0.0) / flux)
 
     def seen_from(self, emitter: Emitter, eye_mm: Floats) -> Emitter:
-        """The die's image that the primary lens shows an eye."""
+        """Return the die's image that an eye sees through the primary lens."""
         away = eye_mm - emitter.centre_mm
         away = away / np.linalg.norm(away)
         across = away - (away @ emitter.normal) * emitter.normal

@@ -1,4 +1,4 @@
-"""Targets that are not as described: a bent board, a white tile with a lobe and a stain."""
+"""Targets that differ from their description: a bent board, a white tile with a lobe and a stain."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ class TargetStranger(BaseModel):
     tile_stain: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Share of the light that a stain on the white tile takes at its middle."""
     tile_stain_mm: Annotated[float, Field(gt=0)] = 8.0
-    """Radius where the stain takes 0.6 of that; it lies off the tile's middle by as much, along x."""
+    """Radius at which the stain takes 0.6 of that share. The stain lies off the tile's middle by the same length,
+    along x."""
 
     def disturbed_surface(self, kind: str, surface: Surface) -> Surface:
         if kind == "charuco_board" and self.board_bend_um:

@@ -17,8 +17,8 @@ from sim.world.config import Config, Settings
 __all__ = ["Config", "Settings", "World"]
 
 _START_TIMEOUT_S = 900.0
-"""Time-out for the start: at its first start on a machine a world compiles its code, which takes a minute or two,
-on a busy machine many."""
+"""Time-out for the start. At its first start on a machine a world compiles its code, which takes a minute or two,
+or many minutes on a busy machine."""
 _ANSWER_TIMEOUT_S = 180.0
 _STOP_TIMEOUT_S = 5.0
 
@@ -33,7 +33,7 @@ class World:
 
     @staticmethod
     def start(config: dict[str, Any]) -> World:
-        """Start a world for this process; it ends when this process does.
+        """Start a world for this process; it ends together with this process.
 
         `config` is the JSON form of `Config`. Raises DeviceError if the world does not start.
         """
@@ -96,7 +96,7 @@ class World:
         self._process.stdout.close()
 
     def wait(self) -> None:
-        """Wait until the world ends. Raises DeviceLost if it ended otherwise than by being told to."""
+        """Wait until the world ends. Raises DeviceLost if it ended without a command."""
         assert self._process is not None
         if code := self._process.wait():
             how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
@@ -109,7 +109,7 @@ class World:
 
 
 def _launch() -> subprocess.Popen[str]:
-    """A world that waits for its configuration."""
+    """Launch a world that waits for its configuration."""
     return subprocess.Popen(
         [sys.executable, "-m", "sim.world.world"],
         stdin=subprocess.PIPE,

@@ -1,11 +1,11 @@
 """The world's time, and its distribution to other processes.
 
 World time runs `speed` times as fast as the machine's monotonic clock, but never past the next unprocessed event
-(the *horizon*): in a slow or lock-stepped world, time is stretched, and no event happens late. Readers need only a
-few numbers in shared memory.
+(the *horizon*). So in a slow or lock-stepped world, time is stretched, and no event happens late. Readers need
+only a few numbers in shared memory.
 
-With `hurry_only_when_told`, the world runs in real time except until a moment that its client sets: the client's
-own work then takes as much world time as in a real cell, and only its waiting is shortened.
+With `hurry_only_when_told`, the world runs fast only until a moment that its client sets; otherwise it runs in
+real time. So the client's own work takes as much world time as in a real cell, and only its waiting is shortened.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _SEQUENCE, _WISH = struct.Struct("<Q"), struct.Struct("<q")
 BLOCK_BYTES = _BLOCK.size + _WISH.size
 _NAP_S = 0.02
 _LOOK_EVERY_NS = 20_000_000
-"""Interval, by the machine's clock, at which a reader looks whether the world's process still runs."""
+"""Interval, by the machine's clock, at which a reader checks whether the world's process still runs."""
 FOREVER_NS = 2**62
 
 
@@ -64,7 +64,7 @@ class ClockWriter:
         self.publish(horizon_ns=0)
 
     def paced_ns(self) -> int:
-        """World time by the pace alone, without regard to events."""
+        """World time by the pace alone; events are ignored."""
         now_ns = time.monotonic_ns()
         world_ns = self._pace.world_at(now_ns)
         if self._told:
@@ -78,7 +78,7 @@ class ClockWriter:
         return (world_ns - self.paced_ns()) / 1e9 / self.speed
 
     def slip_to(self, world_ns: int) -> None:
-        """Set world time to `world_ns`: a world that is behind its pace does not catch up."""
+        """Set world time to `world_ns`. A world that is behind its pace does not catch up."""
         self._pace = Pace(time.monotonic_ns(), world_ns, self.speed, self._pace.hurry_until_ns)
 
     def publish(self, horizon_ns: int, *, alive: bool = True) -> None:
@@ -99,12 +99,13 @@ class ClockWriter:
 class SharedClock:
     """A reader's side: `coupole.clock.Clock` on the block at `path`.
 
-    When the world has ended, or its process was killed, time goes on at the world's speed: whoever waits for
-    something by this clock must not wait for ever.
+    When the world has ended, or its process was killed, time goes on at the world's speed. So nobody who waits by
+    this clock waits for ever.
     """
 
     _process: int | None = None
-    """A descriptor that can be read once the world's process has ended; None where there are none."""
+    """A descriptor that can be read once the world's process has ended; None if the system has no such
+    descriptors."""
 
     def __init__(self, path: Path) -> None:
         with path.open("r+b") as file:

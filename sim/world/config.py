@@ -27,7 +27,7 @@ from sim.strangers.arm_stranger import NO_STRANGER
 from sim.world import faults as script
 
 WHITE_SHARE = 0.6
-"""A white target at the support's centre reaches this fraction of full scale at the plan's exposure."""
+"""Share of full scale that a white target at the support's centre reaches at the plan's exposure."""
 
 
 _OF_THE_TRUE_CAMERA = (
@@ -57,13 +57,13 @@ class MaterialConfig(_Model):
 
 
 class SpecimenConfig(_Model):
-    """A material that is no sum of Lambert and GGX (`sim.objects.specimens`)."""
+    """A material that is not a sum of Lambert and GGX (`sim.objects.specimens`)."""
 
     specimen: Literal["tabulated", "layered", "makie", "four-flux", "fabric"]
 
 
 class MeasuredConfig(_Model):
-    """A measured material (`sim.objects.measured_files`): one of these."""
+    """A measured material (`sim.objects.measured_files`), given by one of these files."""
 
     merl: Path | None = None
     bsdf: Path | None = None
@@ -89,11 +89,12 @@ class MeshConfig(_Model):
 
     path: Path
     pictures_beside: Path | None = None
-    """The textures that the mesh names are beside this file; None: beside `path`."""
+    """File beside which the textures of the mesh are; None: beside `path`."""
     unit: Literal["mm", "m", "um"]
     support_from_object: list[list[float]]
     material: MaterialConfig | SpecimenConfig | MeasuredConfig | None = None
-    """Multiplied by the mesh's own colours; None: these alone, or warm stone for a mesh without colours."""
+    """Material that is multiplied by the mesh's own colours. None: only these colours, or warm stone for a mesh
+    without colours."""
 
 
 class SceneConfig(_Model):
@@ -112,7 +113,7 @@ class InterreflectionConfig(_Model):
     """Light from surface to surface, as in `sim.render.interreflection`."""
 
     bounces: Annotated[int, Field(ge=2, le=16)] = 4
-    """The most surfaces that light meets."""
+    """Greatest number of surfaces that light meets."""
     rays: Annotated[int, Field(ge=4, le=4096)] = 128
     """Number of rays from each side of a patch."""
 
@@ -134,14 +135,15 @@ class CameraConfig(_Model):
     """k1, k2, p1, p2, k3 of the Brown-Conrady model, in OpenCV's order and sign."""
     f_number: Annotated[float, Field(gt=0)] = 8.0
     samples_per_side: Annotated[int, Field(ge=1, le=8)] = 1
-    """Rays through each pixel, k x k: for targets whose corners are located to a fraction of a pixel."""
+    """Rays through each pixel, k x k. Use several for targets whose corners are located to a fraction of a
+    pixel."""
     blur: bool = False
     rim_radius: float = 3.0
     rim_shift: float = 4.0
     lateral_colour: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sensor: SensorModel = SensorModel()
     sensor_temperature_c: float = 25.0
-    """The settings from `blur` on are as in `sim.devices.camera_body.Settings`."""
+    """Temperature of the sensor. The settings from `blur` on are as in `sim.devices.camera_body.Settings`."""
     flange_from_camera: list[list[float]]
     nominal_exposure_us: int
     """The exposure at which white reaches `white_share` of full scale."""
@@ -163,11 +165,13 @@ class Settings(_Model):
 
     speed: Annotated[float, Field(gt=0, le=1000)] = 1.0
     hurry_only_when_told: bool = False
-    """Real time, except for `speed` while the controller announces that it only waits (dry runs)."""
+    """True: the world runs at `speed` only while the controller announces that it only waits (dry runs), otherwise
+    in real time."""
     seed: int = 1
     white_at_us: Annotated[int, Field(gt=0)] | None = None
-    """The exposure at which white reaches a fixed share of full scale; None: the plan's, so that whatever it asks
-    is exposed well. A camera that is calibrated must have one, or each plan has a camera of its own."""
+    """The exposure at which white reaches a fixed share of full scale. None: the plan's exposure, so that every
+    plan is exposed well. A camera that is calibrated must have this value; otherwise each plan has a camera of its
+    own."""
     ledbox: LedBoxSettings = ledbox_firmware.Settings()
     robot: RobotSettings = kuka_controller.Settings()
     camera: CameraSettings = camera_server.Settings()
@@ -176,19 +180,20 @@ class Settings(_Model):
     """Things on the support in addition to the plan's object."""
     shading: Literal["pixel", "flat"] = "pixel"
     """`pixel`: light and shadow on each pixel, with interreflection and blur. `flat`: one radiance for each
-    triangle, without these two. Both can be set by themselves."""
+    triangle, without interreflection and blur. Both can be set separately."""
     interreflection: InterreflectionConfig | bool | None = None
-    """None: as `shading` has it."""
+    """Light from surface to surface. None: as `shading` determines."""
     arm_shadows: bool = True
     """True if arm and tool block light."""
     cables: tuple[ToolBody, ...] = ()
-    """Capsules in the support frame that hang in the cell and block light, of which no plan and no rig knows."""
+    """Capsules in the support frame that hang in the cell and block light. No plan and no rig knows of them."""
     material: MaterialConfig | SpecimenConfig | MeasuredConfig | None = None
-    """Material of the plan's object, multiplied by its mesh's own colours; None: these alone, or warm stone."""
+    """Material of the plan's object, multiplied by its mesh's own colours. None: only these colours, or warm
+    stone."""
     detail: tuple[Layer, ...] = ()
     """Detail of the plan's object: texture, bumps and turned normals that its mesh does not have."""
     true_surface: Literal["plaque"] | None = None
-    """The surface of which the plan's mesh is a scan: `sim.objects.plaque`, in the scan's frame, with its own
+    """The surface that was scanned for the plan's mesh: `sim.objects.plaque`, in the scan's frame, with its own
     materials. None: the mesh itself."""
     stickers: Stickers | None = None
     """Stickers on the plan's object."""
@@ -197,13 +202,13 @@ class Settings(_Model):
     dome: DomeErrors = DomeErrors()
     """Deviations of the dome from its table."""
     glare: Glare | None = None
-    """Veiling glare of the camera; `{}`: 1 % of white; None: none."""
+    """Veiling glare of the camera. `{}` means 1 % of white; None means no glare."""
     strangers: Strangers = Strangers()
-    """Causes that no calibration has a term for."""
+    """Causes for which no calibration has a term."""
     exposures_remembered: Annotated[int, Field(ge=0)] = 0
-    """Number of last exposures whose true light the world tells on its control connection."""
+    """Number of newest exposures for which the world reports the true light on its control connection."""
     panels: tuple[Panel, ...] = ()
-    """The flat white panels 1 to 4, visible to the camera; without them a panel is uniform ambient light."""
+    """The flat white panels 1 to 4, which the camera may see. Without them a panel is uniform ambient light."""
 
     @property
     def light_between_surfaces(self) -> InterreflectionConfig | None:
@@ -240,7 +245,7 @@ class Config(_Model):
     scene: SceneConfig
     camera: CameraConfig
     tells_refusals: bool = False
-    """Stand-ins tell on standard error what they refuse, for clients that are not Coupole."""
+    """True: stand-ins report their refusals on standard error, for clients that are not Coupole."""
 
     @property
     def rendered_camera(self) -> CameraConfig:

@@ -1,7 +1,7 @@
-"""The true light of the last exposures, for checking labels from outside: the program under test never sees it.
+"""The true light of the newest exposures, for checking labels from outside. The program under test never sees it.
 
-Frames of the simulated camera do not carry it, rendered or not. It is asked for on the world's control connection
-(`exposures`), by the number of the exposure, and found by the frame's id and timestamp.
+Frames of the simulated camera do not contain this light, rendered or not. A client requests it on the world's
+control connection (`exposures`), by the number of the exposure, and finds it by the frame's id and timestamp.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from sim.world.lighting import Lighting
 
 
 class LitExposure(NamedTuple):
-    """One exposure and what shone during it."""
+    """One exposure and the LEDs that were lit during it."""
 
     number: int
     """Counts exposures from power-on."""
@@ -27,7 +27,7 @@ class LitExposure(NamedTuple):
 
 
 class ExposureLog:
-    """Keeps the last `size` exposures; with 0 none, and nothing is computed."""
+    """Keeps the newest `size` exposures. With 0 it keeps none, and computes nothing."""
 
     def __init__(self, lighting: Lighting, size: int) -> None:
         self._lighting = lighting

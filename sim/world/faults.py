@@ -22,7 +22,7 @@ Place = Annotated[float, Field(ge=-1, le=2)]
 
 
 class When(BaseModel):
-    """Moment of a fault; with neither field: at power-on."""
+    """Moment of a fault. Without a field it is power-on."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -114,7 +114,7 @@ class FlickeringLed(_Model):
 
 
 class DimLed(When):
-    """An LED that has aged, or whose contact has become worse: it loses `loss` of its flux for good."""
+    """An LED that has aged, or whose contact has become worse. It loses `loss` of its flux permanently."""
 
     kind: Literal["dim_led"]
     led: Count

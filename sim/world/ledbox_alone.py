@@ -1,8 +1,8 @@
 """A world with nothing but an LED box in it, on a thread of its own: the other end of the wire of a box's driver,
 for `coupole.testing.LedBoxConformance` and `TableLedBoxConformance`.
 
-A stand-in is built on the world's event loop (`reactor`). It tells the world of its light by `light` and `dark`
-(or `darken_one`), of its panels by `switch_panel`, of its edges by `edge`.
+A stand-in is built on the world's event loop (`reactor`). It reports its light to the world by `light` and `dark`
+(or `darken_one`), its panels by `switch_panel`, and its edges by `edge`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sim.world.reactor import Reactor
 
 _PATIENCE_S = 20.0
 _SLOW = 0.5
-"""Pace of a world in which a driver's time-out takes longer than anything the machine is busy with."""
+"""Speed of a world in which a driver's time-out takes longer than any other work of the machine."""
 
 
 class Sender(Protocol):
@@ -51,7 +51,7 @@ class BoxAlone(Protocol):
 
 @dataclass
 class LedBoxAlone:
-    """The box, its clock, and what it did to the world: a `coupole.testing.TableLedBoxWorld`."""
+    """The box, its clock, and its effects on the world: a `coupole.testing.TableLedBoxWorld`."""
 
     reactor: Reactor
     clock: SharedClock
@@ -61,7 +61,7 @@ class LedBoxAlone:
     link: Sender = field(init=False)
     """Carrier of its answers."""
     opener: Callable[..., AbstractContextManager[Any]] = field(init=False)
-    """Opens the driver on the box, with settings that differ from the usual ones."""
+    """Opens the driver on the box, with settings that may differ from the usual ones."""
     lighting: Lighting = field(default_factory=Lighting)
     edges_ns: list[int] = field(default_factory=list)
     """Times of all edges that the box sent."""
@@ -101,7 +101,7 @@ class LedBoxAlone:
     # What a test does and sees.
 
     def do(self, action: Callable[[], Any]) -> Any:
-        """Run `action` on the world's thread and wait until it is done; what it gave."""
+        """Run `action` on the world's thread, wait until it is done, and return its result."""
         is_done = threading.Event()
         returned_values: list[Any] = []
 
@@ -126,7 +126,8 @@ class LedBoxAlone:
         self.do(self.box.unplug)
 
     def lose_answers(self, count: int) -> list[bytes]:
-        """The box's next `count` answers get lost on their way; the list that they are collected in."""
+        """Let the box's next `count` answers get lost on their way. Return the list in which they are
+        collected."""
         lost_answers: list[bytes] = []
         send = self.link.send
 
@@ -140,7 +141,8 @@ class LedBoxAlone:
         return lost_answers
 
     def slow_down(self) -> None:
-        """Let a time-out of the driver take longer than anything the machine is busy with, from now on."""
+        """Slow the world down from now on, so that a time-out of the driver takes longer than any other work of
+        the machine."""
 
         def act() -> None:
             self.reactor.clock.speed = _SLOW
@@ -154,7 +156,7 @@ class LedBoxAlone:
         return lit_leds
 
     def wait_until_dark(self) -> None:
-        """Wait until nothing shines; fails if something shines on and on."""
+        """Wait until nothing shines. Fails if something does not stop shining."""
         end_s = time.monotonic() + _PATIENCE_S
         while self.shining():
             assert time.monotonic() < end_s, "waited in vain for darkness"
@@ -176,7 +178,7 @@ def ledbox_alone(
 ) -> Iterator[LedBoxAlone]:
     """A running world, at `speed` times real time, until the context ends.
 
-    `make(world)` gives the stand-in and what carries its answers; `opener(world, **settings)` opens the driver,
+    `make(world)` gives the stand-in and the carrier of its answers. `opener(world, **settings)` opens the driver,
     with `world.clock` as its clock. The clock's file is in `folder`.
     """
     clock_path = folder / "clock"

@@ -2,8 +2,8 @@
 
 Stand-ins have no threads. They register callbacks: at a world time (`at`, `after`), when a file descriptor can be
 read (`add_reader`), or from a worker thread (`call_threadsafe`). A timed callback sees its exact world time as
-`now_ns`, however late the machine executes it; so events in the world do not depend on the machine's load, which
-only affects how long the simulation takes.
+`now_ns`, however late the machine executes it. So events in the world do not depend on the machine's load. The
+load affects only the duration of the simulation.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Protocol
 from sim.world.clock import FOREVER_NS, ClockWriter
 
 _MAX_LAG_S = 0.02
-"""A world further behind its pace than this (machine time) gives up catching up."""
+"""A world that is farther behind its pace than this (machine time) gives up catching up."""
 _TIMERS_PER_POLL = 16
 _IDLE_TICK_NS = 10_000_000
 
@@ -66,7 +66,7 @@ class Reactor:
         return self._now_ns
 
     def at(self, t_ns: int, callback: Callable[[], None]) -> Timer:
-        """Call back at world time `t_ns` (at once if that is past)."""
+        """Call back at world time `t_ns`, or at once if this time is past."""
         timer = Timer(max(t_ns, self._now_ns), next(self._order), callback)
         heapq.heappush(self._timers, timer)
         return timer
@@ -83,7 +83,7 @@ class Reactor:
         self._selector.unregister(readable)
 
     def call_threadsafe(self, callback: Callable[[], None]) -> None:
-        """Have the reactor's thread call back soon; for worker threads."""
+        """Let the reactor's thread call back soon. This is for worker threads."""
         self._calls.append(callback)
         self._wake()
 
@@ -91,7 +91,7 @@ class Reactor:
     def hold_for(readable: Readable, machine_s: float) -> bool:
         """Pause world time until `readable` has bytes; False if it had none after `machine_s`.
 
-        Used by a stand-in in lock-step with a client: the world waits for the client's answer.
+        A stand-in in lock-step with a client uses this: the world waits for the client's answer.
         """
         return bool(select.select([readable], [], [], machine_s)[0])
 
@@ -106,7 +106,7 @@ class Reactor:
                 os.write(self._wake_write, b"!")
 
     def run(self) -> None:
-        """Process events until stopped; then it is over for good."""
+        """Process events until stopped. It cannot be started again."""
         while not self._stopped.is_set():
             next_ns = self._next_ns()
             wait_s = self.clock.machine_s_until(next_ns)

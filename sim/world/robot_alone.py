@@ -24,7 +24,7 @@ class RobotAlone(ABC):
     """A controller in a world of its own, and drivers that talk to it: a `coupole.testing.RobotCell`.
 
     `controller` is the stand-in, on the world's event loop (`reactor`), which this class runs in a thread. Its
-    `joints_deg` are where the arm truly is.
+    `joints_deg` are the arm's true angles.
     """
 
     settings: Any
@@ -34,7 +34,7 @@ class RobotAlone(ABC):
         self.clock_path, self.reactor, self.controller = clock_path, reactor, controller
         self.cycle_ms = cycle_ms
         self.home_deg = self.joints_deg()
-        """[6] where the arm stood when the world began."""
+        """[6] angles of the arm when the world began."""
         self.trace_deg: list[tuple[float, ...]] = []
         self.reactor.after(0.5 * cycle_ms / 1e3, self._sample)
         self._thread = threading.Thread(target=self.reactor.run)
@@ -45,16 +45,16 @@ class RobotAlone(ABC):
         """The driver opened last."""
 
     def keep(self, robot: Any) -> Any:
-        """A driver that is closed with the cell."""
+        """Keep a driver, to be closed with the cell."""
         self.robot = self._drivers.enter_context(closing(robot))
         return robot
 
     @abstractmethod
     def open(self) -> Robot:
-        """A driver, closed with the cell."""
+        """Open a driver, which is closed with the cell."""
 
     def in_world(self, action: Callable[[], object]) -> None:
-        """Do something on the world's thread and wait until it is done."""
+        """Run an action on the world's thread, and wait until it is done."""
         is_done = threading.Event()
 
         def act() -> None:
@@ -73,11 +73,11 @@ class RobotAlone(ABC):
 
     @property
     def repeatability_mm(self) -> float:
-        """Standard deviation of where the arm comes to rest, mm."""
+        """Standard deviation of the place where the arm comes to rest, mm."""
         return float(self.controller.errors.repeatability_um) / 1e3
 
     def true_base_from_flange(self) -> NDArray[np.float64]:
-        """[4, 4] where the flange truly is, mm."""
+        """Return [4, 4], the true pose of the flange, mm."""
         return np.array(self.controller.true_base_from_flange())
 
     def emergency_stop(self) -> None:
@@ -89,19 +89,20 @@ class RobotAlone(ABC):
         self.in_world(self.controller.reset)
 
     def lose_link(self, seconds: float) -> None:
-        """No packet comes through for so long."""
+        """Let no packet come through for this time."""
         self.in_world(lambda: self.controller.lose_link(seconds))
 
     def push_aside(self, turns_deg: tuple[float, ...]) -> None:
-        """Turn the axes by so much, though nobody has commanded it."""
+        """Turn the axes by these angles, without a command."""
         self.in_world(lambda: self.controller.nudge(turns_deg))
 
     def joints_deg(self) -> NDArray[np.float64]:
-        """[6] where the axes truly are."""
+        """Return [6], the true angles of the axes."""
         return np.array(self.controller.joints_deg)
 
     def wait_until(self, condition: Callable[[], bool]) -> None:
-        """Wait for something of the world, and look at the arm meanwhile, as whoever moves it must."""
+        """Wait for a condition of the world, and look at the arm meanwhile, as every supervisor of a motion
+        must."""
         give_up = time.monotonic() + 30.0
         while not condition():
             with suppress(DeviceError):  # a motion that nobody looks at is ended
@@ -111,15 +112,15 @@ class RobotAlone(ABC):
             time.sleep(0.001)
 
     def under_way(self) -> bool:
-        """True if a motion from home has begun in earnest."""
+        """True if a motion from home is clearly under way."""
         return bool(np.max(np.abs(self.joints_deg() - self.home_deg)) > 8.0)
 
     def wait_until_under_way(self) -> None:
-        """Wait until a motion from home has begun in earnest."""
+        """Wait until a motion from home is clearly under way."""
         self.wait_until(self.under_way)
 
     def stop_under_way(self, robot: Robot) -> None:
-        """Stop a motion from home in its midst."""
+        """Stop a motion from home on its way."""
         self.wait_until_under_way()
         robot.stop()
 
@@ -140,8 +141,8 @@ class RobotAlone(ABC):
         return np.array(self.settings.arm().velocity_deg_s)
 
     def assert_smooth(self) -> None:
-        """Speed, acceleration and jerk of all that was sampled are within the driver's limits. In real time a late
-        answer halts the arm for a cycle, so there nothing is asserted."""
+        """Assert that speed, acceleration and jerk of all samples are within the driver's limits. In real time a
+        late answer halts the arm for a cycle, so nothing is asserted then."""
         if not getattr(self, "lock_step", True):
             return
         dt_s = self.cycle_ms / 1e3
@@ -154,7 +155,7 @@ class RobotAlone(ABC):
             )
 
     def assert_stands(self) -> None:
-        """The arm does not move for half a second of world time."""
+        """Assert that the arm does not move for half a second of world time."""
         before = self.joints_deg()
         self.clock.sleep(0.5)
         assert not self.controller.moving

@@ -1,4 +1,4 @@
-"""Lengths of the simulated cell as a person would measure them with ruler and tape, in mm."""
+"""Lengths of the simulated cell, mm, as a person would measure them with ruler and tape."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from sim.world.config import SceneConfig
 
 
 class Ruler:
-    """Measurements with a ruler: the tool over the disk, the tool itself, disk and dome, and where the first board
-    lies."""
+    """Measurements with a ruler: the tool above the disk, the tool itself, disk and dome, and the place of the
+    first board."""
 
     def __init__(self, scene: SceneConfig, things: Sequence[Thing], leds_mm: NDArray[np.float64]) -> None:
-        """`leds_mm` [n, 3]: where the LEDs really are, base frame."""
+        """`leds_mm` [n, 3] are the true places of the LEDs, base frame."""
         self._scene = scene
         self._support_from_base = inverse(np.array(scene.base_from_support))
         self._leds_mm = leds_mm

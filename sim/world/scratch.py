@@ -1,4 +1,4 @@
-"""The folder of a running world: clock, sockets; in memory where the machine has such a place.
+"""The folder of a running world, with clock and sockets. It is in memory if the machine has a place for this.
 
 A world that is killed cannot remove its folder, so the next world removes the folders of worlds that are gone.
 Each world holds a lock on its own folder as long as it lives.
@@ -23,7 +23,8 @@ _LOCK = "lock"
 
 @contextmanager
 def world_folder(scratch: Path = SCRATCH) -> Iterator[Path]:
-    """A folder of one's own in `scratch`, removed at the end; those of killed worlds are removed first."""
+    """Give a folder for this world in `scratch`, which is removed at the end. Folders of killed worlds are removed
+    first."""
     with _beginning(scratch):
         _remove_abandoned(scratch)
         folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=scratch))
@@ -38,7 +39,8 @@ def world_folder(scratch: Path = SCRATCH) -> Iterator[Path]:
 
 @contextmanager
 def _beginning(scratch: Path) -> Iterator[None]:
-    """One world at a time makes its folder, so that none is taken for abandoned before it holds its lock."""
+    """Let one world at a time make its folder, so that no folder seems abandoned before its world holds the
+    lock."""
     with (scratch / f"coupole-worlds-{os.getuid()}.lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield

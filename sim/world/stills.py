@@ -34,7 +34,8 @@ class Stills:
         exposure_s: float,
         gain: float = 1.0,
     ) -> NDArray[np.uint16]:
-        """A RAW frame [h, w], DN; LEDs and panels are lit throughout, and of the arm only the tool is present."""
+        """Return a RAW frame [h, w], DN. LEDs and panels are lit throughout. Only the tool of the arm is
+        present."""
         pixels = np.empty(self._shape, np.uint16)
         shining = dict.fromkeys(leds, exposure_s)
         tool = tool_capsules(base_from_flange, self._tool) if self._arm_shadows else NONE

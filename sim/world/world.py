@@ -1,7 +1,8 @@
 """The simulated cell: one process, one reactor, and the stand-ins that share its state.
 
-`python -m sim.world.world` reads its configuration as one JSON line from standard input, prints its endpoints as
-one JSON line and serves until standard input closes (its parent has ended), a signal comes or it is told to stop.
+`python -m sim.world.world` reads its configuration as one JSON line from standard input, and prints its endpoints
+as one JSON line. It serves until standard input closes (because its parent has ended), a signal comes, or a client
+tells it to stop.
 """
 
 from __future__ import annotations
@@ -128,7 +129,7 @@ class World:
     # -- the cables ---------------------------------------------------------------------------------------
 
     def _in_the_light(self) -> Capsules:
-        """Parts of arm and tool that block light, and cables that hang in the cell."""
+        """Return the parts of arm and tool that block light, and cables that hang in the cell."""
         return np.concatenate([self._arm(), self._cables])
 
     def _arm(self) -> Capsules:
@@ -145,12 +146,12 @@ class World:
                 assert_never(kind)
 
     def _light(self, led: int, t_on_ns: int, t_off_ns: int) -> None:
-        """The box switches an LED on; it is lit with its present flux."""
+        """Note that the box switches an LED on; it is lit with its present flux."""
         flux = self._flashes.flux(led, self.box.temperature_of_led_c(led)) * self._disturber.flux(led, t_on_ns)
         self.lighting.light(led, t_on_ns, t_off_ns, flux)
 
     def _edge_counted(self, number: int) -> None:
-        """The box has sent, or dropped, edge `number`: faults scheduled for it happen."""
+        """Let faults happen that are scheduled for edge `number`, which the box has sent or dropped."""
         for fault in self._faults_at_edge.pop(number, ()):
             self._happen(fault)
 
@@ -244,7 +245,7 @@ class World:
         client.close()
 
     def _answer(self, data: bytes) -> dict[str, Any]:
-        """Do what a client asks for; what is no command is answered with an error."""
+        """Obey a client's command. Data that are not a command are answered with an error."""
         try:
             command = json.loads(data)
         except (ValueError, RecursionError):
@@ -314,7 +315,7 @@ class OneFault(BaseModel):
 
 
 def _tell(message: str) -> None:
-    """Print a message on the terminal of whoever serves this world; standard output is for the endpoints."""
+    """Print a message on the terminal of the user who serves this world. Standard output is for the endpoints."""
     print(message, file=sys.stderr, flush=True)
 
 
@@ -337,8 +338,8 @@ def main() -> int:
 
 
 def _end_when_parent_is_gone() -> None:
-    """End this process by a signal when the parent is gone, so that a world in the making ends too: its code may
-    be compiled for minutes."""
+    """End this process by a signal when the parent is gone. So a world that is being started ends too; its code
+    may be compiled for minutes."""
     with contextlib.suppress(OSError):
         while os.read(sys.stdin.fileno(), 4096):
             pass

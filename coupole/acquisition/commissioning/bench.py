@@ -64,7 +64,7 @@ class Findings:
     answers: list[Answer] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     remedy: str = ""
-    """Remedy if a limit is missed or an answer is no."""
+    """Action for the case that a limit is exceeded, or that the person answers no."""
 
     def at_most(self, quantity: str, figure: float, limit: float, unit: str) -> bool:
         """Note a figure and its limit; returns whether it is met. A figure that is not finite misses it."""

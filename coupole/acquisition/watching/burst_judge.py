@@ -24,8 +24,8 @@ _STILL_THERE = 0.5
 """Share of a local change that the last frame of its LED must still show. Noise is less than half of a change that
 is found."""
 _COMES_BACK_MM = 0.1
-"""Displacement of the picture that is normal after the arm has left the view and come back: makers of industrial
-arms state a pose repeatability (ISO 9283) of some 0.02 to 0.06 mm, which counts for each of the two poses."""
+"""Displacement of the picture that is normal after the arm has left the view and come back. Makers of industrial
+arms state a pose repeatability (ISO 9283) of some 0.02 to 0.06 mm. It counts for each of the two poses."""
 Floats = NDArray[np.float64]
 
 

@@ -3,8 +3,8 @@
 The result comes from Monte Carlo (JCGM 101). The reason is that in a mesh of 200 um edges with vertices known to
 30 um, the normal is uncertain by degrees, and 1 / cos is then far from linear. GUM's linear formula is the
 cross-check. A test of section 8 of JCGM 101 shows whether it is sufficient. The importance of a source is given in
-three ways: its share of the linear variance, the width of the interval without the source (the paper's way), and
-the width of the interval from the source alone.
+three ways. These are its share of the linear variance, the width of the interval without the source (the paper's
+way), and the width of the interval from the source alone.
 """
 
 from __future__ import annotations

@@ -46,8 +46,8 @@ class CellCertificate:
     chain: tuple[ChainLink, ...]
     issue_time: datetime
     doubts: tuple[str, ...]
-    """Reasons not to issue it: records that were not accepted, that expired by date or by drift, or whose chains
-    are broken."""
+    """Reasons not to issue it: records that were not accepted, expired records (by date or by drift), and broken
+    chains."""
 
     @property
     def records(self) -> tuple[Record, ...]:

@@ -167,9 +167,9 @@ class LeftOut:
 
     def bound(self, share: float) -> tuple[float, float]:
         """Return a bound of CIEDE2000 for a share of further colours like the patches', and the share that it
-        holds for. The bound is the smallest order statistic k for which k / (n + 1) is at least the share, or the
-        largest of the n patches (split conformal prediction: Vovk, Gammerman and Shafer, Algorithmic Learning in a
-        Random World, 2005)."""
+        holds for. The bound is the smallest order statistic k for which k / (n + 1) is at least the share. If
+        there is none, it is the largest of the n patches (split conformal prediction: Vovk, Gammerman and Shafer,
+        Algorithmic Learning in a Random World, 2005)."""
         count = len(self.de)
         place = min(int(np.ceil(share * (count + 1))), count)
         return float(np.sort(self.de)[place - 1]), min(share, place / (count + 1))

@@ -67,8 +67,8 @@ class Seen:
     light_u: Floats | None = None
     """Errors of the light, as in `Balanced.light_u`."""
     signals_without: Sequence[Signals] | None = None
-    """Signals of all patches for each patch, under a light that was found without this patch; None if the light is
-    known."""
+    """Signals of all patches, once for each patch, under a light that was found without that patch. None if the
+    light is known."""
     shown_chart: ShownChart | None = None
     """The chart in a plain picture."""
     remarks: tuple[str, ...] = ()

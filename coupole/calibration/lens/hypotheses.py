@@ -230,8 +230,8 @@ def _by_chance(before: Solution, after: Solution) -> float:
     """Return the probability that noise alone causes a step as large as that between the boards of the two parts.
 
     It is Hotelling's T^2 of two samples with a common covariance (Anderson, An Introduction to Multivariate
-    Statistical Analysis, 3rd ed., 2003, section 5.3.4), less six degrees of freedom for the hand-eye that both
-    parts share.
+    Statistical Analysis, 3rd ed., 2003, section 5.3.4), with six degrees of freedom less, because both parts share
+    the hand-eye.
     """
     first, second = len(before.scatter), len(after.scatter)
     degrees = first + second - 2 - 6

@@ -1,4 +1,4 @@
-"""Makes the records of dark frames and response. All radiometric records share some of its functions.
+"""Makes the records of dark frames and response; has functions for all radiometric records.
 
 Each calibration returns an `Outcome`: a sealed record, its maps or tables, its picture.
 """
@@ -154,8 +154,8 @@ def _of_means(dark: Dark, u: Floats) -> Floats:
 
 
 def dark_signal(frames: LightFrames, record_path: Path | None) -> Callable[[LightFrame], NDArray[np.float32]]:
-    """Return a function for the dark signal [H, W], DN: from a dark record, or else from the dark frames of the
-    same exposure, or else from the camera's black level."""
+    """Return a function for the dark signal [H, W], DN: from a dark record, else from dark frames of the same
+    exposure, else from the camera's black level."""
     if record_path is not None:
         offset = map_beside(record_path, "dark", "offset_dn", frames)
         current = map_beside(record_path, "dark", "current_dn_per_s", frames)
@@ -179,7 +179,7 @@ def dark_signal(frames: LightFrames, record_path: Path | None) -> Callable[[Ligh
 
 
 def map_beside(path: Path, kind: Kind, name: str, frames: LightFrames) -> NDArray[np.float32]:
-    """Return a map [H, W] beside a record for these frames. Raises InputError for another record."""
+    """Return a map [H, W] beside a record for these frames. Raises InputError."""
     record = read_earlier(path, kind, frames.about, frames.size_px)
     with h5py.File(path.parent / record.files[0].name, "r") as file:
         values: NDArray[np.float32] = file[name][()]
@@ -292,7 +292,7 @@ def _one_scene(frames: LightFrames) -> list[LightFrame]:
 
 
 def _sample(shape: tuple[int, ...], pattern: str, channel: str) -> NDArray[np.bool_]:
-    """Return a mask [H, W] of a sample of a channel's pixels, in whole rows, which keeps neighbours."""
+    """Return a mask [H, W] of a sample of a channel's pixels in whole rows. Neighbours stay neighbours."""
     mask = channel_mask((shape[0], shape[1]), pattern, channel)
     step = max(1, round(float(mask.sum()) / _MOST_PIXELS))
     rows = (np.arange(shape[0]) // 2) % step == 0

@@ -3,7 +3,7 @@
 A pixel shows its own light and a veil: sum over k of a_k (K_k * own)(x). K_0 is the same everywhere (the mean of
 the picture). The others are normal distributions of decreasing width, `WIDTHS` times the picture's width. Each has
 the sum 1 in the plane. Light from beyond the picture's edge is not known, and counts as zero. ISO 9358 measures
-the same figure as one number, the veiling glare index; Talvala et al. (SIGGRAPH 2007) and McCann and Rizzi (2007)
+the same figure as one number, the veiling glare index. Talvala et al. (SIGGRAPH 2007) and McCann and Rizzi (2007)
 show that the part which does not depend on the scene is smooth. So the veil is computed on blocks of pixels, far
 larger than any blur.
 """
@@ -97,7 +97,7 @@ def of_white(size_px: tuple[int, int], pixels: Floats) -> Floats:
 
 
 def _between(pixels: NDArray[np.intp], block_px: int, count: int) -> tuple[NDArray[np.intp], Floats]:
-    """Return the block before each pixel, and the share of the block behind it."""
+    """Return the block before each pixel, and the interpolation weight of the next block."""
     place = np.clip((pixels + 0.5) / block_px - 0.5, 0.0, count - 1.0)
     first = np.floor(place).astype(np.intp)
     return first, place - first

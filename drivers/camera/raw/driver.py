@@ -8,7 +8,7 @@ picture, and it wraps from 9999 to 1. So a picture that never arrives leaves a g
 capture time with its fraction of a second. The run ends with a message if a file arrives after a later one, a
 number is repeated, a capture time runs backwards, or camera, exposure or sensitivity differ.
 
-*Slow.* Marks are shifted by a sixteenth of a period (docs/decisions/0002), so the period must be 40 times the
+*Slow.* Marks are shifted by a sixteenth of a period (docs/decisions/0002). So the period must be 40 times the
 jitter of the timestamps: 0.4 s with hundredths of a second, 20 s with whole seconds.
 """
 

@@ -45,8 +45,8 @@ class Settings(BaseModel):
     motion."""
     declared_cycle_ms: float | None = Field(default=None, gt=0)
     """Cycle of a simulated controller whose world waits for answers, or runs at another speed than the machine's
-    clock. It is compared instead of the arrival. The world provides it. A controller that does not call itself
-    simulated is measured."""
+    clock. This cycle is compared instead of the arrival of packets. The world provides it. A controller that does
+    not call itself simulated is measured."""
     sen_type: str = Field(default="ImFree", pattern=r"^[\w.-]+$")
     """SENTYPE of the controller's RSI configuration."""
     measured_tag: str = Field(default="AIPos", pattern=_TAG)

@@ -4,10 +4,10 @@
     corrections still count from this session's start. And the distance from the axes that this packet reports to
     the answer's place must be at most the lag of the arm plus one cycle's step.
 
-*Proves* means: since the last answered packet, the controller's counter of late answers contains every cycle of
-its IPOC that was not answered, and the counter has not decreased; and a silence on the machine's clock is also a
-silence by the IPOC. A controller that restarts RSI needs some cycles for it, counts none of them, and begins its
-counter at 0. The old corrections would then lead as far from the arm as it had moved.
+*Proves* has three conditions. The controller's counter of late answers contains every cycle of its IPOC that was
+not answered since the last answered packet. The counter has not decreased. A silence on the machine's clock is
+also a silence by the IPOC. A controller that restarts RSI needs some cycles for it, counts none of them, and
+begins its counter at 0. The old corrections would then lead as far from the arm as it had moved.
 
 *Lag* means: the arm is between the places to which the answers led within the last `follow_lag_s`, within
 `follow_deg`. If it is not there, no answer leads farther away from it.

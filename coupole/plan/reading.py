@@ -51,8 +51,8 @@ def read_plan(plan_path: Path, rig_path: Path | None = None, *, text: str | None
         raise InputError(problems)
     if cell.rig.arm is None:
         message = (
-            f"expected the arm that `{cell.rig.robot.driver}` moves, as its file: preflight must know what it "
-            "could touch"
+            f"expected the file of the arm that `{cell.rig.robot.driver}` moves: preflight must know what "
+            "the arm could touch"
         )
         problems.append(cell.document.problem(("arm",), message))
     wrong = missing_lights(plan, cell.leds, cell.rig.support.base_from_support.matrix())

@@ -128,8 +128,8 @@ def _last_part(name: str) -> str:
 
 def _twice(name: str) -> str:
     return (
-        f"two pictures are called {name}; pictures are looked for in one folder by the last part of their names: "
-        "put all into one folder under names of their own, and name these here"
+        f"two pictures are called {name}; pictures are looked for in one folder by the last part of their "
+        "names: put all into one folder under different names, and write these names here"
     )
 
 

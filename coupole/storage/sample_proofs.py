@@ -105,5 +105,5 @@ def _read_proofs(path: Path) -> list[Proof]:
             fields = json_of(line, str(path), line=number)
             proofs.append(Proof(str(fields["view"]), str(fields["digest"]), bool(fields["is_first"])))
         except (InputError, KeyError, TypeError) as error:
-            raise StorageError(f"{path}: line {number} is no proof of samples: {error}") from error
+            raise StorageError(f"{path}: line {number} is not a proof of samples: {error}") from error
     return proofs

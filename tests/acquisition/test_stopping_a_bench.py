@@ -71,7 +71,7 @@ def test_who_lights_again_and_again_is_refused_after_a_stop(monkeypatch: pytest.
     monkeypatch.setattr(BenchFrames, "_refuse_what_there_is_not", lambda *_: None)
     frames: Any = BenchFrames.__new__(BenchFrames)
     asked = FrameAsked.model_validate({"version": 1, "command": "frame", "exposure_us": 100, "stops": 0})
-    with pytest.raises(InputError, match="the bench was stopped meanwhile"):
+    with pytest.raises(InputError, match="the bench was stopped while it waited"):
         frames.frame(asked, stops=1)
 
 

@@ -93,7 +93,7 @@ def test_a_temperature_that_nobody_measured_is_the_runs_or_allowed_for(tmp_path:
             ("file: c.pdf", "file: d.pdf"),
             "board.yaml:8:102: artefact.certificate.file: expected the certificate's file",
         ),
-        (("file: c.pdf", f"file: c.pdf, sha256: '{'0' * 64}'"), "another than its `sha256`"),
+        (("file: c.pdf", f"file: c.pdf, sha256: '{'0' * 64}'"), "which differs from its `sha256`"),
         (("k: 2}\n  flatness", "k: 0}\n  flatness"), "board.yaml:11:"),
         (("16.0016", "25.4"), "16 mm within 1 %"),
         (("artefact:", "scale_u_ppm: 20\nartefact:"), "no `scale_u_ppm` beside a certified artefact.square_mm"),

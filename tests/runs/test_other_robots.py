@@ -182,7 +182,7 @@ def test_a_plan_for_an_arm_that_nothing_describes_is_refused_before_a_device_is_
     cell.write()
     ended = cell.acquire()
     assert ended.code == 2
-    assert "arm: expected the arm that `drivers.ur.driver:UrRobot` moves, as its file" in ended.err
+    assert "arm: expected the file of the arm that `drivers.ur.driver:UrRobot` moves" in ended.err
 
 
 def test_the_planned_arm_has_the_speeds_of_rig_and_driver() -> None:

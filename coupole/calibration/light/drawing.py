@@ -156,7 +156,9 @@ def draw_led_power(powers: Mapping[str, LedPower], positions: Positions, record:
     x, y = _dome_map(positions, green.ids)
     dots = axes[0, 0].scatter(x[lit], y[lit], c=relative[lit], cmap="viridis", s=14)
     axes[0, 0].plot(x[green.power == 0], y[green.power == 0], "x", color=RED, ms=9, mew=2)
-    axes[0, 0].set(title="Power of green over the mean; dead in red", aspect="equal", xticks=[], yticks=[])
+    axes[0, 0].set(
+        title="Power of green divided by the mean; dead LEDs in red", aspect="equal", xticks=[], yticks=[]
+    )
     axes[0, 0].spines[["left", "bottom"]].set_visible(False)
     figure.colorbar(dots, ax=axes[0, 0], shrink=0.8)
     for channel, power in powers.items():

@@ -42,7 +42,7 @@ def write_pick_page(
     points, faces = simplified_mesh(vertices_mm, triangles, most_triangles)
     if len(faces) == 0:
         raise InputError(
-            f"{title}: nothing is left of the mesh at {most_triangles} triangles; check its triangles"
+            f"{title}: nothing is left of the mesh when it is simplified to {most_triangles} triangles; check it"
         )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -119,7 +119,7 @@ def find(target: Array, palette: Sequence[Paint], face: Face, noise: float, at_m
     if bands.sum() < _LEAST_BANDS:
         raise InputError(
             f"target and palette have {int(bands.sum())} common bands between 380 and 780 nm; expected "
-            f"{_LEAST_BANDS} or more: leave out the paint that is known in few"
+            f"{_LEAST_BANDS} or more: leave out the paint that is known in only a few bands"
         )
     problem = _Problem(target[bands], palette, bands, face, noise)
     recipes: list[Recipe] = []

@@ -40,7 +40,7 @@ _HALTED_PACKETS = 5
 """The arm has halted after this many consecutive cycles without an advance. Answers were late, or the arm is not
 where it was led."""
 _QUIET_NS = 500_000_000
-"""A packet without a delay counter counts as the first of a session after this silence."""
+"""Silence after which a packet without a delay counter counts as the first of a session."""
 
 _SESSION_ENDS = (shared_state.LINK_LOST, shared_state.RESTARTED, shared_state.OUT_OF_BOUNDS)
 """Faults after which nothing is answered, because the controller may have begun a new session, or because no
@@ -351,7 +351,7 @@ class RsiSession:
         elif advance > 0:
             self.fail(shared_state.LINK_LOST, f"{advance // step - self._astray_run} packets are missing")
         else:
-            self.fail(shared_state.RESTARTED, "RSI was restarted: its packets begin to count anew")
+            self.fail(shared_state.RESTARTED, "RSI was restarted: its packets have begun to count anew")
 
     def _watch(self, packet: Packet, *, strays: bool) -> None:
         """Compare the measured axes with those commanded in the last answer."""

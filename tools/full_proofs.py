@@ -75,6 +75,11 @@ PROOFS = (
     Proof("cells", "intervals of 100 random cells hold", "tools/prove_calibrations.py --cells 100"),
     Proof("cells-absolute", "the same with the arm's absolute errors", "tools/prove_calibrations.py --absolute"),
     Proof(
+        "led-positions",
+        "intervals of LED positions hold with causes that a plain adjustment lacks",
+        "tools/prove_led_positions.py",
+    ),
+    Proof(
         "artefacts",
         "E_n of independent boards and tiles holds as stated; wrong ones are found",
         "tools/prove_artefacts.py",

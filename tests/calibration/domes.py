@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,8 +96,17 @@ def eyes(count: int, boards: LedTable, random: np.random.Generator) -> Array:
     return np.array(poses)
 
 
-def dome(seed: int, *, boards: int = 8, views: int = 12, noise: Noise = Noise(), most_views: int = 100) -> Dome:
-    """A dome that differs from its table, seen by a camera that differs from its records."""
+def dome(
+    seed: int,
+    *,
+    boards: int = 8,
+    views: int = 12,
+    noise: Noise = Noise(),
+    most_views: int = 100,
+    image: Callable[[Array, Array, Array], Array] = lambda centre_mm, normal, eye_mm: centre_mm,
+) -> Dome:
+    """A dome that differs from its table, seen by a camera that differs from its records; `image` is where an eye
+    sees the middle of a die with this normal."""
     random = np.random.default_rng(seed)
     known = table(boards)
     true_mm, true_normals = known.positions_mm.copy(), known.normals.copy()
@@ -116,7 +125,8 @@ def dome(seed: int, *, boards: int = 8, views: int = 12, noise: Noise = Noise(),
         there = (true_mm - eye[:3, 3]) @ eye[:3, :3]
         facing = np.einsum("ni,ni->n", eye[:3, 3] - true_mm, true_normals) / np.linalg.norm(there, axis=1)
         for row in np.flatnonzero((there[:, 2] > 200) & (facing > np.cos(np.radians(65)))):
-            middle = outline_middle(LENS, eye, true_mm[row], true_normals[row], random)
+            seen_mm = image(true_mm[row], true_normals[row], eye[:3, 3])
+            middle = outline_middle(LENS, eye, seen_mm, true_normals[row], random)
             if np.all((middle > 60) & (middle < np.array(SIZE_PX) - 60)) and led.count(row) < most_views:
                 view.append(number)
                 led.append(row)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -37,9 +37,10 @@ def images(made: Dome) -> LedImages:
     return LedImages(made.seen, made.base_from_flange, names, SIZE_PX, (), About(is_simulated=True), inputs)
 
 
-def found(made: Dome, *, accept_faults: bool = False) -> LedsFound:
+def found(made: Dome, *, accept_faults: bool = False, limits: Mapping[str, float] | None = None) -> LedsFound:
+    request = replace(REQUEST, limits=limits or {})
     return leds_from(
-        images(made), made.table, made.prior, REQUEST, stated_noise=Stated(), accept_faults=accept_faults
+        images(made), made.table, made.prior, request, stated_noise=Stated(), accept_faults=accept_faults
     )
 
 

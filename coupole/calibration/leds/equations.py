@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from coupole.calibration import optics
 from coupole.calibration.leds.boards import Boards
 from coupole.calibration.leds.matching import LedSightings
 from coupole.calibration.leds.spots import outline_offsets
+from coupole.calibration.leds.suspects import Mode, shifts_px
 from coupole.calibration.point_sets import Indices
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.rotations import Floats, between, inverses, moved_transforms, skew
@@ -47,6 +49,8 @@ class LedState:
     lens: Floats
     axis_zeros_deg: Floats
     """[k] deviation of the arm's axis zeros from their record."""
+    coefficients: Floats
+    """[c] of the suspects' modes."""
 
 
 @dataclass(frozen=True)
@@ -66,10 +70,18 @@ class Problem:
     by_axes: Floats
     """[v, 6, k] step of each pose per degree of each axis of the arm."""
     stated_noise: Stated
+    modes: tuple[Mode, ...]
+    """[c] of suspects."""
     sightings_of: tuple[Indices, ...]
     """[b] spots on each board."""
     columns_of: tuple[Indices, ...]
     """[b] columns of the shared parameters that these depend on."""
+
+    @property
+    def columns_of_modes(self) -> slice:
+        """Columns of the suspects among the shared parameters."""
+        end = 6 * len(self.reported_poses) + self.of_camera
+        return slice(end - len(self.modes), end)
 
     @property
     def sigmas(self) -> Floats:
@@ -78,13 +90,13 @@ class Problem:
 
     @property
     def shared_count(self) -> int:
-        """Number of shared parameters: six for each view, then lens, hand-eye and axes."""
+        """Number of shared parameters: six for each view, then lens, hand-eye, suspects and axes."""
         return 6 * len(self.reported_poses) + len(self.prior_whiten)
 
     @property
     def of_camera(self) -> int:
-        """Number of these that belong to lens and hand-eye, on which each spot depends beside its view."""
-        return len(self.prior.free) + 6
+        """Number of these that belong to lens, hand-eye and suspects, on which all spots depend."""
+        return len(self.prior.free) + 6 + len(self.modes)
 
 
 def problem_of(
@@ -94,16 +106,16 @@ def problem_of(
     reported_poses: Floats,
     prior: CameraPrior,
     stated_noise: Stated,
+    modes: Sequence[Mode],
 ) -> Problem:
     whiten = np.linalg.inv(np.linalg.cholesky(sightings.covariance))
     board = boards.board_of[place]
     sightings_of = tuple(np.flatnonzero(board == b) for b in range(len(boards.numbers)))
-    tail = 6 * len(reported_poses) + np.arange(6 + len(prior.free))
+    tail = 6 * len(reported_poses) + np.arange(6 + len(prior.free) + len(modes))
     columns_of = tuple(
         np.concatenate([(6 * np.unique(sightings.view[rows])[:, None] + np.arange(6)).ravel(), tail])
         for rows in sightings_of
     )
-    prior_whiten = np.linalg.inv(np.linalg.cholesky(prior.covariance))
     return Problem(
         boards,
         place,
@@ -112,12 +124,29 @@ def problem_of(
         whiten,
         reported_poses,
         prior,
-        prior_whiten,
+        _prior_whiten(prior, modes),
         prior.by_axes(reported_poses),
         stated_noise,
+        tuple(modes),
         sightings_of,
         columns_of,
     )
+
+
+def _prior_whiten(prior: CameraPrior, modes: Sequence[Mode]) -> Floats:
+    """Factor that brings `camera_step` to unit variance."""
+    first = 6 + len(prior.free)
+    of_modes = first + np.arange(len(modes))
+    whiten = np.zeros((len(prior.covariance) + len(modes),) * 2)
+    of_records = np.delete(np.arange(len(whiten)), of_modes)
+    whiten[np.ix_(of_records, of_records)] = np.linalg.inv(np.linalg.cholesky(prior.covariance))
+    whiten[of_modes, of_modes] = [1.0 / mode.sigma for mode in modes]
+    return whiten
+
+
+def with_modes(problem: Problem, modes: Sequence[Mode]) -> Problem:
+    """The same with other prior standard deviations of the modes."""
+    return replace(problem, modes=tuple(modes), prior_whiten=_prior_whiten(problem.prior, modes))
 
 
 def at_centres(problem: Problem, state: LedState) -> Problem:
@@ -145,9 +174,21 @@ def points_seen(problem: Problem, state: LedState) -> tuple[Floats, Floats, Floa
 
 def whitened_residuals(problem: Problem, state: LedState) -> Floats:
     """Residuals [k, 2] over the stated noise."""
-    projection = optics.project(points_seen(problem, state)[2], state.lens)
-    result: Floats = np.einsum("kij,kj->ki", problem.whiten, problem.observed - projection.pixels)
+    in_camera = points_seen(problem, state)[2]
+    projection = optics.project(in_camera, state.lens)
+    computed_px = projection.pixels + _by_modes(problem, state, in_camera, projection) @ state.coefficients
+    result: Floats = np.einsum("kij,kj->ki", problem.whiten, problem.observed - computed_px)
     return result
+
+
+def _by_modes(problem: Problem, state: LedState, in_camera: Floats, projection: optics.Projected) -> Floats:
+    """Shift [k, 2, c] px of each spot by one unit of each mode."""
+    board = problem.boards.board_of[problem.place]
+    flange = state.base_from_flange[problem.view, :3, :3]
+    camera_from_board = (
+        np.swapaxes(flange @ state.flange_from_camera[:3, :3], 1, 2) @ (state.base_from_board[board, :3, :3])
+    )
+    return shifts_px(problem.modes, in_camera, camera_from_board, projection, state.lens[2:4])
 
 
 @dataclass(frozen=True)
@@ -163,12 +204,13 @@ class Linear:
     by_view: Floats
     """[k, 2, 6]."""
     by_camera: Floats
-    """[k, 2, free + 6]: lens, then hand-eye."""
+    """[k, 2, free + 6 + c]: lens, hand-eye, then suspects."""
 
 
 def linearisation(problem: Problem, state: LedState) -> Linear:
     on_board, in_flange, in_camera = points_seen(problem, state)
     projection = optics.project(in_camera, state.lens)
+    by_modes = _by_modes(problem, state, in_camera, projection)
     by_point = problem.whiten @ projection.by_point
     by_flange_point = by_point @ state.flange_from_camera[:3, :3].T
     by_base_point = by_flange_point @ np.swapaxes(state.base_from_flange[problem.view, :3, :3], 1, 2)
@@ -176,12 +218,19 @@ def linearisation(problem: Problem, state: LedState) -> Linear:
     by_offset = by_base_point @ turn
     free = [optics.NAMES.index(name) for name in problem.prior.free]
     return Linear(
-        np.einsum("kij,kj->ki", problem.whiten, problem.observed - projection.pixels),
+        np.einsum(
+            "kij,kj->ki", problem.whiten, problem.observed - projection.pixels - by_modes @ state.coefficients
+        ),
         np.concatenate([by_base_point, -by_offset @ skew(on_board)], axis=2),
         by_offset,
         np.concatenate([-by_base_point, by_flange_point @ skew(in_flange)], axis=2),
         np.concatenate(
-            [problem.whiten @ projection.by_intrinsics[:, :, free], -by_flange_point, by_point @ skew(in_camera)],
+            [
+                problem.whiten @ projection.by_intrinsics[:, :, free],
+                -by_flange_point,
+                by_point @ skew(in_camera),
+                problem.whiten @ by_modes,
+            ],
             axis=2,
         ),
     )
@@ -194,10 +243,12 @@ def pose_errors(problem: Problem, state: LedState) -> Floats:
 
 
 def camera_step(problem: Problem, state: LedState) -> Floats:
-    """[free + 6 + k] step from the records' values to those of the state."""
+    """[free + 6 + c + k] step from the records' values to those of the state, and the suspects' coefficients."""
     free = [optics.NAMES.index(name) for name in problem.prior.free]
     hand_eye = between(problem.prior.flange_from_camera, state.flange_from_camera)
-    return np.concatenate([(state.lens - problem.prior.lens.vector())[free], hand_eye, state.axis_zeros_deg])
+    return np.concatenate(
+        [(state.lens - problem.prior.lens.vector())[free], hand_eye, state.coefficients, state.axis_zeros_deg]
+    )
 
 
 def cost_of(
@@ -221,6 +272,7 @@ def stepped_state(
     problem: Problem, state: LedState, shared_step: Floats, own_steps: list[Floats], share: float
 ) -> LedState:
     views, free = len(problem.reported_poses), len(problem.prior.free)
+    first_mode, axes = 6 * views + free + 6, 6 * views + problem.of_camera
     offsets, lens = state.offsets_mm.copy(), state.lens.copy()
     for board, step in enumerate(own_steps):
         offsets[problem.boards.rows_of(board)] += share * step[6:].reshape(-1, 3)
@@ -231,9 +283,8 @@ def stepped_state(
         moved_transforms(state.base_from_board, share * np.array([step[:6] for step in own_steps])),
         offsets,
         moved_transforms(state.base_from_flange, share * shared_step[: 6 * views].reshape(-1, 6)),
-        moved_transforms(
-            state.flange_from_camera, share * shared_step[6 * views + free : 6 * views + problem.of_camera]
-        ),
+        moved_transforms(state.flange_from_camera, share * shared_step[6 * views + free : first_mode]),
         lens,
-        state.axis_zeros_deg + share * shared_step[6 * views + problem.of_camera :],
+        state.axis_zeros_deg + share * shared_step[axes:],
+        state.coefficients + share * shared_step[first_mode:axes],
     )

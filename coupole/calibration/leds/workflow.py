@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.acceptance import against_limits
-from coupole.calibration.calibrated_arm import ZEROS, CalibratedArm, calibrated_poses
+from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
 from coupole.calibration.leds.acceptance import LEDS
 from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
 from coupole.calibration.leds.boards import Boards, board_poses, boards_of
 from coupole.calibration.leds.equations import GROUPS, ORIENTATION, POSITION, SPOTS, TOLERANCE, Stated
 from coupole.calibration.leds.matching import Matching, fault_lines, match_leds
+from coupole.calibration.leds.remarks import remarks_of
 from coupole.calibration.leds.sources import LedImages
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.record import (
@@ -105,7 +106,7 @@ def leds_from(
         lines=_views(images.views, sightings.view, geometry),
         limits=limits,
         faults=faults,
-        remarks=(*fault_lines(faults), *_remarks(images, geometry, prior, limits, arm)),
+        remarks=(*fault_lines(faults), *remarks_of(images, geometry, prior, limits, arm)),
     )
     return LedsFound(
         record,
@@ -248,6 +249,13 @@ def _h5(
         write_dataset("normal_covariance", normal, "deg^2", "[leds, 2, 2] of turns about the board's x and y")
         axes = geometry.state.base_from_board[boards.board_of[where], :3, :2]
         write_dataset("board_axes", axes, "", "[leds, 3, 2] x and y of its board in the base")
+        write_dataset(
+            "left_out_covariance",
+            geometry.views.centre_covariance[where],
+            "mm^2",
+            "[leds, 3, 3] of the centre by the jackknife over views",
+        )
+        write_dataset("degrees_of_freedom", geometry.degrees[where], "", "[leds] effective, of the centre's u")
         shared_text = (
             "[leds] share of the centre's variance from poses, lens and hand-eye, common to its neighbours"
         )
@@ -357,41 +365,8 @@ def _figures(geometry: LedGeometry, leds: _InTableOrder) -> dict[str, float]:
         "robot_ratio": float(max(geometry.noise[POSITION], geometry.noise[ORIENTATION])),
         "rejected": float(1 - geometry.accepted_mask.mean()),
         "record_step": float(np.abs(geometry.prior_step).max()),
+        "left_out": geometry.left_out_ratio(leds.place[leds.found_mask]),
     }
-
-
-def _remarks(
-    images: LedImages,
-    geometry: LedGeometry,
-    prior: CameraPrior,
-    limits: Sequence[Limit],
-    arm: CalibratedArm | None,
-) -> list[str]:
-    return [*_of_records(geometry, prior, limits), *_of_spots(images.left_out), *_of_the_arm(arm)]
-
-
-def _of_records(geometry: LedGeometry, prior: CameraPrior, limits: Sequence[Limit]) -> list[str]:
-    if next(limit.is_met for limit in limits if limit.name == "record_step"):
-        return []
-    names = [*prior.free, *(f"flange_from_camera.{s}" for s in ("x", "y", "z", "rx", "ry", "rz")), *ZEROS]
-    worst = int(np.argmax(np.abs(geometry.prior_step)))
-    return [
-        f"{names[worst]} would have to be {abs(geometry.prior_step[worst]):.0f} standard uncertainties from its "
-        "record: the record was made at another focus, or the camera was pushed since then. Calibrate camera and "
-        "hand-eye anew"
-    ]
-
-
-def _of_the_arm(arm: CalibratedArm | None) -> list[str]:
-    if arm is None:
-        return []
-    return ["poses are corrected by the axis zeros of the hand-eye record; use them with these LEDs"]
-
-
-def _of_spots(left_out: Sequence[str]) -> list[str]:
-    if not left_out:
-        return []
-    return [f"{len(left_out)} bright regions are not spots, e.g. {left_out[0]}"]
 
 
 def _view_errors(geometry: LedGeometry, reported_poses: Floats) -> Floats:

@@ -37,7 +37,8 @@ def _of_records(geometry: LedGeometry, prior: CameraPrior, limits: Sequence[Limi
     worst = int(np.argmax(np.abs(geometry.prior_step)))
     return [
         f"{names[worst]} would have to be {abs(geometry.prior_step[worst]):.0f} standard uncertainties from its "
-        "record: the record was made at another focus, or the camera was pushed since then. Calibrate camera and hand-eye anew"
+        "record: the record was made at another focus, or the camera was pushed since then. Calibrate camera and "
+        "hand-eye anew"
     ]
 
 

@@ -24,6 +24,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from coupole.errors import StorageError
+from coupole.intake.regular_file import open_regular
 from coupole.plan.shot_id import MAX_CHARACTERS
 
 FREE, STORED, PROVEN, DISCARDED = 0, 1, 2, 3
@@ -106,6 +107,7 @@ class Layout:
 def open_view(path: Path) -> Iterator[h5py.File]:
     """A view's file, to be read. If h5py or the caller then finds a fault in it, StorageError is raised."""
     try:
+        open_regular(path).close()
         with h5py.File(path, "r") as file:
             yield file
     except _WRONG as error:

@@ -13,6 +13,7 @@ from coupole.calibration.campaign_steps import OBJECT, STEPS, Step
 from coupole.commands import calibrate_geometry, calibrate_lens, calibrate_light
 from coupole.commands.simulated_support import BOARD, CERTIFICATE_OF_SIMULATED_TILE, TILE, with_things
 from coupole.errors import CalibrationRefused, Interrupted
+from coupole.viewing.terminal import forget_typing
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -111,6 +112,7 @@ class Campaign:
         self._console.rule(f"acquire {step.name}")
         if self._ask:
             self._console.print(f"Place on the support: [bold]{step.stands}[/].")
+            forget_typing()
             if not typer.confirm("Ready?", default=True):
                 raise Interrupted("stopped by the operator; call it again to continue")
         summary: dict[str, Any] = {}

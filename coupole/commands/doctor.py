@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 
 from coupole.commands.common import JsonOption
 from coupole.errors import PreflightRefused
@@ -97,8 +96,8 @@ def _measure(cell: Cell, seconds: float, console: Console) -> list[Any]:
 def line_of(part: str, need: HostNeed) -> str:
     """Return a need as a line for people, with the remedy if it is not met."""
     mark = "[green]ok  [/]" if need.is_met else "[red]lack[/]" if need.is_vital else "[yellow]weak[/]"
-    remedy = "" if need.is_met else f". {escape(need.remedy)}"
-    return f"{mark} {part}: {escape(need.name)}: {escape(need.state)}{remedy}"
+    remedy = "" if need.is_met else f". {need.remedy}"
+    return f"{mark} {part}: {need.name}: {need.state}{remedy}"
 
 
 def words_of(jitter: Any) -> str:

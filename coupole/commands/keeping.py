@@ -118,8 +118,6 @@ def verify(
 
 
 def _show_verified(console: Console, run: Run, verification: Verification) -> None:
-    from rich.markup import escape
-
     for problem in verification.bad:
         console.print("[red]bad:[/]", problem)
     if verification.missing:
@@ -133,7 +131,7 @@ def _show_verified(console: Console, run: Run, verification: Verification) -> No
     if verification.discarded_counts:
         _show_discarded(console, verification)
     if verification.not_compared:
-        console.print(f"[yellow]not compared with the plan:[/] {escape(verification.not_compared)}")
+        console.print(f"[yellow]not compared with the plan:[/] {verification.not_compared}")
     if verification.listed_count and not verification.bad:
         console.print(f"{verification.listed_count} files have the checksums of manifest.sha256")
     if verification.unlisted:

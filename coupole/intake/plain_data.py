@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from coupole.errors import InputError, Problem
+from coupole.intake.regular_file import open_regular
 
 MOST_BYTES = 256 * 1024**2
 MAX_DEPTH = 100
@@ -45,7 +46,9 @@ def read_json(path: Path, *, allow_nan: bool = False) -> Any:
         raise InputError(
             [Problem(str(path), 0, 0, "", f"expected at most {MOST_BYTES} bytes, found {size_bytes}")]
         )
-    return json_of(path.read_bytes(), str(path), allow_nan=allow_nan)
+    with open_regular(path) as file:
+        raw = file.read()
+    return json_of(raw, str(path), allow_nan=allow_nan)
 
 
 def json_of(raw: bytes | str, name: str, *, line: int = 1, allow_nan: bool = False) -> Any:

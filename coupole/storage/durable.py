@@ -9,10 +9,12 @@ import hashlib
 import os
 from pathlib import Path
 
+from coupole.intake.regular_file import open_regular
+
 
 def sha256(path: Path) -> str:
-    """Hex digest of a file."""
-    with path.open("rb") as file:
+    """Hex digest of a file. Raises OSError."""
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

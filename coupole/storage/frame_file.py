@@ -24,6 +24,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from coupole.errors import StorageError
+from coupole.intake.regular_file import open_regular
 from coupole.plan.shot_id import MAX_CHARACTERS
 
 FREE, STORED, PROVEN, DISCARDED = 0, 1, 2, 3
@@ -107,6 +108,7 @@ class Layout:
 def open_view(path: Path) -> Iterator[h5py.File]:
     """Open a view's file for reading. Raises StorageError if h5py or the caller then finds a fault in it."""
     try:
+        open_regular(path).close()
         with h5py.File(path, "r") as file:
             yield file
     except _WRONG as error:

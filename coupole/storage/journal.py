@@ -17,6 +17,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from coupole.errors import InputError, StorageError
 from coupole.intake.plain_data import NotDataError, json_of
+from coupole.intake.regular_file import open_regular
 from coupole.storage.journal_events import JOURNAL_VERSION, Event, JournalBegun
 from coupole.storage.line_file import LineFile
 
@@ -93,7 +94,7 @@ def read_events(path: Path) -> Iterator[Event]:
     that is not an event, and for a journal of a later version.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             yield from _events(path, file)
     except FileNotFoundError:
         return
@@ -104,7 +105,7 @@ def read_events(path: Path) -> Iterator[Event]:
 def tail(path: Path, most_bytes: int) -> list[Event]:
     """Return the events in the last `most_bytes` of a journal; none if there is no journal."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             offset = max(0, path.stat().st_size - most_bytes)
             file.seek(offset)
             lines = file.read(most_bytes).splitlines()
@@ -124,7 +125,7 @@ class Follower:
     def news(self) -> list[Event]:
         """Return the events since the last call; the first call returns all events. Raises StorageError."""
         try:
-            with self._path.open("rb") as file:
+            with open_regular(self._path) as file:
                 file.seek(self._read)
                 whole, newline, _ = file.read().rpartition(b"\n")
         except FileNotFoundError:

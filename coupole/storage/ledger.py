@@ -25,10 +25,10 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from coupole.errors import InputError, StorageError
+from coupole.intake.regular_file import NO_FILE
 from coupole.plan.base_model import Name
 from coupole.plan.cell import Cell
 from coupole.storage.ledger_lines import (
-    NO_FILE,
     Asked,
     BudgetSet,
     History,

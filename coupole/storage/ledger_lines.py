@@ -3,9 +3,7 @@ budget."""
 
 from __future__ import annotations
 
-import errno
 import os
-import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, BinaryIO, ClassVar, Literal, TypeAlias
@@ -13,13 +11,13 @@ from typing import Annotated, BinaryIO, ClassVar, Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from coupole.errors import DoseBudgetReached, StorageError
+from coupole.intake.regular_file import open_regular
 from coupole.storage.line_file import utc_now
 
 BY_HAND = "by hand"
 """Name instead of a run's name, for light that was entered with `coupole dose --add`."""
 _ROUNDING = 1e-9
 _TAIL_BYTES = 256
-NO_FILE = "a pipe or a device, expected a file"
 Amount = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 
 
@@ -198,21 +196,12 @@ class Asked:
 def read_lines(path: Path) -> list[bytes]:
     """Return the lines of a file; none if there is no file. Raises StorageError."""
     try:
-        with _open_regular(path) as file:
+        with open_regular(path) as file:
             return file.read().split(b"\n")
     except FileNotFoundError:
         return []
     except OSError as error:
         raise _unreadable(path, error) from error
-
-
-def _open_regular(path: Path) -> BinaryIO:
-    """Open a file for reading. Raises OSError, also for a pipe or a device, without waiting for it."""
-    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-        file.close()
-        raise OSError(errno.EINVAL, NO_FILE)
-    return file
 
 
 def history_of(texts: list[bytes]) -> History:
@@ -237,7 +226,7 @@ class Reading:
         """Add the complete lines that are new. If the file was replaced, read all its lines again. Raises
         StorageError."""
         try:
-            with _open_regular(path) as file:
+            with open_regular(path) as file:
                 return self._with_rest(path, file)
         except FileNotFoundError:
             self._refuse_loss(path, "was removed")

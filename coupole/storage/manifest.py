@@ -18,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from coupole.errors import StorageError, reason
+from coupole.intake.regular_file import open_regular
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sha256, write_synced
 from coupole.storage.inner_path import inner
@@ -39,7 +40,8 @@ def read_checksums(run: Path) -> dict[str, str]:
     kind."""
     path = run / NAME
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        with open_regular(path) as file:
+            lines = file.read().decode().splitlines()
     except FileNotFoundError:
         return {}
     except (OSError, UnicodeDecodeError) as error:

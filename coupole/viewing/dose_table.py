@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from coupole.appearance.spectra.damage import B_PER_NM
@@ -28,9 +27,7 @@ def show_dose(console: Console, ledger: Ledger, history: History, similar_ids: l
             notes.append(
                 f"of which at most {part.unsettled_lux_h:.3f} are planned light: how that burst ended is not known"
             )
-        table.add_row(
-            escape(run), part.entries[0].t, f"{part.total_lux_h:.3f}", _damage(part), escape("; ".join(notes))
-        )
+        table.add_row(run, part.entries[0].t, f"{part.total_lux_h:.3f}", _damage(part), "; ".join(notes))
     table.add_row("[bold]total[/]", "", f"[bold]{history.total_lux_h:.3f}[/]", _damage(history), "")
     console.print(table)
     for number, budget in enumerate(history.budgets):
@@ -50,7 +47,7 @@ def show_dose(console: Console, ledger: Ledger, history: History, similar_ids: l
         console.print(f"[yellow]note:[/] there is also a ledger of `{similar_id}`: is it the same object?")
     if history.unreadable:
         console.print(f"[yellow]note:[/] {history.unreadable} lines of the ledger cannot be read")
-    console.print(f"  {escape(str(ledger.path))}", soft_wrap=True)
+    console.print(f"  {ledger.path}", soft_wrap=True)
     if is_new:  # a person must know it, as a file may have been moved away
         state = "there is none yet" if history.is_empty else "it was begun now"
         console.print(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 import sys
+import termios
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
 _PLAIN_LINE_EVERY_S = 5.0
 _WIDE = 110
 """Number of a terminal's columns from which rates are shown beside the bars."""
+_MARKUP = re.compile(r"\[(bold|dim|green|red|yellow)\](.*?)\[/\]", re.DOTALL)
 
 
 def make_console(*, quiet: bool) -> Console:
@@ -45,7 +48,23 @@ def make_console(*, quiet: bool) -> Console:
 
 
 class _Console(Console):
-    """Console as wide as the terminal that reads it, even if there is a queue between them."""
+    """Console as wide as the terminal that reads it, even if there is a queue between them. Of rich's markup it
+    knows only `[red]words[/]` and the other names in `_MARKUP`. All other brackets, such as those of paths, are
+    printed as they are."""
+
+    def render_str(self, text: str, *, markup: bool | None = None, **options: Any) -> Text:
+        parts, spans, end, length = [], [], 0, 0
+        for match in _MARKUP.finditer(text) if markup is None else ():
+            start = length + match.start() - end
+            length = start + len(match[2])
+            spans.append((match[1], start, length))
+            parts += [text[end : match.start()], match[2]]
+            end = match.end()
+        plain = "".join([*parts, text[end:]])
+        rendering = super().render_str(plain, **options | {"markup": False, "emoji": False})
+        for colour, start, stop in spans:
+            rendering.stylize(colour, start, stop)
+        return rendering
 
     @property
     def size(self) -> ConsoleDimensions:
@@ -82,7 +101,12 @@ def step_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
     """Show a bar for each step of a job, with the time left. Call the given function with a step, the number that
     is done, and the number in all. A step is over when the next one begins. Without a terminal there are no bars;
     each step gets a line when it begins."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=console) as bars:
         tasks: dict[str, TaskID] = {}
 
@@ -105,8 +129,16 @@ def alarm(message: str) -> None:
     print(message, file=_Terminal(sys.stderr), flush=True)
 
 
+def forget_typing() -> None:
+    """Drop what was typed at the terminal before a question: it was no answer to it."""
+    with contextlib.suppress(OSError, ValueError, AttributeError, termios.error):  # no terminal
+        termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
+
+
 def ask(question: str) -> bool:
-    """Ask a yes-or-no question on standard error, even with `--json`; any answer but yes counts as no."""
+    """Ask a yes-or-no question on standard error, even with `--json`; any answer but yes counts as no. What was
+    typed before the question does not count."""
+    forget_typing()
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
     try:
         return sys.stdin.readline().strip().lower() in {"y", "yes"}
@@ -117,6 +149,7 @@ def ask(question: str) -> bool:
 def ask_number(question: str) -> float | None:
     """Ask for a number on standard error, again if the answer is not a number; None for an empty answer."""
     while True:
+        forget_typing()
         print(f"{question} ", end="", file=sys.stderr, flush=True)
         try:
             answer = sys.stdin.readline().strip()
@@ -166,10 +199,10 @@ class RunObserver:
             return
         columns = (
             SpinnerColumn(),
-            TextColumn("{task.description}", justify="left"),
+            TextColumn("{task.description}", justify="left", markup=False),
             BarColumn(bar_width=None),
             MofNCompleteColumn(),
-            TextColumn("{task.fields[detail]}"),
+            TextColumn("{task.fields[detail]}", markup=False),
         )
         with Progress(*columns, console=self._console, expand=True) as self._bars:
             self._run_bar = self._bars.add_task("frames", total=frames, completed=self._before, detail="")

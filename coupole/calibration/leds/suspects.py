@@ -85,9 +85,9 @@ class SuspectedShift:
         if self.name == PRIMARY:
             if self.coefficients[0] < 0.0:
                 return (
-                    f"images of the dies shift away from the camera by {-self.coefficients[0]:.3f} mm (u {u:.3f} mm) "
-                    "times the sine of the angle to the normal, as under a flat window; then heights are wrong by "
-                    "about as much, which uncertainties do not account for. Measure heights with a probe"
+                    f"images of the dies shift away from the camera by {-self.coefficients[0]:.3f} mm (u {u:.3f} "
+                    "mm) times the sine of the angle to the normal, as under a flat window; then heights are "
+                    "wrong by about as much, which uncertainties do not account for. Measure heights with a probe"
                 )
             return (
                 f"lenses on the dies shift their images towards the camera by {self.coefficients[0]:.3f} mm "

@@ -117,6 +117,13 @@ def test_a_primary_lens_has_the_amplitude_of_its_estimate(estimate: float, ampli
     assert suspect.is_named == (estimate > 0.4)
 
 
+def test_a_lens_that_shifts_images_away_is_told_to_be_like_a_window() -> None:
+    away, towards = (judge(MODES[:1], np.array([mm]), np.array([[0.01]]), 50.0)[0] for mm in (-0.5, 0.5))
+    assert "away from the camera by 0.500 mm" in away.sentence()
+    assert "as under a flat window" in away.sentence()
+    assert "flat window" not in towards.sentence()
+
+
 def test_other_suspects_have_the_most_likely_amplitude() -> None:
     """With equal variances it is that of the mean square less the variance."""
     modes = [mode for mode in MODES if mode.suspect == OVAL]

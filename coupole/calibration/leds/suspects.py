@@ -83,6 +83,12 @@ class SuspectedShift:
         """Cause and remedy, for the record's page."""
         size, u = float(np.linalg.norm(self.coefficients)), float(self.u.max())
         if self.name == PRIMARY:
+            if self.coefficients[0] < 0.0:
+                return (
+                    f"images of the dies shift away from the camera by {-self.coefficients[0]:.3f} mm (u {u:.3f} "
+                    "mm) times the sine of the angle to the normal, as under a flat window; then heights are "
+                    "wrong by about as much, which uncertainties do not account for. Measure heights with a probe"
+                )
             return (
                 f"lenses on the dies shift their images towards the camera by {self.coefficients[0]:.3f} mm "
                 f"(u {u:.3f} mm) times the sine of the angle to the normal; places and uncertainties account for "

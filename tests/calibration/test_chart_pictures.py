@@ -316,7 +316,7 @@ def test_another_chart_or_place_is_refused(even: Path, tmp_path: Path) -> None:
     )
     flat = write_picture(tmp_path / "flat.tif", np.full((480, 640, 3), 0.3))
     why = refusal(flat, "--chart", even / "chart.yaml")
-    assert "flat.tif: the chart was not found: expected 4 rows of 6" in why
+    assert "flat.tif: the chart was not found: expected a sharp picture of the whole chart, 4 rows of 6" in why
     assert "--corners" in why
 
 
@@ -325,12 +325,12 @@ def test_bad_white_cards_are_refused(uneven: Path, even: Path, tmp_path: Path) -
     white = uneven_chart().picture(white=True)
     bright = write_picture(tmp_path / "bright.tif", 3.0 * white)
     assert "--white bright.tif: saturated" in refusal(*arguments, bright)
-    assert "no smooth light" in refusal(*arguments, uneven / "chart.tif")
+    assert "the light is not smooth" in refusal(*arguments, uneven / "chart.tif")
     small = write_picture(tmp_path / "small.tif", white[::2, ::2])
     assert "expected pictures of one camera" in refusal(*arguments, small)
     half = white.copy()
     half[:, 320:] *= 0.2
-    assert "no smooth light" in refusal(*arguments, write_picture(tmp_path / "half.tif", half))
+    assert "the light is not smooth" in refusal(*arguments, write_picture(tmp_path / "half.tif", half))
 
 
 def test_files_and_options_that_do_not_belong_are_refused(even: Path, tmp_path: Path) -> None:

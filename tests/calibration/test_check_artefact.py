@@ -116,7 +116,7 @@ def test_what_is_not_independent_is_refused_by_name(cell: Path, tmp_path: Path) 
     assert "expected a block `artefact`" in refusal(check(cell, tmp_path / "plain.yaml", tmp_path))
     words = ["--records", cell / "records", "--board", board(tmp_path, "CB-2"), "--out", tmp_path]
     same = CliRunner().invoke(calibrate_app, ["check-artefact", str(cell / "pictures"), *map(str, words)])
-    assert "was made from the same images (pictures/0.png), which check nothing" in refusal(same)
+    assert "was made from the same images (pictures/0.png), so the comparison would check nothing" in refusal(same)
     neither = CliRunner().invoke(calibrate_app, ["check-artefact", str(cell / "place4"), "--out", str(tmp_path)])
     assert "give one of --board and --tile" in refusal(neither)
 

@@ -81,4 +81,4 @@ def test_the_command_finds_a_red_that_is_magnified_and_a_blue_that_is_not(tmp_pa
 def test_pictures_without_colours_are_refused(tmp_path: Path) -> None:
     ended = cells.here("calibrate", "chromatic", write_folder(tmp_path / "grey"), "--out", tmp_path)
     assert ended.code == 2
-    assert "there is no red in it" in ended.err
+    assert "has no red channel" in ended.err

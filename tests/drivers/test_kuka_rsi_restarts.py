@@ -342,7 +342,7 @@ def at(ipoc: int, a1_deg: float = 0.0, delay: int | None = 0) -> Packet:
         ([at(4), at(8, delay=1), at(12)], 0.0, "fell from 1 to 0"),
         ([at(4), at(8), at(4)], 0.0, "went back from 8 to 4"),
         ([at(4), at(8), at(8)], 0.0, "went back from 8 to 8"),
-        ([*map(at, range(4, 60, 4)), at(58)], 0.0, "went on by 2"),
+        ([*map(at, range(4, 60, 4)), at(58)], 0.0, "advanced by 2"),
         ([at(4, delay=None), at(8, delay=None), at(16, delay=None)], 0.0, "no counter tells"),
     ],
 )

@@ -73,7 +73,7 @@ def test_triangles_without_a_fit_have_no_residual(result: RunResult) -> None:
 def test_the_command_tells_how_much_is_kept_and_where_it_lies(result: RunResult, tmp_path: Path) -> None:
     ended = cells.here("show", result.folder, "--residual-planes", "5", "--out", tmp_path / "look.html")
     assert ended.code == 0, ended.err
-    assert "residual: 5 planes have 99." in ended.err
+    assert "residual: 5 planes contain 99." in ended.err
     told = cells.here("show", result.folder, "--residual-planes", "0", "--out", tmp_path / "look.html", "--json")
     assert "residual" not in told.document["about"]
     assert told.document["about"]["fit"] == "ggx"

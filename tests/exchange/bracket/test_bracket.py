@@ -156,7 +156,7 @@ def test_steps_that_leave_waves_of_the_response_open_are_told_and_written(tmp_pa
 
     assert done.exit_code == 0, done.output
     (remark,) = json.loads(done.stdout)["remarks"]
-    assert "nearer than 4.0 times" in remark
+    assert "differ by at least 4.0 times" in remark
     header = OpenEXR.File(str(tmp_path / "merged.exr")).header()
     assert any(remark in str(value) for value in header.values())
 

@@ -16,6 +16,7 @@ from coupole.storage import frame_file, manifest
 from coupole.storage.archive_view import ArchivedView, Progress, archive_view
 from coupole.storage.bitshuffle import Codec
 from coupole.storage.discarding import discarded_views, finish
+from coupole.storage.processing import refuse_while_processed
 from coupole.storage.run import Run
 
 KEPT_FOLDER = "unarchived"
@@ -64,11 +65,13 @@ def archive_run(
     With `keep` the original files are kept in `RUN/unarchived`. With `partial` the complete views of an incomplete
     run are archived; incomplete views never are, so that the run can be resumed.
 
-    Raises InputError if another process has locked the run, and UnprovenError if frames are missing (without
-    `partial`). Raises ChecksumMismatch if a frame differs from the proven one, before or after, and DiskFull.
-    After an error the current view is unchanged.
+    Raises InputError if another process has locked the run or makes its result, and UnprovenError if frames are
+    missing (without `partial`). Raises ChecksumMismatch if a frame differs from the proven one, before or after,
+    and DiskFull. After an error the current view is unchanged.
     """
     with run.hold_lock():
+        if run.asked_result:
+            refuse_while_processed(run.folder, run.asked_result)
         proven = run.proven()
         missing = [shot for shot in run.expected_shots() if shot not in proven]
         if missing and not partial:

@@ -189,10 +189,23 @@ def refuse_held(result: Path) -> None:
         raise InputError(_at_work(result))
 
 
-def _at_work(result: Path) -> str:
+def refuse_while_processed(run: Path, result: Path) -> None:
+    """Raise InputError while a process makes the result of a run from the run's frames."""
+    if _is_held(result / _LOCK):
+        raise InputError(
+            f"{run}: {_worker(result)} still makes {result} from its frames; `coupole status RUN` shows the "
+            "progress. Wait until it has ended"
+        )
+
+
+def _worker(result: Path) -> str:
     pid = holder_of(result / _LOCK)
+    return f"process {pid}" if pid else "another process"
+
+
+def _at_work(result: Path) -> str:
     return (
-        f"{result}: {f'process {pid}' if pid else 'another process'} makes this result during the acquisition; "
+        f"{result}: {_worker(result)} makes this result during the acquisition; "
         "`coupole status RUN` shows its progress. Wait until it has ended, or name another folder with --out"
     )
 

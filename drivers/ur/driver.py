@@ -233,9 +233,9 @@ class UrRobot:
         return np.full(6, settings.speed_deg_s * (delay_s + 0.5 * settings.stop_s))
 
     def statistics(self) -> Mapping[str, float]:
-        """Figures of the process's latest answer."""
+        """Return figures of the process's latest answer, even if the process is lost."""
         with contextlib.suppress(DeviceLost):
-            self._last = self._state()
+            self._state()
         state = self._last
         return {
             "samples": state.samples,
@@ -266,7 +266,8 @@ class UrRobot:
 
     def _state(self) -> State:
         with self._asking:
-            return self._process.ask(Ask("state", looks=self._attention.look() is not None))
+            self._last = self._process.ask(Ask("state", looks=self._attention.look() is not None))
+            return self._last
 
     def _wait(
         self, is_done: Callable[[State], bool], deadline: Deadline, expectation: str, *, faults: bool = True

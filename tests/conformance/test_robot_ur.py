@@ -259,6 +259,16 @@ def test_nobody_at_the_address_is_told(cell: UrCell) -> None:
         cell.open()
 
 
+def test_figures_of_a_dead_process_are_those_of_its_latest_answer(robot: UrRobot) -> None:
+    opened_samples = robot.statistics()["samples"]
+    time.sleep(0.2)
+    robot.measured()
+    os.kill(robot._process.pid, signal.SIGKILL)
+    with pytest.raises(DeviceLost):
+        robot.measured()
+    assert robot.statistics()["samples"] > opened_samples
+
+
 def test_closing_twice_or_with_a_dead_process_raises_nothing(cell: UrCell, robot: UrRobot) -> None:
     robot.move_to(AWAY_DEG)
     cell.wait_until_under_way()

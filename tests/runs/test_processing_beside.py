@@ -131,7 +131,7 @@ def test_a_resumed_run_goes_on_with_what_was_asked(tmp_path: Path) -> None:
     ended = cells.finish(process)
     assert ended.code == 130, ended.err
     assert not is_beside(worker)
-    assert ended.document["reflectance"]["why"] == "ended with the run, which is not complete"
+    assert ended.document["reflectance"]["why"] == "the processing ended with the run, which is not complete"
     kept = {path.name: path.stat().st_mtime_ns for path in (result_of(cell) / "samples").glob("*.json")}
     resumed = cells.here("acquire", "--resume", cell.run_folder, "--yes", "--json")
     assert frames_alone_count(resumed)["is_whole"]

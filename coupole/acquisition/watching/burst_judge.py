@@ -164,7 +164,8 @@ class BurstJudge:
             in_the_end = series.changes[last_of_led[_led_of(series.lit[place].label)]].tile_shares[worst]
             over.append(float(figure[worst]) if change.by_places >= change.by_shift else 0.0)
             shares.append(float(np.abs(np.where(figure > 1.0, change.tile_shares, 0.0)).max()))
-            stays.append(bool(in_the_end / change.tile_shares[worst] >= _STILL_THERE))
+            share = change.tile_shares[worst]
+            stays.append(bool(share and in_the_end / share >= _STILL_THERE))
         return _Places(np.array(over) > 1.0, np.array(shares) > _OPAQUE, np.array(stays))
 
     def _place_found(

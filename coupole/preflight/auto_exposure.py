@@ -1,15 +1,15 @@
 """Chooses exposures in the run for each LED of a view, from the view's frames (`exposure: {kind: auto}`).
 
 1. *First pass.* Some LEDs, spread over the dome, are taken at the middle one of the times. Each fourth LED is
-taken twice, which gives the noise (`exposure_advice.noise_of_pairs`). LEDs that clip are taken again four stops
-shorter; if all is dark, some are taken four stops longer.
+   taken twice, which gives the noise (`exposure_advice.noise_of_pairs`). LEDs that clip are taken again four stops
+   shorter; if all is dark, some are taken four stops longer.
 2. *All LEDs.* The rates of the pixels (DN per us) under the first LEDs give two times for each of these LEDs.
-Above the longest time, more than the allowed share of pixels is clipped. Below the shortest time, too few of the
-object's pixels reach the signal-to-noise ratio. Both times are scaled to other LEDs by the illuminance of the LED
-table, and interpolated by direction (logarithms, weighted by inverse squares of the distance). `exposure_times`
-chooses.
+   Above the longest time, more than the allowed share of pixels is clipped. Below the shortest time, too few of
+   the object's pixels reach the signal-to-noise ratio. Both times are scaled to other LEDs by the illuminance of
+   the LED table, and interpolated by direction (logarithms, weighted by inverse squares of the distance).
+   `exposure_times` chooses.
 3. *Corrections.* Each LED's own frames are judged; for clipping, all pixels count. An LED that does not meet the
-plan's limits gets one more exposure, at most twice.
+   plan's limits gets one more exposure, at most twice.
 
 A pixel that gets light only from other surfaces need not reach the ratio (`exposure_evidence`).
 """

@@ -165,7 +165,7 @@ def test_a_dead_led_and_two_swapped_ones_are_named(lit: Path, tmp_path: Path) ->
 
 
 def test_accepted_faults_leave_the_table_with_swapped_leds_at_each_others_place(lit: Path, tmp_path: Path) -> None:
-    few_views = ("--limit", "missing=0.1", "--limit", "centre_mm=0.8")
+    few_views = ("--limit", "missing=0.1", "--limit", "centre_mm=1.0")
     ended = leds(lit, tmp_path, None, "--accept-faults", *few_views)
     assert ended.code == 0, ended.err
     (written,) = tmp_path.glob("*.csv")

@@ -25,8 +25,6 @@ from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file
 from coupole.storage.archive import KEPT_FOLDER, Archived, archive_run
 from coupole.storage.bitshuffle import CODECS, FILL_DN, codec_of, compressed_tiles, tile_shape
-from coupole.storage.journal_events import ProcessingAsked
-from coupole.storage.processing import hold_result
 from coupole.storage.run import Run
 from coupole.storage.verification import verify
 from coupole.storage.view_writer import ViewWriter
@@ -395,13 +393,3 @@ def test_punx_finds_nothing_against_the_nexus_base_classes(made: MadeRun, when: 
 
 def test_the_result_of_nothing_to_do_has_no_ratio() -> None:
     assert Archived().figures()["ratio"] is None
-
-
-def test_a_run_whose_result_is_still_made_from_its_frames_is_not_archived(made: MadeRun, tmp_path: Path) -> None:
-    result, before = tmp_path / "result", views_bytes(made.run)
-    with (made.run.folder / "journal.jsonl").open("a") as journal:
-        journal.write(ProcessingAsked(result=str(result)).model_dump_json() + "\n")
-    with hold_result(result), pytest.raises(InputError, match=f"process {os.getpid()} still makes {result} from"):
-        archive_run(made.run, LZ4)
-    assert views_bytes(made.run) == before
-    assert archive_run(made.run, LZ4).views

@@ -4,6 +4,7 @@ channel, GGX's D and the height-correlated V.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -36,7 +37,7 @@ def read_result(
             raise InputError(f"{folder}: cluster: expected 0 to {len(kd) - 1}, found {cluster}")
         rows = np.array([cluster])
     else:
-        fits = sorted(path.stem for path in (folder / "fits").glob("*.h5") if path.stem != _CLUSTERS)
+        fits = _fits_of_triangles(folder)
         if fits and fit not in fits:
             raise InputError(f"{folder}: fit: expected one of {', '.join(fits)}; found {fit}")
         numbers, kd, ks, alpha = _read_materials(folder, fit)
@@ -57,6 +58,16 @@ def _mixed_brdf(wi: Array, wo: Array, *, kd: Array, lobes: Sequence[tuple[Array,
     for ks, alpha in lobes:
         total = total + ks * brdf.ggx(wi, wo, roughness=alpha, fresnel=lambda c: np.ones((*np.shape(c), 1)))
     return total
+
+
+def _fits_of_triangles(folder: Path) -> list[str]:
+    """Return the names of the fits that have a material for each triangle; a result of pictures has none."""
+    names = []
+    for path in sorted((folder / "fits").glob("*.h5")):
+        with contextlib.suppress(OSError), h5py.File(path, "r") as file:
+            if {"triangles", "kd"} <= file.keys():
+                names.append(path.stem)
+    return names
 
 
 def _read_materials(folder: Path, name: str) -> tuple[Array, Array, Array, Array]:

@@ -11,6 +11,7 @@ LEDS = (
     Allowed("robot_ratio", "robot's noise, estimated over stated value", 3.0),
     Allowed("rejected", "spots left out", 0.05),
     Allowed("record_step", "distance of camera and hand-eye from their record, in standard uncertainties", 4.0),
+    Allowed("image_away", "shift of the dies' images away from the camera, in standard uncertainties", 4.0),
     Allowed("left_out", "views left out: uncertainty by them, over the stated one", 2.0),
 )
 """`centre_mm`, `normal_deg`: standard uncertainties (seed 003: 700 um, 0.21 deg). `left_out`: of the centres,

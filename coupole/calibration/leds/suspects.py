@@ -9,10 +9,11 @@ LEDs (a pupil that is vignetted, or elsewhere).
 
 Each suspect is a set of modes, whose coefficients are first estimated freely beside all other unknowns. The
 variance under which these estimates are most likely is their prior variance in the second adjustment (empirical
-Bayes; Efron and Morris, J. Am. Stat. Assoc. 68, 1973). Of the primary lens it is the square of the estimate: by
-likelihood, a lens of once to three times its uncertainty would be taken for none in too many cells, and each mm of
-it moves the heights by 0.7 mm. The other suspects move the LEDs by less; they are left out if noise alone gives
-such estimates in a tenth of all cells.
+Bayes; Efron and Morris, J. Am. Stat. Assoc. 68, 1973). Of the primary lens it is the square of the estimate and
+its variance together: by likelihood, a lens of once to three times its uncertainty would be taken for none in too
+many cells, and each mm of it moves the heights by 0.7 mm. A lens never shifts an image away from the viewer, so a
+negative estimate counts as 0 here; if it is sure, the record is refused. The other suspects move the LEDs by less;
+they are left out if noise alone gives such estimates in a tenth of all cells.
 """
 
 from __future__ import annotations
@@ -75,6 +76,11 @@ class SuspectedShift:
     """Probability that noise alone gives estimates as far from 0."""
 
     @property
+    def away(self) -> float:
+        """Shift of the images away from the camera over its standard uncertainty; 0 for a shift towards it."""
+        return max(0.0, -float(self.coefficients[0] / self.u[0])) if self.name == PRIMARY else 0.0
+
+    @property
     def is_named(self) -> bool:
         """True if leaving the suspect out would hurt the fit, though all others are present."""
         return self.by_chance < _BY_CHANCE
@@ -86,13 +92,14 @@ class SuspectedShift:
             if self.coefficients[0] < 0.0:
                 return (
                     f"images of the dies shift away from the camera by {-self.coefficients[0]:.3f} mm (u {u:.3f} "
-                    "mm) times the sine of the angle to the normal, as under a flat window; then heights are "
-                    "wrong by about as much, which uncertainties do not account for. Measure heights with a probe"
+                    "mm) times the sine of the angle to the normal, which no lens does; heights may be wrong by "
+                    "about as much. Check records and views, and measure heights with a probe"
                 )
             return (
                 f"lenses on the dies shift their images towards the camera by {self.coefficients[0]:.3f} mm "
                 f"(u {u:.3f} mm) times the sine of the angle to the normal; places and uncertainties account for "
-                "it. Heights rest on this law of the shift: check one with a probe"
+                "it. Heights rest on this law: a flat window over the dies gives nearly the same spots, but its "
+                "heights are off the other way. Check one height with a probe"
             )
         if self.name == OVAL:
             return (
@@ -138,7 +145,7 @@ def judge(
         estimate, own_covariance = coefficients[own_modes], covariance[np.ix_(own_modes, own_modes)]
         ratio = float(estimate @ np.linalg.solve(own_covariance, estimate)) / len(own_modes)
         by_chance = float(fdtrc(len(own_modes), max(degrees, 1.0), ratio))
-        variance = float(estimate[0] ** 2)
+        variance = float(max(estimate[0], 0.0) ** 2 + own_covariance[0, 0])
         if name != PRIMARY:
             variance = _most_likely_variance(estimate, own_covariance) if by_chance < _DOUBTFUL else 0.0
         suspects.append(

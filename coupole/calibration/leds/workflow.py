@@ -365,6 +365,7 @@ def _figures(geometry: LedGeometry, leds: _InTableOrder) -> dict[str, float]:
         "robot_ratio": float(max(geometry.noise[POSITION], geometry.noise[ORIENTATION])),
         "rejected": float(1 - geometry.accepted_mask.mean()),
         "record_step": float(np.abs(geometry.prior_step).max()),
+        "image_away": max(suspect.away for suspect in geometry.suspects),
         "left_out": geometry.left_out_ratio(leds.place[leds.found_mask]),
     }
 

@@ -19,6 +19,7 @@
     ├── StorageError          6  the disk
     │   ├── DiskFull          6  ... has no space left
     │   └── ChecksumMismatch  6  ... does not give back what was written
+    ├── ResourceShortage      1  this machine or process has too little memory, files or processes
     └── Interrupted         130  the operator stopped the run (129: hang-up, 143: SIGTERM)
 
 A message names what was expected, what happened and what to do next.
@@ -186,6 +187,12 @@ class DiskFull(StorageError):
 
 class ChecksumMismatch(StorageError):
     """Bytes on disk differ from those that were written."""
+
+
+class ResourceShortage(CoupoleError):
+    """Memory, open files or processes ran short: a limit of this machine or of this process, no defect."""
+
+    exit_code = 1
 
 
 class Interrupted(CoupoleError):

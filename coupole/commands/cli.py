@@ -22,6 +22,7 @@ from coupole.bounded import leave
 from coupole.commands.common import fail
 from coupole.commands.examples import add_examples
 from coupole.commands.extras import lacking_extras, missing_extra
+from coupole.commands.shortages import place_of, shortage_behind
 from coupole.errors import CoupoleError, Interrupted, StorageError
 from coupole.viewing import text_outlet
 
@@ -255,6 +256,12 @@ def _code_of_missing(error: ImportError) -> int:
 
 
 def _code_of_defect(error: Exception) -> int:
+    shortage = shortage_behind(error)
+    if shortage is not None:
+        fail(shortage, as_json="--json" in sys.argv)
+        _say(shortage)
+        print(f"(met at {place_of(error)}: {type(error).__name__}: {error})", file=sys.stderr)
+        return shortage.exit_code
     with contextlib.suppress(OSError):
         traceback.print_exception(error)
         print("This is a defect of Coupole: please report it, with the lines above.", file=sys.stderr)

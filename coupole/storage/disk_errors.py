@@ -18,4 +18,8 @@ def disk_error(path: Path, error: OSError) -> StorageError:
             f"{path}: a file would be longer than this process or its file system allows. Raise the limit "
             "(`ulimit -f`), or store on another file system."
         )
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return StorageError(
+            f"{path}: no more files may be open at once. Raise the limit (`ulimit -n 1024`), then resume the run."
+        )
     return StorageError(f"{path}: {error.strerror or error}. Check the disk, then resume the run.")

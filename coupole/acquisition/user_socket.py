@@ -26,6 +26,9 @@ from coupole.storage.stopped_process import is_stopped
 LONGEST_REQUEST_BYTES = 65536
 PATIENCE_S = 10.0
 _SAID_AFTER_S = 1.5
+_MOST_WAITING = 256
+"""Connections that a process may leave waiting, as one that is stopped does with each `coupole status`."""
+_CONNECTS_AGAIN_S = 0.05
 Gone = Callable[[], bool]
 """Function that tells whether the other end has closed the connection."""
 _LONGEST_ANSWER_BYTES = 16 * 1024**2
@@ -47,7 +50,7 @@ class UserSocket:
         try:
             self._socket.bind(str(hidden_path))
             hidden_path.chmod(0o600)
-            self._socket.listen(16)
+            self._socket.listen(_MOST_WAITING)
             hidden_path.replace(self.path)
         except BaseException:
             self._socket.close()
@@ -116,7 +119,7 @@ def exchange(
     begun_s = time.monotonic()
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(patience_s)
-        connection.connect(str(path))
+        _connect(connection, path, patience_s)
         try:
             connection.sendall(json.dumps(request).encode() + b"\n")
             if not select.select([connection], [], [], min(patience_s, _SAID_AFTER_S))[0]:
@@ -130,6 +133,24 @@ def exchange(
     except InputError as error:
         raise ValueError(str(error)) from error
     return fields
+
+
+def _connect(connection: socket.socket, path: Path, patience_s: float) -> None:
+    """Connect; wait for a place while too many others wait already. Raises OSError, TimeoutError."""
+    begun_s = time.monotonic()
+    while True:
+        try:
+            connection.connect(str(path))
+        except BlockingIOError as error:  # the queue of the listening process is full
+            if time.monotonic() - begun_s > patience_s:
+                raise TimeoutError(
+                    f"the process behind {path.name} accepts no connection, and {_MOST_WAITING} wait already. It "
+                    "is stopped (Ctrl-Z, SIGSTOP) or hangs: `ps -eo pid,stat,args` shows stopped ones by T, and "
+                    "`kill -CONT PID` lets one run again"
+                ) from error
+            time.sleep(_CONNECTS_AGAIN_S)
+        else:
+            return
 
 
 @contextmanager

@@ -215,7 +215,7 @@ def ledger_warnings(job: Job, history: History, more_lux_h: float) -> list[str]:
             "object?"
         )
     if history.unreadable:
-        warnings.append(f"object {name}: {history.unreadable} lines of its ledger cannot be read")
+        warnings.append(f"object {name}: {history.unreadable_words}")
     return warnings
 
 

@@ -113,6 +113,11 @@ class History:
         return self.without_plan > self.unreadable
 
     @property
+    def unreadable_words(self) -> str:
+        """How many lines of the ledger cannot be read, for a person."""
+        return f"{self.unreadable} line{'s' if self.unreadable != 1 else ''} of the ledger cannot be read"
+
+    @property
     def is_empty(self) -> bool:
         """True if nothing was ever entered. The object is then new, or its file was moved away."""
         return not self.entries and not self.budgets and self.warn_above_lux_h is None and not self.unreadable

@@ -20,6 +20,7 @@ import json
 import os
 import platform
 import shlex
+import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -80,6 +81,7 @@ class Run:
         """Make `<UTC time>-<name>` under `parent`, with copies of the inputs. It is on the disk when this
         returns."""
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+        folder: Path | None = None
         try:
             make_folder(parent)
             folder = _new_folder(parent, f"{stamp}-{name}")
@@ -98,6 +100,8 @@ class Run:
             sync_folder(parent)
             manifest.begin(folder)
         except OSError as error:
+            if folder is not None:  # it holds nothing but copies, and is no run
+                shutil.rmtree(folder, ignore_errors=True)
             raise StorageError(f"{parent}: cannot make a run folder: {error.strerror}") from error
         return Run(folder)
 

@@ -46,7 +46,7 @@ def show_dose(console: Console, ledger: Ledger, history: History, similar_ids: l
     for similar_id in similar_ids:
         console.print(f"[yellow]note:[/] there is also a ledger of `{similar_id}`: is it the same object?")
     if history.unreadable:
-        console.print(f"[yellow]note:[/] {history.unreadable} lines of the ledger cannot be read")
+        console.print(f"[yellow]note:[/] {history.unreadable_words}")
     console.print(f"  {ledger.path}", soft_wrap=True)
     if is_new:  # a person must know it, as a file may have been moved away
         state = "there is none yet" if history.is_empty else "it was begun now"

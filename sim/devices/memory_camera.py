@@ -7,6 +7,7 @@ It is for machines without libaravis, and for rates above those of loopback. The
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import mmap
 import os
@@ -167,6 +168,8 @@ class MemoryCamera:
     def _map(self, slots: int, frame_format: FrameFormat) -> None:
         with self._lock:
             _, descriptors = self._exchange("memory", {})
+        if not descriptors:  # the system drops them if this process may open no more
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
         pitch = -(-frame_format.frame_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
         try:
             self._memory = mmap.mmap(descriptors[0], slots * pitch)

@@ -17,6 +17,9 @@ from benches import ASKS, HERE, Bench, begun, bench, holding
 from cells import CellFolder
 from PIL import Image
 
+from coupole.acquisition.cell_bench import bench_arm
+from coupole.acquisition.cell_bench.bench_arm import HoldLostError
+from coupole.acquisition.cell_bench.bench_requests import JogAsked
 from sim.devices.kuka_kinematics import flange_pose as flange_by_the_simulation
 from sim.world.client import World
 
@@ -90,6 +93,8 @@ def test_it_tells_each_device_and_the_arm(asked: Bench, world: World) -> None:
         (b'{"version": 1, "command": "plan_path", "to": {"joints_deg": [0, 0, 0]}}', "joints_deg"),
         (b'{"version": 1, "command": "drive", "path": "77"}', "expected one that `plan_path` has shown"),
         (b'{"version": 1, "command": "jog", "axis": "A1", "direction": 2, "from": "x"}', "direction"),
+        (b'{"version": 1, "command": "jog", "axis": "A1", "direction": true, "from": "x"}', "direction"),
+        (b'{"version": 1, "command": "jog", "axis": "A1", "direction": 1, "from": "x", "share": 1e-300}', "share"),
         (b'{"version": 1, "command": "plan_path", "to": {"joints_deg": [0, 0, 0, 0, 0, 1e3]}}', "A6 would be"),
     ],
 )
@@ -176,6 +181,17 @@ def test_an_arm_whose_console_is_killed_stops_at_once(asked: Bench, world: World
     assert asked.ask("jog", **again)["state"] == "done", "it must be pressed anew"
     time.sleep(0.3)
     assert np.allclose(joints_deg(world), rested["joints_deg"], atol=0.01)
+
+
+def test_a_renewal_that_comes_late_revives_no_hold() -> None:
+    """As after a freeze of the bench, when the renewal is read before the watch looks at the time."""
+    asked = JogAsked.model_validate({"version": 1, "command": "jog", "axis": "A1", "direction": 1, "from": HERE})
+    hold = bench_arm._Hold(1, asked)
+    hold.check()
+    time.sleep(bench_arm.HOLD_S * 1.1)
+    hold.renew()
+    with pytest.raises(HoldLostError, match="it was not renewed for 300 ms"):
+        hold.check()
 
 
 def test_towards_the_support_it_stops_before_it(asked: Bench, cell: CellFolder, world: World) -> None:

@@ -201,9 +201,11 @@ class _Hold:
         self.number, self.asked = number, request
         self.work: Work | None = None
         self._ended = ""
-        self.renew()
+        self._renewed_s = time.monotonic()
 
     def renew(self) -> None:
+        """Hold on, unless the hold has lapsed: what reaches a bench late, after a freeze, revives nothing."""
+        self._note_lapse()
         self._renewed_s = time.monotonic()
 
     def let_go(self) -> None:
@@ -211,7 +213,10 @@ class _Hold:
 
     def check(self) -> None:
         """Raise HoldLostError unless it is still held."""
-        if not self._ended and time.monotonic() - self._renewed_s > HOLD_S:
-            self._ended = f"it was not renewed for {1e3 * HOLD_S:g} ms"
+        self._note_lapse()
         if self._ended:
             raise HoldLostError(self._ended)
+
+    def _note_lapse(self) -> None:
+        if not self._ended and time.monotonic() - self._renewed_s > HOLD_S:
+            self._ended = f"it was not renewed for {1e3 * HOLD_S:g} ms"

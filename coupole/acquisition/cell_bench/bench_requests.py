@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 from coupole.errors import InputError
 
@@ -17,6 +17,12 @@ Axis = Literal["A1", "A2", "A3", "A4", "A5", "A6", "x", "y", "z", "rx", "ry", "r
 """An axis of the arm, or an axis of the robot's base frame. The camera moves along a base axis (`x`) or turns
 about it (`rx`)."""
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+def _no_truth_value(value: object) -> object:
+    """Refuse true and false, which are equal to the numbers 1 and 0."""
+    assert not isinstance(value, bool), "expected a number, found true or false"
+    return value
 
 
 class _Request(BaseModel):
@@ -70,8 +76,8 @@ class StopAsked(_Request):
 class JogAsked(_Request):
     command: Literal["jog"]
     axis: Axis
-    direction: Literal[1, -1]
-    share: Annotated[float, Field(gt=0, le=1)] = 0.4
+    direction: Annotated[Literal[1, -1], BeforeValidator(_no_truth_value)]
+    share: Annotated[float, Field(ge=0.01, le=1)] = 0.4
     """Share of reduced speed, 250 mm/s."""
     hold: int | None = None
     """The number that the first answer gave. A request without it counts as a new press of the button."""

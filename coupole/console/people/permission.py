@@ -20,5 +20,6 @@ def allow(service: Service, account: Account, role: Role, action: str, *, acts: 
         raise NotAllowed(403, f"{action}: only for {role.word}s; {account.name} is {account.role.word}")
     of_command_line = account is service.command_line.account
     if acts and not service.control.act(account, keep=not of_command_line):
-        how = "`coupole queue RIG --take-control` takes it" if of_command_line else "ask for it first"
+        takes = f"`coupole queue {service.cell.document.path} --take-control`"
+        how = f"{takes} takes it" if of_command_line else "ask for it first"
         raise NotAllowed(409, f"{action}: {service.control.now.name} is in control; {how}")

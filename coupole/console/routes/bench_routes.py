@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import secrets
 from typing import Any
 
 from anyio import to_thread
@@ -17,9 +18,10 @@ from coupole.console.people.still_wanted import HELD_STOOD_STILL_S
 from coupole.console.routes.messages import Text
 from coupole.console.service_parts import Service
 from coupole.errors import CoupoleError, InputError
+from coupole.intake.plain_data import json_of
 
 HOLD = "/api/v1/bench/hold"
-_RENEWED = {"axis", "direction", "share"}
+_PRESSED = {"axis", "direction", "share"}
 
 
 def add_bench_routes(app: FastAPI, service: Service) -> None:
@@ -49,9 +51,10 @@ def add_bench_routes(app: FastAPI, service: Service) -> None:
 
     @app.websocket(HOLD)
     async def hold(socket: WebSocket) -> None:
-        """Move an axis while a button is held. The page sends `{axis, direction, share}`, the next one only when
-        the answer to the last has come. When the button is let go, or the connection is lost, the connection ends,
-        and so does the motion."""
+        """Move an axis while a button is held. The page sends `{axis, direction, share}`. A renewal also has the
+        word of the newest answer (`renew`), so it cannot be sent before that answer has come: renewals that wait
+        in the network, or are sent in advance, hold nothing. When the button is let go, or the connection is lost,
+        the connection ends, and so does the motion."""
         await socket.accept()
         await _Hold(service, socket).serve()
 
@@ -63,21 +66,24 @@ class _Hold:
         self._service, self._socket = service, socket
         self._number: int | None = None
         self._asked: dict[str, Any] = {}
+        self._next_word = ""
+        """What the next renewal must have."""
 
     async def serve(self) -> None:
         outcome, is_moving = "the button was released", False
         try:
             while True:
-                jog_request = await self._socket.receive_json()
+                jog_request = json_of(await self._socket.receive_text(), "request")
                 work = await to_thread.run_sync(self._press_or_renew, jog_request)
                 if not is_moving:
                     is_moving = True
                     self._note(f"begins to move {_words(jog_request)}", 200)
-                await self._socket.send_json({"state": work["state"]})
+                self._next_word = secrets.token_hex(8)
+                await self._socket.send_json({"state": work["state"], "renew": self._next_word})
                 if work["state"] != "running":
                     outcome = str(work.get("ended") or work["why"] or work["state"])
                     break
-        except (WebSocketDisconnect, ValueError, KeyError):
+        except (WebSocketDisconnect, KeyError):
             outcome = await to_thread.run_sync(self._let_go)
         except (NotAllowed, CoupoleError) as error:
             outcome = str(error)
@@ -89,16 +95,27 @@ class _Hold:
 
     def _press_or_renew(self, request: Any) -> dict[str, Any]:
         """Press or renew. Raises NotAllowed, InputError."""
-        if not isinstance(request, dict) or set(request) != _RENEWED:
-            raise InputError(f"expected {', '.join(sorted(_RENEWED))}")
+        is_press = self._number is None
+        keys = _PRESSED if is_press else _PRESSED | {"renew"}
+        if not isinstance(request, dict) or set(request) != keys:
+            raise InputError(f"expected {', '.join(sorted(keys))}")
+        if not is_press:
+            self._refuse_untimely(request.pop("renew"), request)
         if refusal := self._service.loop_watch.refusal(HELD_STOOD_STILL_S):
             raise NotAllowed(409, refusal)
         allow(self._service, self._account(), Role.OPERATOR, "move by hand", acts=True)
-        goes_on = {"hold": self._number} if self._number is not None else {}
+        goes_on = {} if is_press else {"hold": self._number}
         self._asked = {**request, "from": address_of(self._socket)}
         work = self._service.bench.ask("jog", **self._asked, **goes_on)
         self._number = int(work["hold"])
         return work
+
+    def _refuse_untimely(self, word: Any, request: dict[str, Any]) -> None:
+        """Raise InputError unless a renewal was sent after the newest answer, and is for the same motion."""
+        if word != self._next_word:
+            raise InputError("renew: expected the word of the newest answer; a renewal sent before it is void")
+        if any(request[key] != self._asked[key] for key in ("axis", "direction")):
+            raise InputError("a renewal is for the axis and the direction of the press")
 
     def _let_go(self) -> str:
         """End the motion at once: a renewal the other way ends a hold."""

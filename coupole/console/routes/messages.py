@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+import unicodedata
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from coupole.console.plans.plan_queue import Entry
 
-Text = Annotated[str, Field(max_length=2000)]
+
+def _without_control_characters(text: str) -> str:
+    """Refuse what would move a terminal's cursor or colour its text where it is printed."""
+    if any(unicodedata.category(character) == "Cc" and character != "\n" for character in text):
+        raise ValueError("expected text without control characters")
+    return text
+
+
+def _one_line(text: str) -> str:
+    if "\n" in text:
+        raise ValueError("expected one line")
+    return text
+
+
+Text = Annotated[str, Field(max_length=2000), AfterValidator(_without_control_characters)]
+Line = Annotated[Text, AfterValidator(_one_line)]
 
 
 MOST_LUX_H = 1e9
@@ -41,7 +57,7 @@ class NewEntry(Asked):
     """File of the plan, relative to the folder of plans."""
     resume: Text = ""
     """Folder of the run to be resumed, relative to the cell's storage folder."""
-    hold: Text = ""
+    hold: Line = ""
     """Task to be done before the queue goes on."""
     before: Text = ""
     """Id of the waiting entry before which it comes; empty: at the end."""

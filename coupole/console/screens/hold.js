@@ -1,5 +1,5 @@
-/* A button that moves the arm as long as it is held. The next renewal is sent only when the last one was answered,
-   so that none can wait in the network; the bench stops the arm 300 ms after the last one that it hears. */
+/* A button that moves the arm as long as it is held. Each renewal has the word of the newest answer, so none can be
+   sent in advance or wait in the network; the bench stops the arm 300 ms after the last one that it hears. */
 (() => {
   const RENEW_MS = 100;
   let held = null;
@@ -23,18 +23,20 @@
     release("released");
     const {axis, direction} = button.dataset;
     const share = Number(document.querySelector("[data-name=share]").value);
-    const asked = JSON.stringify({axis, direction: Number(direction), share});
+    const asked = {axis, direction: Number(direction), share};
     const socket = new WebSocket(location.origin.replace(/^http/, "ws") + "/api/v1/bench/hold");
     const mine = held = {button, socket};
     button.classList.add("held");
     say(`${button.textContent} is held`);
-    const renew = () => { if (held === mine && socket.readyState === WebSocket.OPEN) socket.send(asked); };
-    socket.onopen = renew;
+    const send = request => {
+      if (held === mine && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(request));
+    };
+    socket.onopen = () => send(asked);
     socket.onmessage = event => {
       const said = JSON.parse(event.data);
       if (held !== mine) return;
       if (said.ended) release(`stopped: ${said.ended}`);
-      else setTimeout(renew, RENEW_MS);
+      else setTimeout(() => send({...asked, renew: said.renew}), RENEW_MS);
     };
     socket.onclose = () => { if (held === mine) release("stopped: the connection to the console was lost"); };
   }

@@ -100,7 +100,7 @@ class _Screen:
         for other_id in similar:
             light_html += f'<p class="warm">There is also an object {html.escape(other_id)}: is it the same?</p>'
         if history.unreadable:
-            light_html += f'<p class="bad">{history.unreadable} lines of the ledger cannot be read.</p>'
+            light_html += f'<p class="bad">{history.unreadable_words}.</p>'
         self._sums.set_content(light_html)
         self._bar.set_visibility(budget is not None)
         self._bar.set_value(min(1.0, total / budget) if budget else 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections.abc import Callable, Iterator
@@ -245,6 +246,26 @@ def test_nobody_else_holds_the_arm(room: Room) -> None:
         with pytest.raises(websockets.exceptions.InvalidStatus):
             asyncio.run(asked(cookie, origin))
     assert not room.world.ask("state")["arm_moving"]
+
+
+def test_renewals_that_are_sent_in_advance_hold_nothing(room: Room) -> None:
+    """2,000 at once, as a program that is not the page might send them; the connection stays open."""
+    import websockets.sync.client
+
+    url = room.served.url.replace("http", "ws") + "/api/v1/bench/hold"
+    cookies = "; ".join(f"{one['name']}={one['value']}" for one in room.ada.driver.get_cookies())
+    headers = {"Cookie": cookies, "Origin": room.served.url}
+    press = {"axis": "A1", "direction": 1, "share": 0.1}
+    with websockets.sync.client.connect(url, additional_headers=headers) as button:
+        with contextlib.suppress(websockets.exceptions.ConnectionClosed):  # the console ends it meanwhile
+            for request in (press, *[{**press, "renew": "0"}] * 2000):
+                button.send(json.dumps(request))
+        answers = [json.loads(button.recv(cells.PATIENCE_S))]
+        while "ended" not in answers[-1]:
+            answers.append(json.loads(button.recv(cells.PATIENCE_S)))
+        cells.wait_until(lambda: not room.world.ask("state")["arm_moving"], "the arm at rest")
+    assert [list(answer) for answer in answers] == [["state", "renew"], ["ended"]], answers
+    assert "sent before it is void" in answers[-1]["ended"]
 
 
 # -- focus and expose -----------------------------------------------------------------------------------------

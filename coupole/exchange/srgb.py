@@ -16,7 +16,7 @@ def srgb(linear: NDArray[Any]) -> NDArray[Any]:
     return result
 
 
-def linear_from_srgb(encoded: NDArray[Any]) -> NDArray[Any]:
+def linear_from_srgb(codes: NDArray[Any]) -> NDArray[Any]:
     """Linear values, 0 to 1, of encoded ones."""
-    linear: NDArray[Any] = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    linear: NDArray[Any] = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
     return linear

@@ -23,7 +23,7 @@ _LINEAR, _SRGB, _BT709 = 1, 2, 1
 _UP_TO_DATE = 2
 """Version of the basic descriptor block: Khronos Data Format 1.3."""
 _PARTITIONS = 16
-"""How many of BC7's 64 partitions are tried: four times the time of none, and half the squared error."""
+"""Number of BC7's 64 partitions that are tried: four times the time of none, half the squared error."""
 
 
 @dataclass(frozen=True)
@@ -70,15 +70,15 @@ def encode_ktx2(levels: Sequence[Codes], texel_format: TexelFormat, notes: Mappi
     descriptor, pairs = _descriptor(layout), _pairs(notes)
     first_level = len(_IDENTIFIER) + 9 * 4 + 4 * 4 + 2 * 8 + 24 * len(levels)
     place = first_level + len(descriptor) + len(pairs)
-    index, packed = [b""] * len(levels), []
+    index, level_bytes = [b""] * len(levels), []
     for n in range(len(levels) - 1, -1, -1):
         blocks = _blocks(levels[n], texel_format)
-        packed.append(compressor.compress(blocks))
-        index[n] = struct.pack("<3Q", place, len(packed[-1]), len(blocks))
-        place += len(packed[-1])
+        level_bytes.append(compressor.compress(blocks))
+        index[n] = struct.pack("<3Q", place, len(level_bytes[-1]), len(blocks))
+        place += len(level_bytes[-1])
     header = struct.pack("<9I", layout.vulkan, 1, width, height, 0, 0, 1, len(levels), _ZSTANDARD)
     header += struct.pack("<4I2Q", first_level, len(descriptor), first_level + len(descriptor), len(pairs), 0, 0)
-    return b"".join([_IDENTIFIER, header, *index, descriptor, pairs, *packed])
+    return b"".join([_IDENTIFIER, header, *index, descriptor, pairs, *level_bytes])
 
 
 def _descriptor(layout: _Layout) -> bytes:
@@ -93,11 +93,11 @@ def _descriptor(layout: _Layout) -> bytes:
 
 def _pairs(notes: Mapping[str, str]) -> bytes:
     """Keys and values in the order of the keys, each padded to four bytes."""
-    found = b""
+    pairs_bytes = b""
     for key in sorted(notes):
         pair = key.encode() + b"\0" + notes[key].encode() + b"\0"
-        found += struct.pack("<I", len(pair)) + pair + bytes(-len(pair) % 4)
-    return found
+        pairs_bytes += struct.pack("<I", len(pair)) + pair + bytes(-len(pair) % 4)
+    return pairs_bytes
 
 
 def _blocks(codes: Codes, texel_format: TexelFormat) -> bytes:
@@ -107,10 +107,10 @@ def _blocks(codes: Codes, texel_format: TexelFormat) -> bytes:
     texels = np.concatenate([whole, np.full((*whole.shape[:2], 1), 255, np.uint8)], axis=2)
     if texel_format is TexelFormat.RGBA8:
         return texels.tobytes()
-    return _compressed(texels, texel_format)
+    return _compressed_blocks(texels, texel_format)
 
 
-def _compressed(texels: NDArray[np.uint8], texel_format: TexelFormat) -> bytes:
+def _compressed_blocks(texels: NDArray[np.uint8], texel_format: TexelFormat) -> bytes:
     import etcpak
 
     height, width = texels.shape[:2]

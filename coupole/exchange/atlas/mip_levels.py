@@ -21,7 +21,7 @@ Codes = NDArray[np.uint8]
 Singles = NDArray[np.float32]
 
 _BLOCK = 512
-"""Rows that are decoded together."""
+"""Rows that are value_of_code together."""
 _CODES = np.arange(256) / 255.0
 
 
@@ -29,7 +29,7 @@ _CODES = np.arange(256) / 255.0
 class Meaning:
     """Meaning of a map's codes: what their averages are averages of."""
 
-    decoded: Singles
+    value_of_code: Singles
     """[256] value of each code."""
     encode: Callable[[Singles], Singles]
     """Codes of values [..., c], 0 to 1."""
@@ -53,20 +53,21 @@ def mip_levels(codes: Codes, is_known: NDArray[np.bool_], meaning: Meaning) -> I
     must be known."""
     smaller = [_halved_codes(codes, is_known, meaning)] if max(is_known.shape) > 1 else []
     while smaller and max(smaller[-1][1].shape) > 1:
-        smaller.append(_halved(*smaller[-1]))
+        smaller.append(_next_level(*smaller[-1]))
     for level in range(len(smaller) - 2, -1, -1):
         values, weights = smaller[level]
         _fill(values, weights > 0.0, smaller[level + 1][0])
     largest = codes.copy()
     if smaller:
-        _fill(largest, is_known, _encoded(smaller[0][0], meaning))
+        _fill(largest, is_known, _codes_of(smaller[0][0], meaning))
     yield largest
     for values, _ in smaller:
-        yield _encoded(values, meaning)
+        yield _codes_of(values, meaning)
 
 
-def _encoded(values: Singles, meaning: Meaning) -> Codes:
-    return np.rint(255.0 * np.clip(meaning.encode(values), 0.0, 1.0)).astype(np.uint8)
+def _codes_of(values: Singles, meaning: Meaning) -> Codes:
+    codes: Codes = np.rint(255.0 * np.clip(meaning.encode(values), 0.0, 1.0)).astype(np.uint8)
+    return codes
 
 
 def _halved_codes(codes: Codes, is_known: NDArray[np.bool_], meaning: Meaning) -> tuple[Singles, Singles]:
@@ -75,12 +76,12 @@ def _halved_codes(codes: Codes, is_known: NDArray[np.bool_], meaning: Meaning) -
     for first in range(0, len(codes), _BLOCK):
         rows = slice(first, first + _BLOCK)
         weights = is_known[rows].astype(np.float32)
-        sums = meaning.decoded[codes[rows]] * weights[..., None]
+        sums = meaning.value_of_code[codes[rows]] * weights[..., None]
         blocks.append((_halved_along(sums, 1), _halved_along(weights, 1)))
     return _means(*(_halved_along(np.concatenate(parts), 0) for parts in zip(*blocks, strict=True)))
 
 
-def _halved(values: Singles, weights: Singles) -> tuple[Singles, Singles]:
+def _next_level(values: Singles, weights: Singles) -> tuple[Singles, Singles]:
     """Values and weights, the known share of each texel's area, of the next level."""
     sums, shares = (
         _halved_along(_halved_along(of_texels, 1), 0) for of_texels in (values * weights[..., None], weights)

@@ -23,6 +23,18 @@ _OF_GLTF = """
 require("gltf-validator").validateBytes(new Uint8Array(require("fs").readFileSync(process.argv[1])))
   .then(({ issues }) => console.log(JSON.stringify(issues)));
 """
+_OF_KTX2 = """
+import(process.argv[2]).then(({ read }) => {
+  const file = read(new Uint8Array(require("fs").readFileSync(process.argv[1])));
+  const { vkFormat, pixelWidth, pixelHeight, supercompressionScheme, dataFormatDescriptor, keyValue } = file;
+  const levels = file.levels.map((one) => [
+    Buffer.from(one.levelData).toString("base64"), one.uncompressedByteLength ]);
+  const text = (value) => typeof value === "string" ? value : Buffer.from(value).toString().replace(/\\0$/, "");
+  const notes = Object.fromEntries(Object.entries(keyValue).map(([key, value]) => [key, text(value)]));
+  console.log(JSON.stringify({
+    vkFormat, pixelWidth, pixelHeight, supercompressionScheme, dataFormatDescriptor, levels, notes }));
+});
+"""
 _KEEP_CONTEXT = """
 import sys
 from io import BytesIO
@@ -63,6 +75,15 @@ def gltf_messages(path: Path) -> list[str]:
     found = json.loads(_run(node, "-e", _OF_GLTF, path, NODE_PATH=str(HOME / "node/node_modules")))
     assert not found["truncated"]
     return [f"{one['code']} {one['message']}" for one in found["messages"] if one["severity"] < 2]
+
+
+def ktx2_contents(path: Path) -> dict[str, Any]:
+    """Contents of a KTX 2.0 file as ktx-parse reads it; levels are pairs of their data, as in the file (base64),
+    and the size of what that holds."""
+    node = shutil.which("node") or HOME / "bin/node"
+    module = (HOME / "node/node_modules/ktx-parse/dist/index.mjs").as_uri()
+    contents: dict[str, Any] = json.loads(_run(node, "-e", _OF_KTX2, path, module))
+    return contents
 
 
 _OF_ANNOTATIONS = """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -80,8 +80,10 @@ def write_result(
     coat: Coat | None = None,
     camera_mm: tuple[float, float, float] = (60.0, -120.0, 330.0),
     channels: slice = slice(0, 3),
+    finer: int = 1,
 ) -> RunResult:
-    """A folder with one view, `top`, of triangles [n, 3, 3] in the support frame."""
+    """A folder with one view, `top`, of triangles [n, 3, 3] in the support frame; its pixels may be so many times
+    as fine as `SIZE_PX` says."""
     coat = coat or Coat()
     corners = moved(BASE_FROM_SUPPORT, corners_mm)
     normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
@@ -89,7 +91,8 @@ def write_result(
         (folder / name).mkdir(parents=True)
     write_object(folder / OBJECT, corners, BASE_FROM_SUPPORT)
     pose = BASE_FROM_SUPPORT @ camera_pose(np.array(camera_mm), np.zeros(3))
-    surface = seen_surface(PacketMesh(corners), normals, LENS, pose, SIZE_PX)
+    lens = replace(LENS, **{name: finer * getattr(LENS, name) for name in ("fx", "fy", "cx", "cy")})
+    surface = seen_surface(PacketMesh(corners), normals, lens, pose, (finer * SIZE_PX[0], finer * SIZE_PX[1]))
     seen, mine = surface.places, surface.triangles
     led_mm = moved(BASE_FROM_SUPPORT, LED_MM)
     with h5py.File(folder / "samples/top.h5", "w") as file:

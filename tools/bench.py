@@ -289,6 +289,15 @@ def bench_watching(options: Asked) -> None:
         line(**figure)
 
 
+def bench_page(options: Asked) -> None:
+    """The page of 20 million texels on the software renderer: its first picture against 3 s, and pictures while
+    the object is turned against 15 a second."""
+    from bench_page import figures
+
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
+        line(**figure)
+
+
 BENCHES: dict[str, Callable[[Asked], None]] = {
     "check": bench_check,
     "sequencing": bench_sequencing,
@@ -307,6 +316,7 @@ BENCHES: dict[str, Callable[[Asked], None]] = {
     "workers": bench_workers,
     "console": bench_console,
     "watching": bench_watching,
+    "page": bench_page,
 }
 
 

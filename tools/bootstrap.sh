@@ -9,7 +9,7 @@
 root=$(dirname "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")")
 checkers="$root/.tools/checkers"
 checkers_from_pypi=("roc-validator>=0.13,<0.14")
-checkers_from_npm=("gltf-validator@2.0.0-dev.3.10" "validate-web-annotation@0.3.0")
+checkers_from_npm=("gltf-validator@2.0.0-dev.3.10" "ktx-parse@2.0.0" "validate-web-annotation@0.3.0")
 
 prepare() {
     forget_stale_kernels
@@ -72,7 +72,7 @@ prepare_checkers() {
     if has_checkers || [[ -e $tried ]]; then
         return 0
     fi
-    say "installing roc-validator, gltf-validator and validate-web-annotation into $checkers, for the tests (once; needs the network)"
+    say "installing roc-validator, gltf-validator, ktx-parse and validate-web-annotation into $checkers, for the tests (once; needs the network)"
     (
         if command -v flock >/dev/null; then flock 9; fi
         has_checkers || install_checkers || : >"$tried"

@@ -1,7 +1,7 @@
 """Opens exports of a result in Blender, and compares its pictures with those of `relight --from`.
 
     python tools/prove_in_blender.py [RESULT] [--to gltf usd obj] [--install [WHEEL]] [--blender PYTHON]
-        [--pictures FOLDER]
+        [--pictures FOLDER] [--uv MESH]
 
 Without a result one is made: the relief with paint and bumps that its mesh does not have (`detailed_result` of the
 tests), in the simulated cell. Blender's importers open the files, Cycles renders them on the CPU (`in_blender.py`,
@@ -48,7 +48,7 @@ from relief_cells import detailed_result  # noqa: E402
 
 from coupole.errors import InputError  # noqa: E402
 from coupole.exchange.of_results.export_result import export_result  # noqa: E402
-from coupole.exchange.of_results.measured_surface import under_a_layer  # noqa: E402
+from coupole.exchange.of_results.measured_surface import ExportChoice, under_a_layer  # noqa: E402
 from coupole.exchange.srgb import srgb  # noqa: E402
 from coupole.reflectance.fits import TEXELS  # noqa: E402
 from coupole.reflectance.new_light.light_kinds import DistantLight  # noqa: E402
@@ -82,6 +82,7 @@ def main() -> int:
     parser.add_argument("--install", nargs="?", const=PACKAGE, metavar="WHEEL", help="make .tools/blender first")
     parser.add_argument("--samples", type=int, default=16, help="of a pixel")
     parser.add_argument("--pictures", type=Path, help="folder for pictures, ours beside Blender's")
+    parser.add_argument("--uv", type=Path, help="the mesh with texture coordinates, in which maps are laid out")
     parser.add_argument("--lights", type=int, default=len(LIGHTS), help="of the five, from the first")
     add_smallest(parser, to=["gltf"], samples=4, lights=1)
     arguments = parser.parse_args()
@@ -113,7 +114,7 @@ def _prove(arguments: argparse.Namespace, result: Path, folder: Path) -> int:
     complete_words: dict[str, dict[str, Any]] = {}
     for to in arguments.to:
         with console.status(f"--to {to}"):
-            export_result(result, to, folder / to)
+            export_result(result, to, folder / to, options=ExportChoice(uv_mesh=arguments.uv))
         words: dict[str, Any] = {"file": str(folder / to / FILES[to])}
         jobs.append(_job(folder / f"{to} as imported", lights, arguments.samples, **words))
         if to in MENDED:

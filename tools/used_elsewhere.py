@@ -58,6 +58,7 @@ _.BEAT_MS, _.COMMAND_ELEMENTS, _.STATUS_ELEMENTS  # make_kuka_files.py, for the 
 
 _.describe_collect, _.collect_asset_docs, _.get_index, _.success  # bluesky: DomeCell, ProvenFrames
 _.run_folder, _.take_view  # users of coupole/neighbours/bluesky.py
+_.m_max_partitions  # etcpak: parameter of BC7
 
 # ---- by tests alone ----
 _.LEFT_BY_SFNC, _.is_safe, _.light_given_s  # coupole/testing, for the tests of others

@@ -15,6 +15,7 @@ EXTRA_OF = {
     "cv2": "pictures",
     "dask": "xarray",
     "distributed": "cluster",
+    "etcpak": "ktx2",
     "fastapi": "console",
     "genicam": "gentl",
     "harvesters": "gentl",
@@ -38,6 +39,7 @@ EXTRA_OF = {
     "uvicorn": "console",
     "xarray": "xarray",
     "xsdata": "materials",
+    "zstandard": "ktx2",
 }
 """Extra of pyproject.toml by the name under which a library is imported."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -177,7 +178,7 @@ class Texels:
     def tell(self, forecast: TexelForecast) -> None:
         from coupole.commands.texels_told import lines_of
 
-        for line in lines_of(forecast):
+        for line in lines_of(forecast, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")):
             self.print_line(line)
 
 

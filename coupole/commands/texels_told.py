@@ -23,8 +23,8 @@ def read_size(text: str) -> TexelSize:
         raise size_refused(text) from None
 
 
-def lines_of(forecast: TexelForecast) -> Iterator[str]:
-    """Yield messages to the user about texels before they are made."""
+def lines_of(forecast: TexelForecast, machine_bytes: int) -> Iterator[str]:
+    """Yield messages to the user about texels before they are made, on a machine with so much memory."""
     views, size_mm = forecast.views, forecast.size.mm
     sides = sorted({view.side_px for view in views})
     pixels = "single pixels" if sides == [1] else f"{' and '.join(f'{n} x {n}' for n in sides)} pixels each"
@@ -37,6 +37,11 @@ def lines_of(forecast: TexelForecast) -> Iterator[str]:
         f"they need some {memory} of memory and {disk} of disk; after the fits of triangles they take "
         f"{duration} on this machine"
     )
+    if forecast.memory_bytes > machine_bytes:
+        yield (
+            f"this machine has {bytes_text(machine_bytes)} of memory: the work may be ended for want of it; "
+            "larger texels (--texels MM) and a smaller --memory need less"
+        )
     if size_mm is not None and size_mm > forecast.edge_mm:
         yield (
             f"texels of {size_mm:g} mm are larger than the mesh's triangles, whose edge is {forecast.edge_mm:.2g} "

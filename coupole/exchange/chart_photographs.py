@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from coupole.calibration.colour.chart_pictures import PlainPicture
 from coupole.errors import InputError, reason
 from coupole.exchange.bracket.photographs import PLAIN, read_raw
+from coupole.exchange.srgb import linear_from_srgb
 
 RAW = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".3fr", ".iiq"}
 """Suffixes of raw files that are looked for in a folder; a file that is named may have another."""
@@ -93,9 +94,7 @@ def _plain(path: Path, *, srgb: bool) -> PlainPicture:
 def _linear(most: int, *, srgb: bool) -> NDArray[np.float32]:
     """[most + 1] values, 0 to 1, of the codes."""
     codes = np.arange(most + 1) / most
-    if srgb:
-        codes = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
-    return np.asarray(codes, np.float32)
+    return np.asarray(linear_from_srgb(codes) if srgb else codes, np.float32)
 
 
 def _unknown(values: NDArray[Any]) -> NDArray[np.bool_]:

@@ -77,6 +77,9 @@ _TABLE = (
     _result("gltf", "a .glb for viewers and browsers, with maps of colour, normal, roughness and specular", *MAPS),
     _result("obj", "an OBJ with maps, for modelling programs", *MAPS),
     _result("usd", "a .usdz with maps, for USD programs and telephones", *MAPS),
+    _result(
+        "ktx2", "maps as KTX 2.0 textures with mip levels, for programs that load textures, and an OBJ", *MAPS
+    ),
     _result("materialx", "a MaterialX document of OpenPBR, with maps and mesh", *MAPS),
     _result("exr", "a multi-part OpenEXR for each view: material, normal, place and uncertainties of each pixel"),
     _result("bsdf", "tables of materials in RGL's tensor format, for Mitsuba", "triangle", "adaptive"),

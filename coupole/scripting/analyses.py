@@ -219,14 +219,16 @@ def fit_runs(
     forecast = None
     if texels is not None:
         from coupole.reflectance.discarded_frames import refuse_texels
-        from coupole.reflectance.texels.texel_forecast import foresee_texels
+        from coupole.reflectance.texels.texel_forecast import foresee_texels, refuse_full_disk
         from coupole.storage.run import Run
 
         for run in request.runs:
             refuse_texels(Run(run), out)
         forecast = foresee_texels(request, out, texels)
-        if forecast is not None and tell is not None:
-            tell(forecast)
+        if forecast is not None:
+            if tell is not None:
+                tell(forecast)
+            refuse_full_disk(forecast, out)
     about = reflectance_of(request, out, scheduler=scheduler, say=progress)
     if texels is not None:
         from coupole.reflectance.texels.texel_job import add_texels

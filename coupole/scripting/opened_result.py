@@ -156,8 +156,8 @@ class Result:
     def to(
         self, name: str, out: str | os.PathLike[str], *, fit: str | None = None, overwrite: bool = False
     ) -> list[Path]:
-        """Write the result in a format of `coupole export` (ply, gltf, obj, usd, materialx, exr, bsdf, merl,
-        bird, alta) into the folder `out`; return its files. Raises InputError for another
+        """Write the result in a format of `coupole export` (ply, gltf, obj, usd, ktx2, materialx, exr, bsdf,
+        merl, bird, alta) into the folder `out`; return its files. Raises InputError for another
         format, and for a folder with files in it (unless `overwrite`); StorageError."""
         from coupole.exchange.of_results.export_result import export_result
 

@@ -223,9 +223,9 @@ def test_maps_are_as_large_as_asked(detailed: Made, tmp_path: Path) -> None:
     ("options", "told"),
     [
         (("--to", "ply", "--fit", "texels"), "texels: is for formats with maps"),
-        (("--to", "ply", "--map-px", "512"), "--map-px: is for --to gltf, obj, usd, materialx"),
+        (("--to", "ply", "--map-px", "512"), "--map-px: is for --to gltf, obj, usd, ktx2, materialx"),
         (("--to", "obj", "--texel-mm", "0.001"), "give --texel-mm"),
-        (("--to", "ply", "--uv", "model.obj"), "--uv: is for --to gltf, obj, usd, materialx"),
+        (("--to", "ply", "--uv", "model.obj"), "--uv: is for --to gltf, obj, usd, ktx2, materialx"),
         (("--to", "obj", "--uv", "configs/objects/relief.ply"), "has no texture coordinates"),
     ],
 )

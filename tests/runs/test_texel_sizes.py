@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cells
 import numpy as np
@@ -175,10 +177,30 @@ def test_maps_are_as_coarse_as_they_are(coarse: Made) -> None:
 
 def test_texels_larger_than_triangles_are_told() -> None:
     view = ViewForecast("top", 45, 200_000, 30_000, 0.4, 4)
-    lines = list(lines_of(TexelForecast(TexelSize(1.6), (view,), 1.2, 500_000_000, 2_000_000, 75.0)))
+    lines = list(lines_of(TexelForecast(TexelSize(1.6), (view,), 1.2, 500_000_000, 2_000_000, 75.0), 10**9))
     assert lines[0] == "texels: some 1,900 in 1 view, 4 x 4 pixels each, 1.6 mm on the surface"
     assert lines[1].startswith(
         "they need some 500.0 MB of memory and 2.0 MB of disk; after the fits of triangles they take 1 min 15 s"
     )
     assert "larger than the mesh's triangles, whose edge is 1.2 mm" in lines[2]
-    assert len(list(lines_of(TexelForecast(TexelSize(), (view,), 1.2, 1, 1, 1.0)))) == 2
+    assert len(list(lines_of(TexelForecast(TexelSize(), (view,), 1.2, 1, 1, 1.0), 1))) == 2
+
+
+def test_memory_that_the_machine_does_not_have_is_told() -> None:
+    view = ViewForecast("top", 1080, 12_582_912, 10_000_000, 0.05, 1)
+    forecast = TexelForecast(TexelSize(), (view, view), 0.3, 12 * 10**9, 2 * 10**9, 7200.0)
+    assert len(list(lines_of(forecast, 12 * 10**9))) == 2
+    assert "this machine has 11.90 GB of memory" in list(lines_of(forecast, 11_900_000_000))[2]
+
+
+def test_texels_that_the_disk_cannot_hold_are_refused_before_the_work(
+    detailed: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the memory, disk and time that they take said first."""
+    out = tmp_path / "new/result"
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(total=0, used=0, free=1_000_000))
+    ended = cells.here(*arguments(detailed, out, "auto"))
+    assert ended.code == 6, ended.err
+    assert re.search(r"texels need some \d\.\d\d GB, and 0\.00 GB are free", " ".join(ended.err.split()))
+    assert "of disk; after the fits" in " ".join(ended.out.split()) + " ".join(ended.err.split())
+    assert not out.exists()

@@ -57,6 +57,7 @@ BENCHED = {
     "workers": True,
     "console": True,
     "watching": True,
+    "page": True,
 }
 """Benches, and whether they are run at full scale only."""
 

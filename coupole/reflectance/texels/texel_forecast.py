@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -20,7 +21,7 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError
+from coupole.errors import DiskFull, InputError
 from coupole.reflectance.extraction.extraction import MOST_BLUR_PX, Geometry, view_pass
 from coupole.reflectance.extraction.frames_for_check import MOST_FRAMES
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
@@ -134,6 +135,17 @@ def foresee_texels(request: RunRequest, out: Path, size: TexelSize) -> TexelFore
         return TexelForecast(size, tuple(lacking), edge_mm, memory, disk, time_s)
     finally:
         forget()
+
+
+def refuse_full_disk(forecast: TexelForecast, out: Path) -> None:
+    """Raise DiskFull for texels that the disk of a result folder, which need not exist yet, cannot hold."""
+    folder = next(path for path in (out.resolve(), *out.resolve().parents) if path.exists())
+    free_bytes = shutil.disk_usage(folder).free
+    if forecast.disk_bytes > free_bytes:
+        raise DiskFull(
+            f"{out}: texels need some {forecast.disk_bytes / 1e9:.2f} GB, and {free_bytes / 1e9:.2f} GB are free. "
+            "Free space, name another --out, or make larger texels (--texels MM)"
+        )
 
 
 def _refuse_narrower(size: TexelSize, views: list[ViewForecast]) -> None:

@@ -15,7 +15,7 @@ FOLDERS = ("coupole", "drivers", "sim", "tools")
 MOST_MODULE_LINES = 400
 MOST_FUNCTION_LINES = 60
 """Most lines of a function, from the first decorator or `def` to the last line, including the docstring."""
-MOST_ROOMS, MOST_TOP_FILES = 19, 9
+MOST_ROOMS, MOST_TOP_FILES = 19, 10
 """Packages and top-level files in coupole/."""
 SHARED_NAMES = {"__init__", "records", "report", "settings"}
 """Names that modules of several packages may have."""

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.kernels import kernel
 from sim.optics import noise
 from sim.optics.sensor_model import SensorModel
 
@@ -157,7 +158,7 @@ def _settings(
     )
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _fill_pattern(response, offset_e, dark, hot, figures, response_key, dark_key, table):  # type: ignore[no-untyped-def]
     height, width = response.shape
     prnu, dsnu_e, dark_median, dark_spread, hot_share, hot_factor = figures
@@ -172,7 +173,7 @@ def _fill_pattern(response, offset_e, dark, hot, figures, response_key, dark_key
             dark[row, col] = rate * hot_factor if hot[row, col] else rate
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _collect(mean_e, site, radiance, falloff, channels, electrons):  # type: ignore[no-untyped-def]
     height, width = mean_e.shape
     k = len(site) // height
@@ -192,7 +193,7 @@ def _collect(mean_e, site, radiance, falloff, channels, electrons):  # type: ign
             mean_e[row, col] = total * falloff[row, col] * share
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _collect_all(mean_e, site, radiance, falloff, electrons):  # type: ignore[no-untyped-def]
     height, width, _ = mean_e.shape
     k = len(site) // height
@@ -213,7 +214,7 @@ def _collect_all(mean_e, site, radiance, falloff, electrons):  # type: ignore[no
                     mean_e[row, col, 2] = blue * scale
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _develop(  # type: ignore[no-untyped-def]
     out,
     light_e,

@@ -18,6 +18,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from coupole.errors import CoupoleError
+from coupole.kernels import kernel
 
 _TRIANGLES, _INDEX, _VERTEX, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
 _COMPACT, _ROBUST = 1 << 1, 1 << 2
@@ -156,7 +157,7 @@ def _packet_call(_context, _address, _valid, _scene, _rays, _arguments):  # type
 _call_embree: Any = intrinsic(_packet_call)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def centroid_and_normal(corners, t, centroid, normal):  # type: ignore[no-untyped-def]
     """Fill a triangle's centroid [3] and flat unit normal [3]; the normal is zero if the triangle has no area."""
     for k in range(3):
@@ -172,7 +173,7 @@ def centroid_and_normal(corners, t, centroid, normal):  # type: ignore[no-untype
         normal[k] = normal[k] / length if length > 0.0 else 0.0
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _trace(occlusion_test, scene, corners, sides, light, first, bits, arguments):  # type: ignore[no-untyped-def]
     chunks = -(-len(sides) // _CHUNK)
     start = first // _CHUNK
@@ -210,7 +211,7 @@ def _trace(occlusion_test, scene, corners, sides, light, first, bits, arguments)
                 lane = 0
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _cast(occlusion_test, scene, points, triangle, normals, light, radiance, arguments):  # type: ignore[no-untyped-def]
     for chunk in numba.prange(-(-len(points) // _CHUNK)):
         rays, words, valid = _packet()
@@ -241,7 +242,7 @@ def _cast(occlusion_test, scene, points, triangle, normals, light, radiance, arg
                 lane = 0
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _meet(intersect, scene, corners, origins, ways, hit_triangles, arguments):  # type: ignore[no-untyped-def]
     for chunk in numba.prange(-(-len(hit_triangles) // _CHUNK)):
         rays, words, valid = _packet()
@@ -273,7 +274,7 @@ def _meet(intersect, scene, corners, origins, ways, hit_triangles, arguments):  
                     hit_triangles[first + lane] = 2 * triangle + (facing > 0.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _packet():  # type: ignore[no-untyped-def]
     """Return the memory of one RTCRayHit16, aligned to 64 bytes. It has 12 rows of 16 for the rays (org xyz,
     tnear, dir xyz, time, tfar, mask, id, flags) and the rows of the hits, as float32 and as uint32. Also return

@@ -12,10 +12,10 @@ from contextlib import closing
 from dataclasses import dataclass
 
 import h5py
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.extraction.extraction import Geometry
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
@@ -195,7 +195,7 @@ class _Entries:
         return means
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _mean(starts, channel, is_reached, values, means):  # type: ignore[no-untyped-def]
     """Fill `means` [texels, channels, leds] from values [pixels, leds]. A mean is over the pixels that light has
     reached, if these are at least half of all; it is NaN if one of them has no value."""

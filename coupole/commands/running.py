@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -75,7 +74,7 @@ def acquire(
     console owns the cell (`coupole serve`), the command acquires in the console's name, if nothing runs or waits
     there.
     """
-    from coupole.acquisition.session import acquire_plan, rehearse
+    from coupole.acquisition.session import SessionRequest, acquire_plan, rehearse
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
 
@@ -96,9 +95,11 @@ def acquire(
             rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, figures=summary)
         else:
             job = read_job(plan or plan_of(resume), rig)
-            begin = partial(acquire_plan, job, console, parent=output, resume=resume, with_mesh=with_mesh)
             with _beside(job, console, resume, result, summary, is_asked=reflectance) as beside:
-                begin(confirm=not yes, figures=summary, beside=beside)
+                wanted_session = SessionRequest(
+                    output, resume, confirm=not yes, with_mesh=with_mesh, beside=beside
+                )
+                acquire_plan(job, console, wanted_session, summary)
     except CoupoleError as error:
         fail(error, as_json=as_json, figures=summary)
         raise

@@ -58,43 +58,33 @@ def fixed_pattern(model: SensorModel, height_px: int, width_px: int) -> FixedPat
     return FixedPattern(response, offset_e, dark, hot)
 
 
-def expose(
-    out: NDArray[np.uint16],
+def mosaic_electrons(
     site: NDArray[np.int32],
     radiance: NDArray[np.float32],
     falloff: NDArray[np.float32],
     *,
     model: SensorModel,
     electrons_per_radiance: float,
-    frame: int,
-    exposure_s: float = 0.0,
-    gain: float = 1.0,
-    temperature_c: float = 25.0,
-    more_e: NDArray[np.float32] | None = None,
-) -> None:
-    """Fill `out` [h, w] with one frame, DN.
+) -> NDArray[np.float32]:
+    """[h, w] mean electrons at every pixel, in its own channel.
 
     `site` [h k, w k] holds, for k x k samples of each pixel, a row of `radiance` [sites, 3], or -1 for nothing;
     the pixel takes their mean. Radiance times `falloff` [h, w] times `electrons_per_radiance` is the mean number
-    of electrons of a pixel with response 1. `exposure_s` and `temperature_c` set dark current and ambient light;
-    `gain` divides the electrons per DN. `more_e` [h, w] are mean electrons of other light, such as that of lamps
-    in the picture.
+    of electrons of a pixel with response 1.
 
     Raises:
         InputError: The shapes do not fit together.
     """
-    height, width = out.shape
+    height, width = falloff.shape
     k = site.shape[0] // height
-    if k < 1 or site.shape != (height * k, width * k) or falloff.shape != out.shape:
+    if k < 1 or site.shape != (height * k, width * k):
         raise InputError(
-            f"sensor: expected sites of k times {out.shape} parts and a falloff of {out.shape}; "
-            f"found {site.shape} and {falloff.shape}; render for the camera's size"
+            f"sensor: expected sites of k times {falloff.shape} parts, as the falloff has; found {site.shape}; "
+            "render for the camera's size"
         )
-    mean_e = np.empty(out.shape, np.float32)
+    mean_e = np.empty(falloff.shape, np.float32)
     _collect(mean_e, site, radiance, falloff, model.channels(), electrons_per_radiance)
-    if more_e is not None:
-        mean_e += more_e
-    _develop(out, mean_e, *_settings(model, out.shape, frame, exposure_s, gain, temperature_c))
+    return mean_e
 
 
 def electrons(
@@ -105,7 +95,7 @@ def electrons(
     electrons_per_radiance: float,
 ) -> NDArray[np.float32]:
     """[h, w, 3] mean electrons in all three channels at every pixel, for stages before the Bayer filter, such as
-    the lens's blur. Arguments as in `expose`."""
+    the lens's blur. Arguments as in `mosaic_electrons`."""
     mean_e = np.empty((*falloff.shape, 3), np.float32)
     _collect_all(mean_e, site, radiance, falloff, electrons_per_radiance)
     return mean_e
@@ -122,6 +112,8 @@ def expose_electrons(
     temperature_c: float = 25.0,
 ) -> None:
     """Fill `out` [h, w] with one frame, DN, from the mean electrons [h, w] of light in pixels of response 1.
+
+    `exposure_s` and `temperature_c` set dark current and ambient light; `gain` divides the electrons per DN.
 
     Raises:
         InputError: The shapes differ.

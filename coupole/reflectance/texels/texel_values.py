@@ -27,7 +27,7 @@ from coupole.reflectance.lanes import LANES
 from coupole.reflectance.new_light.pictured_surface import Surface
 from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.run_result import ViewSamples
-from coupole.reflectance.texels.pixel_values import fill_rows, light_of
+from coupole.reflectance.texels.pixel_values import LitPixels, fill_rows, light_of
 from coupole.reflectance.texels.texel_grid import TexelGrid
 
 _TEXELS = 1 << 13
@@ -108,9 +108,8 @@ class TexelReader:
                 codes, direct = light_of(file, entries.rows, part, channels)
                 of_pixels[:] = NO_VALUE
                 of_leds = of_pixels[:, : part.stop - part.start]
-                fill_rows(
-                    pool, entries.rows, reader, response, batch, seen_mm, (codes, direct), of_leds, root_share
-                )
+                lit_pixels = LitPixels(entries.rows, seen_mm, (codes, direct), of_leds)
+                fill_rows(pool, reader, response, batch, lit_pixels, root_share)
                 is_reached = codes[:, : part.stop - part.start] == REACHED
 
                 def mean(first: int, part: slice = part, is_reached: NDArray[np.bool_] = is_reached,

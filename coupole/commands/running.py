@@ -13,13 +13,15 @@ import typer
 from coupole.commands.common import (
     JsonOption,
     PlanPath,
+    PlanUnlessResumed,
     RigOption,
+    RunsParentOption,
     fail,
     person_named,
     plan_of,
     served_cell,
 )
-from coupole.commands.completion import plans, runs
+from coupole.commands.completion import runs
 from coupole.errors import CoupoleError
 from coupole.plan.shipped_files import SIMULATED_CELL, file_of
 
@@ -46,14 +48,9 @@ ResultOption = Annotated[
 
 
 def acquire(
-    plan: Annotated[
-        Path | None,
-        typer.Argument(
-            help="The plan (YAML); not needed with --resume.", show_default=False, autocompletion=plans
-        ),
-    ] = None,
+    plan: PlanUnlessResumed = None,
     rig: RigOption = None,
-    output: Annotated[Path | None, typer.Option("--output", help="Parent folder of the run.")] = None,
+    output: RunsParentOption = None,
     resume: Annotated[Path | None, typer.Option("--resume", help="Resume this run.", autocompletion=runs)] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Rehearse on the rig's simulated twin.")] = False,
     speed: Annotated[float, typer.Option("--speed", min=0.1, max=1000, help="Pace of a dry run.")] = 20.0,

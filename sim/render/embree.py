@@ -158,6 +158,18 @@ _call_embree: Any = intrinsic(_packet_call)
 
 
 @kernel
+def _trace_packet(function, valid, scene, rays, arguments):  # type: ignore[no-untyped-def]
+    """Trace the valid rays of a packet by the function at an address."""
+    _call_embree(
+        function,
+        np.uint64(valid.ctypes.data),
+        scene,
+        np.uint64(rays.ctypes.data),
+        np.uint64(arguments.ctypes.data),
+    )
+
+
+@kernel
 def centroid_and_normal(corners, t, centroid, normal):  # type: ignore[no-untyped-def]
     """Fill a triangle's centroid [3] and flat unit normal [3]; the normal is zero if the triangle has no area."""
     for k in range(3):
@@ -198,13 +210,7 @@ def _trace(occlusion_test, scene, corners, sides, light, first, bits, arguments)
                 lane += 1
             if lane == _PACKET or (place == last - 1 and lane > 0):
                 valid[lane:] = 0
-                _call_embree(
-                    occlusion_test,
-                    np.uint64(valid.ctypes.data),
-                    scene,
-                    np.uint64(rays.ctypes.data),
-                    np.uint64(arguments.ctypes.data),
-                )
+                _trace_packet(occlusion_test, valid, scene, rays, arguments)
                 for k in range(lane):
                     if rays[8, k] >= 0.0:  # Embree sets tfar of a ray that hit something to minus infinity
                         bits[place_of_lane[k] >> 3] |= np.uint8(1 << (place_of_lane[k] & 7))
@@ -229,13 +235,7 @@ def _cast(occlusion_test, scene, points, triangle, normals, light, radiance, arg
                 lane += 1
             if lane == _PACKET or (i == last - 1 and lane > 0):
                 valid[lane:] = 0
-                _call_embree(
-                    occlusion_test,
-                    np.uint64(valid.ctypes.data),
-                    scene,
-                    np.uint64(rays.ctypes.data),
-                    np.uint64(arguments.ctypes.data),
-                )
+                _trace_packet(occlusion_test, valid, scene, rays, arguments)
                 for k in range(lane):
                     if rays[8, k] < 0.0:
                         radiance[site_of_lane[k], :] = 0.0
@@ -257,13 +257,7 @@ def _meet(intersect, scene, corners, origins, ways, hit_triangles, arguments):  
             rays[3, :], rays[8, :] = 0.0, np.inf
             words[9, :], words[11, :] = np.uint32(0xFFFFFFFF), np.uint32(0)
             words[18, :] = np.uint32(0xFFFFFFFF)  # no geometry met
-            _call_embree(
-                intersect,
-                np.uint64(valid.ctypes.data),
-                scene,
-                np.uint64(rays.ctypes.data),
-                np.uint64(arguments.ctypes.data),
-            )
+            _trace_packet(intersect, valid, scene, rays, arguments)
             for lane in range(count):
                 hit_triangles[first + lane] = -1
                 if words[18, lane] != np.uint32(0xFFFFFFFF):

@@ -6,42 +6,11 @@
 
 import importlib
 import os
-import stat
-import tempfile
-from pathlib import Path
 from typing import Any
 
 # Matrices here are small and many: OpenBLAS's threads cost more than they bring (six times on a busy machine of
 # two cores, adjusting a mesh's pose), and simulator and stream want the cores. Set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-
-def _is_writable(folder: Path) -> bool:
-    """Tell whether a folder can be written, or made."""
-    there = next((path for path in (folder, *folder.parents) if path.exists()), Path("/"))
-    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
-
-
-def _keep_kernels_somewhere() -> None:
-    """Give numba a folder for its compiled code, which is usually beside the package or in the user's cache. If
-    neither can be written (another user's installation, no home), it is a folder of this user among the temporary
-    files. A folder that somebody else has made there is not used, because code is loaded from it. Call this before
-    numba is imported.
-    """
-    places = (Path(__file__).parent, Path("~/.cache").expanduser())
-    if "NUMBA_CACHE_DIR" in os.environ or any(map(_is_writable, places)):
-        return
-    place = Path(tempfile.gettempdir()) / f"coupole-kernels-{os.getuid()}"
-    try:
-        place.mkdir(mode=0o700, exist_ok=True)
-        state = place.lstat()
-        is_own = stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & 0o077
-    except OSError:
-        is_own = False
-    os.environ["NUMBA_CACHE_DIR"] = str(place) if is_own else tempfile.mkdtemp(prefix="coupole-kernels-")
-
-
-_keep_kernels_somewhere()
 
 __version__ = "0.2.0"
 

@@ -7,7 +7,8 @@ Angles are degrees of the arm's six axes; speeds, accelerations and jerks are of
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -76,24 +77,33 @@ def farthest_stop_deg(
     return farthest_deg
 
 
+@dataclass(frozen=True)
+class StateReader(Generic[State]):
+    """A driver's way to read its arm's state, and its words for it."""
+
+    read_state: Callable[[], State]
+    pause: Callable[[], None]
+    """Waits until the next reading."""
+    describe: Callable[[State], str]
+    remedy: str
+    """Advice for an arm that does not come to the expected state."""
+
+
 def wait_for(
-    read_state: Callable[[], State],
+    reader: StateReader[State],
     is_done: Callable[[State], bool],
     deadline: Deadline,
     expectation: str,
     *,
     check: Callable[[State], None] | None,
-    pause: Callable[[], None],
-    describe: Callable[[State], str],
-    remedy: str,
 ) -> None:
-    """Read the arm's state until it is `is_done`, with a `pause` between reads; `check` is applied to every state.
+    """Read the arm's state until it is `is_done`; `check` is applied to every state.
 
-    Errors of `read_state` and `check` are raised unchanged. Raises DeviceTimeout at the deadline, with the last
-    state in the words of `describe`.
+    Errors of the reader and of `check` are raised unchanged. Raises DeviceTimeout at the deadline, with the last
+    state in the reader's words.
     """
     while True:
-        state = read_state()
+        state = reader.read_state()
         if check is not None:
             check(state)
         if is_done(state):
@@ -102,10 +112,10 @@ def wait_for(
             raise DeviceTimeout(
                 "robot",
                 expected=f"{expectation} within {deadline.seconds:.1f} s",
-                happened=describe(state),
-                remedy=remedy,
+                happened=reader.describe(state),
+                remedy=reader.remedy,
             )
-        pause()
+        reader.pause()
 
 
 class MessageTime:

@@ -22,9 +22,11 @@ from nursery import NURSERY
 from skip_budget import over_budget
 from xdist.scheduler.loadscope import LoadScopeScheduling
 
+from coupole.kernels import kept_in
 from sim.world import client
 
 pytest_plugins = ["coupole.testing"]
+os.environ.setdefault("NUMBA_CACHE_DIR", str(kept_in()))  # also of commands whose home is a test's folder
 compile_each_kernel_once()
 client._launch = NURSERY.start  # type: ignore[assignment] # for what runs in the tests' own process
 

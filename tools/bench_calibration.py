@@ -177,7 +177,7 @@ def _leds(rounds: int, size: Size) -> dict[str, Any]:
     """LEDs on boards of six, each seen six times."""
     from coupole.calibration.leds.adjustment import adjust_leds
     from coupole.calibration.leds.boards import Boards
-    from coupole.calibration.leds.equations import Stated
+    from coupole.calibration.leds.equations import Stated, problem_of
     from coupole.calibration.leds.matching import LedSightings
     from coupole.calibration.optics import NAMES, Intrinsics
     from coupole.calibration.posed_camera import CameraPrior
@@ -196,15 +196,9 @@ def _leds(rounds: int, size: Size) -> dict[str, Any]:
     prior = CameraPrior(Intrinsics(*LENS), NAMES[:8], scene.flange_from_camera, np.diag(sigma**2))
 
     def run_coupole() -> Any:
-        return adjust_leds(
-            sightings,
-            scene.point,
-            scene.base_from_flange,
-            boards,
-            scene.base_from_body,
-            prior,
-            Stated(tolerance_mm=TOLERANCE_MM),
-        )
+        stated_noise = Stated(tolerance_mm=TOLERANCE_MM)
+        problem = problem_of(sightings, scene.point, boards, scene.base_from_flange, prior, stated_noise)
+        return adjust_leds(problem, scene.base_from_body)
 
     figure = _compare_times(
         f"calibration_leds_{count}_x_6",

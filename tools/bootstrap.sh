@@ -12,7 +12,6 @@ checkers_from_pypi=("roc-validator>=0.13,<0.14")
 checkers_from_npm=("gltf-validator@2.0.0-dev.3.10" "ktx-parse@2.0.0" "validate-web-annotation@0.3.0")
 
 prepare() {
-    forget_stale_kernels
     is_ready && return 0
     mkdir -p "$root/.tools"
     local status=0
@@ -96,18 +95,6 @@ prepare_packages() {
 }
 
 # ---- helpers ----
-
-# Numba keeps what it compiled as long as a function's own file is the same, also if one that it calls has changed
-# in another file: after another commit was checked out it compiles anew.
-forget_stale_kernels() {
-    local made_for="$root/.tools/kernels" commit
-    [[ -e "$root/.git" && -w "$root" ]] || return 0
-    commit=$(git -C "$root" rev-parse HEAD 2>/dev/null) || return 0
-    [[ -f "$made_for" && "$(<"$made_for")" == "$commit" ]] && return 0
-    find "$root/coupole" "$root/drivers" "$root/sim" -name '*.nbi' -delete 2>/dev/null || : # or another tool was faster
-    mkdir -p "$root/.tools"
-    printf '%s\n' "$commit" >"$made_for"
-}
 
 say() { printf 'coupole: %s\n' "$*" >&2; }
 

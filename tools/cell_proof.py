@@ -18,13 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from coupole.appearance.render.led_squares import read_leds
 from coupole.calibration.adjustment import coverage_factor
-from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses, read_arm
+from coupole.calibration.calibrated_arm import CalibratedArm, CarriedCamera, calibrated_poses, read_arm
 from coupole.calibration.leds.equations import Stated as StatedOfLeds
 from coupole.calibration.leds.workflow import leds_from
 from coupole.calibration.lens.board import Board
 from coupole.calibration.lens.bundle import RobotNoise
 from coupole.calibration.lens.images import find_board
-from coupole.calibration.lens.workflow import camera_from, hand_eye_from
+from coupole.calibration.lens.workflow import CameraArm, camera_from, hand_eye_from
 from coupole.calibration.posed_camera import CameraPrior, read_posed_camera
 from coupole.calibration.record import Record, write_record
 from coupole.calibration.request import Request
@@ -169,7 +169,9 @@ def _camera_and_hand_eye(
     off = (0.3, 0.02) if cell.absolute else (0.0, 1e-5)
     robot = RobotNoise(absolute_mm=off[0], absolute_deg=off[1])
     camera = camera_from(detections, sources, "brown4", request)[1].record
-    return camera, hand_eye_from(detections, sources, board, "brown4", request, robot=robot, arm=model)[2].record
+    return camera, hand_eye_from(detections, sources, board, "brown4", request, arm=CameraArm(robot, model))[
+        2
+    ].record
 
 
 def _of_camera(cell: RandomCell, record: Record) -> Iterator[Judged]:
@@ -249,9 +251,8 @@ def _prove_mesh(
     depth_mm = (200.0, 900.0)
     images = find_all_stickers(sources, prior.lens, diameter_mm=STICKER_MM, depth_mm=depth_mm)
     stated_tolerances = StatedOfMesh(scanner_mm=0.03, robot_mm=0.03, robot_deg=0.003)
-    mesh_pose = mesh_from(
-        images, sources, scan, prior, request, stated_noise=stated_tolerances, depth_mm=depth_mm, arm=arm
-    ).pose
+    camera = CarriedCamera(prior, arm)
+    mesh_pose = mesh_from(images, sources, scan, camera, request, stated_noise=stated_tolerances).pose
     in_support = transform(place["translation_mm"], place["abc_deg"])
     true = cell.base_from_support @ in_support @ inverse(scanner_from_thing(cell.seed))
     u = np.sqrt(np.diag(mesh_pose.covariance))

@@ -18,7 +18,17 @@ import grimp
 
 ROOT = Path(__file__).resolve().parent.parent
 OUTPUT = ROOT / "docs" / "pictures" / "rooms.svg"
-CONTRACTS = ("bounded", "clock", "devices", "errors", "geometry", "joint_chain", "kinematics", "supervision")
+CONTRACTS = (
+    "bounded",
+    "clock",
+    "devices",
+    "errors",
+    "geometry",
+    "joint_chain",
+    "kernels",
+    "kinematics",
+    "supervision",
+)
 BESIDE = ("drivers", "sim")
 _STEP_X, _STEP_Y, _BOX_W, _BOX_H, _MARGIN = 74, 46, 132, 34, 16
 

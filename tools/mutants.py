@@ -169,24 +169,21 @@ class Bench:
         """Exit code of pytest, and the first test that failed."""
         command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--no-header"]
         command += ["-k", mutant.select] if mutant.select else []
-        has_numba = "numba" in (self._root / mutant.path).read_text(encoding="utf-8")
-        with tempfile.TemporaryDirectory() as fresh:
-            # numba does not look into the files of functions that a compiled function calls
-            cache = fresh if has_numba else str(self._scratch / ".numba")
-            env = {**os.environ, "NUMBA_CACHE_DIR": cache, "PYTHONDONTWRITEBYTECODE": "1"}
-            env["PYTHONPATH"] = str(self._scratch)  # also for the scripts that tests begin
-            try:
-                process = subprocess.run(
-                    [*command, *mutant.tests],
-                    cwd=self._scratch,
-                    env=env,
-                    capture_output=True,
-                    text=True,
-                    timeout=TIMEOUT_S,
-                    check=False,
-                )
-            except subprocess.TimeoutExpired:
-                return _FAILED, f"no end within {TIMEOUT_S:g} s"
+        # what a mutant does not change is compiled once for all of them (coupole/kernels.py)
+        env = {**os.environ, "NUMBA_CACHE_DIR": str(self._scratch / ".numba"), "PYTHONDONTWRITEBYTECODE": "1"}
+        env["PYTHONPATH"] = str(self._scratch)  # also for the scripts that tests begin
+        try:
+            process = subprocess.run(
+                [*command, *mutant.tests],
+                cwd=self._scratch,
+                env=env,
+                capture_output=True,
+                text=True,
+                timeout=TIMEOUT_S,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            return _FAILED, f"no end within {TIMEOUT_S:g} s"
         lines = [line for line in process.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
         return process.returncode, lines[0].split(" ", 1)[1].split(" - ")[0] if lines else ""
 

@@ -47,7 +47,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from coupole.calibration.adjustment import coverage_factor
 from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
 from coupole.calibration.leds.boards import board_poses, boards_of
-from coupole.calibration.leds.equations import Stated
+from coupole.calibration.leds.equations import Stated, problem_of
 from coupole.calibration.leds.workflow import LedsFound, leds_from
 from coupole.calibration.request import Request
 from drawn_leds import DrawnLeds, Floats, draw_leds
@@ -179,16 +179,9 @@ _MISSING = "LEDs not found"
 
 def _plain(cell: DrawnLeds, calibration: LedsFound) -> LedGeometry:
     boards, matching = boards_of(cell.table), calibration.matching
-    return adjust_leds(
-        matching.sightings,
-        matching.sightings.led,
-        cell.images.base_from_flange,
-        boards,
-        board_poses(boards, matching.by_place_mm),
-        cell.prior,
-        Stated(),
-        modes=(),
-    )
+    sightings = matching.sightings
+    problem = problem_of(sightings, sightings.led, boards, cell.images.base_from_flange, cell.prior, Stated(), ())
+    return adjust_leds(problem, board_poses(boards, matching.by_place_mm))
 
 
 def _against_truth(geometry: LedGeometry, true_mm: Floats, rows: NDArray[np.bool_]) -> tuple[float, float, Floats]:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numba
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 import cells  # noqa: E402
 
 from coupole.geometry import apply  # noqa: E402
+from coupole.kernels import kernel  # noqa: E402
 from coupole.reflectance.extraction.lamp_sight import lit_on  # noqa: E402
 from coupole.reflectance.ggx import tangents  # noqa: E402
 from coupole.reflectance.run_job import RunRequest, extract_runs, reflectance_of  # noqa: E402
@@ -254,7 +254,7 @@ def _unit(vectors: Floats) -> Floats:
     return unit_vectors
 
 
-@numba.njit(cache=True)
+@kernel
 def _look_up_all(table, normals, lights, eyes, values):  # type: ignore[no-untyped-def]
     for n in range(len(values)):
         a, b, c = normals[n], lights[n], eyes[n]

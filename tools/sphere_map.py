@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from coupole.appearance.matter.tabulated import SpecularTable
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
+from coupole.kernels import kernel
 
 PHI_NODES = 25
 """Nodes of half a mesh in phi, from 0 to pi."""
@@ -99,7 +99,7 @@ def sphere_map(table: SpecularTable, to_eye: Array, to_lights: Array, irradiance
     return SphereMap(eye, lights, theta, radiance)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _shade(eye, lights, firsts, power, incidence, theta, table, radiance):  # type: ignore[no-untyped-def]
     count, bands = table.shape[2], table.shape[3]
     cosines_phi = np.cos(np.arange(PHI_NODES) * np.pi / (PHI_NODES - 1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from concurrent import futures
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,7 +14,7 @@ from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor
 from coupole.acquisition.dose import DoseMeter, led_time_s
 from coupole.acquisition.frame_grabber import FrameGrabber, buffers_for, memory_for_buffers
 from coupole.acquisition.frame_matching import UNLABELLED, FaultModel, Match, match
-from coupole.acquisition.host_burst import HostBurst
+from coupole.acquisition.host_burst import HostBurst, Overseer
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.acquisition.verdict import Verdict
@@ -58,8 +57,16 @@ class _RunningBurst:
     """Time when the panel was switched on; None without one."""
 
 
+@dataclass(frozen=True)
+class CameraSettings:
+    """Settings of the camera that all bursts share."""
+
+    gain_db: float
+    max_frames_per_s: float
+
+
 class BurstRunner:
-    """Fires bursts while the arm is at rest. `tell(burst, step)` is called during a burst."""
+    """Fires bursts while the arm is at rest."""
 
     def __init__(
         self,
@@ -68,16 +75,12 @@ class BurstRunner:
         arm: ArmSupervisor,
         dose: DoseMeter,
         outcome: Outcome,
-        *,
-        gain_db: float,
-        max_frames_per_s: float,
-        tell: Callable[[Burst, int], None],
-        wait_while_paused: Callable[[], None],
+        camera: CameraSettings,
+        overseer: Overseer,
     ) -> None:
         self._cell, self._recorder, self._arm, self._dose = cell, recorder, arm, dose
-        self._outcome, self._gain_db, self._max_frames_per_s = outcome, gain_db, max_frames_per_s
-        self._tell = tell
-        self._by_host = HostBurst(cell, recorder, arm, tell, wait_while_paused, dose, self._note)
+        self._outcome, self._camera, self._overseer = outcome, camera, overseer
+        self._by_host = HostBurst(cell, recorder, arm, overseer, dose, self._note)
         self._uploader = Workers(1, "upload")
         self._upload: futures.Future[None] | None = None
         self._buffer_memory_bytes = memory_for_buffers()
@@ -92,7 +95,7 @@ class BurstRunner:
 
     def exposure(self, burst: Burst) -> Exposure:
         """Return the settings that the camera must have for a burst."""
-        return Exposure(burst.timing.exposure_us, self._gain_db, burst.hardware)
+        return Exposure(burst.timing.exposure_us, self._camera.gain_db, burst.hardware)
 
     def prepare(self, burst: Burst) -> None:
         """Begin to upload the burst's table in another thread, so that the arm is watched meanwhile."""
@@ -190,7 +193,7 @@ class BurstRunner:
     def _follow(self, running: _RunningBurst) -> None:
         """Read log and frames until the burst is over, and prove frames meanwhile."""
         box, clock, burst, grabber = table_box(self._cell.ledbox), self._cell.clock, running.burst, running.grabber
-        readout_s = 1.0 / self._max_frames_per_s + burst.timing.exposure_us * 1e-6
+        readout_s = 1.0 / self._camera.max_frames_per_s + burst.timing.exposure_us * 1e-6
         step_s = burst.timing.period_us * 1e-6
         next_step = Deadline(clock, step_s + _STALL_S)
         last_frames: Deadline | None = None
@@ -219,7 +222,7 @@ class BurstRunner:
                 judged_at = (confirmed_frames, len(running.log))
                 running.match = self._match(running, taken_frames, complete=complete)
                 self._prove(running, confirmed_frames, complete=complete)
-                self._tell(burst, len(running.log))
+                self._overseer.tell(burst, len(running.log))
             if complete:
                 return
             self._recorder.commit(now=False)

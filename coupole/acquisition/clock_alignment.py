@@ -7,8 +7,9 @@ sent an edge. `view` and `steps_out` are int64 [frames]: the row of a step, or o
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from coupole.kernels import kernel
 
 SURPLUS = -1
 """No step fired the frame."""
@@ -20,7 +21,7 @@ DOUBTFUL = -4
 """The others fit one line only if this frame is left out, or this frame is one that can be left out for it."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _align(  # type: ignore[no-untyped-def]
     frame_ns, step_ns, anchor_frame, anchor_step, jitter_ns, drift, max_surplus, in_flight, steps_out
 ):
@@ -61,7 +62,7 @@ def _align(  # type: ignore[no-untyped-def]
     return surplus
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _misfit(box_ns, excess_ns, left_out, jitter_ns, triple):  # type: ignore[no-untyped-def]  # noqa: PLR0912
     """True if no line passes within `jitter_ns` of all points that are not left out; `triple` [3] then holds three
     points that prove it. It is the exchange algorithm for the best line in the maximum norm, stopped at the first
@@ -107,7 +108,7 @@ def _misfit(box_ns, excess_ns, left_out, jitter_ns, triple):  # type: ignore[no-
     return False
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _leave_out(frame_ns, step_ns, view, may_leave_out, jitter_ns):  # type: ignore[no-untyped-def]  # noqa: PLR0912
     """Mark in `view` the frames as DOUBTFUL that some solution leaves out. A solution leaves out at most
     `may_leave_out` frames so that the others fit one line. Returns False if there is no solution."""
@@ -159,7 +160,7 @@ def _leave_out(frame_ns, step_ns, view, may_leave_out, jitter_ns):  # type: igno
     return fits
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def agree_on_steps(  # type: ignore[no-untyped-def]
     frame_ns, step_ns, jitter_ns, drift, max_surplus, in_flight, first_view, agrees
 ):

@@ -71,22 +71,30 @@ class Dose(Protocol):
     def ask_again(self, burst: Burst, step: int) -> None: ...
 
 
+@dataclass(frozen=True)
+class Overseer:
+    """The session, which follows bursts and may pause them."""
+
+    tell: Callable[[Burst, int], None]
+    """Called during a burst, with the number of its step."""
+    wait_while_paused: Callable[[], None]
+
+
 class HostBurst:
     """Fires bursts with software trigger. The `dose` is asked before the burst and before each of its lights.
-    `tell(burst, step)` is called during a burst. `note` counts the burst's light and writes its journal line."""
+    `note` counts the burst's light and writes its journal line."""
 
     def __init__(
         self,
         cell: OpenedCell,
         recorder: Recorder,
         arm: ArmSupervisor,
-        tell: Callable[[Burst, int], None],
-        wait_while_paused: Callable[[], None],
+        overseer: Overseer,
         dose: Dose,
         note: Callable[..., None],
     ) -> None:
         self._cell, self._recorder, self._arm = cell, recorder, arm
-        self._tell, self._wait_while_paused, self._dose, self._note = tell, wait_while_paused, dose, note
+        self._overseer, self._dose, self._note = overseer, dose, note
         self._panel_s = 0.0
         """Greatest time for which the panel of this burst can have been on."""
 
@@ -105,7 +113,7 @@ class HostBurst:
             self._dose.begin(burst)
             for index, shot in enumerate(burst.shots):
                 self._arm.attend()
-                self._wait_while_paused()
+                self._overseer.wait_while_paused()
                 if _gives_light(burst, index):
                     self._dose.ask_again(burst, index)
                 picture = self._fire_one(burst, index, records)
@@ -121,7 +129,7 @@ class HostBurst:
                     kept_frames += self._keep(picture, picture.frame, burst, index)
                 if burst.marks == "none":
                     self._prove(kept_frames)
-                self._tell(burst, index)
+                self._overseer.tell(burst, index)
                 self._recorder.commit(now=False)
             reason = reason or ("a dark mark was not seen" if marks else "")
             if not reason:

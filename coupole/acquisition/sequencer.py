@@ -13,11 +13,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor, SettledPose
-from coupole.acquisition.burst_runner import BurstRunner
+from coupole.acquisition.burst_runner import BurstRunner, CameraSettings
 from coupole.acquisition.bursts_of_views import BurstsOfViews
 from coupole.acquisition.collector import collected_when_asked
 from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_matching import compile_now
+from coupole.acquisition.host_burst import Overseer
 from coupole.acquisition.observer import Control, Held, Observer, Unwatched
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
@@ -87,10 +88,8 @@ class Sequencer:
             self._arm,
             self._dose,
             self.outcome,
-            gain_db=job.plan.gain_db,
-            max_frames_per_s=job.cell.rig.sensor.max_frames_per_s,
-            tell=self._tell,
-            wait_while_paused=self._wait_while_paused,
+            CameraSettings(job.plan.gain_db, job.cell.rig.sensor.max_frames_per_s),
+            Overseer(self._tell, self._wait_while_paused),
         )
         compile_now()
 

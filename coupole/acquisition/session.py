@@ -7,7 +7,7 @@ import os
 import signal
 import time
 from collections.abc import Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -79,24 +79,36 @@ _ASKED_BOARDS = 12
 # -- the run ----------------------------------------------------------------------------------------------
 
 
-def acquire_plan(
-    job: Job,
-    console: Console,
-    *,
-    parent: Path | None,
-    resume: Path | None,
-    confirm: bool,
-    figures: dict[str, Any],
-    with_mesh: bool = False,
-    beside: ProcessingBeside | None = None,
-) -> None:
-    """Run a plan into a run folder. `figures` is filled with the figures of `--json`, even if this raises.
+@dataclass(frozen=True)
+class SessionRequest:
+    """A session that is asked for, besides its plan."""
 
-    A mesh of more than 100 MB is copied into the folder only if `with_mesh` is set. `beside` processes the run's
-    views while it is acquired.
-    """
+    parent: Path | None
+    """Folder for the run's folder; None: the rig's."""
+    resume: Path | None
+    """A run to be resumed; None begins one."""
+    confirm: bool
+    """True if a person is asked before the arm of a real cell moves."""
+    with_mesh: bool = False
+    """True to copy a mesh of more than 100 MB into the folder too."""
+    beside: ProcessingBeside | None = None
+    """Processes the run's views while it is acquired."""
+
+
+@dataclass(frozen=True)
+class _Session:
+    """A session whose devices and journal are open."""
+
+    cell: OpenedCell
+    run: Run
+    recorder: RunRecorder
+    faults: ArmFaults
+
+
+def acquire_plan(job: Job, console: Console, request: SessionRequest, figures: dict[str, Any]) -> None:
+    """Run a plan into a run folder. `figures` is filled with the figures of `--json`, even if this raises."""
     with contextlib.ExitStack() as stack:
-        run = Run(resume) if resume else None
+        run = Run(request.resume) if request.resume else None
         if run is not None:
             stack.callback(os.close, run.lock())
             run.refuse_old_journal()
@@ -104,33 +116,19 @@ def acquire_plan(
             refuse_lost(run.folder, run.proven().values())
         job = without_hidden(job, run.hidden_leds if run else None)
         job = with_choices(job, run.choices() if run else {})
-        _acquire_into(
-            run,
-            job,
-            console,
-            parent=parent,
-            confirm=confirm,
-            figures=figures,
-            exit_stack=stack,
-            with_mesh=with_mesh,
-            beside=beside,
-        )
+        _acquire_into(run, job, console, request, figures, stack)
 
 
 def _acquire_into(
     run: Run | None,
     job: Job,
     console: Console,
-    *,
-    parent: Path | None,
-    confirm: bool,
+    request: SessionRequest,
     figures: dict[str, Any],
     exit_stack: contextlib.ExitStack,
-    with_mesh: bool,
-    beside: ProcessingBeside | None,
 ) -> None:
-    is_resumed = run is not None
-    folder = (run.folder if run else parent or job.cell.storage_folder).resolve()
+    is_resumed, beside = run is not None, request.beside
+    folder = (run.folder if run else request.parent or job.cell.storage_folder).resolve()
     job, preflight = preflight_of(
         job,
         folder,
@@ -144,7 +142,7 @@ def _acquire_into(
         _close_complete(run, job, console, beside, figures)
         return
     faults_of(job.cell).refuse(job.cell.document.path)
-    ask_to_begin(job.cell, confirm=confirm)
+    ask_to_begin(job.cell, confirm=request.confirm)
     compile_ahead()
     console.print("opening the devices ...")
     with open_cell(job.cell, job=job, on_opened=identity_printer(console)) as cell:
@@ -153,7 +151,7 @@ def _acquire_into(
         on_disk("the cell's commissioning record", partial(refuse_uncommissioned, job.cell, cell.identities))
         room_c = run_bounded(lambda: _refuse_other_calibrations(job, cell))
         if run is None:
-            inputs = replace(job.inputs, copy_large=with_mesh)
+            inputs = replace(job.inputs, copy_large=request.with_mesh)
             create = partial(Run.create, folder, job.plan.name, inputs, about_run(job, cell))
             run = on_disk(str(folder), create, copied_s(inputs))
             exit_stack.callback(os.close, run.lock())
@@ -174,7 +172,7 @@ def _acquire_into(
             tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
-            _acquire(job, cell, run, recorder, console, faults, light, figures=figures)
+            _acquire(job, _Session(cell, run, recorder, faults), console, light, figures)
         finally:
             _end_recording(recorder, beside)
 
@@ -230,18 +228,11 @@ def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float | None:
 
 
 def _acquire(
-    job: Job,
-    cell: OpenedCell,
-    run: Run,
-    recorder: RunRecorder,
-    console: Console,
-    faults: ArmFaults,
-    light: Mapping[str, float],
-    *,
-    figures: dict[str, Any],
+    job: Job, session: _Session, console: Console, light: Mapping[str, float], figures: dict[str, Any]
 ) -> None:
     """Run the session itself. At its end the objects will have received `light`, lux hours by id. However the
     session ends, the cell is made safe first; then the end is written to the disk."""
+    cell, run, recorder, faults = session.cell, session.run, session.recorder, session.faults
     control = Control()
     observer = RunObserver(console, job.cell.rig.frame_bytes, len(recorder.proven()))
     sequencer = run_bounded(partial(Sequencer, job, cell, recorder, observer=observer, control=control))

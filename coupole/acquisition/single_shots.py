@@ -18,7 +18,7 @@ from coupole.devices import NO_LED, STEP_DTYPE, Exposure, Frame, Step, table_box
 from coupole.errors import DeviceTimeout
 from coupole.plan.bursts import BurstTiming, burst_timing
 from coupole.plan.cell import Cell
-from coupole.plan.rig_devices import longest_light_s, watchdog_s
+from coupole.plan.rig_devices import device_times, longest_light_s, watchdog_s
 from coupole.viewing.raw_preview import Coding
 
 _FRAME_S = 2.0
@@ -103,14 +103,7 @@ class SingleShots:
         self._armed_for = exposure
 
     def _timing(self, exposure_us: int) -> BurstTiming:
-        sensor = self._rig.sensor
-        return burst_timing(
-            exposure_us,
-            rise_us=self._rig.led_limits.rise_us,
-            readout_us=1e6 / sensor.max_frames_per_s,
-            exposure_gap_us=sensor.exposure_gap_us,
-            hardware=self._opened.ledbox.runs_tables,
-        )
+        return burst_timing(exposure_us, device_times(self._rig), hardware=self._opened.ledbox.runs_tables)
 
     def _enter(self, led: int, timing: BurstTiming) -> None:
         """Count a flash that is about to be given."""

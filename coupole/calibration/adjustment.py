@@ -68,6 +68,18 @@ class Block:
 
 
 @dataclass(frozen=True)
+class _Problem(Generic[S]):
+    """The problem: blocks of a state, the state after a step [parameters], and the groups of observations."""
+
+    evaluate: Callable[[S], list[Block]]
+    move: Callable[[S, Floats], S]
+    groups: Sequence[Group]
+    parameters: int
+    calibration_name: str
+    """Name of the calibration in errors."""
+
+
+@dataclass(frozen=True)
 class Component:
     """Estimate of one group's noise from its residuals."""
 
@@ -121,6 +133,7 @@ def adjust(
     and the others are weighted by their noise alone. `calibration_name` names the calibration in errors. Raises
     InputError if the observations do not determine all parameters.
     """
+    problem = _Problem(evaluate, move, groups, parameters, calibration_name)
     factors = np.ones(len(groups))
     blocks = evaluate(state)
     masks = [np.ones(len(block.residuals), dtype=np.bool_) for block in blocks]
@@ -131,14 +144,12 @@ def adjust(
         for _ in range(_MAX_ROUNDS):
             if robust:
                 weights = [_huber(b, groups[b.group].rejects, factors[b.group]) for b in blocks]
-            state, blocks, steps = _descend(
-                state, blocks, evaluate, move, weights, factors, parameters, calibration_name
-            )
+            state, blocks, steps = _descend(problem, state, blocks, weights, factors)
             step_count += steps
             if robust:
                 new_factors = _robust_factors(blocks, groups, factors)
             else:
-                new_factors = _seen_factors(blocks, groups, masks, weights, factors, parameters, calibration_name)
+                new_factors = _seen_factors(problem, blocks, masks, weights, factors)
             is_settled = bool(np.all(np.abs(new_factors / factors - 1) < _SETTLED))
             factors = new_factors
             if not robust and (new_masks := _reject(blocks, groups, masks, factors)):
@@ -149,7 +160,7 @@ def adjust(
         if robust:
             masks = _reject(blocks, groups, masks, factors) or masks
             weights = [k.astype(np.float64) for k in masks]
-    return _summary(state, blocks, groups, masks, weights, factors, parameters, calibration_name, step_count)
+    return _summary(problem, state, blocks, masks, weights, factors, step_count)
 
 
 def _normals(
@@ -172,26 +183,19 @@ def _cost(blocks: Sequence[Block], weights: Sequence[Floats], factors: Floats) -
 
 
 def _descend(
-    state: S,
-    blocks: list[Block],
-    evaluate: Callable[[S], list[Block]],
-    move: Callable[[S, Floats], S],
-    weights: Sequence[Floats],
-    factors: Floats,
-    parameters: int,
-    calibration_name: str,
+    problem: _Problem[S], state: S, blocks: list[Block], weights: Sequence[Floats], factors: Floats
 ) -> tuple[S, list[Block], int]:
     """Run Levenberg-Marquardt with fixed weights, until a step no longer lowers the cost."""
     damping, cost = 1e-6, _cost(blocks, weights, factors)
     for step in range(1, _MAX_STEPS + 1):
-        matrices, sides = _normals(blocks, weights, len(factors), parameters)
+        matrices, sides = _normals(blocks, weights, len(factors), problem.parameters)
         normal = np.einsum("g,gij->ij", factors**-2.0, matrices)
         side = factors**-2.0 @ sides
         while True:
             damped_normal = normal + damping * np.diag(np.diag(normal))
-            change = cho_solve(_cholesky_factor(damped_normal, calibration_name), side)
-            tried_state = move(state, change)
-            tried_blocks = evaluate(tried_state)
+            change = cho_solve(_cholesky_factor(damped_normal, problem.calibration_name), side)
+            tried_state = problem.move(state, change)
+            tried_blocks = problem.evaluate(tried_state)
             tried_cost = _cost(tried_blocks, weights, factors)
             if tried_cost <= cost or damping > 1e8:
                 break
@@ -203,9 +207,8 @@ def _descend(
         if predicted_gain < 1e-7 or gain < 1e-12 * cost:  # a step of 3e-4 of the uncertainty
             return state, blocks, step
     raise InputError(
-        f"{calibration_name}: no convergence in {_MAX_STEPS} steps. Look for views of another board or camera, "
-        f"and take views "
-        "that differ more in tilt, roll and distance."
+        f"{problem.calibration_name}: no convergence in {_MAX_STEPS} steps. Look for views of another board or "
+        "camera, and take views that differ more in tilt, roll and distance."
     )
 
 
@@ -253,19 +256,17 @@ def _robust_factors(blocks: Sequence[Block], groups: Sequence[Group], factors: F
 
 
 def _seen_factors(
+    problem: _Problem[S],
     blocks: Sequence[Block],
-    groups: Sequence[Group],
     accepted_masks: Sequence[np.ndarray[tuple[int], np.dtype[np.bool_]]],
     weights: Sequence[Floats],
     factors: Floats,
-    parameters: int,
-    calibration_name: str,
 ) -> Floats:
     """Return the noise of each group from its squared residuals over its redundancy."""
-    matrices, _ = _normals(blocks, weights, len(groups), parameters)
-    covariance = _covariance(matrices, factors, calibration_name)
+    matrices, _ = _normals(blocks, weights, len(problem.groups), problem.parameters)
+    covariance = _covariance(matrices, factors, problem.calibration_name)
     new_factors = factors.copy()
-    for number, group in enumerate(groups):
+    for number, group in enumerate(problem.groups):
         if not group.is_estimated:
             continue
         chi2, count = _chi2(blocks, accepted_masks, number)
@@ -308,20 +309,18 @@ def _reject(
 
 
 def _summary(
+    problem: _Problem[S],
     state: S,
     blocks: list[Block],
-    groups: Sequence[Group],
     accepted_masks: list[np.ndarray[tuple[int], np.dtype[np.bool_]]],
     weights: Sequence[Floats],
     factors: Floats,
-    parameters: int,
-    calibration_name: str,
     steps: int,
 ) -> Adjusted[S]:
-    matrices, _ = _normals(blocks, weights, len(groups), parameters)
-    covariance = _covariance(matrices, factors, calibration_name)
+    matrices, _ = _normals(blocks, weights, len(problem.groups), problem.parameters)
+    covariance = _covariance(matrices, factors, problem.calibration_name)
     components, contributions, redundancies = [], [], []
-    for number, group in enumerate(groups):
+    for number, group in enumerate(problem.groups):
         information = matrices[number] / factors[number] ** 2
         contributions.append(np.einsum("ij,jk,ki->i", covariance, information, covariance, optimize=True))
         chi2, count = _chi2(blocks, accepted_masks, number)

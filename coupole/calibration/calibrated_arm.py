@@ -36,6 +36,15 @@ class CalibratedArm:
     (deg)."""
 
 
+@dataclass(frozen=True)
+class CarriedCamera:
+    """A camera on an arm, as its records describe it."""
+
+    prior: CameraPrior
+    arm: CalibratedArm | None = None
+    """None if the hand-eye record has no axis zeros."""
+
+
 def has_axis_zeros(hand_eye: Path) -> bool:
     """Tell whether a hand-eye record was made with the arm's model."""
     return any(parameter.name in ZEROS for parameter in read_record(hand_eye).parameters)

@@ -69,6 +69,11 @@ def draw(outcome: Outcome) -> bytes:
     images = f": {len(record.images)} images" if record.images else ""
     title = f"{record.kind} calibration {record.name}{images}, {verdict}"
     figure.suptitle(title + (" (simulated)" if record.simulated else ""), fontsize=16, color=DARK)
+    return png_of(figure)
+
+
+def png_of(figure: Figure) -> bytes:
+    """Return a drawn figure as PNG, in the style of all calibrations' pictures."""
     for ax in figure.axes:
         ax.spines[["top", "right"]].set_visible(False)
         ax.tick_params(colors=DARK)

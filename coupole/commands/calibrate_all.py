@@ -11,7 +11,7 @@ import typer
 
 from coupole.calibration.campaign_steps import MESH, STEPS
 from coupole.commands.calibrate_geometry import RepeatabilityDeg, RepeatabilityMm
-from coupole.commands.campaign import Campaign, Repeatability
+from coupole.commands.campaign import Campaign, Operator, Repeatability
 from coupole.commands.common import JsonOption, fail
 from coupole.errors import CoupoleError, InputError
 
@@ -58,10 +58,9 @@ def calibrate_all(
             raise InputError(f"--only {MESH}: needs the object's scan, as `coupole scan` writes it: --scan FOLDER")
         names.remove(MESH)
         console.print(f"{MESH}: skipped, as no --scan is given")
-    repeatability, ask = Repeatability(repeatability_mm, repeatability_deg), not yes and not is_simulated
-    campaign = Campaign(
-        rig, out, scan, repeatability, is_simulated=is_simulated, ask=ask, console=console, valid_days=valid_days
-    )
+    repeatability = Repeatability(repeatability_mm, repeatability_deg)
+    operator = Operator(console, is_asked=not yes and not is_simulated)
+    campaign = Campaign(rig, out, scan, repeatability, operator, is_simulated=is_simulated, valid_days=valid_days)
     try:
         with borrowed_cell(cell, "calibrate all"):
             campaign.do_all(only or names)

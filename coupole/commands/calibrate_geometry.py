@@ -131,7 +131,7 @@ def mesh(
     robot: RobotRepeatability,
 ) -> Work:
     """Find the pose of a scanned object in the base, from its stickers in six views or more."""
-    from coupole.calibration.calibrated_arm import has_axis_zeros
+    from coupole.calibration.calibrated_arm import CarriedCamera, has_axis_zeros
     from coupole.calibration.posed_camera import read_posed_camera
     from coupole.calibration.report import Outcome
     from coupole.calibration.sources import open_sources
@@ -161,12 +161,10 @@ def mesh(
             images,
             sources,
             scanned_mesh,
-            prior,
+            CarriedCamera(prior, arm),
             request,
             stated_noise=tolerances,
-            depth_mm=depth_mm,
             base_from_support=support,
-            arm=arm,
         )
         return Outcome(calibration.record, partial(draw_mesh, calibration))
 

@@ -161,19 +161,18 @@ def hand_eye(
 ) -> Work:
     """Pose of the camera on the flange, from 10 to 60 images of a board that is not moved."""
     from coupole.calibration.lens.bundle import RobotNoise
-    from coupole.calibration.lens.workflow import hand_eye_from
+    from coupole.calibration.lens.workflow import CameraArm, hand_eye_from
 
     def work(console: Console, request: Request) -> Outcome:
         _refuse_unknown_model(model)
-        arm = _arm(rig)
+        model_of_arm = _arm(rig)
         sources, target, sightings = look_for_board(paths, board, poses, console, warmth)
         earlier = _earlier_lens(camera_record, sources, sightings)
         sources = sources.with_file(camera_record).with_file(rig)
         noise = RobotNoise(robot.repeatability_mm, robot.repeatability_deg, robot.absolute_mm, robot.absolute_deg)
         with console.status("adjusting lens, hand-eye, board and the robot's errors"):
-            drawing = hand_eye_from(
-                sightings, sources, target, model, request, robot=noise, arm=arm, lens=earlier
-            )[2]
+            arm = CameraArm(noise, model_of_arm)
+            drawing = hand_eye_from(sightings, sources, target, model, request, arm=arm, lens=earlier)[2]
         return _outcome_with_drawing(drawing)
 
     return work

@@ -6,7 +6,7 @@ import inspect
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import wraps
 from pathlib import Path
@@ -116,7 +116,7 @@ def calibration(
         @wraps(flat)
         def run(*arguments: Any, **options: Any) -> None:
             common_options = {name: options.pop(name, default) for name, _, default in common}
-            _calibrate(kind, flat(*arguments, **options), limits=limits, **common_options)
+            _calibrate(kind, flat(*arguments, **options), _CommonOptions(**common_options), limits)
 
         signature = inspect.signature(flat)
         common_parameters = [
@@ -139,34 +139,35 @@ def _limit_option(words: str) -> Any:
     return Annotated[list[str] | None, typer.Option("--limit", metavar="NAME=VALUE", help=words)]
 
 
-def _calibrate(
-    kind: str,
-    work: Work,
-    *,
-    out: Path,
-    name: str | None,
-    valid_days: int,
-    as_json: bool,
-    lens: str | None = None,
-    limit: Sequence[str] | None = None,
-    limits: Sequence[Allowed],
-) -> None:
-    """Do the work, write record, files and report, print the result, refuse a record that exceeds its limits.
+@dataclass(frozen=True)
+class _CommonOptions:
+    """Options of all calibrations."""
 
-    `limit` are the operator's settings of the calibration's `limits`.
-    """
+    out: Path
+    name: str | None
+    valid_days: int
+    as_json: bool
+    lens: str | None = None
+    """Description of the lens; None also where records are not of one lens."""
+    limit: Sequence[str] | None = None
+    """Settings of the calibration's limits, as NAME=VALUE."""
+
+
+def _calibrate(kind: str, work: Work, options: _CommonOptions, limits: Sequence[Allowed]) -> None:
+    """Do the work, write record, files and report, print the result, refuse a record that exceeds its limits."""
     from coupole.calibration.request import Request
     from coupole.viewing.terminal import make_console
 
-    console = make_console(quiet=as_json)
+    console, as_json, name = make_console(quiet=options.as_json), options.as_json, options.name
     now = datetime.now(UTC)
     try:
         _refuse_name(name)
+        wanted_limits = parse_limits(options.limit or (), limits)
         request = Request(
-            name or f"{kind}-{now:%Y%m%d}", now, valid_days, lens, limits=parse_limits(limit or (), limits)
+            name or f"{kind}-{now:%Y%m%d}", now, options.valid_days, options.lens, limits=wanted_limits
         )
-        record_path = out / f"{request.name}.yaml"
-        for path in (out / f"{request.name}{suffix}" for suffix in _SUFFIXES):
+        record_path = options.out / f"{request.name}.yaml"
+        for path in (options.out / f"{request.name}{suffix}" for suffix in _SUFFIXES):
             if path.exists():
                 raise InputError(f"{path}: exists already. Choose another --name or --out.")
         outcome = work(console, request)

@@ -27,6 +27,15 @@ class Repeatability:
     deg: float
 
 
+@dataclass(frozen=True)
+class Operator:
+    """The person who makes the campaign."""
+
+    console: Console
+    is_asked: bool
+    """True if a person is asked before each step. Otherwise all that a step needs is on the support."""
+
+
 class Campaign:
     """The folder of a campaign: `plans/`, `rigs/`, `runs/`, and the records with their reports.
 
@@ -39,16 +48,15 @@ class Campaign:
         out: Path,
         scan: Path | None,
         robot_noise: Repeatability,
+        operator: Operator,
         *,
         is_simulated: bool,
-        ask: bool,
-        console: Console,
         valid_days: int | None = None,
     ) -> None:
-        self._rig, self._out, self._console = rig.resolve(), out.resolve(), console
+        self._rig, self._out, self._console = rig.resolve(), out.resolve(), operator.console
         self._days = {} if valid_days is None else {"valid_days": valid_days}
         self._given_scan, self._stated = scan, robot_noise
-        self._simulated, self._ask = is_simulated, ask
+        self._simulated, self._operator = is_simulated, operator
         for folder in ("plans", "rigs", "runs"):
             (self._out / folder).mkdir(parents=True, exist_ok=True)
         tile = TILE + (CERTIFICATE_OF_SIMULATED_TILE if is_simulated else "")
@@ -101,7 +109,7 @@ class Campaign:
 
     def _acquire(self, step: Step) -> Path:
         """The step's run, complete."""
-        from coupole.acquisition.session import acquire_plan
+        from coupole.acquisition.session import SessionRequest, acquire_plan
         from coupole.preflight.job import read_job
         from coupole.storage.run_status import is_complete, newest_run
 
@@ -110,16 +118,15 @@ class Campaign:
         if resumed_run is not None and is_complete(resumed_run):
             return resumed_run
         self._console.rule(f"acquire {step.name}")
-        if self._ask:
+        if self._operator.is_asked:
             self._console.print(f"Place on the support: [bold]{step.stands}[/].")
             forget_typing()
             if not typer.confirm("Ready?", default=True):
                 raise Interrupted("stopped by the operator; call it again to continue")
         summary: dict[str, Any] = {}
         job = read_job(plan)
-        acquire_plan(
-            job, self._console, parent=self._out / "runs", resume=resumed_run, confirm=self._ask, figures=summary
-        )
+        request = SessionRequest(self._out / "runs", resumed_run, confirm=self._operator.is_asked)
+        acquire_plan(job, self._console, request, summary)
         return Path(summary["run"])
 
     def _plan(self, step: Step) -> Path:

@@ -16,6 +16,11 @@ if TYPE_CHECKING:
     from coupole.plan.cell import Cell
 
 PlanPath = Annotated[Path, typer.Argument(help="The plan (YAML).", show_default=False, autocompletion=plans)]
+PlanUnlessResumed = Annotated[
+    Path | None,
+    typer.Argument(help="The plan (YAML); not needed with --resume.", show_default=False, autocompletion=plans),
+]
+RunsParentOption = Annotated[Path | None, typer.Option("--output", help="Parent folder of the run.")]
 RigOption = Annotated[
     Path | None,
     typer.Option("--rig", help="A rig other than the one that the plan names: a file, or a name such as sim."),

@@ -85,7 +85,7 @@ def _make(folder: Path, plan_name: str, console: Console) -> Demo:
 
 def _acquire(parent: Path, plan_name: str, console: Console) -> Path:
     """The plan's run, complete."""
-    from coupole.acquisition.session import acquire_plan
+    from coupole.acquisition.session import SessionRequest, acquire_plan
     from coupole.plan.shipped_files import shipped_folder
     from coupole.preflight.job import read_job
     from coupole.storage.run_status import is_complete, newest_run
@@ -95,7 +95,7 @@ def _acquire(parent: Path, plan_name: str, console: Console) -> Path:
     if run is not None and is_complete(run):
         return run
     figures: dict[str, Any] = {}
-    acquire_plan(job, console, parent=parent, resume=run, confirm=False, figures=figures)
+    acquire_plan(job, console, SessionRequest(parent, run, confirm=False), figures)
     return Path(figures["run"])
 
 

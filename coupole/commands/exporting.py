@@ -226,7 +226,7 @@ def _export_crate(request: Asked, console: Console) -> Found:
 def _export_frames(request: Asked, console: Console) -> Found:
     from rich.progress import Progress
 
-    from coupole.exchange.export import export_run
+    from coupole.exchange.export import FramePatterns, export_run
     from coupole.storage.run import Run
 
     with Progress(console=console, disable=not console.is_terminal) as bars:
@@ -235,10 +235,8 @@ def _export_frames(request: Asked, console: Console) -> Found:
             Run(request.source),
             request.to,
             request.out,
-            views=request.texts("views"),
-            shots=request.texts("shots"),
+            patterns=FramePatterns(request.texts("views"), request.texts("shots")),
             colour=_colour_of(request),
-            linear="linear" in request.options,
             overwrite=request.overwrite,
             progress=lambda count, total: bars.update(bar, completed=count, total=total),
         )
@@ -262,7 +260,7 @@ def _colour_of(request: Asked) -> ColourWanted | None:
         if eye or "led-spectrum" in request.options or "calibrations" in request.options:
             raise InputError("--sensor-spectra: expected a table of nm, red, green, blue, from the sensor's maker")
         return None
-    return ColourWanted(sensor, request.path("led-spectrum"), request.records)
+    return ColourWanted(sensor, request.path("led-spectrum"), request.records, "linear" in request.options)
 
 
 def _with_bars(console: Console, write: Callable[[Callable[[str, int, int], None]], list[Path]]) -> list[Path]:

@@ -10,8 +10,16 @@ from typing import Annotated
 
 import typer
 
-from coupole.commands.common import JsonOption, PlanPath, RigOption, fail, plan_of
-from coupole.commands.completion import plans, runs, schemas, templates
+from coupole.commands.common import (
+    JsonOption,
+    PlanPath,
+    PlanUnlessResumed,
+    RigOption,
+    RunsParentOption,
+    fail,
+    plan_of,
+)
+from coupole.commands.completion import runs, schemas, templates
 from coupole.commands.suggest_plan import plan_suggest
 from coupole.errors import InputError, PreflightRefused
 from coupole.plan.shipped_files import SIMULATED_CELL, file_of
@@ -21,14 +29,9 @@ plan_app.command("suggest")(plan_suggest)
 
 
 def check(
-    plan: Annotated[
-        Path | None,
-        typer.Argument(
-            help="The plan (YAML); not needed with --resume.", show_default=False, autocompletion=plans
-        ),
-    ] = None,
+    plan: PlanUnlessResumed = None,
     rig: RigOption = None,
-    output: Annotated[Path | None, typer.Option("--output", help="Parent folder of the run.")] = None,
+    output: RunsParentOption = None,
     resume: Annotated[
         Path | None, typer.Option("--resume", help="Check the rest of this run.", autocompletion=runs)
     ] = None,

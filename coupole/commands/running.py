@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,13 +13,15 @@ import typer
 from coupole.commands.common import (
     JsonOption,
     PlanPath,
+    PlanUnlessResumed,
     RigOption,
+    RunsParentOption,
     fail,
     person_named,
     plan_of,
     served_cell,
 )
-from coupole.commands.completion import plans, runs
+from coupole.commands.completion import runs
 from coupole.errors import CoupoleError
 from coupole.plan.shipped_files import SIMULATED_CELL, file_of
 
@@ -47,14 +48,9 @@ ResultOption = Annotated[
 
 
 def acquire(
-    plan: Annotated[
-        Path | None,
-        typer.Argument(
-            help="The plan (YAML); not needed with --resume.", show_default=False, autocompletion=plans
-        ),
-    ] = None,
+    plan: PlanUnlessResumed = None,
     rig: RigOption = None,
-    output: Annotated[Path | None, typer.Option("--output", help="Parent folder of the run.")] = None,
+    output: RunsParentOption = None,
     resume: Annotated[Path | None, typer.Option("--resume", help="Resume this run.", autocompletion=runs)] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Rehearse on the rig's simulated twin.")] = False,
     speed: Annotated[float, typer.Option("--speed", min=0.1, max=1000, help="Pace of a dry run.")] = 20.0,
@@ -75,7 +71,7 @@ def acquire(
     console owns the cell (`coupole serve`), the command acquires in the console's name, if nothing runs or waits
     there.
     """
-    from coupole.acquisition.session import acquire_plan, rehearse
+    from coupole.acquisition.session import SessionRequest, acquire_plan, rehearse
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
 
@@ -96,9 +92,11 @@ def acquire(
             rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, figures=summary)
         else:
             job = read_job(plan or plan_of(resume), rig)
-            begin = partial(acquire_plan, job, console, parent=output, resume=resume, with_mesh=with_mesh)
             with _beside(job, console, resume, result, summary, is_asked=reflectance) as beside:
-                begin(confirm=not yes, figures=summary, beside=beside)
+                wanted_session = SessionRequest(
+                    output, resume, confirm=not yes, with_mesh=with_mesh, beside=beside
+                )
+                acquire_plan(job, console, wanted_session, summary)
     except CoupoleError as error:
         fail(error, as_json=as_json, figures=summary)
         raise

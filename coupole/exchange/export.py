@@ -34,31 +34,39 @@ class Exported:
     bytes: int
 
 
+@dataclass(frozen=True)
+class FramePatterns:
+    """Names of frames, with `*` and `?`. View and label (`led0417/e0`) must each match one of their patterns;
+    without patterns all do."""
+
+    views: Sequence[str] = ()
+    shots: Sequence[str] = ()
+
+    def has(self, shot: ShotId) -> bool:
+        return _matches(shot.view, self.views) and _matches(str(shot.label), self.shots)
+
+
+ALL_FRAMES = FramePatterns()
+
+
 def export_run(
     run: Run,
     to: str,
     folder: Path,
     *,
-    views: list[str],
-    shots: list[str],
+    patterns: FramePatterns = ALL_FRAMES,
     colour: ColourWanted | None = None,
-    linear: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Exported:
-    """Write proven frames into `folder`, as `<view>_led0417_e0.<to>`. View and label (`led0417/e0`) must each
-    match one of the patterns (`*` and `?`); without patterns all do. With `colour` a TIFF is sRGB for the eye, or
-    `linear`, and a DNG has its matrix.
+    """Write proven frames that match `patterns` into `folder`, as `<view>_led0417_e0.<to>`. With `colour` a TIFF
+    has colours for the eye, and a DNG has its matrix.
 
     Raises InputError if nothing matches or a file exists already (unless `overwrite`), before anything is written;
     ChecksumMismatch if a frame is not what was proven, DiskFull or StorageError.
     """
-    encode = _encoder(to, run, colour, linear=linear)
-    frames = [
-        frame
-        for shot, frame in run.proven().items()
-        if _matches(shot.view, views) and _matches(str(shot.label), shots)
-    ]
+    encode = _encoder(to, run, colour)
+    frames = [frame for shot, frame in run.proven().items() if patterns.has(shot)]
     if not frames:
         raise InputError(f"{run.folder}: no proven frame matches; see `coupole status` for its views")
     refuse_discarded(run, [frame.shot for frame in frames], _words_of_kept)
@@ -78,7 +86,7 @@ def _words_of_kept(kept_shots: Sequence[ShotId]) -> str:
     return f"Name frames that are kept with --shots, such as `{label}`; "
 
 
-def _encoder(to: str, run: Run, colour: ColourWanted | None, *, linear: bool) -> Callable[[Picture], bytes]:
+def _encoder(to: str, run: Run, colour: ColourWanted | None) -> Callable[[Picture], bytes]:
     format_named(to, Source.RUN, Writer.FRAMES)
     if colour is None:
         encode: Callable[[Picture], bytes] = importlib.import_module(f"coupole.exchange.{to}").encode
@@ -86,10 +94,10 @@ def _encoder(to: str, run: Run, colour: ColourWanted | None, *, linear: bool) ->
     camera_colour = colour_of_run(run, colour)
     if to == "dng":
         return partial(dng.encode, colour=camera_colour)
-    return partial(tiff_for_the_eye.encode, colour=camera_colour, linear=linear)
+    return partial(tiff_for_the_eye.encode, colour=camera_colour, linear=colour.is_linear)
 
 
-def _matches(name: str, patterns: list[str]) -> bool:
+def _matches(name: str, patterns: Sequence[str]) -> bool:
     return not patterns or any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
 
 

@@ -28,6 +28,8 @@ class ColourWanted:
     """Table of nm, power; None: the rig's."""
     records: tuple[Path, ...] = ()
     """Records in place of those that the run names."""
+    is_linear: bool = False
+    """True for a TIFF with linear values, in place of sRGB for the eye."""
 
 
 def colour_of_run(run: Run, colour_request: ColourWanted) -> CameraColour:

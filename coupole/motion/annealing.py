@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from coupole.kernels import kernel
 
-@numba.njit(cache=True, nogil=True)
+
+@kernel
 def anneal(seconds, posture_cost_s, first, order, tour_places, rolls, hottest_s, coldest_s):  # type: ignore[no-untyped-def]
     """Return the best order of groups [n] that random changes find, and the chosen places [n].
 
@@ -54,7 +55,7 @@ def anneal(seconds, posture_cost_s, first, order, tour_places, rolls, hottest_s,
     return best_order, best_tour[1:]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _reversed_s(seconds, tour, i, j):  # type: ignore[no-untyped-def]
     """Return the additional cost of visits i to j in reversed order."""
     change_s = seconds[tour[i - 1], tour[j]] - seconds[tour[i - 1], tour[i]]
@@ -63,7 +64,7 @@ def _reversed_s(seconds, tour, i, j):  # type: ignore[no-untyped-def]
     return change_s
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _moved_s(seconds, tour, i, j, place):  # type: ignore[no-untyped-def]
     """Return the additional cost if visit i becomes the j-th visit, at another place."""
     after_i, after_j = i + 1, j if j < i else j + 1

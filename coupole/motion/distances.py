@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from coupole.kernels import kernel
 
 DISK, DOME, SPHERE, BOX, SHAPE = range(5)
 """Kinds of obstacles: the disk and everything below it, the dome and everything beyond it, keep-outs, a tree of
@@ -49,7 +50,7 @@ class Model(NamedTuple):
 # Indexed by numbers, not by rows and slices: this saves seconds of compile time.
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def place_links(base, joints, flange, joints_deg, frames):  # type: ignore[no-untyped-def]
     """Fill `frames` [9, 3, 4], rotation and origin of each link's frame in the support frame."""
     for r in range(3):
@@ -75,12 +76,12 @@ def place_links(base, joints, flange, joints_deg, frames):  # type: ignore[no-un
                 frames[7, r, q] += frames[6, r, p] * flange[p, q]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _length(x, y, z):  # type: ignore[no-untyped-def]
     return np.sqrt(x * x + y * y + z * z)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _to_solid(kind, figures, pair, x, y, z):  # type: ignore[no-untyped-def]
     """Return the distance of a point of the support frame to a DISK, DOME, SPHERE or BOX; negative inside."""
     f0, f1, f2, f3 = figures[pair, 7], figures[pair, 8], figures[pair, 9], figures[pair, 10]
@@ -104,7 +105,7 @@ def _to_solid(kind, figures, pair, x, y, z):  # type: ignore[no-untyped-def]
     return max(inside, above) if inside < 0.0 and along > f0 else inside
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _after(i):  # type: ignore[no-untyped-def]
     """Return the node that follows node i and all nodes below it; 0 after the last."""
     while i & 1:
@@ -112,12 +113,12 @@ def _after(i):  # type: ignore[no-untyped-def]
     return i + 1 if i else 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _to_node(nodes, n, x, y, z):  # type: ignore[no-untyped-def]
     return _length(x - nodes[n, 0], y - nodes[n, 1], z - nodes[n, 2]) - nodes[n, 3]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _to_tree(nodes, begin, first_leaf, x, y, z, best, hasty):  # type: ignore[no-untyped-def]
     """Return the distance of a point, in the tree's own frame, to the nearest sphere of the tree, at most `best`.
     If `hasty`, it is the distance to the first sphere found that is nearer than `best`."""
@@ -146,7 +147,7 @@ def _to_tree(nodes, begin, first_leaf, x, y, z, best, hasty):  # type: ignore[no
     return best
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _to_obstacle(nodes, trees, numbers, figures, frames, pair, n, best, hasty):  # type: ignore[no-untyped-def]
     """Return the distance of node n, in the frame of the pair's link, to the pair's obstacle, at most `best`.
     `hasty` works as in `_to_tree`."""
@@ -165,7 +166,7 @@ def _to_obstacle(nodes, trees, numbers, figures, frames, pair, n, best, hasty): 
     return _to_tree(nodes, trees[tree, 0], trees[tree, 1], own_x, own_y, own_z, best + radius, hasty) - radius
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _margin(nodes, trees, numbers, figures, frames, pair, far, hasty):  # type: ignore[no-untyped-def]
     """Return the least distance of a pair minus its clearance, at most `far`. If `hasty`, it is the first value
     found below `far`."""
@@ -190,7 +191,7 @@ def _margin(nodes, trees, numbers, figures, frames, pair, far, hasty):  # type: 
     return best
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _moved_mm(nodes, trees, numbers, figures, joints, frames, pair, turns_rad):  # type: ignore[no-untyped-def]
     """Return a bound of the relative motion of a pair while the axes turn by at most `turns_rad` [6] from a
     posture.
@@ -214,7 +215,7 @@ def _moved_mm(nodes, trees, numbers, figures, joints, frames, pair, turns_rad): 
     return motion_mm
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def margins_at(model, joints_deg, far_mm):  # type: ignore[no-untyped-def]
     """Return the distance minus clearance [n, pairs] with the arm at `joints_deg` [n, 6], at most `far_mm`."""
     frames = np.empty((9, 3, 4))
@@ -228,7 +229,7 @@ def margins_at(model, joints_deg, far_mm):  # type: ignore[no-untyped-def]
     return margins
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def blocked_at(model, start_deg, end_deg):  # type: ignore[no-untyped-def]
     """Return the first pair that is found to come too close on a straight motion in joint space, or CLEAR. Also
     return its parameter on the motion (0 to 1), and the bound of the pair's relative motion within the checked

@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coupole.geometry import Transform, apply, inverse
 from coupole.joint_chain import FLANGE
+from coupole.kernels import kernel
 from coupole.kinematics import link_frames
 from coupole.motion.bodies import Capsule, capsules_of
 from coupole.motion.itinerary import undescribed_arm_error
@@ -284,7 +284,7 @@ def sight_of(rig: Rig, support_from_camera: Transform) -> Sight:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def segment_distance_mm(p, q, a, b):  # type: ignore[no-untyped-def]
     """Return the distance between the segments from p to q and from a to b, points [3] each.
 
@@ -306,7 +306,7 @@ def segment_distance_mm(p, q, a, b):  # type: ignore[no-untyped-def]
     return np.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _first_met(starts, ends, axes, radii, is_asked, center, reach, capsule_numbers):  # type: ignore[no-untyped-def]
     """Fill `capsule_numbers` [n, m]. All segments to an end lie within `reach` of the segment that starts at
     `center`.

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
@@ -20,6 +19,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from coupole.errors import CoupoleError
+from coupole.kernels import kernel
 
 _TRIANGLES, _INDEX, _VERTEX, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
 _COMPACT, _ROBUST = 1 << 1, 1 << 2
@@ -161,7 +161,7 @@ _call_embree: Any = intrinsic(_call_for_packet)
 _call_embree_of_one: Any = intrinsic(_call_for_ray)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def packet():  # type: ignore[no-untyped-def]
     """Return the rows of a packet of rays and hits, as float32 and as uint32, and the mask of its lanes, aligned
     to 64 bytes."""
@@ -171,7 +171,7 @@ def packet():  # type: ignore[no-untyped-def]
     return rows[:_ROWS], rows[:_ROWS].view(np.uint32), rows[_ROWS].view(np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def trace(function, scene, rays, words, valid, lanes, far, arguments):  # type: ignore[no-untyped-def]
     """Trace the first `lanes` rays of a `packet` as far as `far`, in lengths of their ways, by the function at an
     address (`blocked16`). Afterwards a blocked ray has minus infinity in row `FAR`."""
@@ -188,7 +188,7 @@ def trace(function, scene, rays, words, valid, lanes, far, arguments):  # type: 
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill_blocked(function, scene, starts, start_rows, end, arguments, are_blocked):  # type: ignore[no-untyped-def]
     rays, words, valid = packet()
     for first in range(0, len(start_rows), LANES):
@@ -202,7 +202,7 @@ def _fill_blocked(function, scene, starts, start_rows, end, arguments, are_block
             are_blocked[first + lane] = rays[FAR, lane] < 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _blocked_one_by_one(function, scene, starts, ways, arguments, are_blocked):  # type: ignore[no-untyped-def]
     """Trace rays one by one. The numbers of a ray lie one behind the other, like the rows of a packet."""
     rays, words, _ = packet()
@@ -217,7 +217,7 @@ def _blocked_one_by_one(function, scene, starts, ways, arguments, are_blocked): 
         are_blocked[n] = ray[FAR] < 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _first_met(function, scene, start, ways, arguments, number, distance):  # type: ignore[no-untyped-def]
     rays, words, valid = packet()
     for first in range(0, len(ways), LANES):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from coupole.kernels import kernel
 
-@numba.njit(cache=True, nogil=True)
+
+@kernel
 def pairwise_s(places_deg, velocity_deg_s, acceleration_deg_s2, jerk_deg_s3):  # type: ignore[no-untyped-def]
     """Return the durations [n, n], s, of the motions of `kinematics.move_durations_s` between postures [n, 6]. The
     limits are [6] each. The memory is one number per pair, however many postures there are."""
@@ -20,7 +21,7 @@ def pairwise_s(places_deg, velocity_deg_s, acceleration_deg_s2, jerk_deg_s3):  #
     return seconds
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _seconds(from_deg, to_deg, velocity_deg_s, acceleration_deg_s2, jerk_deg_s3):  # type: ignore[no-untyped-def]
     v_most = a_most = j_most = np.inf
     longest_deg = 0.0

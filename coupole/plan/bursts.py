@@ -112,12 +112,22 @@ class Burst:
         return replace(self, table=table, labels=tuple(labels))
 
 
+@dataclass(frozen=True)
+class DeviceTimes:
+    """Times that the LEDs and the camera of a cell need."""
+
+    rise_us: int
+    """Time from an LED's current to its full light."""
+    readout_us: float
+    """Least time from frame to frame."""
+    exposure_gap_us: int
+    """Least time from the end of an exposure to the next one."""
+
+
 def burst_timing(
     exposure_us: int,
+    times: DeviceTimes,
     *,
-    rise_us: int,
-    readout_us: float,
-    exposure_gap_us: int,
     hardware: bool,
     pace: Pace = FASTEST,
 ) -> BurstTiming:
@@ -127,10 +137,10 @@ def burst_timing(
     readout, the exposure plus the sensor's gap, the LED's on-time plus a dark gap, and the limits of disk and
     heat.
     """
-    on_us = rise_us + exposure_us + EXPOSURE_MARGIN_US
+    on_us = times.rise_us + exposure_us + EXPOSURE_MARGIN_US
     if not hardware:
         on_us += SOFTWARE_LATENCY_US
-    camera_us = max(readout_us, exposure_us + exposure_gap_us)
+    camera_us = max(times.readout_us, exposure_us + times.exposure_gap_us)
     camera_us += PERIOD_MARGIN_US + PERIOD_MARGIN_PPM * 1e-6 * camera_us
     periods_us = {
         "camera": int(np.ceil(camera_us)),
@@ -139,7 +149,7 @@ def burst_timing(
         "heat": int(np.ceil(on_us / pace.led_duty)),
     }
     bound = max(periods_us, key=lambda name: periods_us[name])
-    return BurstTiming(exposure_us, on_us, rise_us, periods_us[bound], bound)
+    return BurstTiming(exposure_us, on_us, times.rise_us, periods_us[bound], bound)
 
 
 def bursts_of_exposure(

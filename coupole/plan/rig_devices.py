@@ -16,6 +16,7 @@ from coupole.devices import HostNeed
 from coupole.errors import Problem
 from coupole.kinematics import Arm, slowed_arm
 from coupole.plan.arm_description import ArmDescription, arm_of_driver, read_arm, shipped_arm
+from coupole.plan.bursts import DeviceTimes
 from coupole.plan.registry import (
     ARMS_OF_DRIVERS,
     CAMERA_STAND_INS,
@@ -50,6 +51,12 @@ _WORDS = {
     "without_realtime_by": "the arm may be answered at normal priority",
 }
 """Settings whose value is the name of a person, with the permission that this person gives."""
+
+
+def device_times(rig: Rig) -> DeviceTimes:
+    """Return the times that the rig's LEDs and camera need."""
+    sensor = rig.sensor
+    return DeviceTimes(rig.led_limits.rise_us, 1e6 / sensor.max_frames_per_s, sensor.exposure_gap_us)
 
 
 def described_arm(rig: Rig) -> ArmDescription | None:

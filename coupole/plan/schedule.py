@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import assert_never
 
 from coupole.geometry import Transform, look_at
-from coupole.plan.bursts import FASTEST, Burst, Pace, burst_timing, bursts_of_exposure, with_sentinels
+from coupole.plan.bursts import FASTEST, Burst, DeviceTimes, Pace, burst_timing, bursts_of_exposure, with_sentinels
 from coupole.plan.choices import Choice, OpenView, bound_of, bound_of_lights, has_enough
 from coupole.plan.exposures import AutoExposure
 from coupole.plan.led_table import LedTable
@@ -177,10 +177,8 @@ def build_schedule(
     plan: Plan,
     leds: LedTable,
     base_from_support: Transform,
+    times: DeviceTimes,
     *,
-    rise_us: int,
-    readout_us: float,
-    exposure_gap_us: int,
     pace: Pace = FASTEST,
     runs_tables: bool = True,
 ) -> Schedule:
@@ -204,14 +202,7 @@ def build_schedule(
                 for index, exposure_us in enumerate(plan.exposure.exposures_us)
                 for burst in bursts_of_exposure(
                     lit,
-                    burst_timing(
-                        exposure_us,
-                        rise_us=rise_us,
-                        readout_us=readout_us,
-                        exposure_gap_us=exposure_gap_us,
-                        hardware=hardware,
-                        pace=pace,
-                    ),
+                    burst_timing(exposure_us, times, hardware=hardware, pace=pace),
                     index,
                     repeat,
                     darks=plan.darks_per_view if repeat == 0 else 0,

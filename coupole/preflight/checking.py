@@ -22,7 +22,7 @@ from coupole.preflight.discard_room import discard_room, refusals_of_discarding
 from coupole.preflight.exposure_scale import ExposedWhite, exposed_white, exposure_scale
 from coupole.preflight.framing import ObjectCheck, check_object
 from coupole.preflight.job import Job, at_pace
-from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, Whole, check
+from coupole.preflight.preflight import DISK_SHARE, Course, ObjectLight, Report, StorageFacts, Whole, check
 from coupole.storage.given_back import why_not
 from coupole.storage.ledger import ledger_of, similar_ids
 from coupole.storage.ledger_lines import History
@@ -102,36 +102,19 @@ def check_job(
     itinerary = plan_views(views, home_deg)
     all_views = job.motion.unchecked_itinerary(job.schedule.views, home_deg) if proven else None
     history = ledger_of(job.cell, job.plan.object.id).read_history() if job.plan.object else History()
-    before = history.total_lux_h
+    object_light = ObjectLight(job.shape.dose_points_mm, history.total_lux_h, history.budget_lux_h)
 
     def check_at(pace: Pace) -> tuple[Job, Report]:
         paced_job = at_pace(job, pace)
-        checking = partial(
-            check,
-            job.plan,
-            rig,
-            leds=job.cell.leds,
-            storage=storage,
-            object_points_support_mm=job.shape.dose_points_mm,
-            dose_budget_lux_h=history.budget_lux_h,
-        )
+        checking = partial(check, job.plan, rig, job.cell.leds, storage=storage, object_light=object_light)
         if all_views is None:
-            return paced_job, checking(paced_job.schedule, itinerary=itinerary, dose_before_lux_h=before)
-        of_all = checking(paced_job.schedule, itinerary=all_views)
-        remaining_report = checking(
-            paced_job.schedule.without_proven(proven),
-            itinerary=itinerary,
-            dose_before_lux_h=before,
-            whole=Whole(
-                len(of_all.views),
-                of_all.shots,
-                of_all.frames,
-                of_all.bytes,
-                of_all.duration_s,
-                of_all.dose_lux_h,
-            ),
+            return paced_job, checking(Course(paced_job.schedule, itinerary))
+        of_all = checking(Course(paced_job.schedule, all_views))
+        whole = Whole(
+            len(of_all.views), of_all.shots, of_all.frames, of_all.bytes, of_all.duration_s, of_all.dose_lux_h
         )
-        return paced_job, remaining_report
+        remaining_schedule = paced_job.schedule.without_proven(proven)
+        return paced_job, checking(Course(remaining_schedule, itinerary), whole=whole)
 
     job, report = _at_cool_pace(*check_at(Pace(disk_us=_disk_us(rig, storage))), check_at)
     report.object_check = _object_check(job, itinerary, proven)

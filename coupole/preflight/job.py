@@ -22,7 +22,7 @@ from coupole.plan.cell import Cell
 from coupole.plan.choices import Choice
 from coupole.plan.plan import Plan
 from coupole.plan.reading import read_plan
-from coupole.plan.rig_devices import described_arm, runs_tables
+from coupole.plan.rig_devices import described_arm, device_times, runs_tables
 from coupole.plan.schedule import Schedule, build_schedule
 from coupole.plan.yamlfile import Document
 from coupole.preflight.object_shape import ObjectShape, read_object
@@ -90,9 +90,7 @@ def schedule_of(plan: Plan, cell: Cell, pace: Pace = FASTEST) -> Schedule:
         plan,
         cell.leds,
         cell.rig.support.base_from_support.matrix(),
-        rise_us=cell.rig.led_limits.rise_us,
-        readout_us=1e6 / cell.rig.sensor.max_frames_per_s,
-        exposure_gap_us=cell.rig.sensor.exposure_gap_us,
+        device_times(cell.rig),
         pace=pace,
         runs_tables=runs_tables(cell.rig),
     )

@@ -135,26 +135,42 @@ class Report:
     """Remarks for the operator, a sentence each."""
 
 
+@dataclass(frozen=True)
+class ObjectLight:
+    """The object, as far as light harms it."""
+
+    points_support_mm: NDArray[np.float64]
+    """[n, 3] at which the dose is computed, support frame; the highest dose counts."""
+    dose_before_lux_h: float = 0.0
+    """Light that it has received before, by its ledger."""
+    dose_budget_lux_h: float | None = None
+    """Its own budget, by its ledger; a plan's budget can be stricter."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """The bursts that are taken, and the arm's way to their views."""
+
+    schedule: Schedule
+    itinerary: Itinerary
+    """Visits of the schedule's views, by their numbers."""
+
+
 def check(
     plan: Plan,
     rig: Rig,
-    schedule: Schedule,
     leds: LedTable,
+    course: Course,
     storage: StorageFacts,
-    itinerary: Itinerary,
-    *,
-    object_points_support_mm: NDArray[np.float64],
-    dose_before_lux_h: float = 0.0,
-    dose_budget_lux_h: float | None = None,
+    object_light: ObjectLight,
     whole: Whole | None = None,
 ) -> Report:
-    """Check a whole plan, or the rest of the run `whole`. The dose is computed at `object_points_support_mm` [n,
-    3]; the highest counts. `dose_budget_lux_h` is the object's own budget, by its ledger; a plan's budget can be
-    stricter."""
+    """Check the course of a whole plan, or that of the rest of the run `whole`."""
+    schedule, itinerary = course.schedule, course.itinerary
     report = Report(schedule.is_open, whole, shots=schedule.shots, frames=schedule.frames)
     report.timings = tuple(dict.fromkeys(burst.timing for bursts in schedule.bursts for burst in bursts))
-    report.dose_before_lux_h = dose_before_lux_h
-    budgets = [dose_budget_lux_h, plan.object.dose_budget_lux_h if plan.object else None]
+    report.dose_before_lux_h = object_light.dose_before_lux_h
+    budgets = [object_light.dose_budget_lux_h, plan.object.dose_budget_lux_h if plan.object else None]
     report.dose_budget_lux_h = min(
         (budget_lux_h for budget_lux_h in budgets if budget_lux_h is not None), default=None
     )
@@ -162,7 +178,7 @@ def check(
     report.refusals += _refuse_names(schedule)
     report.refusals += _refuse_optics(plan, rig)
     report.refusals += refuse_on_times(schedule.bursts, rig.led_limits)
-    _time_and_dose(report, plan, rig, schedule, itinerary, leds, object_points_support_mm)
+    _time_and_dose(report, plan, rig, schedule, itinerary, leds, object_light.points_support_mm)
     bursts = [schedule.bursts[index] for index in _order(itinerary)]
     heat = heat_of(bursts, [view.move_s for view in report.views], rig.led_limits, leds)
     report.peak_board_c, report.too_hot = heat.peak_c, heat.too_hot

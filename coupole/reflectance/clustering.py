@@ -11,11 +11,11 @@ import math
 import warnings
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2, vq
 
+from coupole.kernels import kernel
 from coupole.reflectance.ggx import lobe
 from coupole.reflectance.normal_fit import colours_from, fit_from
 from coupole.reflectance.parts_in_threads import in_threads
@@ -131,7 +131,7 @@ def nearest_cluster(
     return nearest
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _looks(kd, ks, alpha, off_cos, root_reflectances):  # type: ignore[no-untyped-def]
     for n in range(len(alpha)):
         for k in range(len(off_cos)):
@@ -140,7 +140,7 @@ def _looks(kd, ks, alpha, off_cos, root_reflectances):  # type: ignore[no-untype
                 root_reflectances[n, channel, k] = math.sqrt(kd[n, channel] + ks[n, channel] * shine)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def axes_about(normal, axes):  # type: ignore[no-untyped-def]
     """Fill `axes` [3, 3] with rows x, y, z of a frame about a normal (Duff et al. 2017)."""
     x, y, z = normal
@@ -152,7 +152,7 @@ def axes_about(normal, axes):  # type: ignore[no-untyped-def]
     axes[2, 0], axes[2, 1], axes[2, 2] = x, y, z
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def turned_to(axes, place, target, direction):  # type: ignore[no-untyped-def]
     d0, d1, d2 = target[0] - place[0], target[1] - place[1], target[2] - place[2]
     length = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
@@ -160,7 +160,7 @@ def turned_to(axes, place, target, direction):  # type: ignore[no-untyped-def]
         direction[k] = (axes[k, 0] * d0 + axes[k, 1] * d1 + axes[k, 2] * d2) / length
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _pool(  # type: ignore[no-untyped-def]
     values,
     led_mm,
@@ -198,7 +198,7 @@ def _pool(  # type: ignore[no-untyped-def]
             counts[number] += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fit_one(values, lights, views, parameters):  # type: ignore[no-untyped-def]
     """Fit one material (kd, ks, alpha, residual) in place, starting from its values."""
     count, channels = values.shape
@@ -223,7 +223,7 @@ def _fit_one(values, lights, views, parameters):  # type: ignore[no-untyped-def]
     parameters[2 * channels], parameters[2 * channels + 1] = math.exp(unknowns[5]), rms
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _nearest(  # type: ignore[no-untyped-def]
     values, led_mm, view_of, cameras_mm, centres_mm, normals, used_samples, kd, ks, alpha, fewest, nearest_clusters
 ):

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from coupole.kernels import kernel
 from coupole.reflectance.discarded_frames import rewrite
 from coupole.reflectance.extraction.sample_codes import BY_UNKNOWN
 from coupole.reflectance.fits import GGX_NORMAL
@@ -85,7 +85,7 @@ def contradiction_mask(
     return dark
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _mark(values, whole, u_noise, led_mm, centres_mm, normals, kd, places_beside, dark):  # type: ignore[no-untyped-def]
     """Mark the samples of LEDs that contradict those of the LEDs beside them."""
     count, leds, _ = values.shape
@@ -107,7 +107,7 @@ def _mark(values, whole, u_noise, led_mm, centres_mm, normals, kd, places_beside
                 dark[triangle, led] = _is_darker(mean, places_beside[led], mean[led], ratios_beside)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _compare(values, whole, u_noise, kd, cosine):  # type: ignore[no-untyped-def]
     """Tell whether a sample is darker than the material in all its channels, by more than its noise. Return also
     the ratio of the sample's mean over the channels to the material's; NaN if there is none."""
@@ -123,7 +123,7 @@ def _compare(values, whole, u_noise, kd, cosine):  # type: ignore[no-untyped-def
     return count > 0 and low_count == count, total / count if count else np.nan
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _is_darker(mean, places, own_ratio, ratios_beside):  # type: ignore[no-untyped-def]
     """Tell whether an LED is darker than the material while the LEDs beside it, `places` in `mean`, agree with the
     material; `ratios_beside` is working memory."""

@@ -16,14 +16,14 @@ from __future__ import annotations
 
 import math
 
-import numba
+from coupole.kernels import kernel
 
 UNKNOWNS = 5
 """Number of unknowns of a fit: two tilts of the normal along its `tangents`, and the logarithms of kd, ks and
 alpha."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def lobe(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
     """Return D V and its derivatives by n l, n v, n h and alpha. All cosines must be positive."""
     alpha2 = alpha * alpha
@@ -41,7 +41,7 @@ def lobe(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
     return value, by_nl, by_nv, by_nh, by_alpha
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def tangents(x, y, z):  # type: ignore[no-untyped-def]
     """Return two unit vectors perpendicular to a unit vector (Duff et al. 2017)."""
     sign = 1.0 if z >= 0.0 else -1.0
@@ -50,7 +50,7 @@ def tangents(x, y, z):  # type: ignore[no-untyped-def]
     return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def root_by_unknowns(normal, t1, t2, light, half, nv, v1, v2, kd, ks, alpha, row):  # type: ignore[no-untyped-def]
     """Return the square root of the radiance, and write its derivatives by the unknowns to `row`; n l must be
     positive. The view is given by its components nv, v1, v2 along the normal and the tangents t1, t2."""
@@ -73,7 +73,7 @@ def root_by_unknowns(normal, t1, t2, light, half, nv, v1, v2, kd, ks, alpha, row
     return root
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def shine(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
     """Return D V, the specular term of GGX without ks, for pictures."""
     alpha2 = alpha * alpha
@@ -83,7 +83,7 @@ def shine(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
     return 0.5 * alpha2 / (math.pi * t * t * (nl * b + nv * a))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def lobe_density(nv, nh, alpha):  # type: ignore[no-untyped-def]
     """Return the probability density, per sr, that a ray drawn from a lobe takes a direction (Heitz 2018, eq.
     17)."""
@@ -92,7 +92,7 @@ def lobe_density(nv, nh, alpha):  # type: ignore[no-untyped-def]
     return 0.5 * alpha2 / (math.pi * t * t * (nv + math.sqrt(alpha2 + (1.0 - alpha2) * nv * nv)))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def sample_reflection(normal, v0, v1, v2, nv, alpha, first, second, way):  # type: ignore[no-untyped-def]
     """Fill `way` [3] with the view (unit, nv to the normal) mirrored at a microfacet normal that is visible from
     it. Two numbers from 0 to 1 choose this normal; return its cosine (Heitz 2018, listing 1)."""

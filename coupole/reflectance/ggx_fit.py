@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from coupole.kernels import kernel
 from coupole.reflectance.ggx import UNKNOWNS, tangents
 from coupole.reflectance.kernel_arrays import assign, assign_rows
 from coupole.reflectance.lanes import LANES, if_less, lanes, larger, load_row, root, store, total
@@ -32,7 +32,7 @@ _TOGETHER = 4
 with an error of 1e4 scales in each sample."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def pack(roots, good, lights, half, views, view_of, packs):  # type: ignore[no-untyped-def]
     """Fill `packs` [n, 11, 8] with the samples `good`; return how many packs they fill. For the other arguments
     see `fit_from`."""
@@ -53,7 +53,7 @@ def pack(roots, good, lights, half, views, view_of, packs):  # type: ignore[no-u
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def fit_packs(packs, views, unknowns, prior, stiffness, usual, settled_share):  # type: ignore[no-untyped-def]
     """Fit by Levenberg-Marquardt from `unknowns` in place, until a step lowers the cost by less than the share
     `settled_share`. Return cost and weighted rms, as `fit_from` does. `usual` is the prior of ks and roughness:
@@ -87,7 +87,7 @@ def fit_packs(packs, views, unknowns, prior, stiffness, usual, settled_share):  
     return cost, rms / math.exp(0.5 * unknowns[3])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _equations(packs, unknowns, prior, stiffness, usual, scale, rows, matrix, right):  # type: ignore[no-untyped-def]
     """Write the normal equations of a step to `matrix` and `right`; return Cauchy's cost and the weighted rms."""
     t1, t2 = tangents(unknowns[0], unknowns[1], unknowns[2])
@@ -111,7 +111,7 @@ def _equations(packs, unknowns, prior, stiffness, usual, scale, rows, matrix, ri
     return cost, rms
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _product(rows, first_row, second_row, count):  # type: ignore[no-untyped-def]
     products = lanes(0.0)
     for n in range(count):
@@ -119,7 +119,7 @@ def _product(rows, first_row, second_row, count):  # type: ignore[no-untyped-def
     return total(products)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _dot(vector, values, first):  # type: ignore[no-untyped-def]
     return (
         vector[0] * load_row(values, first)
@@ -128,7 +128,7 @@ def _dot(vector, values, first):  # type: ignore[no-untyped-def]
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _residuals(packs, unknowns, t1, t2, scale, rows):  # type: ignore[no-untyped-def]
     """Fill `rows` [6 packs, 8] with the residuals' derivatives by the unknowns, then the residuals, all times the
     square root of the weight. Return the sum of the logarithms, and the weighted rms. The formulas are those of

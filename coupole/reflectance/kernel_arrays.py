@@ -6,17 +6,17 @@ two seconds to compile, and are optimised again in each kernel that contains the
 
 from __future__ import annotations
 
-import numba
+from coupole.kernels import kernel
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def assign(to, values):  # type: ignore[no-untyped-def]
     """Copy the numbers `values` [n] to `to` [n]; the lengths are not checked."""
     for n in range(len(to)):
         to[n] = values[n]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def assign_rows(to, values):  # type: ignore[no-untyped-def]
     """Copy the numbers `values` [m, n] to `to` [m, n]; the shapes are not checked."""
     for row in range(to.shape[0]):

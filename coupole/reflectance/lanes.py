@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from llvmlite import ir
 from numba import errors, types
 from numba.extending import intrinsic, models, overload, register_model
+
+from coupole.kernels import digest_of
 
 LANES = 8
 _HALF, _INT = ir.HalfType(), ir.IntType(32)
@@ -21,8 +24,11 @@ _NUMBERS = {types.float32: ir.FloatType(), types.float64: ir.DoubleType()}
 
 
 class _Lanes(types.Type):
+    """Its name has the content of this module: numba takes kept code by the types of arguments, also that of a
+    kernel whose module does not import this one."""
+
     def __init__(self, number: Any) -> None:
-        super().__init__(f"Lanes({number})")
+        super().__init__(f"Lanes({number}, {digest_of(Path(__file__).resolve())[:8]})")
         self.number = number
 
 

@@ -9,12 +9,12 @@ import functools
 from typing import Any
 
 import llvmlite.binding
-import numba
 import numpy as np
 from numba import types
 from numba.extending import get_cython_function_address
 from threadpoolctl import ThreadpoolController
 
+from coupole.kernels import kernel
 from coupole.reflectance.kernel_arrays import assign_rows
 
 _INT, _DOUBLE, _CHAR = map(types.CPointer, (types.intc, types.float64, types.uint8))
@@ -50,7 +50,7 @@ def _libraries() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def gram(rows, product):  # type: ignore[no-untyped-def]
     """Fill `product` [n, n] with rows rows^T of `rows` [n, samples]: the half that `factorise` reads."""
     upper, transpose = np.array([85], np.uint8), np.array([84], np.uint8)  # U and T
@@ -62,7 +62,7 @@ def gram(rows, product):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def sums(rows, values, right):  # type: ignore[no-untyped-def]
     """Fill `right` [m, n] with values rows^T of `values` [m, samples] and `rows` [n, samples]."""
     transpose, plain = np.array([84], np.uint8), np.array([78], np.uint8)  # T and N
@@ -75,7 +75,7 @@ def sums(rows, values, right):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def factorise(product, penalty, factor):  # type: ignore[no-untyped-def]
     """Fill `factor` [n, n] with the Cholesky factor of the matrix from `gram` + diag(penalty); return whether
     there is one."""
@@ -88,7 +88,7 @@ def factorise(product, penalty, factor):  # type: ignore[no-untyped-def]
     return sizes[1] == 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def solve(factor, right):  # type: ignore[no-untyped-def]
     """Solve in place for `right` [m, n], with the factors from `factorise`."""
     upper = np.array([85], np.uint8)
@@ -99,7 +99,7 @@ def solve(factor, right):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def solve_by_samples(rows, penalty, values, memory, factor, right):  # type: ignore[no-untyped-def]
     """Fill `right` [m, n] with the solution that `gram`, `factorise`, `sums` and `solve` give for `rows` [n,
     samples] and `values` [m, samples], with less work if there are fewer samples than rows. Return whether there
@@ -127,7 +127,7 @@ def solve_by_samples(rows, penalty, values, memory, factor, right):  # type: ign
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def left_out(rows, values, coefficients, factor, step, off):  # type: ignore[no-untyped-def]
     """Fill `off` [m, ...] with the amount by which each `step`-th sample is missed by the fit to all the others.
 
@@ -160,7 +160,7 @@ def left_out(rows, values, coefficients, factor, step, off):  # type: ignore[no-
                 off[channel, place] = rest / max(1.0 - square, 1e-9)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _half_solve(factor, right):  # type: ignore[no-untyped-def]
     """Replace each row of `right` [m, n] by L^-1 times the row, where L L^T is the factorised matrix."""
     letters = np.array([76, 85, 84, 78], np.uint8)  # from the left, upper, transposed, not of diagonal 1

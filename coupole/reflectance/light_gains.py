@@ -7,10 +7,10 @@ robust, so a few faulty pictures among many do not change it.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.ggx import lobe
 from coupole.reflectance.light_interpolation import nearest
 from coupole.reflectance.normal_fit import PointMaterials
@@ -55,7 +55,7 @@ def gain_between(
     return float(np.median(gains_of_lights[nearest(light_directions, direction, GAIN_NEIGHBOURS)]))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def modelled_values(normals, kd, ks, alpha, lights, half, view):  # type: ignore[no-untyped-def]
     """[pixels, lights] values of materials under lights; 0 where a light or the view is behind the surface."""
     values = np.zeros((len(normals), len(lights)))

@@ -15,10 +15,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.ggx import UNKNOWNS, lobe, root_by_unknowns, tangents
 from coupole.reflectance.kernel_arrays import assign_rows
 from coupole.reflectance.normal_fit import CAUCHY, SPREAD_KS, colour_weight
@@ -132,7 +132,7 @@ def relative_uncertainty(
     return u_relative
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill(  # type: ignore[no-untyped-def]
     values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, kd, ks, normal_stiffness, prior, order,
     group, covariance, u_kd,
@@ -182,7 +182,7 @@ def _fill(  # type: ignore[no-untyped-def]
         )  # fmt: skip
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def add_scores(roots, good, lights, half, views, view_of, group, normal, grey, bread, meat):  # type: ignore[no-untyped-def]
     """Add the derivatives of the scores of samples to `bread`, and the scores' variance to `meat`; samples are in
     the order of their groups."""
@@ -218,7 +218,7 @@ def add_scores(roots, good, lights, half, views, view_of, group, normal, grey, b
             meat[i, j] *= few
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _colours(  # type: ignore[no-untyped-def]
     sample_colours, good, lights, half, views, view_of, group, normal, grey, kd, ks, covariance, u_kd, u_ks
 ):
@@ -274,20 +274,20 @@ def _colours(  # type: ignore[no-untyped-def]
         u_ks[channel] = math.sqrt(alone[1, 1] / max(ks[channel], 1e-9) ** 2 + more_ks)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _add(single, meat):  # type: ignore[no-untyped-def]
     for i in range(len(meat)):
         meat[i] += single[i]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _add_square(score, meat):  # type: ignore[no-untyped-def]
     for i in range(len(score)):
         for j in range(len(score)):
             meat[i, j] += score[i] * score[j]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _root(normal, t1, t2, light, half, view, grey, row):  # type: ignore[no-untyped-def]
     nv = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
     v1 = t1[0] * view[0] + t1[1] * view[1] + t1[2] * view[2]
@@ -295,7 +295,7 @@ def _root(normal, t1, t2, light, half, view, grey, row):  # type: ignore[no-unty
     return root_by_unknowns(normal, t1, t2, light, half, nv, v1, v2, grey[0], grey[1], grey[2], row)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _relative(led_mm, view_of, cameras_mm, centres_mm, normals, grey, covariance, u_relative):  # type: ignore[no-untyped-def]
     views, light, half, row = np.empty((len(cameras_mm), 3)), np.empty(3), np.empty(3), np.empty(UNKNOWNS)
     for triangle in range(len(u_relative)):

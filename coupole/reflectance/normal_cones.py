@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.ggx import UNKNOWNS
 from coupole.reflectance.material_uncertainty import add_scores, groups_of_leds
 from coupole.reflectance.normal_fit import SHADOW_QUANTILE, SHADOW_SHARE, PointMaterials, rank_normals
@@ -115,7 +115,7 @@ def _fit_spread_deg(
     return fit_deg
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill(values, normals, grey, variance, least, lights, half, views, view_of, order, group, loose):  # type: ignore[no-untyped-def]
     good, roots = np.empty(len(order), np.int64), np.empty(len(order))
     for pixel in range(len(values)):

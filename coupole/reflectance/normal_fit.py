@@ -12,10 +12,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.ggx import UNKNOWNS, lobe, root_by_unknowns, tangents
 from coupole.reflectance.kernel_arrays import assign
 from coupole.reflectance.parts_in_threads import in_threads
@@ -105,7 +105,7 @@ def colours(values: Floats, materials: PointMaterials, lights: Floats, view: Flo
     return kd, ks
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fit_colours(values, normals, grey_kd, grey_ks, alphas, lights, half, view, kd, ks):  # type: ignore[no-untyped-def]
     views, only_view, indices = view.reshape(1, 3), np.zeros(len(lights), np.int64), np.arange(len(lights))
     grey = np.empty(3)
@@ -117,7 +117,7 @@ def _fit_colours(values, normals, grey_kd, grey_ks, alphas, lights, half, view, 
             )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def colours_from(values, used_samples, normal, grey, lights, half, views, view_of, kd, ks):  # type: ignore[no-untyped-def]
     """Fill `kd` and `ks` [channels] from the samples `used_samples` of values [samples, channels]. Normal and
     `grey` (kd, ks, alpha) were fitted to the channels' means; samples have the weights of the last step of that
@@ -155,14 +155,14 @@ def colours_from(values, used_samples, normal, grey, lights, half, views, view_o
         kd[channel], ks[channel] = max(diffuse, 0.0), max(specular, 0.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def colour_weight(model, values, grey_kd):  # type: ignore[no-untyped-def]
     """Return the weight of a sample in `colours_from`, for values [channels] and the value `model` of `grey`."""
     off = (math.sqrt(model) - math.sqrt(max(0.0, values.mean()))) / (CAUCHY * math.sqrt(grey_kd))
     return 1.0 / ((1.0 + off * off) * max(model, 1e-12))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fit_all(values, lights, half, views, view_of, normals, albedo, least, parameters):  # type: ignore[no-untyped-def]
     for pixel in range(len(values)):
         sample = values[pixel]
@@ -189,7 +189,7 @@ def _fit_all(values, lights, half, views, view_of, normals, albedo, least, param
                 parameters[pixel, 5], parameters[pixel, 6] = math.exp(unknowns[5]), rms
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def fit_from(roots, used_samples, lights, half, views, view_of, unknowns, prior, stiffness, usual):  # type: ignore[no-untyped-def]
     """Fit `unknowns` (normal, log kd, log ks, log alpha) by Levenberg-Marquardt in place; return cost and weighted
     rms.
@@ -244,7 +244,7 @@ def fit_from(roots, used_samples, lights, half, views, view_of, unknowns, prior,
     return cost, rms / math.exp(0.5 * unknowns[3])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _least_cosine(normal, views):  # type: ignore[no-untyped-def]
     """Return the least cosine between the normal and the views."""
     least = 1.0
@@ -254,7 +254,7 @@ def _least_cosine(normal, views):  # type: ignore[no-untyped-def]
     return least
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _move(unknowns, step, trial):  # type: ignore[no-untyped-def]
     """Fill `trial` with the unknowns after a step: two tilts along the normal's tangents, then the logarithms."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
@@ -270,7 +270,7 @@ def _move(unknowns, step, trial):  # type: ignore[no-untyped-def]
     trial[5] = min(math.log(_MOST_ALPHA), max(math.log(LEAST_ALPHA), log_alpha))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _cost(roots, used_samples, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale):  # type: ignore[no-untyped-def]
     """Return Cauchy's cost, and the weighted rms of the residuals."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
@@ -294,7 +294,7 @@ def _cost(roots, used_samples, lights, half, views, view_of, unknowns, prior, st
     return cost, scale * math.sqrt(squares / weights)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _equations(  # type: ignore[no-untyped-def]
     roots, used_samples, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale, matrix, right
 ):
@@ -343,7 +343,7 @@ def _equations(  # type: ignore[no-untyped-def]
     return cost, scale * math.sqrt(squares / max(weights, 1e-12))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _solve(matrix, right, damping):  # type: ignore[no-untyped-def]
     """Return the damped step, by Cholesky factors. Only the lower half of the matrix is filled."""
     factor, step = np.zeros((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)

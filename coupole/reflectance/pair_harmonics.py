@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from coupole.kernels import kernel
 from coupole.reflectance.clustering import Pool, axes_about, turned_to
 from coupole.reflectance.slice_basis import diagonal, recurrence
 from coupole.reflectance.triangle_fit import FEWEST, TriangleSamples
@@ -90,7 +90,7 @@ def _orders(degrees: int) -> list[tuple[int, int, int]]:
     ]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _legendre(z, degrees, a, b, first, polynomials):  # type: ignore[no-untyped-def]
     """Fill `polynomials` [degrees, degrees] with P(l, m) of z, without the power of the distance from the axis."""
     p_mm = math.sqrt(0.25 / math.pi)
@@ -103,7 +103,7 @@ def _legendre(z, degrees, a, b, first, polynomials):  # type: ignore[no-untyped-
             polynomials[degree, m] = now
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _pair(light, view, degrees, a, b, first, of_light, of_view, cosines, row):  # type: ignore[no-untyped-def]
     _legendre(light[2], degrees, a, b, first, of_light)
     _legendre(view[2], degrees, a, b, first, of_view)
@@ -123,14 +123,14 @@ def _pair(light, view, degrees, a, b, first, of_light, of_view, cosines, row):  
                 place += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _functions(lights, views, degrees, a, b, first, harmonics):  # type: ignore[no-untyped-def]
     of_light, of_view, cosines = np.empty((degrees, degrees)), np.empty((degrees, degrees)), np.empty(degrees)
     for n in range(len(lights)):
         _pair(lights[n], views[n], degrees, a, b, first, of_light, of_view, cosines, harmonics[n])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _values(  # type: ignore[no-untyped-def]
     led_mm, view_of, cameras_mm, centres_mm, normals, cluster, coefficients, degrees, a, b, first, modelled_values
 ):

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError, Problem, reason
 from coupole.intake.plain_data import read_json
+from coupole.kernels import kernel
 from coupole.reflectance.cluster_file import Clusters, read_clusters
 from coupole.reflectance.extraction.frame_veils import GLARE, U_GLARE
 from coupole.reflectance.fits import MATERIALS, SLICES
@@ -386,7 +386,7 @@ def _rows(view: ViewSamples, triangles: NDArray[np.int64]) -> range:
     return range(int(first), int(end))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _times_cosine(values, centres_mm, normals, led_mm):  # type: ignore[no-untyped-def]
     """Multiply values [triangles, leds, channels] with the cosines of incidence."""
     for triangle in range(len(values)):

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.extraction.lamp_sight import lit_by
 
 Floats = NDArray[np.float64]
@@ -169,7 +169,7 @@ def _geometry(corners_mm: Floats, led_mm: Floats, led_normals: Floats, paper: bo
     return geometry
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _lit_each(centres, led_mm, led_normals, paper):  # type: ignore[no-untyped-def]
     lit, towards = np.empty(len(centres)), np.empty(3)
     for n in range(len(centres)):

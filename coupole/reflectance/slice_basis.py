@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from coupole.kernels import kernel
 
 Floats = NDArray[np.float64]
 
@@ -112,7 +113,7 @@ _DIAGONAL = diagonal(_DEGREES)
 _CENTRES = centres()
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def functions(harmonic, x, y, z, rows):  # type: ignore[no-untyped-def]
     """Write the values of a basis in directions x, y, z [n] to `rows` [COUNT, n]."""
     if harmonic:
@@ -121,7 +122,7 @@ def functions(harmonic, x, y, z, rows):  # type: ignore[no-untyped-def]
         _radial(x, y, z, rows)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _harmonics(x, y, z, rows):  # type: ignore[no-untyped-def]
     """Write Y(l, m) to row l (l + 1) + m: sqrt 2 P(l, |m|) times Re or Im of (x + iy)^|m|."""
     cosine, sine = np.ones(len(x)), np.zeros(len(x))
@@ -146,7 +147,7 @@ def _harmonics(x, y, z, rows):  # type: ignore[no-untyped-def]
                 rows[middle + m, n] = now[n] * cosine[n]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _radial(x, y, z, rows):  # type: ignore[no-untyped-def]
     count = len(_CENTRES)
     for k in range(count):

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy import ascontiguousarray as ordered  # functions are compiled for each layout
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.kernel_arrays import assign_rows
 from coupole.reflectance.least_squares import (
     factorise,
@@ -95,7 +95,7 @@ def slice_values(
     return np.maximum(values, 0.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _frame(normal, centre_mm, camera_mm, frame):  # type: ignore[no-untyped-def]
     """Fill `frame` [3, 3] with the axes of a slice, row by row."""
     x, y, z = normal
@@ -112,7 +112,7 @@ def _frame(normal, centre_mm, camera_mm, frame):  # type: ignore[no-untyped-def]
     frame[2, 0], frame[2, 1], frame[2, 2] = x, y, z
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _directions(frame, centre_mm, led_mm, led_numbers, x, y, z):  # type: ignore[no-untyped-def]
     """Fill `x`, `y` and `z` with the directions of the LEDs `led_numbers` [n] in a slice's frame; LEDs below the
     surface get z = 0. Return the number of LEDs above the surface."""
@@ -128,7 +128,7 @@ def _directions(frame, centre_mm, led_mm, led_numbers, x, y, z):  # type: ignore
     return above
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fit_part(  # type: ignore[no-untyped-def]
     values,
     residuals,
@@ -176,7 +176,7 @@ def _fit_part(  # type: ignore[no-untyped-def]
                 )  # fmt: skip
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fit_one(  # type: ignore[no-untyped-def]
     rows, product, values, residuals, sample_numbers, first, penalty, over, memories, coefficients
 ):
@@ -206,7 +206,7 @@ def _fit_one(  # type: ignore[no-untyped-def]
             _stack(off, right, coefficients)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _take_samples(values, sample_numbers, first, targets):  # type: ignore[no-untyped-def]
     """Fill `targets` [channels, n] with the samples `sample_numbers` [n] in the channels from `first` on."""
     for channel in range(len(targets)):
@@ -214,7 +214,7 @@ def _take_samples(values, sample_numbers, first, targets):  # type: ignore[no-un
             targets[channel, number] = values[sample_numbers[number], first + channel]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _stack(off, plain, coefficients):  # type: ignore[no-untyped-def]
     """Combine `coefficients` [channels, COUNT + 1] (a model and its residual) and `plain` [channels, COUNT] into
     the weighted mean with the smallest error. `off` [2, channels, samples] are the errors of both.
@@ -232,7 +232,7 @@ def _stack(off, plain, coefficients):  # type: ignore[no-untyped-def]
             coefficients[channel, k] = share * coefficients[channel, k] + (1.0 - share) * plain[channel, k]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _held_by(residuals, values, sample_numbers, first):  # type: ignore[no-untyped-def]
     """Return the factor on the usual ridge, from the residuals [channels, n] of the samples `sample_numbers` [n]
     in the channels from `first` on."""
@@ -244,7 +244,7 @@ def _held_by(residuals, values, sample_numbers, first):  # type: ignore[no-untyp
     return min(1.0, max(LEAST_RESIDUAL, USUAL_LEFT * whole / max(remains, 1e-30)))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _solve(rows, product, penalty, values, room, factor, right):  # type: ignore[no-untyped-def]
     """Fill `right` with the coefficients; return whether there is a solution. The equations are solved by samples
     or by functions, whichever are fewer. `product` comes from `gram` if there are at least as many samples as
@@ -259,7 +259,7 @@ def _solve(rows, product, penalty, values, room, factor, right):  # type: ignore
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _known_samples(values, used_samples, sample_numbers):  # type: ignore[no-untyped-def]
     """Fill `sample_numbers` with those of the samples `used_samples` in which a channel has a value; return their
     number."""
@@ -271,7 +271,7 @@ def _known_samples(values, used_samples, sample_numbers):  # type: ignore[no-unt
     return n
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _same(values, used_samples, channel):  # type: ignore[no-untyped-def]
     """Tell whether a channel has the same samples as the one before."""
     same = True
@@ -280,7 +280,7 @@ def _same(values, used_samples, channel):  # type: ignore[no-untyped-def]
     return same
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _add_part(coefficients, led_mm, camera_mm, centres_mm, normals, harmonic, modelled_values):  # type: ignore[no-untyped-def]
     count, samples, channels = modelled_values.shape
     frame, indices, total = np.empty((3, 3)), np.arange(samples), np.empty(samples)

@@ -12,10 +12,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.ggx import lobe, tangents
 from coupole.reflectance.ggx_fit import ROWS, fit_packs, pack
 from coupole.reflectance.kernel_arrays import assign
@@ -164,7 +164,7 @@ def model_values(samples: TriangleSamples, materials: TriangleMaterials) -> NDAr
     return modelled_values
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffness, free, used_samples, parameters):  # type: ignore[no-untyped-def]
     count, samples, channels = values.shape
     lights, half = np.empty((samples, 3)), np.empty((samples, 3))
@@ -194,7 +194,7 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
             ks[channel] = min(ks[channel], MOST_KS)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _recolour(values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, used_samples, kd, ks):  # type: ignore[no-untyped-def]
     count, samples, channels = values.shape
     lights, half, views = np.empty((samples, 3)), np.empty((samples, 3)), np.empty((len(cameras_mm), 3))
@@ -215,7 +215,7 @@ def _recolour(values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, us
             ks[triangle, channel] = min(ks[triangle, channel], MOST_KS)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def gather(  # type: ignore[no-untyped-def]
     values, led_mm, view_of, cameras_mm, centre_mm, normal, used_samples, colours, good, roots, lights, half, views
 ):
@@ -244,7 +244,7 @@ def gather(  # type: ignore[no-untyped-def]
     return n
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _best_start(roots, good, lights, half, views, view_of, normal, stiffness, packs):  # type: ignore[no-untyped-def]
     """Return, approximately, the end of the best of the starts, from some of the samples; `packs` is working
     memory."""
@@ -262,7 +262,7 @@ def _best_start(roots, good, lights, half, views, view_of, normal, stiffness, pa
     return best_unknowns
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _first_kd(roots, good, lights, normal):  # type: ignore[no-untyped-def]
     """Return the median of value over cosine, because few samples are highlights."""
     ratios = np.empty(len(good))
@@ -273,21 +273,21 @@ def _first_kd(roots, good, lights, normal):  # type: ignore[no-untyped-def]
     return max(np.median(ratios), 1e-9)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def towards(place, target, direction):  # type: ignore[no-untyped-def]
     x, y, z = target[0] - place[0], target[1] - place[1], target[2] - place[2]
     length = math.sqrt(x * x + y * y + z * z)
     direction[0], direction[1], direction[2] = x / length, y / length, z / length
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def between(light, view, half):  # type: ignore[no-untyped-def]
     x, y, z = light[0] + view[0], light[1] + view[1], light[2] + view[2]
     length = math.sqrt(x * x + y * y + z * z)
     half[0], half[1], half[2] = x / length, y / length, z / length
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _model(led_mm, view_of, cameras_mm, centres_mm, normals, kd, ks, alpha, modelled_values):  # type: ignore[no-untyped-def]
     count, samples, channels = modelled_values.shape
     views, light, half = np.empty((len(cameras_mm), 3)), np.empty(3), np.empty(3)
@@ -311,7 +311,7 @@ def _model(led_mm, view_of, cameras_mm, centres_mm, normals, kd, ks, alpha, mode
                 )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def turned_normals(normals, tilts):  # type: ignore[no-untyped-def]
     """Return unit normals [n, 3] after tilts [n, 2] along their tangents."""
     new_normals = np.empty_like(normals)

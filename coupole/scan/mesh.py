@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.kernels import kernel
 from coupole.scan.mesh_text import OK, TOO_FEW
 
 CHUNK = 4_000_000
@@ -62,7 +62,7 @@ def expect_corners(path: Path, triangles: NDArray[np.uint32], vertices: int, fir
         )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _first_not_finite(points):  # type: ignore[no-untyped-def]
     for k in range(len(points)):
         if not np.isfinite(points[k, 0] + points[k, 1] + points[k, 2]):
@@ -70,7 +70,7 @@ def _first_not_finite(points):  # type: ignore[no-untyped-def]
     return -1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _first_beyond(triangles, vertices):  # type: ignore[no-untyped-def]
     for k in range(len(triangles)):
         if triangles[k, 0] >= vertices or triangles[k, 1] >= vertices or triangles[k, 2] >= vertices:

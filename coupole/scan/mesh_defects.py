@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.scan.mesh import Mesh
 
 OUT_OF_PROPORTION = 200.0
@@ -69,7 +69,7 @@ def _odd_scale(mesh: Mesh) -> int:
     return int(np.flatnonzero(odd)[0]) * every if odd.mean() > _ODD_SHARE else -1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _degenerate(vertices, triangles):  # type: ignore[no-untyped-def]
     """Number of triangles without area, in float64, and the first of them."""
     count, first = 0, -1
@@ -86,7 +86,7 @@ def _degenerate(vertices, triangles):  # type: ignore[no-untyped-def]
     return count, first
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill_edge_keys(triangles, keys):  # type: ignore[no-untyped-def]
     """Keys of lower vertex, higher vertex and, in the last bit, the orientation of the triangle."""
     for t in range(len(triangles)):
@@ -98,7 +98,7 @@ def _fill_edge_keys(triangles, keys):  # type: ignore[no-untyped-def]
                 keys[3 * t + k] = b << np.uint64(33) | a << np.uint64(1) | np.uint64(1)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _count_edges(keys):  # type: ignore[no-untyped-def]
     """Number of open edges; number and first key of edges with more than two triangles; the same for flipped
     edges."""
@@ -121,7 +121,7 @@ def _count_edges(keys):  # type: ignore[no-untyped-def]
     return open_edges, (crowded_count, first_crowded), (turned_count, first_turned)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _triangle_with(triangles, key):  # type: ignore[no-untyped-def]
     """The first triangle that has an edge."""
     low, high = key >> np.uint64(33), (key >> np.uint64(1)) & np.uint64(0xFFFFFFFF)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from coupole.errors import InputError
+from coupole.kernels import kernel
 from coupole.scan import mesh_text
 from coupole.scan.mesh import Mesh, expect_finite, expect_text
 from coupole.scan.mesh_bytes import MeshFile
@@ -27,7 +27,7 @@ def read_obj(source: MeshFile) -> Mesh:
     return Mesh(vertices, triangles)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _obj_line(data, at, end):  # type: ignore[no-untyped-def]
     """1 for a vertex, 2 for a face, 0 for anything else; and the offset of its first value."""
     at = mesh_text.skip_blanks(data, at, end)
@@ -39,7 +39,7 @@ def _obj_line(data, at, end):  # type: ignore[no-untyped-def]
     return 0, at
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _count_obj(data):  # type: ignore[no-untyped-def]
     at, line, vertices, triangles = 0, 1, 0, 0
     while at < len(data):
@@ -60,7 +60,7 @@ def _count_obj(data):  # type: ignore[no-untyped-def]
     return vertices, triangles, 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill_obj(data, vertices, triangles):  # type: ignore[no-untyped-def]
     """Faces with more than three corners become triangle fans; negative corners count back from the last
     vertex."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.kernels import kernel
 from coupole.scan import mesh_text
 from coupole.scan.mesh import CHUNK, Mesh, expect_corners, expect_finite, expect_records, expect_room, expect_text
 from coupole.scan.mesh_bytes import MeshFile, read_records
@@ -200,7 +200,7 @@ def _after_lines(path: Path, data: NDArray[np.uint8], at: int, element: _Element
     return int(begins[element.count]) if len(begins) > element.count else len(data)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill_vertices(data, at, line, columns, vertices):  # type: ignore[no-untyped-def]
     last_column = columns.max()
     for n in range(len(vertices)):
@@ -219,7 +219,7 @@ def _fill_vertices(data, at, line, columns, vertices):  # type: ignore[no-untype
     return OK, at, line
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill_faces(data, at, line, triangles, vertices):  # type: ignore[no-untyped-def]
     for n in range(len(triangles)):
         if at >= len(data):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.kernels import kernel
 from coupole.scan import mesh_text
 from coupole.scan.mesh import CHUNK, Mesh, expect_finite, expect_text
 from coupole.scan.mesh_bytes import MeshFile, read_records
@@ -58,7 +58,7 @@ def _read_ascii_stl(source: MeshFile) -> Mesh:
     return welder.mesh()
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _starts_with(data, at, end, word):  # type: ignore[no-untyped-def]
     matches = end - at >= len(word)
     for k in range(len(word)):
@@ -66,7 +66,7 @@ def _starts_with(data, at, end, word):  # type: ignore[no-untyped-def]
     return matches
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _count_lines_with(data, word):  # type: ignore[no-untyped-def]
     at, lines, count = 0, 0, 0
     while at < len(data):
@@ -76,7 +76,7 @@ def _count_lines_with(data, word):  # type: ignore[no-untyped-def]
     return count, lines
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill_ascii_stl(data, word, points):  # type: ignore[no-untyped-def]
     at, line, n = 0, 1, 0
     while at < len(data) and n < len(points):
@@ -120,7 +120,7 @@ class _Welder:
         return Mesh(self._vertices[: self._known].copy(), self._triangles)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _slot(slots, vertices, x, y, z):  # type: ignore[no-untyped-def]
     """Slot of a point in the hash table (open addressing), or the free slot for it."""
     key = np.empty(3, np.float32)
@@ -138,13 +138,13 @@ def _slot(slots, vertices, x, y, z):  # type: ignore[no-untyped-def]
     return at
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill_slots(slots, vertices, vertex_count):  # type: ignore[no-untyped-def]
     for n in range(vertex_count):
         slots[_slot(slots, vertices, vertices[n, 0], vertices[n, 1], vertices[n, 2])] = n
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _weld(points, done_count, slots, vertices, vertex_count, out):  # type: ignore[no-untyped-def]
     while done_count < len(points):
         x, y, z = points[done_count, 0], points[done_count, 1], points[done_count, 2]

@@ -5,8 +5,9 @@ They are read once to count and once to fill arrays of the right size.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from coupole.kernels import kernel
 
 OK, NOT_A_NUMBER, TOO_FEW, BAD_CORNER = 0, 1, 2, 3
 _NEWLINE, _SPACE, _TAB, _RETURN = 10, 32, 9, 13
@@ -14,7 +15,7 @@ _DIGITS = 18
 """More do not fit into a 64-bit integer; further digits are below the resolution of float64."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def line_end(data, at):  # type: ignore[no-untyped-def]
     """Offset of the newline that ends the line at `at`, or the end of the data."""
     while at < len(data) and data[at] != _NEWLINE:
@@ -22,21 +23,21 @@ def line_end(data, at):  # type: ignore[no-untyped-def]
     return at
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def skip_blanks(data, at, end):  # type: ignore[no-untyped-def]
     while at < end and (data[at] == _SPACE or data[at] == _TAB or data[at] == _RETURN):
         at += 1
     return at
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def token_end(data, at, end):  # type: ignore[no-untyped-def]
     while at < end and data[at] != _SPACE and data[at] != _TAB and data[at] != _RETURN:
         at += 1
     return at
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def whole(data, at, end):  # type: ignore[no-untyped-def]
     """The integer at `at`, the offset after it, and whether there was one."""
     negative = at < end and data[at] == 45
@@ -49,7 +50,7 @@ def whole(data, at, end):  # type: ignore[no-untyped-def]
     return (-value if negative else value), at, at > first
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def decimal(data, at, end):  # type: ignore[no-untyped-def]
     """The decimal number at `at` (also nan and inf, as NaN), the offset after it, and whether there was one."""
     stop = token_end(data, at, end)

@@ -157,6 +157,7 @@ def register(
     Raises InputError: no two scans overlap; ExtraMissing.
     """
     from coupole.scan.registration import registering
+    from coupole.scan.registration.control import TargetTables
     from coupole.scan.registration.viewpoint import STANDS
 
     stand = next((candidate for candidate in STANDS if candidate == seen_from), None)
@@ -166,8 +167,9 @@ def register(
         _paths(scans),
         unit,
         stand=stand,
-        targets=None if targets is None else Path(targets),
-        control=None if control is None else Path(control),
+        tables=TargetTables(
+            None if targets is None else Path(targets), None if control is None else Path(control)
+        ),
         trust_poses=trust_poses,
         say=progress or _silent,
     )

@@ -26,6 +26,7 @@ from coupole.plan.choices import has_enough
 from coupole.plan.led_table import read_led_table
 from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
+from coupole.plan.rig_devices import device_times
 from coupole.plan.schedule import Schedule, build_schedule
 from coupole.plan.shot_id import ShotId, ShotLabel
 from coupole.storage.run import Run
@@ -138,14 +139,7 @@ def as_planned(run: Run) -> AsPlanned:
     rig = document.validate(Rig)
     leds = read_led_table(document.resolve(rig.dome.leds), files)
     description, _ = arm_named(document, rig.arm, rig.robot.driver, rig.robot.settings, files)
-    schedule = build_schedule(
-        plan,
-        leds,
-        rig.support.base_from_support.matrix(),
-        rise_us=rig.led_limits.rise_us,
-        readout_us=1e6 / rig.sensor.max_frames_per_s,
-        exposure_gap_us=rig.sensor.exposure_gap_us,
-    )
+    schedule = build_schedule(plan, leds, rig.support.base_from_support.matrix(), device_times(rig))
     return AsPlanned(rig, schedule, description.arm if description else None)
 
 

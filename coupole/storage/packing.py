@@ -16,9 +16,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from coupole.kernels import kernel
 
 Order = Literal["lsb", "msb"]
 
@@ -49,7 +50,7 @@ def unpack12(packed_bytes: NDArray[np.uint8], order: Order = "lsb") -> NDArray[n
     return pixels
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _pack(pixels, packed_bytes, msb_first):  # type: ignore[no-untyped-def]
     """Pack the pixels; return the bitwise or of all of them."""
     all_bits = np.uint16(0)
@@ -67,7 +68,7 @@ def _pack(pixels, packed_bytes, msb_first):  # type: ignore[no-untyped-def]
     return all_bits
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _unpack(packed_bytes, pixels, msb_first):  # type: ignore[no-untyped-def]
     for pair in range(len(packed_bytes) // 3):
         first, middle, last = (

@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coupole.errors import InputError
 from coupole.intake.plain_data import read_json
-from coupole.storage.stopped_process import holder_of, is_stopped
+from coupole.storage.stopped_process import holder_of, is_locked, is_stopped
 
 FOLDER = "beside"
 RESULT = "result.json"
@@ -211,12 +211,7 @@ def _at_work(result: Path) -> str:
 
 
 def _is_held(lock: Path) -> bool:
-    with contextlib.suppress(OSError):
-        fd = os.open(lock, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except OSError:
-            return True
-        finally:
-            os.close(fd)
-    return False
+    try:
+        return is_locked(lock)
+    except OSError:
+        return False

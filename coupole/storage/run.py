@@ -46,7 +46,7 @@ from coupole.storage.line_file import utc_now
 from coupole.storage.run_inputs import Inputs, changes_since, keep
 from coupole.storage.run_json import RUN_JSON, SCHEMA_VERSION, read_description
 from coupole.storage.run_readme import readme
-from coupole.storage.stopped_process import holder_of
+from coupole.storage.stopped_process import holder_of, is_locked
 
 _LOCK_TRIALS, _LOCK_NAP_S = 20, 0.01
 
@@ -236,14 +236,7 @@ class Run:
     @property
     def in_use(self) -> bool:
         """True while a process acquires into the run, or archives it."""
-        fd = os.open(self.folder / RUN_JSON, os.O_RDONLY)
-        try:
-            fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except OSError:
-            return True
-        finally:
-            os.close(fd)
-        return False
+        return is_locked(self.folder / RUN_JSON)
 
     @property
     def holder(self) -> int | None:

@@ -3,6 +3,8 @@ stopped."""
 
 from __future__ import annotations
 
+import fcntl
+import os
 from pathlib import Path
 
 _LOCKS = Path("/proc/locks")
@@ -17,6 +19,18 @@ def is_stopped(pid: int) -> bool:
     except (OSError, IndexError):
         return False
     return state in ("T", "t")
+
+
+def is_locked(file: Path) -> bool:
+    """True while a process holds the exclusive lock of a file (flock). Raises OSError if it cannot be opened."""
+    fd = os.open(file, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(fd)
+    return False
 
 
 def holder_of(file: Path) -> int | None:

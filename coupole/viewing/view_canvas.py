@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coupole.geometry import Transform, apply, inverse
+from coupole.kernels import kernel
 from coupole.viewing.view_colours import Colour
 from coupole.viewing.view_solids import Points, Solid
 
@@ -186,7 +186,7 @@ def _edges(body: NDArray[np.int64]) -> NDArray[np.bool_]:
     return edge
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _rasterise(pixels, near, nearest, face):  # type: ignore[no-untyped-def]
     """Write the nearest triangle of each pixel (pixels [n, 3, 2], nearness [n, 3]) into `nearest` and `face`."""
     height, width = nearest.shape

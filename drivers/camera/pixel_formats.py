@@ -9,9 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from coupole.kernels import kernel
 
 Packing = Literal["two bytes", "one byte", "10p", "12p", "10Packed", "12Packed"]
 
@@ -65,7 +66,7 @@ FORMATS = {
 """Formats by the name that the feature `PixelFormat` has."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _widen_12p(out, data):  # type: ignore[no-untyped-def]
     """Two pixels in three bytes: a bit stream, least significant bit first."""
     for pair in range(len(out) // 2):
@@ -74,7 +75,7 @@ def _widen_12p(out, data):  # type: ignore[no-untyped-def]
         out[2 * pair + 1] = np.uint16(middle) >> np.uint16(4) | np.uint16(last) << np.uint16(4)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _widen_12_packed(out, data):  # type: ignore[no-untyped-def]
     """Two pixels in three bytes: the outer bytes hold the upper eight bits, the middle one the lower four."""
     for pair in range(len(out) // 2):
@@ -83,7 +84,7 @@ def _widen_12_packed(out, data):  # type: ignore[no-untyped-def]
         out[2 * pair + 1] = np.uint16(last) << np.uint16(4) | np.uint16(middle >> 4)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _widen_10p(out, data):  # type: ignore[no-untyped-def]
     """Four pixels in five bytes: a bit stream, least significant bit first."""
     for quad in range(len(out) // 4):
@@ -95,7 +96,7 @@ def _widen_10p(out, data):  # type: ignore[no-untyped-def]
         out[4 * quad + 3] = d >> 6 | e << 2
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _widen_10_packed(out, data):  # type: ignore[no-untyped-def]
     """Two pixels in three bytes: the middle byte holds the lower two bits of each; those of the second pixel begin
     at bit 4."""
@@ -105,7 +106,7 @@ def _widen_10_packed(out, data):  # type: ignore[no-untyped-def]
         out[2 * pair + 1] = np.uint16(last) << np.uint16(2) | np.uint16(middle >> 4 & 3)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _widen_bytes(out, data):  # type: ignore[no-untyped-def]
     for pixel in range(len(out)):
         out[pixel] = data[pixel]

@@ -27,7 +27,15 @@ from coupole.devices import ArmCondition, ArmState, HostNeed, Identity
 from coupole.errors import ArmUnattended, DeviceLost, DeviceRefused
 from coupole.kinematics import Arm
 from coupole.supervision import ATTENTION_S, LOOK_S, Attention
-from drivers.arm_motion import MessageTime, checked_speed, checked_target, overtaken, refusal, wait_for
+from drivers.arm_motion import (
+    MessageTime,
+    StateReader,
+    checked_speed,
+    checked_target,
+    overtaken,
+    refusal,
+    wait_for,
+)
 from drivers.fair_lock import FairLock
 from drivers.host_checks import package
 from drivers.ur.messages import (
@@ -272,12 +280,8 @@ class UrRobot:
     def _wait(
         self, is_done: Callable[[State], bool], deadline: Deadline, expectation: str, *, faults: bool = True
     ) -> None:
-        wait_for(
+        reader = StateReader(
             self._state,
-            is_done,
-            deadline,
-            expectation,
-            check=raise_fault if faults else None,
             pause=lambda: self._clock.sleep(_POLL_S, LOOK_S),
             describe=lambda state: (
                 f"joints measured at {np.round(state.joints_deg, 3).tolist()} deg, "
@@ -285,6 +289,7 @@ class UrRobot:
             ),
             remedy="See the controller's messages; its speed slider must not be moved during a motion",
         )
+        wait_for(reader, is_done, deadline, expectation, check=raise_fault if faults else None)
 
     def _is_settled(self, state: State, number: int) -> bool:
         if self._number != number:

@@ -61,14 +61,7 @@ class KukaController:
         self.ended_programs = 0
         """Programs that a client has ended with the stop element."""
         self._refusals = Refusals("robot", tell)
-        self.errors = PoseErrors(
-            seed=settings.seed,
-            repeatability_um=settings.repeatability_um,
-            repeatability_deg=settings.repeatability_deg,
-            absolute_mm=settings.absolute_mm,
-            absolute_deg=settings.absolute_deg,
-            stranger=stranger,
-        )
+        self.errors = PoseErrors.of(settings, stranger)
         self._reactor, self._settings = reactor, settings
         self._cycle_ns = settings.cycle_ms * 1_000_000
         self._axes = Axes(settings, reactor.now_ns)

@@ -76,14 +76,7 @@ class KukaEkiController:
         """Reason why the robot program does not run; empty while it does."""
         self.settled_since_ns: int | None = reactor.now_ns
         """World time since which the axes are at rest; None while they move."""
-        self.errors = PoseErrors(
-            seed=settings.seed,
-            repeatability_um=settings.repeatability_um,
-            repeatability_deg=settings.repeatability_deg,
-            absolute_mm=settings.absolute_mm,
-            absolute_deg=settings.absolute_deg,
-            stranger=stranger,
-        )
+        self.errors = PoseErrors.of(settings, stranger)
         self._reactor, self._settings = reactor, settings
         self._motion: Motion = standing(settings.start_joints_deg)
         self._begun_ns = reactor.now_ns

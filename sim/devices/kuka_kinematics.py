@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,21 @@ def joints_near(base_from_flange: Transform, joints_deg: Sequence[float]) -> tup
     return newton.joints_near(_chain, base_from_flange, joints_deg)
 
 
+class ErrorSettings(Protocol):
+    """Settings of a simulated controller that state its arm's errors."""
+
+    @property
+    def seed(self) -> int: ...
+    @property
+    def repeatability_um(self) -> float: ...
+    @property
+    def repeatability_deg(self) -> float: ...
+    @property
+    def absolute_mm(self) -> float: ...
+    @property
+    def absolute_deg(self) -> float: ...
+
+
 @dataclass(frozen=True)
 class PoseErrors:
     """Difference between the true flange pose and the controller's; reproducible by seed.
@@ -79,6 +95,18 @@ class PoseErrors:
     absolute_deg: float
     stranger: ArmStranger = NO_STRANGER
     """Errors that depend on the arm's present and previous place."""
+
+    @classmethod
+    def of(cls, settings: ErrorSettings, stranger: ArmStranger) -> PoseErrors:
+        """The errors that a controller's settings state."""
+        return cls(
+            settings.seed,
+            settings.repeatability_um,
+            settings.repeatability_deg,
+            settings.absolute_mm,
+            settings.absolute_deg,
+            stranger,
+        )
 
     def base_error_mm(self) -> NDArray[np.float64]:
         """[3]."""

@@ -18,14 +18,7 @@ def main(speed: float) -> None:
     with tempfile.TemporaryDirectory() as folder:
         clock_path = Path(folder) / "clock"
         reactor = Reactor(ClockWriter(clock_path, speed))
-        box = LedBoxFirmware(
-            reactor,
-            Settings(),
-            on_edge=lambda t_ns: None,
-            on_light=lambda led, t_on_ns, t_off_ns: None,
-            on_dark=lambda t_ns: None,
-            on_panel=lambda panel, on, t_ns: None,
-        )
+        box = LedBoxFirmware(reactor, Settings())
         sys.stdout.write(json.dumps({"port": box.port, "clock": str(clock_path)}) + "\n")
         sys.stdout.flush()
         for name in (signal.SIGINT, signal.SIGTERM):

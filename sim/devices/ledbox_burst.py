@@ -67,11 +67,10 @@ class Burst:
         *,
         dead_leds: set[int],
         led_current_ma: int,
-        jitter_ns: Callable[[], float],
     ) -> None:
         self._reactor, self._quartz, self._boards, self._wiring = reactor, quartz, boards, wiring
         self._steps: list[tuple[int, int, int, int, int]] = table.tolist()
-        self._dead_leds, self._led_current_ma, self._jitter_ns = dead_leds, led_current_ma, jitter_ns
+        self._dead_leds, self._led_current_ma = dead_leds, led_current_ma
         self._timers: list[Timer] = []
         self._lit: tuple[int, int, int] | None = None  # led, world ns on, world ns off
         self.state = "RUN"
@@ -118,7 +117,7 @@ class Burst:
         if flags & FLAG_NO_TRIGGER:
             status |= STATUS_NO_EDGE
         else:
-            t_edge = t_on + delay_us * 1000 + round(self._jitter_ns())
+            t_edge = t_on + delay_us * 1000 + round(self._quartz.edge_lateness_ns())
             self._timers.append(at(world_ns(t_edge), self._edge))
         finish = partial(self._finish, _Done(index, led, status, t_on, t_edge, current_ma))
         self._timers.append(at(world_ns(max(t_off, t_edge)), finish))
@@ -183,29 +182,32 @@ class Quartz:
         return abs(self._random.gauss(0.0, self._jitter_ns))
 
 
+@dataclass(frozen=True)
+class BoardHeat:
+    """Thermal properties of the boards."""
+
+    leds_per_board: int
+    ambient_c: float
+    warm_k: float
+    """Excess over ambient at power-on."""
+    limit_c: float
+    led_power_w: float
+    heat_k_per_j: float
+    time_constant_s: float
+
+
 class Boards:
     """Temperature of every board: one first-order thermal node each.
 
     T(t) = ambient + (T(t0) - ambient) exp(-(t - t0) / tau), and each lit joule adds `heat_k_per_j`.
     """
 
-    def __init__(
-        self,
-        count: int,
-        *,
-        leds_per_board: int,
-        ambient_c: float,
-        warm_k: float,
-        limit_c: float,
-        led_power_w: float,
-        heat_k_per_j: float,
-        time_constant_s: float,
-    ) -> None:
-        self.limit_c, self._ambient_c = limit_c, ambient_c
-        self._leds_per_board = leds_per_board
-        self._kelvin_per_s = led_power_w * heat_k_per_j
-        self._tau_ns = time_constant_s * 1e9
-        self._excess_k = [warm_k] * count
+    def __init__(self, count: int, heat: BoardHeat) -> None:
+        self.limit_c, self._ambient_c = heat.limit_c, heat.ambient_c
+        self._leds_per_board = heat.leds_per_board
+        self._kelvin_per_s = heat.led_power_w * heat.heat_k_per_j
+        self._tau_ns = heat.time_constant_s * 1e9
+        self._excess_k = [heat.warm_k] * count
         self._since_ns = [0] * count
         self.tripped = False
         """True from the moment an unlit board exceeds the limit, until it has cooled."""

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.devices.ledbox_burst import Boards, Burst, Quartz, Wiring
+from sim.devices.ledbox_burst import BoardHeat, Boards, Burst, Quartz, Wiring
 from sim.devices.ledbox_link import Link
 from sim.devices.ledbox_table import MAX_RECORDS, STEP, check_table, read_table
 from sim.devices.pty_port import PtyPort
@@ -71,41 +72,48 @@ class Settings(BaseModel):
     """An incomplete block is discarded after this time without further bytes."""
 
 
+@dataclass(frozen=True)
+class BoxCables:
+    """The box's cables into the world; times are the world's. By default nothing is connected."""
+
+    on_edge: Callable[[int], None] = lambda t_ns: None
+    """Called for each pulse on the trigger cable."""
+    on_light: Callable[[int, int, int], None] = lambda led, t_on_ns, t_off_ns: None
+    """Called at t_on."""
+    on_dark: Callable[[int], None] = lambda t_ns: None
+    """Called if a light ends before its t_off."""
+    on_panel: Callable[[int, bool, int], None] = lambda panel, on, t_ns: None
+    ready: Callable[[], bool] = lambda: True
+    """Reads the camera's exposure-ready line."""
+
+
+NOT_CONNECTED = BoxCables()
+
+
 class LedBoxFirmware:
     """The box. All methods must be called on the reactor's thread.
 
-    `on_light(led, t_on_ns, t_off_ns)` is called at t_on; `on_dark(t_ns)` if that light ends before its t_off;
-    `on_edge(t_ns)` for each pulse on the trigger cable; `on_panel(panel, on, t_ns)`; `ready()` reads the camera's
-    exposure-ready line. `on_edge_counted`, if set, gets each edge's number since power-on (from 0), after the
-    edge, for faults at a given edge. Without `link`, the box opens a pseudo-terminal.
+    `on_edge_counted`, if set, gets each edge's number since power-on (from 0), after the edge, for faults at a
+    given edge. Without `link`, the box opens a pseudo-terminal.
     """
 
     def __init__(
-        self,
-        reactor: Reactor,
-        settings: Settings,
-        *,
-        on_edge: Callable[[int], None],
-        on_light: Callable[[int, int, int], None],
-        on_dark: Callable[[int], None],
-        on_panel: Callable[[int, bool, int], None],
-        ready: Callable[[], bool] = lambda: True,
-        link: Link | None = None,
+        self, reactor: Reactor, settings: Settings, cables: BoxCables = NOT_CONNECTED, *, link: Link | None = None
     ) -> None:
-        self._reactor, self._settings = reactor, settings
-        self._on_edge, self._on_light, self._on_dark, self._on_panel = on_edge, on_light, on_dark, on_panel
-        self._ready_line = ready
+        self._reactor, self._settings, self._cables = reactor, settings, cables
         self.on_edge_counted: Callable[[int], None] | None = None
         self._quartz = Quartz(settings.clock_offset_ns, settings.clock_ppm, settings.edge_jitter_us, settings.seed)
         self._boards = Boards(
             -(-settings.led_count // settings.leds_per_board),
-            leds_per_board=settings.leds_per_board,
-            ambient_c=settings.ambient_c,
-            warm_k=settings.warm_k,
-            limit_c=settings.board_limit_c,
-            led_power_w=settings.led_power_w,
-            heat_k_per_j=settings.heat_k_per_j,
-            time_constant_s=settings.thermal_time_constant_s,
+            BoardHeat(
+                leds_per_board=settings.leds_per_board,
+                ambient_c=settings.ambient_c,
+                warm_k=settings.warm_k,
+                limit_c=settings.board_limit_c,
+                led_power_w=settings.led_power_w,
+                heat_k_per_j=settings.heat_k_per_j,
+                time_constant_s=settings.thermal_time_constant_s,
+            ),
         )
         self._edge_count = 0
         self._dropped_edges: set[int] = set()
@@ -262,9 +270,9 @@ class LedBoxFirmware:
             raise ScpiError(102, f"board {board} is at {celsius:.1f} C")
         wiring = Wiring(
             send_edge=self._send_edge,
-            on_light=self._on_light,
-            on_dark=self._on_dark,
-            ready=self._ready_line if self._ready_source == "INP" else None,
+            on_light=self._cables.on_light,
+            on_dark=self._cables.on_dark,
+            ready=self._cables.ready if self._ready_source == "INP" else None,
             on_end=self._burst_ended,
         )
         self._running_bank = self._bank
@@ -276,7 +284,6 @@ class LedBoxFirmware:
             wiring,
             dead_leds=self.dead_leds,
             led_current_ma=self._settings.led_current_ma,
-            jitter_ns=self._quartz.edge_lateness_ns,
         )
         self._watch()
 
@@ -349,19 +356,19 @@ class LedBoxFirmware:
         n, now_ns = self._edge_count, self._reactor.now_ns
         self._edge_count += 1
         if n not in self._dropped_edges:
-            self._on_edge(now_ns)
+            self._cables.on_edge(now_ns)
         if n in self._doubled_edges:
             self._reactor.after(self._doubled_edges[n] * 1e-6, self._send_surplus_edge)
         if self.on_edge_counted is not None:
             self.on_edge_counted(n)
 
     def _send_surplus_edge(self) -> None:
-        self._on_edge(self._reactor.now_ns)
+        self._cables.on_edge(self._reactor.now_ns)
 
     def _switch_panel(self, panel: int, *, on: bool) -> None:
         if self._panels[panel] != on:
             self._panels[panel] = on
-            self._on_panel(panel, on, self._reactor.now_ns)
+            self._cables.on_panel(panel, on, self._reactor.now_ns)
 
     def _watch(self) -> None:
         """Check the watchdog. Its one timer is set to the earliest time at which it may trip."""

@@ -84,15 +84,8 @@ def build(
     number of each edge to faults that wait for an edge."""
     match settings:
         case ledbox_firmware.Settings():
-            box = ledbox_firmware.LedBoxFirmware(
-                reactor,
-                settings,
-                on_edge=camera.edge,
-                on_light=on_light,
-                on_dark=lighting.dark,
-                on_panel=lighting.panel,
-                ready=camera.ready,
-            )
+            cables = ledbox_firmware.BoxCables(camera.edge, on_light, lighting.dark, lighting.panel, camera.ready)
+            box = ledbox_firmware.LedBoxFirmware(reactor, settings, cables)
             box.on_edge_counted = on_edge_counted
             return box
         case text_box.Settings():

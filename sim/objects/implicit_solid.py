@@ -14,6 +14,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
+
 Array = NDArray[np.float64]
 Point = tuple[float, float, float]
 
@@ -73,7 +75,7 @@ def height_above_plane(solid: Sequence[Form], x: Array, y: Array, turn: Array, t
     return heights.reshape(x.shape)
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _trace(table, places, plane_to_solid, top, bottom, heights):  # type: ignore[no-untyped-def]
     for i in numba.prange(len(places)):
         along, foot = np.empty(3), np.empty(3)
@@ -95,7 +97,7 @@ def _trace(table, places, plane_to_solid, top, bottom, heights):  # type: ignore
         heights[i] = z
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _forms_near_ray(table, foot, along, near_rows):  # type: ignore[no-untyped-def]
     """Write the rows of those forms that can shape the solid on the ray; return their number."""
     count = 0
@@ -116,7 +118,7 @@ def _forms_near_ray(table, foot, along, near_rows):  # type: ignore[no-untyped-d
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _distance(table, rows, x, y, z):  # type: ignore[no-untyped-def]
     """Bound of the signed distance to the solid of these rows of the table; negative inside."""
     total = 1e9
@@ -130,7 +132,7 @@ def _distance(table, rows, x, y, z):  # type: ignore[no-untyped-def]
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _smooth_minimum(a, b, blend):  # type: ignore[no-untyped-def]
     if blend <= 0.0:
         return min(a, b)
@@ -138,7 +140,7 @@ def _smooth_minimum(a, b, blend):  # type: ignore[no-untyped-def]
     return min(a, b) - 0.25 * overlap * overlap * blend
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _distance_to_form(form, x, y, z):  # type: ignore[no-untyped-def]
     sx, sy, sz = form[10], form[11], form[12]
     px, py, pz = (x - form[0]) / sx, (y - form[1]) / sy, (z - form[2]) / sz

@@ -10,6 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from sim.optics.objective import CHANNEL_UM, Objective, defocus_px, diffraction_px
 
 Image = NDArray[np.float32]
@@ -96,7 +97,7 @@ def _magnify(image: Image, scale: float) -> Image:
     return magnified_image
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _blur_tiles(image, sigma, more, variances, curves, lengths, cell_mask, out):  # type: ignore[no-untyped-def]
     height, width = image.shape
     across = -(-width // _COLUMNS)
@@ -128,7 +129,7 @@ def _blur_tiles(image, sigma, more, variances, curves, lengths, cell_mask, out):
                             _mix(pixels, sums, spread_variance, more, before, variances[layer])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _layers_between(sigma, more, variances):  # type: ignore[no-untyped-def]
     """Return first and last of the layers that the variances `sigma`^2 + `more` need."""
     low, high = np.float32(np.inf), np.float32(0.0)
@@ -143,7 +144,7 @@ def _layers_between(sigma, more, variances):  # type: ignore[no-untyped-def]
     return first, last
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _mix(pixels, layer, sigma, more, before, variance):  # type: ignore[no-untyped-def]
     """Bring pixels towards a layer of `variance`, as far as their own variance needs. So far they have at most the
     variance `before` (below 0: none)."""
@@ -157,7 +158,7 @@ def _mix(pixels, layer, sigma, more, before, variance):  # type: ignore[no-untyp
             pixels[k] += share * (layer[k] - pixels[k])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _copy(image, top, left_px, source):  # type: ignore[no-untyped-def]
     """Fill `source` from the image, which is continued by reflection; return its greatest value."""
     height, width = image.shape
@@ -171,7 +172,7 @@ def _copy(image, top, left_px, source):  # type: ignore[no-untyped-def]
     return brightest
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _mirrored_index(place, count):  # type: ignore[no-untyped-def]
     """Return the index in an axis of `count` that is continued by reflection, with doubled edges."""
     if 0 <= place < count:
@@ -180,7 +181,7 @@ def _mirrored_index(place, count):  # type: ignore[no-untyped-def]
     return place if place < count else 2 * count - 1 - place
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _down(source, row, curve, length, sums, halves):  # type: ignore[no-untyped-def]
     """Compute weighted sums of the rows around one row. `halves` get the even and the odd columns, so that
     `_along` reads its values in sequence."""
@@ -197,7 +198,7 @@ def _down(source, row, curve, length, sums, halves):  # type: ignore[no-untyped-
         halves[0, len(sums) >> 1] = sums[-1]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _along(halves, first, curve, length, out):  # type: ignore[no-untyped-def]
     """Weighted sums around every second column from `first` on."""
     middle = halves[first & 1, first >> 1 :]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform, inverse
+from coupole.kernels import kernel
 from sim.optics.objective import Objective, defocus_px
 from sim.render.emitter import Emitter
 from sim.render.lens import Sight, distorted_points
@@ -102,7 +103,7 @@ def _box(seen_mm: NDArray[np.float64], through: Sight, margin_px: float) -> tupl
     return slice(int(top), int(bottom)), slice(int(left_px), int(right))
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _cover(coverage, edges, top, left_px, focal, centre_x, centre_y, shift):  # type: ignore[no-untyped-def]
     """Compute the fraction of each pixel whose rays are on the inner side of all planes through camera centre and
     edge.
@@ -135,7 +136,7 @@ def _cover(coverage, edges, top, left_px, focal, centre_x, centre_y, shift):  # 
                 coverage[row, col] = _area_within(lines, square, clip_buffer)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _bend(at, shift, row, col):  # type: ignore[no-untyped-def]
     """Add the lens's shift and its derivatives to a pixel's ray."""
     above, below = max(row - 1, 0), min(row + 1, shift.shape[1] - 1)
@@ -146,7 +147,7 @@ def _bend(at, shift, row, col):  # type: ignore[no-untyped-def]
         at[2, k] += (shift[k, below, col] - shift[k, above, col]) / (below - above)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _area_within(lines, square, cut_corners):  # type: ignore[no-untyped-def]
     """Area of the part of the unit square about 0 where a + b x + c y > 0 for all `lines` [4, 3] (a, b, c).
 

@@ -23,7 +23,7 @@ from sim.optics.dome import as_built
 from sim.optics.glow import Glow, glow
 from sim.optics.led_light import channel_factors
 from sim.optics.objective import Objective, vignetting
-from sim.optics.sensor import electrons, expose, expose_electrons
+from sim.optics.sensor import electrons, expose_electrons, mosaic_electrons
 from sim.render import arm_shadow
 from sim.render.camera_view import View, Viewer, slopes
 from sim.render.embree import Obstacles
@@ -198,17 +198,13 @@ class Photographer:
             mean_e = disturbance.cover_up(mean_e)
             if self._glare is not None:
                 mean_e = self._glare.over(mean_e, self.sensor.channels())
-            expose_electrons(out, mean_e, **sensor_arguments)
         else:
-            expose(
-                out,
-                look.view.site,
-                radiance,
-                self._falloff,
-                electrons_per_radiance=scale,
-                more_e=glows,
-                **sensor_arguments,
+            mean_e = mosaic_electrons(
+                look.view.site, radiance, self._falloff, model=self.sensor, electrons_per_radiance=scale
             )
+            if glows is not None:
+                mean_e += glows
+        expose_electrons(out, mean_e, **sensor_arguments)
         self._strangers.sensor.add_tails(out, exposure.number, self.sensor.white_dn)
 
     def _blurred_electrons(self, look: Look, sharp: NDArray[np.float32]) -> NDArray[np.float32]:

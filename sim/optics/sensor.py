@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.kernels import kernel
 from sim.optics import noise
 from sim.optics.sensor_model import SensorModel
 
@@ -57,43 +58,33 @@ def fixed_pattern(model: SensorModel, height_px: int, width_px: int) -> FixedPat
     return FixedPattern(response, offset_e, dark, hot)
 
 
-def expose(
-    out: NDArray[np.uint16],
+def mosaic_electrons(
     site: NDArray[np.int32],
     radiance: NDArray[np.float32],
     falloff: NDArray[np.float32],
     *,
     model: SensorModel,
     electrons_per_radiance: float,
-    frame: int,
-    exposure_s: float = 0.0,
-    gain: float = 1.0,
-    temperature_c: float = 25.0,
-    more_e: NDArray[np.float32] | None = None,
-) -> None:
-    """Fill `out` [h, w] with one frame, DN.
+) -> NDArray[np.float32]:
+    """[h, w] mean electrons at every pixel, in its own channel.
 
     `site` [h k, w k] holds, for k x k samples of each pixel, a row of `radiance` [sites, 3], or -1 for nothing;
     the pixel takes their mean. Radiance times `falloff` [h, w] times `electrons_per_radiance` is the mean number
-    of electrons of a pixel with response 1. `exposure_s` and `temperature_c` set dark current and ambient light;
-    `gain` divides the electrons per DN. `more_e` [h, w] are mean electrons of other light, such as that of lamps
-    in the picture.
+    of electrons of a pixel with response 1.
 
     Raises:
         InputError: The shapes do not fit together.
     """
-    height, width = out.shape
+    height, width = falloff.shape
     k = site.shape[0] // height
-    if k < 1 or site.shape != (height * k, width * k) or falloff.shape != out.shape:
+    if k < 1 or site.shape != (height * k, width * k):
         raise InputError(
-            f"sensor: expected sites of k times {out.shape} parts and a falloff of {out.shape}; "
-            f"found {site.shape} and {falloff.shape}; render for the camera's size"
+            f"sensor: expected sites of k times {falloff.shape} parts, as the falloff has; found {site.shape}; "
+            "render for the camera's size"
         )
-    mean_e = np.empty(out.shape, np.float32)
+    mean_e = np.empty(falloff.shape, np.float32)
     _collect(mean_e, site, radiance, falloff, model.channels(), electrons_per_radiance)
-    if more_e is not None:
-        mean_e += more_e
-    _develop(out, mean_e, *_settings(model, out.shape, frame, exposure_s, gain, temperature_c))
+    return mean_e
 
 
 def electrons(
@@ -104,7 +95,7 @@ def electrons(
     electrons_per_radiance: float,
 ) -> NDArray[np.float32]:
     """[h, w, 3] mean electrons in all three channels at every pixel, for stages before the Bayer filter, such as
-    the lens's blur. Arguments as in `expose`."""
+    the lens's blur. Arguments as in `mosaic_electrons`."""
     mean_e = np.empty((*falloff.shape, 3), np.float32)
     _collect_all(mean_e, site, radiance, falloff, electrons_per_radiance)
     return mean_e
@@ -121,6 +112,8 @@ def expose_electrons(
     temperature_c: float = 25.0,
 ) -> None:
     """Fill `out` [h, w] with one frame, DN, from the mean electrons [h, w] of light in pixels of response 1.
+
+    `exposure_s` and `temperature_c` set dark current and ambient light; `gain` divides the electrons per DN.
 
     Raises:
         InputError: The shapes differ.
@@ -157,7 +150,7 @@ def _settings(
     )
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _fill_pattern(response, offset_e, dark, hot, figures, response_key, dark_key, table):  # type: ignore[no-untyped-def]
     height, width = response.shape
     prnu, dsnu_e, dark_median, dark_spread, hot_share, hot_factor = figures
@@ -172,7 +165,7 @@ def _fill_pattern(response, offset_e, dark, hot, figures, response_key, dark_key
             dark[row, col] = rate * hot_factor if hot[row, col] else rate
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _collect(mean_e, site, radiance, falloff, channels, electrons):  # type: ignore[no-untyped-def]
     height, width = mean_e.shape
     k = len(site) // height
@@ -192,7 +185,7 @@ def _collect(mean_e, site, radiance, falloff, channels, electrons):  # type: ign
             mean_e[row, col] = total * falloff[row, col] * share
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _collect_all(mean_e, site, radiance, falloff, electrons):  # type: ignore[no-untyped-def]
     height, width, _ = mean_e.shape
     k = len(site) // height
@@ -213,7 +206,7 @@ def _collect_all(mean_e, site, radiance, falloff, electrons):  # type: ignore[no
                     mean_e[row, col, 2] = blue * scale
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _develop(  # type: ignore[no-untyped-def]
     out,
     light_e,

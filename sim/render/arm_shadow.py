@@ -10,6 +10,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
+
 _CHUNK = 256
 """Number of sites for which the bodies that may hide the light are found together."""
 
@@ -35,7 +37,7 @@ def warm_up() -> None:
     cast(np.ones((1, 3), np.float32), np.zeros((1, 3), np.float32), capsules, np.array([0.0, 0.0, 100.0]))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def distance_mm(a, b, c, d):  # type: ignore[no-untyped-def]
     """Distance of the segments a b and c d (Ericson, Real-Time Collision Detection, 5.1.9).
 
@@ -63,7 +65,7 @@ def distance_mm(a, b, c, d):  # type: ignore[no-untyped-def]
     return np.sqrt(gap @ gap)
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _cast(radiance, points, capsules, light):  # type: ignore[no-untyped-def]
     for part in numba.prange(-(-len(points) // _CHUNK)):
         first, last = part * _CHUNK, min(len(points), (part + 1) * _CHUNK)
@@ -79,7 +81,7 @@ def _cast(radiance, points, capsules, light):  # type: ignore[no-untyped-def]
                     break
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _near(points, capsules, light):  # type: ignore[no-untyped-def]
     """Return the numbers of the capsules that may hide the light from any of a few points, found by a ball around
     these points."""

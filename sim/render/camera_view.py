@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform
+from coupole.kernels import kernel
 from sim.render.embree import centroid_and_normal
 from sim.render.fine_surface import Fine, fine_surface
 from sim.render.lens import Lens, Sight, sight
@@ -108,7 +109,7 @@ def slopes(through: Sight) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return pair[0], pair[1]
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _gather(corners, triangles, eye, sides, centroids, normals):  # type: ignore[no-untyped-def]
     chunk = 4096
     for part in numba.prange(-(-len(triangles) // chunk)):

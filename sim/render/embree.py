@@ -18,6 +18,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from coupole.errors import CoupoleError
+from coupole.kernels import kernel
 
 _TRIANGLES, _INDEX, _VERTEX, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
 _COMPACT, _ROBUST = 1 << 1, 1 << 2
@@ -156,7 +157,19 @@ def _packet_call(_context, _address, _valid, _scene, _rays, _arguments):  # type
 _call_embree: Any = intrinsic(_packet_call)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
+def _trace_packet(function, valid, scene, rays, arguments):  # type: ignore[no-untyped-def]
+    """Trace the valid rays of a packet by the function at an address."""
+    _call_embree(
+        function,
+        np.uint64(valid.ctypes.data),
+        scene,
+        np.uint64(rays.ctypes.data),
+        np.uint64(arguments.ctypes.data),
+    )
+
+
+@kernel
 def centroid_and_normal(corners, t, centroid, normal):  # type: ignore[no-untyped-def]
     """Fill a triangle's centroid [3] and flat unit normal [3]; the normal is zero if the triangle has no area."""
     for k in range(3):
@@ -172,7 +185,7 @@ def centroid_and_normal(corners, t, centroid, normal):  # type: ignore[no-untype
         normal[k] = normal[k] / length if length > 0.0 else 0.0
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _trace(occlusion_test, scene, corners, sides, light, first, bits, arguments):  # type: ignore[no-untyped-def]
     chunks = -(-len(sides) // _CHUNK)
     start = first // _CHUNK
@@ -197,20 +210,14 @@ def _trace(occlusion_test, scene, corners, sides, light, first, bits, arguments)
                 lane += 1
             if lane == _PACKET or (place == last - 1 and lane > 0):
                 valid[lane:] = 0
-                _call_embree(
-                    occlusion_test,
-                    np.uint64(valid.ctypes.data),
-                    scene,
-                    np.uint64(rays.ctypes.data),
-                    np.uint64(arguments.ctypes.data),
-                )
+                _trace_packet(occlusion_test, valid, scene, rays, arguments)
                 for k in range(lane):
                     if rays[8, k] >= 0.0:  # Embree sets tfar of a ray that hit something to minus infinity
                         bits[place_of_lane[k] >> 3] |= np.uint8(1 << (place_of_lane[k] & 7))
                 lane = 0
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _cast(occlusion_test, scene, points, triangle, normals, light, radiance, arguments):  # type: ignore[no-untyped-def]
     for chunk in numba.prange(-(-len(points) // _CHUNK)):
         rays, words, valid = _packet()
@@ -228,20 +235,14 @@ def _cast(occlusion_test, scene, points, triangle, normals, light, radiance, arg
                 lane += 1
             if lane == _PACKET or (i == last - 1 and lane > 0):
                 valid[lane:] = 0
-                _call_embree(
-                    occlusion_test,
-                    np.uint64(valid.ctypes.data),
-                    scene,
-                    np.uint64(rays.ctypes.data),
-                    np.uint64(arguments.ctypes.data),
-                )
+                _trace_packet(occlusion_test, valid, scene, rays, arguments)
                 for k in range(lane):
                     if rays[8, k] < 0.0:
                         radiance[site_of_lane[k], :] = 0.0
                 lane = 0
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _meet(intersect, scene, corners, origins, ways, hit_triangles, arguments):  # type: ignore[no-untyped-def]
     for chunk in numba.prange(-(-len(hit_triangles) // _CHUNK)):
         rays, words, valid = _packet()
@@ -256,13 +257,7 @@ def _meet(intersect, scene, corners, origins, ways, hit_triangles, arguments):  
             rays[3, :], rays[8, :] = 0.0, np.inf
             words[9, :], words[11, :] = np.uint32(0xFFFFFFFF), np.uint32(0)
             words[18, :] = np.uint32(0xFFFFFFFF)  # no geometry met
-            _call_embree(
-                intersect,
-                np.uint64(valid.ctypes.data),
-                scene,
-                np.uint64(rays.ctypes.data),
-                np.uint64(arguments.ctypes.data),
-            )
+            _trace_packet(intersect, valid, scene, rays, arguments)
             for lane in range(count):
                 hit_triangles[first + lane] = -1
                 if words[18, lane] != np.uint32(0xFFFFFFFF):
@@ -273,7 +268,7 @@ def _meet(intersect, scene, corners, origins, ways, hit_triangles, arguments):  
                     hit_triangles[first + lane] = 2 * triangle + (facing > 0.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _packet():  # type: ignore[no-untyped-def]
     """Return the memory of one RTCRayHit16, aligned to 64 bytes. It has 12 rows of 16 for the rays (org xyz,
     tnear, dir xyz, time, tfar, mask, id, flags) and the rows of the hits, as float32 and as uint32. Also return

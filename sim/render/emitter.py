@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from coupole.kernels import kernel
 
 LED_SIDE_MM = 7.0
 FAR_SIDES = 36.0
@@ -85,7 +86,7 @@ def packed_emitter(emitter: Emitter) -> NDArray[np.float64]:
     return np.array([*emitter.centre_mm, *emitter.normal, *emitter.half_u_mm, *emitter.half_v_mm, emitter.flux_lm])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _irradiance(points, normals, led, out):  # type: ignore[no-untyped-def]
     shares = np.empty(4)
     work = np.empty((2, 8, 3))
@@ -94,7 +95,7 @@ def _irradiance(points, normals, led, out):  # type: ignore[no-untyped-def]
         out[i] = led[12] * per_lumen(p[0], p[1], p[2], n[0], n[1], n[2], led, shares, work)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _irradiance_of_each(p, n, leds, out):  # type: ignore[no-untyped-def]
     shares = np.empty(4)
     work = np.empty((2, 8, 3))
@@ -102,7 +103,7 @@ def _irradiance_of_each(p, n, leds, out):  # type: ignore[no-untyped-def]
         out[i] = leds[i, 12] * per_lumen(p[0], p[1], p[2], n[0], n[1], n[2], leds[i], shares, work)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def per_lumen(px, py, pz, nx, ny, nz, led, shares, work):  # type: ignore[no-untyped-def]
     """E / Phi in 1/m^2 at p with unit normal n; fills `shares` [4] with the four Gauss points' contributions.
 
@@ -134,7 +135,7 @@ def per_lumen(px, py, pz, nx, ny, nz, led, shares, work):  # type: ignore[no-unt
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _polygon(tx, ty, tz, nx, ny, nz, led, work):  # type: ignore[no-untyped-def]
     """Lambert's sum over the edges of the square, clipped at the horizon; (tx, ty, tz) points to its centre."""
     whole, above = work[0], work[1]

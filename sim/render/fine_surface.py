@@ -12,6 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from sim.scene.scene import Waves
 
 _CHUNK = 4096
@@ -46,7 +47,7 @@ def fine_surface(
     return fine
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _look_closer(  # type: ignore[no-untyped-def]
     waves, first, points, triangle, normals, material, sides, texture, turned_normals
 ):

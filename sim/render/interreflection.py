@@ -18,6 +18,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from sim.render import arm_shadow
 from sim.render.embree import OFFSET_MM, Obstacles, centroid_and_normal
 from sim.render.emitter import Emitter, irradiance
@@ -211,7 +212,7 @@ def _sides_met(
     return side_of_ray
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _areas(corners, area):  # type: ignore[no-untyped-def]
     for t in numba.prange(len(area)):
         square = 0.0
@@ -225,7 +226,7 @@ def _areas(corners, area):  # type: ignore[no-untyped-def]
         area[t] = 0.5 * np.sqrt(square)
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _find_keys(corners, material, cells, key):  # type: ignore[no-untyped-def]
     """Material, cell, and the axis to which the normal is nearest, with its sign."""
     for chunk in numba.prange(-(-len(key) // _CHUNK)):
@@ -241,7 +242,7 @@ def _find_keys(corners, material, cells, key):  # type: ignore[no-untyped-def]
             key[t] = number * 6 + 2 * axis + (normal[axis] < 0.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _place(corners, chosen_triangles, points, normals):  # type: ignore[no-untyped-def]
     centroid, normal = np.empty(3), np.empty(3)
     for patch in range(len(chosen_triangles)):
@@ -252,7 +253,7 @@ def _place(corners, chosen_triangles, points, normals):  # type: ignore[no-untyp
                 normals[patch, 0, number, k], normals[patch, 1, number, k] = normal[k], -normal[k]
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _aim(points, normals, first, rays, origins, ways):  # type: ignore[no-untyped-def]
     """Make rays from points, which are numbered from `first` on, in a cosine distribution. They are spread evenly
     over a disk, and projected up onto the hemisphere. The points of a side share a Fibonacci spiral, which is
@@ -278,7 +279,7 @@ def _aim(points, normals, first, rays, origins, ways):  # type: ignore[no-untype
                 origins[at, k] = points[p, k] + OFFSET_MM * normals[p, k]
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _gather_light(seen_sides, sent_light, received_light):  # type: ignore[no-untyped-def]
     for side in numba.prange(len(seen_sides)):
         red, green, blue = 0.0, 0.0, 0.0
@@ -298,7 +299,7 @@ def _gather_light(seen_sides, sent_light, received_light):  # type: ignore[no-un
         )
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _weigh(corners, sides, normals, patch, neighbours, centres, facing, cells, side_numbers, weights):  # type: ignore[no-untyped-def]
     """Compute the weights: a smooth bump two patches wide, times the agreement of the normals."""
     for chunk in numba.prange(-(-len(sides) // _CHUNK)):
@@ -326,7 +327,7 @@ def _weigh(corners, sides, normals, patch, neighbours, centres, facing, cells, s
                 weights[i, n] /= total
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _interpolate(sides, weights, lux, out):  # type: ignore[no-untyped-def]
     for i in numba.prange(len(out)):
         red, green, blue = 0.0, 0.0, 0.0
@@ -340,7 +341,7 @@ def _interpolate(sides, weights, lux, out):  # type: ignore[no-untyped-def]
         out[i, 0], out[i, 1], out[i, 2] = red, green, blue
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _add(radiance, lux, albedo, triangle):  # type: ignore[no-untyped-def]
     for i in numba.prange(len(radiance)):
         for k in range(3):

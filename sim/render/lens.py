@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.kernels import kernel
 
 Distortion = tuple[float, ...]
 """k1, k2, p1, p2, k3, or these and k4, k5, k6, s1, s2, s3, s4."""
@@ -166,7 +167,7 @@ def distorted_points(xy: NDArray[np.float64], distortion: Distortion | NDArray[n
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def bend(x, y, terms):  # type: ignore[no-untyped-def]
     """Displacement of a normalised position (x, y) by distortion; `terms` as of `Lens.terms`."""
     more = len(terms) > 5
@@ -185,7 +186,7 @@ def bend(x, y, terms):  # type: ignore[no-untyped-def]
     )
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _undistort(focal, centre_x, centre_y, terms, rooks, shift):  # type: ignore[no-untyped-def]
     """Fill `shift` by fixed-point iteration, to 1e-7 pixel; False if it does not converge."""
     height, width = shift.shape[1], shift.shape[2] - LANES

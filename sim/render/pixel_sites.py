@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform
+from coupole.kernels import kernel
 from sim.render.lens import Sight, rook_shifts_px
 
 _LEAST_SLOPE = 1e-6
@@ -56,7 +57,7 @@ def pixel_sites(
     return points, of_triangle
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _is_first(triangle, k, row, col):  # type: ignore[no-untyped-def]
     """True if no earlier ray of the same pixel met the triangle."""
     top, first_column = row - row % k, col - col % k
@@ -67,7 +68,7 @@ def _is_first(triangle, k, row, col):  # type: ignore[no-untyped-def]
     return True
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _count(triangle, k, counts):  # type: ignore[no-untyped-def]
     """Count the sites of each row of blocks; the number is written to the place after the row's own."""
     height, width = triangle.shape
@@ -80,7 +81,7 @@ def _count(triangle, k, counts):  # type: ignore[no-untyped-def]
         counts[line + 1] = count
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _fill(  # type: ignore[no-untyped-def]
     triangle, k, first, centroids, normals, pose, centre, rooks, shift, points, of_triangle
 ):
@@ -103,7 +104,7 @@ def _fill(  # type: ignore[no-untyped-def]
                             site += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _look_through(triangle, k, top, left_px, pose, centre, rooks, shift, rays, hit_triangles):  # type: ignore[no-untyped-def]
     """Fill `rays` [k k, 3] with a pixel's rays in the base frame, of length 1 along the axis, and `hit_triangles`
     [k k] with the triangles that they meet."""
@@ -119,7 +120,7 @@ def _look_through(triangle, k, top, left_px, pose, centre, rooks, shift, rays, h
             rays[part, i] = pose[i, 0] * x + pose[i, 1] * y + pose[i, 2]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _mean_point(rays, hit_triangles, site_triangle, centroids, normals, pose, point):  # type: ignore[no-untyped-def]
     """Fill `point` [3] with the mean of the points where rays meet the plane of the triangle `site_triangle`."""
     height, depth, x, y, z, count = 0.0, 0.0, 0.0, 0.0, 0.0, 0

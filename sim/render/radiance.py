@@ -14,6 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from sim.render.camera_view import View
 from sim.render.emitter import Emitter, packed_emitter, per_lumen
 from sim.scene.brdf_table import look_up
@@ -72,7 +73,7 @@ def panel_radiance(view: View, materials: NDArray[np.float64], panel_lux: float)
     return np.asarray(np.float32(panel_lux / np.pi) * albedo(view, materials))
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _shade(  # type: ignore[no-untyped-def]
     points,
     triangle,
@@ -128,7 +129,7 @@ def _shade(  # type: ignore[no-untyped-def]
                 _add_gloss(px, py, pz, tx, ty, tz, nx, ny, nz, eye, surface, led, shares, lux, out[i])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _shade_by_table(px, py, pz, tx, ty, tz, nx, ny, nz, eye, table, lux, out):  # type: ignore[no-untyped-def]
     """Write into `out` [3] the radiance from a material's table for `lux` from (tx, ty, tz)."""
     vx, vy, vz = eye[0] - px, eye[1] - py, eye[2] - pz
@@ -141,7 +142,7 @@ def _shade_by_table(px, py, pz, tx, ty, tz, nx, ny, nz, eye, table, lux, out):  
         out[k] *= lux
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _add_gloss(px, py, pz, tx, ty, tz, nx, ny, nz, eye, surface, led, shares, lux, out):  # type: ignore[no-untyped-def]
     """Add to `out` [3] the radiance of the specular part of `surface`, a row of the scene's materials, for
     `lux`."""
@@ -158,7 +159,7 @@ def _add_gloss(px, py, pz, tx, ty, tz, nx, ny, nz, eye, surface, led, shares, lu
         out[k] += lux * (surface[3 + k] * base_lobe + (1.0 - surface[3 + k]) * grazing)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _mean_lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha, led, shares):  # type: ignore[no-untyped-def]
     """`_lobe` towards the Gauss points of an emitter centred at (tx, ty, tz), weighted by `shares` [4]."""
     base_lobe, grazing = 0.0, 0.0
@@ -173,7 +174,7 @@ def _mean_lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha, led, shares):  # type:
     return base_lobe, grazing
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha):  # type: ignore[no-untyped-def]
     """D G / (4 n.l n.v) towards a light at (tx, ty, tz), and that times Schlick's (1 - h.v)^5."""
     distance = np.sqrt(tx * tx + ty * ty + tz * tz)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform, inverse
+from coupole.kernels import kernel
 from sim.render.lens import LANES, Sight, bend, rook_shifts_px
 
 NEAR_MM = 1.0
@@ -91,7 +92,7 @@ def visible_triangles(
     return pixels, triangles
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _to_camera(corners, t, m, v):  # type: ignore[no-untyped-def]
     """Fill `v` [3, 3] with a triangle's corners in camera coordinates."""
     for k in range(3):
@@ -100,7 +101,7 @@ def _to_camera(corners, t, m, v):  # type: ignore[no-untyped-def]
             v[k, i] = m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _box(v, lens, width, height):  # type: ignore[no-untyped-def]
     """Return first and last column and row of the distorted image that a triangle may reach. Its corners are in
     the camera frame."""
@@ -136,7 +137,7 @@ def _box(v, lens, width, height):  # type: ignore[no-untyped-def]
     return int(first_col), int(last_col), int(first_row), int(last_row)
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _find_bands(corners, camera_from_base, lens, width, height, boxes, counts):  # type: ignore[no-untyped-def]
     """Columns and rows that each triangle may reach (last before first for none), and the number of each chunk's
     triangles in each band."""
@@ -151,7 +152,7 @@ def _find_bands(corners, camera_from_base, lens, width, height, boxes, counts): 
                     counts[chunk, band] += 1
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _list_bands(boxes, starts, members):  # type: ignore[no-untyped-def]
     """Fill `members` with the triangles of each band, in their order."""
     for chunk in numba.prange(len(starts)):
@@ -163,7 +164,7 @@ def _list_bands(boxes, starts, members):  # type: ignore[no-untyped-def]
                     place[band] += 1
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _fill_bands(  # type: ignore[no-untyped-def]
     corners, boxes, camera_from_base, lens, shift, rooks, members, bounds, order, pixels, firsts, firsts_in_band
 ):
@@ -202,7 +203,7 @@ def _fill_bands(  # type: ignore[no-untyped-def]
         firsts_in_band[band] = first_count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _merge(firsts, bounds, firsts_in_band, number_of_triangle):  # type: ignore[no-untyped-def]
     """Return all visible triangles, once each, in the order of bands. `firsts` gets their numbers in this list
     instead."""
@@ -219,7 +220,7 @@ def _merge(firsts, bounds, firsts_in_band, number_of_triangle):  # type: ignore[
     return triangles[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _renumber(pixels, numbers, bounds):  # type: ignore[no-untyped-def]
     """Replace numbers within bands by numbers within the image."""
     for row in numba.prange(len(pixels)):
@@ -229,14 +230,14 @@ def _renumber(pixels, numbers, bounds):  # type: ignore[no-untyped-def]
                 pixels[row, col] = numbers[start + pixels[row, col]]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _is_small(v, box):  # type: ignore[no-untyped-def]
     """True if the image of a triangle's edges is straight to 3e-4 pixel in any usual lens."""
     near = v[0, 2] < NEAR_MM or v[1, 2] < NEAR_MM or v[2, 2] < NEAR_MM
     return box[1] - box[0] < _SMALL and box[3] - box[2] < _SMALL and not near
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _move_corners(v, lens):  # type: ignore[no-untyped-def]
     """Move the corners, at the same depth, to where a lens without distortion would give the same image."""
     for k in range(3):
@@ -246,7 +247,7 @@ def _move_corners(v, lens):  # type: ignore[no-untyped-def]
         v[k, 1] += by_y * v[k, 2]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill_triangle(v, box, member, lens, shift, rooks, top, nearest):  # type: ignore[no-untyped-def]
     """Z-buffer one triangle of camera coordinates, which lies within `box`, into a band of rows from `top` on. The
     high bits of a pixel's value are its nearness, a positive float32 whose bits increase with it. The low bits are
@@ -300,7 +301,7 @@ def _fill_triangle(v, box, member, lens, shift, rooks, top, nearest):  # type: i
             nearest[line, col] = max(nearest[line, col], key if sees else np.int64(0))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _span(row, start, stop, edges, lens, shift):  # type: ignore[no-untyped-def]
     """Reduce a row's columns, `start` to before `stop`, to those between a triangle's edges."""
     a0, b0, c0, a1, b1, c1, a2, b2, c2 = edges
@@ -321,7 +322,7 @@ def _span(row, start, stop, edges, lens, shift):  # type: ignore[no-untyped-def]
     return int(np.ceil(first)), int(np.floor(last)) + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _between(a, rest, low, high):  # type: ignore[no-untyped-def]
     """Reduce the range [low, high] of x to where a x + rest >= 0."""
     if a > 0.0:
@@ -331,7 +332,7 @@ def _between(a, rest, low, high):  # type: ignore[no-untyped-def]
     return low, high if rest >= 0.0 else -1e30
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _cross(v, a, b):  # type: ignore[no-untyped-def]
     """Cross product of two corners; with the corners exchanged it is exactly the negative."""
     return (

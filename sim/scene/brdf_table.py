@@ -9,11 +9,11 @@ between the nodes are interpolated linearly.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.appearance.matter.brdf import Brdf
+from coupole.kernels import kernel
 
 NODES = (80, 48, 12)
 """Number of nodes of theta_h, theta_d and phi_d."""
@@ -61,7 +61,7 @@ def _lift_above_horizon(way: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([way[..., 0] * shrink, way[..., 1] * shrink, z], axis=-1)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def look_up(table, nx, ny, nz, lx, ly, lz, vx, vy, vz, out):  # type: ignore[no-untyped-def]
     """Write into `out` [3] the value of a table for unit normal, light and view; light and view must be above the
     horizon."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from coupole.acquisition.frame_matching import FaultModel, Match, match
 from coupole.devices import STEP_RECORD_DTYPE
-from coupole.plan.bursts import Burst
+from coupole.plan.bursts import Burst, DeviceTimes
 from coupole.plan.led_table import LedTable
 from coupole.plan.marks import END_MARK_EXTRA, START_MARK_EXTRA
 from coupole.plan.plan import Plan
@@ -49,7 +49,7 @@ def whole_burst(lights: int, exposure_us: int = 8_000, darks: int = 2) -> Burst:
             "darks_per_view": darks,
         }
     )
-    schedule = build_schedule(plan, leds, np.eye(4), rise_us=1000, readout_us=10_000.0, exposure_gap_us=100)
+    schedule = build_schedule(plan, leds, np.eye(4), DeviceTimes(1000, 10_000.0, 100))
     return schedule.bursts[0][0]
 
 

@@ -20,7 +20,8 @@ from matching_takes import Take
 from numpy.typing import NDArray
 
 from coupole.acquisition.arm_supervisor import ArmMovedError
-from coupole.acquisition.burst_runner import BurstRunner
+from coupole.acquisition.burst_runner import BurstRunner, CameraSettings
+from coupole.acquisition.host_burst import Overseer
 from coupole.acquisition.verdict import Verdict
 from coupole.devices import ArmState, CameraStatistics, Exposure, Frame, FrameFormat
 from coupole.plan.bursts import Burst
@@ -185,10 +186,8 @@ class Cell:
             arm,
             dose,
             outcome,
-            gain_db=0.0,
-            max_frames_per_s=100.0,
-            tell=lambda burst, step: None,
-            wait_while_paused=lambda: None,
+            CameraSettings(gain_db=0.0, max_frames_per_s=100.0),
+            Overseer(tell=lambda burst, step: None, wait_while_paused=lambda: None),
         )
 
     def fire(self, following: Burst | None = None) -> Verdict:

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coupole.acquisition.host_burst import HostBurst, too_bright
+from coupole.acquisition.host_burst import HostBurst, Overseer, too_bright
 from coupole.acquisition.verdict import Verdict
 from coupole.devices import NO_LED, UNKNOWN_NS, CameraStatistics, Frame, FrameFormat, StepRecord
 from coupole.errors import DoseBudgetReached
-from coupole.plan.bursts import Burst
+from coupole.plan.bursts import Burst, DeviceTimes
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import Plan
 from coupole.plan.schedule import build_schedule
@@ -44,8 +44,8 @@ def burst_of(*, runs_tables: bool = False, lights: dict[str, Any] | None = None)
             "trigger": "software",
         }
     )
-    times: dict[str, Any] = {"rise_us": 1000, "readout_us": 10_000.0, "exposure_gap_us": 100}
-    return build_schedule(plan, leds, np.eye(4), **times, runs_tables=runs_tables).bursts[0][0]
+    times = DeviceTimes(1000, 10_000.0, 100)
+    return build_schedule(plan, leds, np.eye(4), times, runs_tables=runs_tables).bursts[0][0]
 
 
 @dataclass
@@ -163,7 +163,7 @@ class Cell:
         cell = SimpleNamespace(ledbox=self, camera=self, clock=self, robot=robot, make_safe=lambda: None)
         note = lambda *given, **more: self.noted.append(given)  # noqa: E731
         runner = HostBurst(  # type: ignore[arg-type]
-            cell, self, arm, lambda *_: None, lambda: None, self, note
+            cell, self, arm, Overseer(lambda *_: None, lambda: None), self, note
         )
         return runner.fire(burst, FORMAT)
 

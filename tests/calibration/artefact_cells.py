@@ -26,12 +26,12 @@ from coupole.calibration.check.workflow import Checked, compare_lengths, compare
 from coupole.calibration.lens.board import Board, Sighting
 from coupole.calibration.lens.bundle import RobotNoise
 from coupole.calibration.lens.images import Found
-from coupole.calibration.lens.workflow import hand_eye_from
+from coupole.calibration.lens.workflow import CameraArm, hand_eye_from
 from coupole.calibration.light.drift_records import Powers
 from coupole.calibration.light.led_power import LedPower, calibrate_led_power, prior_of
 from coupole.calibration.light.led_power_records import covariance_of
 from coupole.calibration.light.spectralon import Tile
-from coupole.calibration.light.tile_views import Positions, Row, rows_of
+from coupole.calibration.light.tile_views import LAMBERTIAN, Positions, Row, rows_of
 from coupole.calibration.posed_camera import read_posed_camera
 from coupole.calibration.poses import kuka_poses
 from coupole.calibration.record import read_record, write_record
@@ -133,7 +133,7 @@ def calibrated(random: np.random.Generator, cell: CheckCell, folder: Path, views
     sources = Sources(images, kuka_poses(poses), About(is_simulated=True), (("drawn", "0" * 64),), used)
     found = Found(sightings, np.arange(len(sightings)), SIZE_PX, ())
     robot = RobotNoise(ROBOT_MM, ROBOT_DEG, 0.0, 1e-5)
-    shown = hand_eye_from(found, sources, board, "brown5", Request("hand-eye", NOW), robot=robot)[2]
+    shown = hand_eye_from(found, sources, board, "brown5", Request("hand-eye", NOW), arm=CameraArm(robot))[2]
     path = folder / "hand-eye.yaml"
     write_record(path, shown.record)
     return path
@@ -239,7 +239,7 @@ def _seen_tile(
     for channel in CHANNELS:
         views = views_of(positions, true_powers[channel], random, truth=tile[channel], **where)
         for v, view in enumerate(views):
-            rows[channel] += rows_of(v, view, positions, described[channel], "lambertian", remarks=[])[0]
+            rows[channel] += rows_of(v, view, positions, described[channel], LAMBERTIAN).rows
     return Place(name, described, rows)
 
 

@@ -11,6 +11,7 @@ import pytest
 from coupole.calibration.budget.budget import Budget, Geometry, Known, budget_of, sample_inputs, spread_over
 from coupole.calibration.budget.measurement import reflectance, reflectance_of
 from coupole.calibration.budget.propagation import linear
+from coupole.calibration.light.irradiance import irradiance_per_flux
 from coupole.errors import InputError
 
 
@@ -23,7 +24,8 @@ def test_a_surface_gives_back_the_reflectance_that_it_was_made_with() -> None:
     """A small Lambertian emitter at 1 m: E = Phi cos_i cos_e / (pi d^2)."""
     led, axis = 1000 * np.array([0.6, 0, 0.8]), -np.array([0.6, 0, 0.8])
     lit = 2e4 * 0.8 / np.pi
-    f = reflectance(0.25 * lit * 0.01 * 0.9, 0.01, 0.9, 2e4, np.zeros(3), np.array([0.0, 0, 1]), led, axis)
+    exact = irradiance_per_flux(np.zeros(3), np.array([0.0, 0, 1]), led, axis)
+    f = reflectance(0.25 * lit * 0.01 * 0.9, 0.01, 0.9, 2e4, exact)
     assert f == pytest.approx(0.25, rel=2e-5)
 
 

@@ -11,7 +11,7 @@ from synthesis import Array
 
 from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
 from coupole.calibration.leds.boards import board_poses, boards_of
-from coupole.calibration.leds.equations import Stated
+from coupole.calibration.leds.equations import Stated, problem_of
 from coupole.calibration.leds.matching import match_leds
 
 NONE = Noise(pixel_px=0.0, robot_mm=0.0, robot_deg=0.0, tolerance_mm=0.0, records=0.0)
@@ -39,15 +39,15 @@ def found(made: Dome, *, robot_mm: float = 0.03, robot_deg: float = 0.003) -> Fo
         made.seen, made.base_from_camera, made.prior.lens, made.table.ids, boards, tolerance_px=20.0
     )
     assert matching.faults == () or all(fault.kind == "few" for fault in matching.faults)
-    geometry = adjust_leds(
+    problem = problem_of(
         matching.sightings,
         matching.place_of[matching.sightings.led],
-        made.base_from_flange,
         boards,
-        board_poses(boards, matching.by_place_mm),
+        made.base_from_flange,
         made.prior,
         Stated(robot_mm=robot_mm, robot_deg=robot_deg),
     )
+    geometry = adjust_leds(problem, board_poses(boards, matching.by_place_mm))
     good = np.isfinite(matching.found_mm[:, 0])
     off = (geometry.centres_mm - made.true_mm)[good]
     whole = good.reshape(-1, 6).all(axis=1)
@@ -113,9 +113,8 @@ def test_a_board_that_was_not_seen_stays_at_its_table_with_an_uncertainty_that_s
     unseen = 3
     rows = np.flatnonzero(made.table.boards[made.seen.led] != unseen)
     part = made.seen.only(rows)
-    geometry = adjust_leds(
-        part, part.led, made.base_from_flange, boards, boards.base_from_board, made.prior, Stated()
-    )
+    problem = problem_of(part, part.led, boards, made.base_from_flange, made.prior, Stated())
+    geometry = adjust_leds(problem, boards.base_from_board)
     mine = boards.rows_of(unseen)
     assert np.allclose(geometry.centres_mm[mine], made.table.positions_mm[mine])
     assert np.sqrt(np.trace(geometry.centre_covariance[mine[0]])) > 10

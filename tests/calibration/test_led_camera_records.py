@@ -13,7 +13,7 @@ from photographed import BOARD, SIZE_PX, write_run
 
 from coupole.calibration.lens.bundle import RobotNoise
 from coupole.calibration.lens.images import find_board
-from coupole.calibration.lens.workflow import hand_eye_from
+from coupole.calibration.lens.workflow import CameraArm, hand_eye_from
 from coupole.calibration.posed_camera import read_posed_camera
 from coupole.calibration.record import write_record
 from coupole.calibration.request import Request
@@ -34,7 +34,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Sources]:
     folder = tmp_path_factory.mktemp("recorded")
     sources = sources_in(folder / "run")
     found = find_board(BOARD, sources)
-    shown = hand_eye_from(found, sources, BOARD, "brown4", Request("he", NOW), robot=RobotNoise())[2]
+    shown = hand_eye_from(found, sources, BOARD, "brown4", Request("he", NOW), arm=CameraArm(RobotNoise()))[2]
     write_record(folder / "he.yaml", shown.record)
     return folder / "he.yaml", sources
 

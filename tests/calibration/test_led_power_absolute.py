@@ -22,6 +22,7 @@ TILE = Tile(reflectance=0.99, minnaert=1.15, support_from_tile=Pose(translation_
 ON_AXIS_PER_M2 = 0.318304687
 """E/Phi of a Lambertian square of 7 mm at 1 m, on axis: the reference value."""
 CENTRE_MM, DOWN = np.array([[0.0, 0.0, 1000.0]]), np.array([[0.0, 0.0, -1.0]])
+IDS = np.array([5])
 
 
 def view_from(angle_deg: float, signal: float = 1.0) -> TileView:
@@ -34,7 +35,7 @@ def view_from(angle_deg: float, signal: float = 1.0) -> TileView:
 
 @pytest.mark.parametrize("angle_deg", [0.0, 30.0, 60.0])
 def test_a_tile_is_seen_by_minnaerts_law_with_the_cosine_of_viewing(angle_deg: float) -> None:
-    h, cos_in = transfer(view_from(angle_deg), CENTRE_MM, DOWN, TILE)
+    h, cos_in = transfer(view_from(angle_deg), Positions(IDS, CENTRE_MM, DOWN), TILE)
     brdf = 0.99 * 2.15 / (2 * math.pi) * math.cos(math.radians(angle_deg)) ** 0.15
     assert h[0, 0] == pytest.approx(brdf * ON_AXIS_PER_M2, rel=1e-6)
     assert cos_in[0, 0] == 1.0
@@ -44,7 +45,7 @@ def test_under_a_slanted_light_both_cosines_count() -> None:
     """An LED at 30 degrees that is turned to the tile: its own cosine is 1."""
     angle = math.radians(30)
     centre = 1000 * np.array([[math.sin(angle), 0.0, math.cos(angle)]])
-    h, _ = transfer(view_from(60.0), centre, -centre / 1000, TILE)
+    h, _ = transfer(view_from(60.0), Positions(IDS, centre, -centre / 1000), TILE)
     towards = 0.318304687 * math.cos(angle)
     brdf = 0.99 * 2.15 / (2 * math.pi) * (math.cos(angle) * 0.5) ** 0.15
     assert h[0, 0] == pytest.approx(brdf * towards, rel=1e-5)

@@ -52,16 +52,9 @@ def matched(made: Dome) -> Matching:
 
 def geometry_of(made: Dome, modes: tuple[Mode, ...] = MODES) -> LedGeometry:
     boards, matching = boards_of(made.table), matched(made)
-    return adjust_leds(
-        matching.sightings,
-        matching.sightings.led,
-        made.base_from_flange,
-        boards,
-        board_poses(boards, matching.by_place_mm),
-        made.prior,
-        Stated(),
-        modes,
-    )
+    seen = matching.sightings
+    problem = problem_of(seen, seen.led, boards, made.base_from_flange, made.prior, Stated(), modes)
+    return adjust_leds(problem, board_poses(boards, matching.by_place_mm))
 
 
 def held(geometry: LedGeometry, made: Dome) -> float:

@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from sticker_scenes import Scene, scene, write_scan
 
+from coupole.calibration.calibrated_arm import CarriedCamera
 from coupole.calibration.record import read_record
 from coupole.calibration.report import Outcome, write_outcome
 from coupole.calibration.request import Request
@@ -34,10 +35,9 @@ def found(made: Scene, folder: Path) -> MeshFound:
         images,
         made.sources,
         scan,
-        made.prior,
+        CarriedCamera(made.prior),
         REQUEST,
         stated_noise=Stated(robot_mm=0.03, robot_deg=0.003),
-        depth_mm=DEPTH_MM,
         base_from_support=BASE_FROM_SUPPORT,
     )
 

@@ -23,15 +23,11 @@ def ledbox_world(
     """A running world; `link` makes what carries the box's bytes, a pseudo-terminal by default."""
 
     def make(world: LedBoxAlone) -> tuple[Any, Any]:
+        cables = ledbox_firmware.BoxCables(
+            world.edge, world.light, world.dark, world.switch_panel, lambda: world.ready
+        )
         box = ledbox_firmware.LedBoxFirmware(
-            world.reactor,
-            ledbox_firmware.Settings(**settings),
-            on_edge=world.edge,
-            on_light=world.light,
-            on_dark=world.dark,
-            on_panel=world.switch_panel,
-            ready=lambda: world.ready,
-            link=link(world.reactor),
+            world.reactor, ledbox_firmware.Settings(**settings), cables, link=link(world.reactor)
         )
         return box, box._link
 

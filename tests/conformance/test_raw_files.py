@@ -26,6 +26,7 @@ from coupole.acquisition.frame_matching import FaultModel, match
 from coupole.clock import SystemClock
 from coupole.devices import STEP_RECORD_DTYPE, Exposure, Frame, FrameFormat
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused
+from coupole.plan.bursts import DeviceTimes
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import Plan
 from coupole.plan.schedule import build_schedule
@@ -105,8 +106,8 @@ def _log_of_a_burst(period_us: int) -> NDArray[np.void]:
             "exposure": exposure,
         }
     )
-    limits = {"rise_us": 1000, "readout_us": float(period_us), "exposure_gap_us": 0}
-    table = build_schedule(plan, leds, np.eye(4), **limits).bursts[0][0].table
+    times = DeviceTimes(rise_us=1000, readout_us=float(period_us), exposure_gap_us=0)
+    table = build_schedule(plan, leds, np.eye(4), times).bursts[0][0].table
     log = np.zeros(len(table), STEP_RECORD_DTYPE)
     log["step"], log["edge_sent"] = np.arange(len(table)), True
     log["t_trigger_ns"] = 10**9 + 1000 * np.cumsum([0, *table["period_us"][:-1].astype(np.int64)])

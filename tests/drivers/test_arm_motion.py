@@ -10,7 +10,7 @@ import pytest
 
 from coupole.clock import Deadline
 from coupole.errors import DeviceFault, DeviceRefused, DeviceTimeout
-from drivers.arm_motion import MessageTime, checked_target, wait_for
+from drivers.arm_motion import MessageTime, StateReader, checked_target, wait_for
 
 LIMITS_DEG = ((-170.0, 170.0),) * 6
 
@@ -36,16 +36,13 @@ def waited(clock: HandTurnedClock, done_at: int, *, faulty_at: int = -1) -> None
         if state == faulty_at:
             raise DeviceFault("robot", expected="no fault", happened="one came", remedy="none")
 
-    wait_for(
+    reader = StateReader(
         lambda: next(states),
-        lambda state: state == done_at,
-        Deadline(clock, 1.0),
-        "the arm at rest",
-        check=check,
         pause=lambda: clock.sleep(0.1),
         describe=lambda state: f"it is in state {state}",
         remedy="See the controller",
     )
+    wait_for(reader, lambda state: state == done_at, Deadline(clock, 1.0), "the arm at rest", check=check)
 
 
 def test_waiting_ends_with_the_state_that_is_waited_for() -> None:

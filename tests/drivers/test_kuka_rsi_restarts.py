@@ -20,7 +20,7 @@ from drivers.kuka.rsi.bounds import StepBounds, follow_bounds
 from drivers.kuka.rsi.corrections import Corrections
 from drivers.kuka.rsi.rsi_session import Config, RsiSession
 from drivers.kuka.rsi.wire import Packet
-from drivers.kuka.rsi.witness import ArmWitness
+from drivers.kuka.rsi.witness import ArmWitness, LagBounds
 from sim.devices.kuka_controller import Settings as ControllerSettings
 from sim.devices.kuka_corrections import Corrections as TheirCorrections
 
@@ -314,12 +314,11 @@ def test_whatever_a_controller_does_no_answer_leads_its_axes_farther_than_one_cy
 def witness() -> ArmWitness:
     corrections = Corrections("axes", "absolute", CONFIG.geometry)
     limits = CONFIG.velocity_deg_s, CONFIG.acceleration_deg_s2
+    step = StepBounds("axes", 0.004, *limits, CONFIG.geometry).farthest
     return ArmWitness(
         corrections.place,
         corrections.between,
-        follow=follow_bounds("axes", 1.0, CONFIG.geometry),
-        step=StepBounds("axes", 0.004, *limits, CONFIG.geometry).farthest,
-        lag_s=0.02,
+        LagBounds(follow_bounds("axes", 1.0, CONFIG.geometry), step, lag_s=0.02),
         cycle_s=0.004,
         counts_in_a_row=False,
         unaccounted_s=0.0,

@@ -21,7 +21,7 @@ from places import SHARED_DATA
 from coupole.devices import FrameFormat
 from coupole.errors import ChecksumMismatch, InputError
 from coupole.exchange import dng, tiff
-from coupole.exchange.export import export_run
+from coupole.exchange.export import FramePatterns, export_run
 from coupole.exchange.exported_frame import Picture
 from coupole.exchange.formats import Source, Writer, formats_of
 from coupole.plan.shot_id import ShotId
@@ -69,7 +69,7 @@ def export(
     made: MadeRun, to: str, out: Path, views: tuple[str, ...] = (), shots: tuple[str, ...] = ()
 ) -> list[str]:
     """Names of the files that were written."""
-    found = export_run(made.run, to, out, views=list(views), shots=list(shots))
+    found = export_run(made.run, to, out, patterns=FramePatterns(views, shots))
     names = sorted(path.name for path in out.iterdir())
     assert found.files == len(names)
     assert found.bytes == sum(path.stat().st_size for path in out.iterdir())
@@ -286,7 +286,7 @@ def test_nothing_is_written_over_unless_that_is_asked(made: MadeRun, out: Path) 
         export(made, "dng", out)
     assert [path.name for path in out.iterdir()] == [mine.name]
     assert mine.read_bytes() == b"mine"
-    export_run(made.run, "dng", out, views=[], shots=[], overwrite=True)
+    export_run(made.run, "dng", out, overwrite=True)
     assert mine.read_bytes() != b"mine"
 
 

@@ -89,7 +89,7 @@ def read_run(path: Path) -> None:
         run.occupied_space,
         run.refuse_old_journal,
         lambda: [frame.read() for frame in open_light_frames([folder]).lit],
-        lambda: export_run(run, "tiff", folder.parent / "exported", views=[], shots=[], overwrite=True),
+        lambda: export_run(run, "tiff", folder.parent / "exported", overwrite=True),
         lambda: open_sources([folder], None),
         lambda: renew_report(run),
     )

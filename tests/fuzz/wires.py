@@ -223,10 +223,6 @@ def read_scpi_messages(path: Path) -> None:
     LedBoxFirmware(
         Reactor(ClockWriter(path.with_suffix(".clock"), 1.0)),
         Settings(baud=0),
-        on_edge=lambda t_ns: None,
-        on_light=lambda led, on_ns, off_ns: None,
-        on_dark=lambda t_ns: None,
-        on_panel=lambda panel, on, t_ns: None,
         link=wire,
     )
     for data in pieces(path.read_bytes()):

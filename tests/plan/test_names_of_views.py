@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from places import REPO
 
+from coupole.plan.bursts import DeviceTimes
 from coupole.plan.led_table import read_led_table
 from coupole.plan.plan import Plan
 from coupole.plan.schedule import build_schedule, names_too_long
@@ -61,8 +62,7 @@ def test_of_a_name_that_is_accepted_every_shot_id_fits(
     plan = plan_of("n" * length, lights=lights, repeats=min(repeats, 4))
     if names_too_long(plan, DOME):
         return
-    times = {"rise_us": 1000, "readout_us": 10_000.0, "exposure_gap_us": 100}
-    for burst in build_schedule(plan, DOME, np.eye(4), **times).bursts[0]:
+    for burst in build_schedule(plan, DOME, np.eye(4), DeviceTimes(1000, 10_000.0, 100)).bursts[0]:
         for shot in burst.shots:
             assert shot is None or ShotId.parse(str(shot)) == shot
 

@@ -13,7 +13,7 @@ from places import REPO
 
 from coupole.devices import NO_LED
 from coupole.geometry import transform
-from coupole.plan.bursts import Burst, burst_timing
+from coupole.plan.bursts import Burst, DeviceTimes, burst_timing
 from coupole.plan.led_table import LedTable, read_led_table
 from coupole.plan.light_selection import interleave, missing_lights
 from coupole.plan.marks import MARKS, START_MARK_EXTRA
@@ -43,8 +43,8 @@ def plan_of(lights: dict[str, Any] | None = None, **changes: Any) -> Plan:
 def schedule_of(
     plan: Plan, leds: LedTable = DOME, readout_us: float = 10_000.0, *, runs_tables: bool = True
 ) -> Schedule:
-    times: dict[str, Any] = {"rise_us": 1000, "readout_us": readout_us, "exposure_gap_us": 100}
-    return build_schedule(plan, leds, BASE_FROM_SUPPORT, **times, runs_tables=runs_tables)
+    times = DeviceTimes(rise_us=1000, readout_us=readout_us, exposure_gap_us=100)
+    return build_schedule(plan, leds, BASE_FROM_SUPPORT, times, runs_tables=runs_tables)
 
 
 def lit_leds(burst: Burst) -> list[int]:
@@ -272,26 +272,29 @@ def test_a_grid_is_named_by_azimuth_and_elevation() -> None:
     assert names == ["top-az0-el45", "top-az-120.5-el45", "top-az0-el60", "top-az-120.5-el60"]
 
 
-times = {
-    "exposure_us": st.integers(10, 1_900_000),
-    "rise_us": st.integers(0, 5_000),
-    "readout_us": st.floats(100, 1e6),
-    "exposure_gap_us": st.integers(0, 5_000),
-}
+exposures_us = st.integers(10, 1_900_000)
+device_times = st.builds(
+    DeviceTimes,
+    rise_us=st.integers(0, 5_000),
+    readout_us=st.floats(100, 1e6),
+    exposure_gap_us=st.integers(0, 5_000),
+)
 
 
-@given(st.fixed_dictionaries(times))
-def test_a_period_is_never_shorter_than_the_camera_allows(asked: dict[str, Any]) -> None:
-    timing = burst_timing(**asked, hardware=True)
-    assert timing.period_us >= asked["readout_us"]
-    assert timing.period_us >= asked["exposure_us"] + asked["exposure_gap_us"]
+@given(exposures_us, device_times)
+def test_a_period_is_never_shorter_than_the_camera_allows(exposure_us: int, times: DeviceTimes) -> None:
+    timing = burst_timing(exposure_us, times, hardware=True)
+    assert timing.period_us >= times.readout_us
+    assert timing.period_us >= exposure_us + times.exposure_gap_us
 
 
-@given(st.fixed_dictionaries(times))
-def test_an_led_is_on_from_before_the_exposure_to_after_it_and_off_before_the_next(asked: dict[str, Any]) -> None:
-    timing = burst_timing(**asked, hardware=True)
-    assert timing.trigger_delay_us >= asked["rise_us"]
-    assert timing.on_us > timing.trigger_delay_us + asked["exposure_us"]
+@given(exposures_us, device_times)
+def test_an_led_is_on_from_before_the_exposure_to_after_it_and_off_before_the_next(
+    exposure_us: int, times: DeviceTimes
+) -> None:
+    timing = burst_timing(exposure_us, times, hardware=True)
+    assert timing.trigger_delay_us >= times.rise_us
+    assert timing.on_us > timing.trigger_delay_us + exposure_us
     assert timing.period_us > timing.on_us
 
 

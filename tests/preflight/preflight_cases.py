@@ -12,9 +12,10 @@ from coupole.motion.itinerary import bodies_of, plan_itinerary
 from coupole.plan.led_table import LedTable, read_led_table
 from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
+from coupole.plan.rig_devices import device_times
 from coupole.plan.schedule import Schedule, build_schedule
 from coupole.plan.yamlfile import read_document
-from coupole.preflight.preflight import Report, StorageFacts, check
+from coupole.preflight.preflight import Course, ObjectLight, Report, StorageFacts, check
 
 RIG, _ = read_document(REPO / "configs/rigs/sim.yaml").problems(Rig)
 DOME = read_led_table(REPO / "configs/domes/coupole.csv")
@@ -44,14 +45,7 @@ def rig_of(**changes: Any) -> Rig:
 
 
 def schedule_of(plan: Plan, rig: Rig, leds: LedTable) -> Schedule:
-    return build_schedule(
-        plan,
-        leds,
-        rig.support.base_from_support.matrix(),
-        rise_us=rig.led_limits.rise_us,
-        readout_us=1e6 / rig.sensor.max_frames_per_s,
-        exposure_gap_us=rig.sensor.exposure_gap_us,
-    )
+    return build_schedule(plan, leds, rig.support.base_from_support.matrix(), device_times(rig))
 
 
 def checked(
@@ -61,14 +55,14 @@ def checked(
     storage: StorageFacts = ROOMY,
     points: np.ndarray[Any, Any] = CENTRE,
     start_joints_deg: Sequence[float] | None = None,
-    **known: Any,
+    dose_before_lux_h: float = 0.0,
 ) -> Report:
     rig = rig or rig_of()
     schedule = schedule_of(plan, rig, leds)
     bodies = bodies_of(rig, DOME, NO_OBJECT)
     start_deg = start_joints_deg or rig.motion.home_joints_deg
     itinerary = plan_itinerary(schedule.views, rig, bodies, start_deg, plan.order)
-    return check(plan, rig, schedule, leds, storage, itinerary, object_points_support_mm=points, **known)
+    return check(plan, rig, leds, Course(schedule, itinerary), storage, ObjectLight(points, dose_before_lux_h))
 
 
 def only_refusal(report: Report) -> str:

@@ -9,7 +9,7 @@ import pytest
 from triangle_cases import unit
 
 from coupole.calibration.budget.measurement import reflectance
-from coupole.calibration.light.irradiance import Emission
+from coupole.calibration.light.irradiance import Emission, irradiance_per_flux
 from coupole.reflectance.run_uncertainty import percentiles
 from coupole.reflectance.sample_uncertainty import SOURCES, MonteCarlo, Places, Sources, bounds, tilt_covariance
 
@@ -117,8 +117,8 @@ def test_draws_are_those_of_the_budgets_measurement_equation(emission: Emission)
     axes = np.broadcast_to(places.led_normals[:, None], leds.shape)
     signal = 1 + random.normal(0, 0.02, (COUNT, draws))
 
-    def true(*arguments: np.ndarray) -> np.ndarray:
-        return reflectance(arguments[0], 1.0, 1.0, *arguments[1:], emission=emission)
+    def true(signal: np.ndarray, power: np.ndarray, *places: np.ndarray) -> np.ndarray:
+        return reflectance(signal, 1.0, 1.0, power, irradiance_per_flux(*places, emission=emission))
 
     flat = unit(np.cross(*(places.corners_mm[:, k] - places.corners_mm[:, 0] for k in (1, 2))))
     middle = places.corners_mm.mean(axis=1)

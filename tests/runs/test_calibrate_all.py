@@ -10,7 +10,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from coupole.calibration.record import read_record
-from coupole.commands.campaign import Campaign, Repeatability
+from coupole.commands.campaign import Campaign, Operator, Repeatability
 from coupole.plan.templates import TEMPLATES
 from coupole.viewing.terminal import make_console
 
@@ -101,7 +101,6 @@ def test_a_description_of_the_tile_that_was_changed_by_hand_is_kept(rig: Path, t
     out = tmp_path / "calibrations"
     out.mkdir()
     (out / "tile.yaml").write_text("schema_version: 1\nside_mm: 40.0\n")
-    Campaign(
-        rig, out, None, Repeatability(0.03, 0.003), is_simulated=True, ask=False, console=make_console(quiet=True)
-    )
+    operator = Operator(make_console(quiet=True), is_asked=False)
+    Campaign(rig, out, None, Repeatability(0.03, 0.003), operator, is_simulated=True)
     assert (out / "tile.yaml").read_text() == "schema_version: 1\nside_mm: 40.0\n"

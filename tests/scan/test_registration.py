@@ -20,6 +20,7 @@ from coupole.commands import cli
 from coupole.errors import InputError
 from coupole.scan.mesh_defects import find_defects
 from coupole.scan.mesh_files import read_mesh
+from coupole.scan.registration.control import TargetTables
 from coupole.scan.registration.joining import join
 from coupole.scan.registration.merging import Merged, merge
 from coupole.scan.registration.pair_matching import PairMotion
@@ -172,7 +173,7 @@ def test_control_points_place_the_scans_in_the_site(surveyed: Surveyed, tmp_path
     (tmp_path / "control.csv").write_text("\n".join(known))
     paths = [surveyed.folder / f"side{k}.ply" for k in range(3)]
     targets, control = tmp_path / "targets.csv", tmp_path / "control.csv"
-    found = register(paths, "mm", targets=targets, control=control, processes=1, say=silent)
+    found = register(paths, "mm", tables=TargetTables(targets, control), processes=1, say=silent)
     assert found.site_from_first is not None
     for number, name in enumerate(found.names):
         site_from_scan = found.site_from_first @ found.first_from_scan[number]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -14,9 +13,9 @@ import pytest
 from places import REPO
 
 from coupole.commands.extras import EXTRA_OF
+from coupole.kernels import kept_in
 
 DEPENDENCIES = next(path for path in map(Path, sys.path) if path.name == "site-packages")
-PACKAGES = ("coupole", "drivers", "sim")
 MOST_BYTES, MOST_INSTALLED_BYTES = 15_000_000, 700_000_000
 LACKING = sorted(library for library in EXTRA_OF if EXTRA_OF[library] not in ("testing", "xarray"))
 WITHOUT_EXTRAS = f"""
@@ -44,6 +43,7 @@ class Installed:
         home = self.folder / "home"
         home.mkdir(exist_ok=True)
         surroundings = {"HOME": str(home), "PATH": "/usr/bin:/bin", "LANG": "C.UTF-8"}
+        surroundings["NUMBA_CACHE_DIR"] = str(kept_in())  # the installed modules are the checkout's byte for byte
         surroundings["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # those beside the shared dependencies
         command = [self.environment / "bin" / words[0], *words[1:]]
         return subprocess.run(
@@ -57,19 +57,6 @@ def uv() -> str:
     return (
         str(own) if own.exists() else shutil.which("uv") or pytest.skip("there is no uv to build the wheel with")
     )
-
-
-def share_kernels(site_packages: Path) -> None:
-    """Give the installed modules, which are the checkout's byte for byte, its compiled kernels: numba takes them
-    for those of a file of the same size and time."""
-    for package in PACKAGES:
-        for kernel in (REPO / package).rglob("*.nb[ic]"):
-            place = site_packages / kernel.relative_to(REPO)
-            place.parent.mkdir(exist_ok=True)
-            shutil.copy2(kernel, place)
-        for source in (REPO / package).rglob("*.py"):
-            time_s = source.stat().st_mtime
-            os.utime(site_packages / source.relative_to(REPO), (time_s, time_s))
 
 
 @pytest.fixture(
@@ -98,7 +85,6 @@ def installed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
     if shared:
         (site_packages / "dependencies.pth").write_text(f"{DEPENDENCIES}\n")
         (site_packages / "sitecustomize.py").write_text(WITHOUT_EXTRAS)
-        share_kernels(site_packages)
     (folder / "Kuppel ä").mkdir()
     return Installed(wheel, environment, folder / "Kuppel ä")
 

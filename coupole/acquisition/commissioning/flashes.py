@@ -13,6 +13,7 @@ from coupole.clock import Deadline
 from coupole.devices import NO_LED, STEP_DTYPE, Exposure, Frame, Step, StepRecord, table_box
 from coupole.errors import DeviceTimeout
 from coupole.plan.bursts import LED_GAP_US, BurstTiming, burst_timing
+from coupole.plan.rig_devices import device_times
 
 _FRAME_S = 2.0
 _BUFFERS = 8
@@ -23,14 +24,7 @@ _TRIES = 8
 
 def timing_of(bench: Bench, exposure_us: int) -> BurstTiming:
     """Return the times of a flash that covers an exposure."""
-    rig = bench.cell.rig
-    return burst_timing(
-        exposure_us,
-        rise_us=rig.led_limits.rise_us,
-        readout_us=1e6 / rig.sensor.max_frames_per_s,
-        exposure_gap_us=rig.sensor.exposure_gap_us,
-        hardware=bench.opened.ledbox.runs_tables,
-    )
+    return burst_timing(exposure_us, device_times(bench.cell.rig), hardware=bench.opened.ledbox.runs_tables)
 
 
 def arm_camera(bench: Bench, exposure_us: int, *, hardware: bool) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.devices import FrameFormat
+from coupole.kernels import kernel
 
 _COLUMNS = 128
 """Greatest number of bins across a frame. With 32 pixels in a bin of the full camera, 0.2 mm are an eighth of a
@@ -77,7 +77,7 @@ def compile_now() -> None:
     grid.look(pixels)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _bin_means(pixels, mean_dn, is_clipped, bin_px, pair_step, white_dn, black_dn):  # type: ignore[no-untyped-def]
     """Add up whole rows before bins, so that the loop over pixels can be vectorised."""
     rows, columns = mean_dn.shape

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.appearance.render.caustic import Reflectance, Sun, reflect_at_gold, smooth_normals, sun_directions
+from coupole.appearance.render.scene_file import Gathered
 from coupole.appearance.shapes.triangles import flat_normals
 from coupole.appearance.spectra.grid import Array
 
@@ -225,8 +226,7 @@ def seen_by_gold(
     suns: Sequence[Sun],
     rays: tuple[Array, Array],
     bands: Sequence[int],
-    count: int,
-    radius_mm: float,
+    gathering_settings: Gathered,
     seed: int,
     progress: Progress,
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -239,10 +239,10 @@ def seen_by_gold(
     mirrors = np.array([isinstance(surface, Mirror) for surface in room.surfaces])
     is_gold = (hits.surface >= 0) & mirrors[hits.surface]
     is_matt = (hits.surface >= 0) & ~is_gold
-    gathering = Gathering(hits, is_matt, len(list(bands)), radius_mm)
-    total, photons_done = len(suns) * count, 0
+    gathering = Gathering(hits, is_matt, len(list(bands)), gathering_settings.radius_mm)
+    total, photons_done = len(suns) * gathering_settings.photons, 0
     for number, sun in enumerate(suns):
-        for part in photons(room, sun, bands, count, (seed, number)):
+        for part in photons(room, sun, bands, gathering_settings.photons, (seed, number)):
             progress(photons_done, total)
             gathering.add(part)
             photons_done += _CHUNK

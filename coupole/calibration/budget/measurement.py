@@ -18,7 +18,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coupole.calibration.light.irradiance import LED_SIDE_MM, Emission, irradiance_per_flux
+from coupole.calibration.light.irradiance import Emission, irradiance_per_flux
 from coupole.calibration.rotations import Floats
 
 VERTICES = tuple(f"vertex{i}.{axis}_mm" for i in range(3) for axis in "xyz")
@@ -34,18 +34,12 @@ def reflectance(
     exposure_s: ArrayLike,
     flat: ArrayLike,
     power: ArrayLike,
-    point_mm: ArrayLike,
-    normal: ArrayLike,
-    led_mm: ArrayLike,
-    led_normal: ArrayLike,
-    *,
-    emission: Emission = "lambertian",
-    side_mm: float = LED_SIDE_MM,
+    lit_per_m2: ArrayLike,
 ) -> Floats:
-    """Return f in 1/sr. Points and directions are [..., 3], and all arguments are broadcast. f is infinite for an
-    LED below the horizon."""
-    lit = irradiance_per_flux(point_mm, normal, led_mm, led_normal, side_mm=side_mm, emission=emission)
-    signal, t, g, phi = (np.asarray(value, float) for value in (signal_dn, exposure_s, flat, power))
+    """Return f in 1/sr; all arguments are broadcast. `lit_per_m2` is the surface's irradiance over the LED's flux
+    (`irradiance_per_flux`). f is infinite for an LED below the horizon."""
+    factors = (signal_dn, exposure_s, flat, power, lit_per_m2)
+    signal, t, g, phi, lit = (np.asarray(value, float) for value in factors)
     with np.errstate(divide="ignore"):
         value: Floats = signal / (t * g * phi * lit)
     return value
@@ -73,16 +67,13 @@ def reflectance_of(q: Mapping[str, Floats], led_normal: Floats, *, emission: Emi
     turns = np.radians(np.stack([q[name] for name in LED_TURN], axis=-1)) @ across
     beside_mm = q[SEEN_OFF[0]] + q[SEEN_OFF[1]] - step[..., 0]
     power = q["power_dn_m2_sr_per_s"] * q["power.own"] * q["power.common"] * q["drift"]
+    led_axis = _turned_vectors(np.broadcast_to(led_normal, led.shape), turns)
     return reflectance(
         (q["signal_dn"] * (1.0 + q["contrast_per_mm"] * beside_mm) - q["veil_dn"]) * q["response"],
         q["exposure_s"],
         q["flat"] * q["flat_field"],
         power,
-        point,
-        normal,
-        led,
-        _turned_vectors(np.broadcast_to(led_normal, led.shape), turns),
-        emission=emission,
+        irradiance_per_flux(point, normal, led, led_axis, emission=emission),
     )
 
 

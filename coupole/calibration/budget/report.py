@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,7 @@ import numpy as np
 from coupole.calibration.budget.accuracy import PAPER_SPREAD, Accuracy, Case
 from coupole.calibration.budget.budget import Budget, Spread
 from coupole.calibration.budget.propagation import Interval, Validation
-from coupole.calibration.report import BLUE, DARK, GREY, RED
+from coupole.calibration.report import BLUE, DARK, GREY, RED, png_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -106,13 +105,7 @@ def draw_budget(budget: Budget, sample_spread: Spread) -> bytes:
         fontsize=16,
         color=DARK,
     )
-    for ax in figure.axes:
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.tick_params(colors=DARK)
-        ax.title.set_fontsize(13)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    return buffer.getvalue()
+    return png_of(figure)
 
 
 def _draw_distribution(figure: Figure, place: Any, budget: Budget) -> None:

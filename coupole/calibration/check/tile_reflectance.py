@@ -23,7 +23,7 @@ from coupole.calibration.light.led_power import LEAST_PRIOR, prior_of
 from coupole.calibration.light.led_power_tile import Setting, TileReader
 from coupole.calibration.light.records import Progress, counter
 from coupole.calibration.light.spectralon import Tile
-from coupole.calibration.light.tile_views import OF_PLACE, Row, rows_of
+from coupole.calibration.light.tile_views import OF_PLACE, Emitter, Row, rows_of
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
@@ -166,6 +166,6 @@ def place_of(name: str, frames: LightFrames, setting: Setting, progress: Progres
     for number, view_frames in enumerate(views.values()):
         for channel, view in reader.view(view_frames, tell).items():
             rows[channel] += rows_of(
-                number, view, setting.positions, tiles[channel], setting.emission, remarks=[]
-            )[0]
+                number, view, setting.positions, tiles[channel], Emitter(setting.emission)
+            ).rows
     return Place(name, tiles, rows)

@@ -41,7 +41,8 @@ from coupole.calibration.colour.image_quality import (
 )
 from coupole.calibration.colour.slanted_edge import SlantedEdge
 from coupole.calibration.light.frames import CHANNELS, LightFrames, PlainSources
-from coupole.calibration.light.records import Progress, counter, sealed_outcome
+from coupole.calibration.light.radiometric_record import Findings, sealed_outcome
+from coupole.calibration.light.records import Progress, counter
 from coupole.calibration.record import Parameter
 from coupole.calibration.report import Outcome
 from coupole.calibration.request import Request
@@ -150,27 +151,29 @@ def colour_outcome(
         request,
         origin.sources,
         origin.size_px,
-        _parameters(forms.profiles["matrix"], covariances, len(balanced_signals.signal)),
-        np.asarray(sum(covariances)),
-        partial(draw_colour, known_chart, lab, forms.left_out_errors.de, edges, measurements.shown_chart),
-        limits=against_limits(
-            COLOUR, request.limits, {"mean": forms.left_out_errors.mean, "worst": forms.left_out_errors.worst}
-        ),
-        files={
-            f"{request.name}.icc": icc_profile(
-                forms.chosen_profile, forms.profiles["matrix"], request.name, request.now
+        Findings(
+            _parameters(forms.profiles["matrix"], covariances, len(balanced_signals.signal)),
+            np.asarray(sum(covariances)),
+            limits=against_limits(
+                COLOUR, request.limits, {"mean": forms.left_out_errors.mean, "worst": forms.left_out_errors.worst}
             ),
-            f"{request.name}.csv": _patch_table(known_chart, balanced_signals, forms, lab).encode(),
-        },
-        fixed_figures=_fixed_figures(forms, figures),
-        remarks=(
-            _choice_remark(forms),
-            *(sentence_of(figure) for figure in figures),
-            *measurements.signals.remarks,
-            *measurements.remarks,
+            files={
+                f"{request.name}.icc": icc_profile(
+                    forms.chosen_profile, forms.profiles["matrix"], request.name, request.now
+                ),
+                f"{request.name}.csv": _patch_table(known_chart, balanced_signals, forms, lab).encode(),
+            },
+            fixed_figures=_fixed_figures(forms, figures),
+            remarks=(
+                _choice_remark(forms),
+                *(sentence_of(figure) for figure in figures),
+                *measurements.signals.remarks,
+                *measurements.remarks,
+            ),
+            more_inputs=origin.inputs,
+            artefacts=used_as("chart", known_chart.chart.artefact),
         ),
-        more_inputs=origin.inputs,
-        artefacts=used_as("chart", known_chart.chart.artefact),
+        partial(draw_colour, known_chart, lab, forms.left_out_errors.de, edges, measurements.shown_chart),
     )
     return replace(outcome, sections=[_patch_section(known_chart, forms, lab)])
 

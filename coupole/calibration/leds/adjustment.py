@@ -15,7 +15,6 @@ section 6), and the size of the reduced system depends on the number of views al
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +22,6 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 
 from coupole.calibration.adjustment import HUBER, REJECT_SIGMA
-from coupole.calibration.leds.boards import Boards
 from coupole.calibration.leds.equations import (
     GROUPS,
     ORIENTATION,
@@ -32,22 +30,18 @@ from coupole.calibration.leds.equations import (
     TOLERANCE,
     LedState,
     Problem,
-    Stated,
     at_centres,
     camera_step,
     cost_of,
     pose_errors,
-    problem_of,
     stepped_state,
     whitened_residuals,
     with_modes,
 )
 from coupole.calibration.leds.left_out import LeftOutViews, views_left_out
-from coupole.calibration.leds.matching import LedSightings
 from coupole.calibration.leds.normal_equations import centres_by_own, cholesky_factor, reduced_normal, solve
-from coupole.calibration.leds.suspects import FIELD, MODES, Mode, SuspectedShift, as_found, judge, step_of_records
+from coupole.calibration.leds.suspects import FIELD, SuspectedShift, as_found, judge, step_of_records
 from coupole.calibration.point_sets import Indices
-from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
@@ -100,32 +94,23 @@ class LedGeometry:
         return float(np.sqrt(np.median(by_views / stated_variance)))
 
 
-def adjust_leds(
-    sightings: LedSightings,
-    place: Indices,
-    base_from_flange: Floats,
-    boards: Boards,
-    start: Floats,
-    prior: CameraPrior,
-    stated_noise: Stated,
-    modes: Sequence[Mode] = MODES,
-) -> LedGeometry:
-    """Adjust boards, LEDs, poses [v, 4, 4] as reported, lens and hand-eye, and judge the suspects.
+def adjust_leds(problem: Problem, start: Floats) -> LedGeometry:
+    """Adjust boards, LEDs, poses, lens and hand-eye, and judge the suspects.
 
-    `place` [k] is that of each spot; `start` [b, 4, 4] is the approximate pose of each board; `modes` are those of
-    the suspects. Raises InputError if the adjustment does not converge, as with contradicting spots.
+    `problem` is made by `problem_of`; `start` [b, 4, 4] is the approximate pose of each board. Raises InputError
+    if the adjustment does not converge, as with contradicting spots.
     """
+    prior, modes = problem.prior, problem.modes
     state = LedState(
         start,
-        np.zeros_like(boards.places_mm),
-        base_from_flange,
+        np.zeros_like(problem.boards.places_mm),
+        problem.reported_poses,
         prior.flange_from_camera,
         prior.lens.vector(),
         np.zeros(len(prior.covariance) - len(prior.free) - 6),
         np.zeros(len(modes)),
     )
-    problem = problem_of(sightings, place, boards, base_from_flange, prior, stated_noise, modes)
-    factors, keep = np.ones(len(GROUPS)), np.ones(len(place), np.bool_)
+    factors, keep = np.ones(len(GROUPS)), np.ones(len(problem.place), np.bool_)
     state, _ = _descend(problem, state, factors, keep, 3.0 * HUBER)
     problem = at_centres(problem, state)
     fit = _settled_fit(problem, _Fit(state, factors, keep, 0), is_robust=True)

@@ -12,7 +12,7 @@ from coupole.calibration import optics
 from coupole.calibration.leds.boards import Boards
 from coupole.calibration.leds.matching import LedSightings
 from coupole.calibration.leds.spots import outline_offsets
-from coupole.calibration.leds.suspects import Mode, shifts_px
+from coupole.calibration.leds.suspects import MODES, Mode, shifts_px
 from coupole.calibration.point_sets import Indices
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.rotations import Floats, between, inverses, moved_transforms, skew
@@ -106,8 +106,10 @@ def problem_of(
     reported_poses: Floats,
     prior: CameraPrior,
     stated_noise: Stated,
-    modes: Sequence[Mode],
+    modes: Sequence[Mode] = MODES,
 ) -> Problem:
+    """Return the problem of adjusting LEDs from their spots. `place` [k] is that of each spot, `reported_poses`
+    [v, 4, 4] are those of the flange, `modes` are those of the suspects."""
     whiten = np.linalg.inv(np.linalg.cholesky(sightings.covariance))
     board = boards.board_of[place]
     sightings_of = tuple(np.flatnonzero(board == b) for b in range(len(boards.numbers)))

@@ -16,7 +16,7 @@ from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
 from coupole.calibration.leds.acceptance import LEDS
 from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
 from coupole.calibration.leds.boards import Boards, board_poses, boards_of
-from coupole.calibration.leds.equations import GROUPS, ORIENTATION, POSITION, SPOTS, TOLERANCE, Stated
+from coupole.calibration.leds.equations import GROUPS, ORIENTATION, POSITION, SPOTS, TOLERANCE, Stated, problem_of
 from coupole.calibration.leds.matching import Matching, fault_lines, match_leds
 from coupole.calibration.leds.remarks import remarks_of
 from coupole.calibration.leds.sources import LedImages
@@ -83,8 +83,8 @@ def leds_from(
     matching = _match_spots(images, table, boards, prior, stated_noise)
     sightings = matching.sightings.only(np.flatnonzero(matching.place_of[matching.sightings.led] >= 0))
     place = matching.place_of[sightings.led]
-    start = board_poses(boards, matching.by_place_mm)
-    geometry = adjust_leds(sightings, place, images.base_from_flange, boards, start, prior, stated_noise)
+    problem = problem_of(sightings, place, boards, images.base_from_flange, prior, stated_noise)
+    geometry = adjust_leds(problem, board_poses(boards, matching.by_place_mm))
     leds = _in_table_order(geometry, matching, boards)
     normals = geometry.normals[boards.board_of[leds.place]]
     new_table = LedTable(
@@ -102,11 +102,13 @@ def leds_from(
         geometry,
         leds,
         stated_noise,
-        files=files,
-        lines=_views(images.views, sightings.view, geometry),
-        limits=limits,
-        faults=faults,
-        remarks=(*fault_lines(faults), *remarks_of(images, geometry, prior, limits, arm)),
+        files,
+        _Assessment(
+            _views(images.views, sightings.view, geometry),
+            limits,
+            faults,
+            (*fault_lines(faults), *remarks_of(images, geometry, prior, limits, arm)),
+        ),
     )
     return LedsFound(
         record,
@@ -161,18 +163,24 @@ def _match_spots(
     return matching
 
 
+@dataclass(frozen=True)
+class _Assessment:
+    """The record's words and figures of the adjustment and of the dome."""
+
+    views: tuple[ImageResidual, ...]
+    limits: Sequence[Limit]
+    faults: tuple[LedFault, ...]
+    remarks: tuple[str, ...]
+
+
 def _record(
     images: LedImages,
     request: Request,
     geometry: LedGeometry,
     leds: _InTableOrder,
     stated_noise: Stated,
-    *,
     files: Mapping[str, bytes],
-    lines: tuple[ImageResidual, ...],
-    limits: Sequence[Limit],
-    faults: tuple[LedFault, ...],
-    remarks: tuple[str, ...],
+    assessment: _Assessment,
 ) -> Record:
     median_u_mm, median_u_deg = (float(np.median(u[leds.found_mask])) for u in (leds.u_mm, leds.u_deg))
     return seal_record(
@@ -190,10 +198,10 @@ def _record(
         },
         files=tuple(Input(name=name, sha256=hashlib.sha256(data).hexdigest()) for name, data in files.items()),
         noise=_noise(geometry, stated_noise),
-        images=lines,
-        limits=limits,
-        faults=faults,
-        remarks=remarks,
+        images=assessment.views,
+        limits=assessment.limits,
+        faults=assessment.faults,
+        remarks=assessment.remarks,
         inputs=tuple(Input(name=name, sha256=digest) for name, digest in images.inputs),
     )
 

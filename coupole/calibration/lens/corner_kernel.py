@@ -18,11 +18,11 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from scipy.special import ndtr
 
 from coupole.calibration.rotations import Floats
+from coupole.kernels import kernel
 
 UNKNOWNS, ROUND, OWN = 14, 9, 12
 """Numbers of unknowns: all; for one round Gaussian blur; for a symmetric blur of each edge's own, with their
@@ -70,7 +70,7 @@ def _bell_table() -> Floats:
 _BELLS = _bell_table()
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def fit_all(windows, firsts, mask_tile, rough, skews, radii, many, results):  # type: ignore[no-untyped-def]
     """Fit corners [n] with `many` unknowns, for given third cumulants `skews` [n, 2] of the blurs.
 
@@ -125,7 +125,7 @@ def fit_all(windows, firsts, mask_tile, rough, skews, radii, many, results):  # 
             solutions[n, k] = unknowns[k]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def start_of(image, mask_tile, radius, unknowns):  # type: ignore[no-untyped-def]
     """Find directions of both edges, level and contrast from the values around the corner. Returns False if there
     are not four sectors."""
@@ -174,7 +174,7 @@ def start_of(image, mask_tile, radius, unknowns):  # type: ignore[no-untyped-def
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fit(image, mask_tile, x, y, radius, unknowns, close_px, many, rows):  # type: ignore[no-untyped-def]
     """Run Levenberg-Marquardt until a step is below `close_px`. Returns False if it diverges, or if the residual
     is too large."""
@@ -214,7 +214,7 @@ def _fit(image, mask_tile, x, y, radius, unknowns, close_px, many, rows):  # typ
     return count > _LEAST_PIXELS and products[many, many] <= count * (_WORST * unknowns[_CONTRAST]) ** 2
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _equations(image, mask_tile, x, y, radius, unknowns, many, rows, products):  # type: ignore[no-untyped-def]
     """Return the number of pixels. `products` [many + 1, many + 1] becomes the normal matrix, bordered by the
     right-hand side and the sum of squared residuals."""
@@ -225,7 +225,7 @@ def _equations(image, mask_tile, x, y, radius, unknowns, many, rows, products): 
     return count
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _products(rows, count, many, products):  # type: ignore[no-untyped-def]
     """Fill in sums of products of the first `many` rows, over `count` pixels."""
     for i in range(many):
@@ -237,7 +237,7 @@ def _products(rows, count, many, products):  # type: ignore[no-untyped-def]
             products[j, i] = total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _rows(image, mask_tile, middle_x, middle_y, radius, unknowns, many, rows):  # type: ignore[no-untyped-def]
     """Return the number of pixels. `rows` [16, pixels] becomes the derivatives by the unknowns, the residuals, and
     the values of the model."""
@@ -285,7 +285,7 @@ def _rows(image, mask_tile, middle_x, middle_y, radius, unknowns, many, rows):  
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _crossing(a, b, together):  # type: ignore[no-untyped-def]
     """Return the term r at a point that is `a` and `b` standard deviations of blur away from the edges, and its
     derivative by the correlation."""
@@ -297,7 +297,7 @@ def _crossing(a, b, together):  # type: ignore[no-untyped-def]
     return value, bell * (1.0 + together * first + together * together * second / 2.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _edge(apart, wide, high, sigma):  # type: ignore[no-untyped-def]
     """Return 2 S - 1 for an edge at distance `apart` from a pixel's middle, its derivatives by the distance and by
     sigma, its third derivative by the distance, and its fourth derivative times sigma^4."""
@@ -326,7 +326,7 @@ def _edge(apart, wide, high, sigma):  # type: ignore[no-untyped-def]
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _integrals(z):  # type: ignore[no-untyped-def]
     """Return the normal distribution at z, integrated twice, once and not at all, and its density. It is computed
     by Taylor's series from the nearest place of the table, to 1e-10 (the density to 1e-7)."""

@@ -104,6 +104,15 @@ def camera_from(
     return fit, _lens_report(record, board_images, good_sightings, residuals, fit.sigma_px, None)
 
 
+@dataclass(frozen=True)
+class CameraArm:
+    """The arm that carries the camera."""
+
+    noise: RobotNoise
+    model: Arm | None = None
+    """The arm's model; the zero errors of its axes are then estimated too."""
+
+
 def hand_eye_from(
     board_images: Found,
     sources: Sources,
@@ -111,8 +120,7 @@ def hand_eye_from(
     model: str,
     request: Request,
     *,
-    robot: RobotNoise,
-    arm: Arm | None = None,
+    arm: CameraArm,
     lens: EarlierLens | None = None,
 ) -> tuple[HandEyeCalibration, Diagnosis, Shown]:
     """Calibrate the camera's pose on the flange. Raises InputError with the likely cause if robot and camera
@@ -129,14 +137,15 @@ def hand_eye_from(
     reported_poses = ReportedPoses(sources.poses.numbers[board_images.image_numbers], sources.poses.convention)
     joints = [sources.images[i].joints_deg for i in board_images.image_numbers]
     joints_deg = [j for j in joints if j is not None]
-    axes = axis_sensitivity(arm, joints_deg) if arm is not None and len(joints_deg) == len(joints) else None
-    diagnosis = _refused_if_contradicting(fit, reported_poses, robot, [s.name for s in good_sightings])
+    model_of_arm = arm.model if len(joints_deg) == len(joints) else None
+    axes = axis_sensitivity(model_of_arm, joints_deg) if model_of_arm is not None else None
+    diagnosis = _refused_if_contradicting(fit, reported_poses, arm.noise, [s.name for s in good_sightings])
     result = calibrate_hand_eye(
         good_sightings,
         Poses(reported_poses.base_from_flange, axes),
         model=model,
         lens=lens or fit.intrinsics,
-        robot=robot,
+        robot=arm.noise,
         board_scale_u_ppm=board.scale_u_ppm,
         size_px=board_images.size_px,
     )

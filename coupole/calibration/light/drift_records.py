@@ -19,8 +19,9 @@ from coupole.calibration.light.drift_drawing import draw_drift
 from coupole.calibration.light.frames import LightFrame, LightFrames
 from coupole.calibration.light.led_power import prior_of
 from coupole.calibration.light.led_power_tile import Setting, TileReader
-from coupole.calibration.light.records import Progress, counter, record_input, sealed_outcome
-from coupole.calibration.light.tile_views import OF_PLACE, rows_of
+from coupole.calibration.light.radiometric_record import Findings, sealed_outcome
+from coupole.calibration.light.records import Progress, counter, record_input
+from coupole.calibration.light.tile_views import OF_PLACE, Emitter, rows_of
 from coupole.calibration.record import Parameter
 from coupole.calibration.report import Outcome
 from coupole.calibration.request import Request
@@ -123,21 +124,23 @@ def drift_outcome(
         request,
         frames,
         (width, height),
-        _parameters(drift),
-        drift.covariance,
-        partial(draw_drift, drift, warmer_k, t_s),
-        limits=against_limits(DRIFT, request.limits, {"factor": float(u.max()), "left_out": left_out}),
-        files={f"{request.name}.csv": _table(drift).encode()},
-        fixed_figures={"start_s": drift.start_s, "hours": drift.hours, "noise": drift.noise},
-        remarks=(
-            f"{len(drift.used_readings)} readings in {len(views)} views; factor {factor.min():.4f} to "
-            f"{factor.max():.4f}",
-            "ln factor = level + rate_per_h (t - start_s) / 3600 + per_k (T - board_c); T is the board's, board_c "
-            "that of the LED in the powers' table",
-            *remarks,
+        Findings(
+            _parameters(drift),
+            drift.covariance,
+            limits=against_limits(DRIFT, request.limits, {"factor": float(u.max()), "left_out": left_out}),
+            files={f"{request.name}.csv": _table(drift).encode()},
+            fixed_figures={"start_s": drift.start_s, "hours": drift.hours, "noise": drift.noise},
+            remarks=(
+                f"{len(drift.used_readings)} readings in {len(views)} views; factor {factor.min():.4f} to "
+                f"{factor.max():.4f}",
+                "ln factor = level + rate_per_h (t - start_s) / 3600 + per_k (T - board_c); T is the board's, "
+                "board_c that of the LED in the powers' table",
+                *remarks,
+            ),
+            more_inputs=(*record_input(led_power), *setting.inputs),
+            artefacts=setting.artefacts([CHANNEL]),
         ),
-        more_inputs=(*record_input(led_power), *setting.inputs),
-        artefacts=setting.artefacts([CHANNEL]),
+        partial(draw_drift, drift, warmer_k, t_s),
     )
 
 
@@ -167,11 +170,12 @@ def _readings(
     frame_done = counter(progress, sum(map(len, frames_of_views)))
     for view_frames in frames_of_views:
         view = tile_reader.view(view_frames, frame_done)[CHANNEL]
-        rows, _ = rows_of(0, view, setting.positions, tile, setting.emission, remarks=remarks)
+        view_rows = rows_of(0, view, setting.positions, tile, Emitter(setting.emission))
+        remarks += view_rows.remarks
         frame_of = {frame.led: frame for frame in view_frames if frame.led is not None}
         readings += [
             _reading(frame_of[row.led], row.value, row.u, row.design, powers)
-            for row in rows
+            for row in view_rows.rows
             if powers.row.get(row.led) is not None and powers.power[powers.row[row.led]] > 0
         ]
     return readings

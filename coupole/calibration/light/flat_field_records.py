@@ -15,12 +15,14 @@ from coupole.calibration.light.flat_field import (
     PANEL_NAMES,
     FlatField,
     FlatView,
+    Spot,
     block_means,
     dust_spots,
     fit_flat_field,
     panel_places,
 )
 from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask, channels_of
+from coupole.calibration.light.radiometric_record import Findings, sealed_outcome
 from coupole.calibration.light.records import (
     Progress,
     block_diagonal,
@@ -30,9 +32,8 @@ from coupole.calibration.light.records import (
     linearise,
     mean_of,
     record_input,
-    sealed_outcome,
 )
-from coupole.calibration.record import Parameter
+from coupole.calibration.record import Limit, Parameter
 from coupole.calibration.report import Outcome
 from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
@@ -67,7 +68,7 @@ def flat_field_outcome(
     dark = dark_signal(frames, dark_record)
     channels = channels_of(frames.pattern)
     straight = {channel: linearise(response_record, channel, frames) for channel in channels}
-    width, height = size_px = frames.size_px
+    size_px = frames.size_px
     views: dict[str, list[FlatView]] = {channel: [] for channel in channels}
     for number, ((view, light), group) in enumerate(by_view.items()):
         for channel, block_view in _flat_views(
@@ -83,10 +84,7 @@ def flat_field_outcome(
     ratio, u_ratio = _ratio(list(by_view.values()), dark, straight, fits, frames, base_from_panel)
     spots = dust_spots(ratio)
     parameters, covariance = _flat_parameters(fits)
-    corners = np.array([(0.0, 0.0), (width - 1.0, 0.0), (0.0, height - 1.0), (width - 1.0, height - 1.0)])
-    worst = max(float(fit.u_at(corners).max()) for fit in fits.values())
-    rejected_share = max(fit.rejected_share for fit in fits.values())
-    deepest = max((spot.depth for spot in spots), default=0.0)
+    inputs = (*record_input(dark_record), *record_input(response_record), *record_input(hand_eye))
     dust = [f"({s.column_px:.0f}, {s.row_px:.0f}) by {s.depth:.1%}" for s in spots[:5]]
     remarks = [f"{len(spots)} dust spots on the sensor, the deepest at {', '.join(dust)}"] if spots else []
     table = np.array([(s.column_px, s.row_px, s.pixels, s.depth) for s in spots]).reshape(-1, 4)
@@ -95,18 +93,29 @@ def flat_field_outcome(
         request,
         frames,
         size_px,
-        parameters,
-        covariance,
-        partial(pictures.draw_flat_field, fits, ratio, spots),
-        limits=(
-            limit_of("uncertainty in the field's corners", worst, _MOST_FLAT_U),
-            limit_of("share of blocks left out", rejected_share, 0.05),
-            limit_of("deepest dust", deepest, _MOST_DUST_DEPTH),
+        Findings(
+            parameters,
+            covariance,
+            limits=_limits(fits, spots, size_px),
+            files={f"{request.name}.h5": h5_of({"g": g, "pixel_response": ratio, "dust_x_y_pixels_depth": table})},
+            fixed_figures={"focal_px": frames.focal_px, "u_pixel_response": u_ratio},
+            remarks=remarks,
+            more_inputs=inputs,
         ),
-        files={f"{request.name}.h5": h5_of({"g": g, "pixel_response": ratio, "dust_x_y_pixels_depth": table})},
-        fixed_figures={"focal_px": frames.focal_px, "u_pixel_response": u_ratio},
-        remarks=remarks,
-        more_inputs=(*record_input(dark_record), *record_input(response_record), *record_input(hand_eye)),
+        partial(pictures.draw_flat_field, fits, ratio, spots),
+    )
+
+
+def _limits(fits: Mapping[str, FlatField], spots: Sequence[Spot], size_px: tuple[int, int]) -> tuple[Limit, ...]:
+    width, height = size_px
+    corners = np.array([(0.0, 0.0), (width - 1.0, 0.0), (0.0, height - 1.0), (width - 1.0, height - 1.0)])
+    worst = max(float(fit.u_at(corners).max()) for fit in fits.values())
+    rejected_share = max(fit.rejected_share for fit in fits.values())
+    deepest = max((spot.depth for spot in spots), default=0.0)
+    return (
+        limit_of("uncertainty in the field's corners", worst, _MOST_FLAT_U),
+        limit_of("share of blocks left out", rejected_share, 0.05),
+        limit_of("deepest dust", deepest, _MOST_DUST_DEPTH),
     )
 
 

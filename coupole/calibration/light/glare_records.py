@@ -18,6 +18,7 @@ from coupole.calibration.light.frames import LightFrame, LightFrames, channel_ma
 from coupole.calibration.light.glare_drawing import draw_glare
 from coupole.calibration.light.glare_fit import GlareFit, TrapLight, TrapView, fit_glare, trap_view
 from coupole.calibration.light.glare_traps import find_traps
+from coupole.calibration.light.radiometric_record import Findings, sealed_outcome
 from coupole.calibration.light.records import (
     Progress,
     block_diagonal,
@@ -25,7 +26,6 @@ from coupole.calibration.light.records import (
     linearise,
     mean_of,
     record_input,
-    sealed_outcome,
 )
 from coupole.calibration.light.veil import PARTS
 from coupole.calibration.record import Parameter
@@ -129,13 +129,15 @@ def _outcome_of(
         request,
         frames,
         (width, height),
-        *_parameters(fits),
+        Findings(
+            *_parameters(fits),
+            limits=against_limits(GLARE, request.limits, figures),
+            fixed_figures=fixed_figures,
+            remarks=(*by_words, f"{words}; {light}", *remarks),
+            more_inputs=tuple(pair for path in files for pair in record_input(path)),
+            artefacts=used_as("glare target", target.artefact),
+        ),
         partial(draw_glare, fits),
-        limits=against_limits(GLARE, request.limits, figures),
-        fixed_figures=fixed_figures,
-        remarks=(*by_words, f"{words}; {light}", *remarks),
-        more_inputs=tuple(pair for path in files for pair in record_input(path)),
-        artefacts=used_as("glare target", target.artefact),
     )
 
 

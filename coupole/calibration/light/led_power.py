@@ -26,6 +26,7 @@ from coupole.calibration.light.irradiance import LED_SIDE_MM, Emission
 from coupole.calibration.light.spectralon import Tile
 from coupole.calibration.light.tile_views import (
     OF_PLACE,
+    Emitter,
     Positions,
     Row,
     TileView,
@@ -117,12 +118,10 @@ def calibrate_led_power(
     lit_elsewhere: set[int] = set()
     for v, view in enumerate(views):
         place = places.index(view.place)
-        view_rows, not_used = rows_of(
-            v, view, positions, tile, emission,
-            side_mm=side_mm, place=place, figures=len(names), remarks=remarks,
-        )  # fmt: skip
-        rows += view_rows
-        lit_elsewhere |= not_used
+        view_rows = rows_of(v, view, positions, tile, Emitter(emission, side_mm), place=place, figures=len(names))
+        rows += view_rows.rows
+        remarks += view_rows.remarks
+        lit_elsewhere |= view_rows.unused_leds
     if not rows:
         raise InputError("LED power: no LED could be used: " + ("; ".join(remarks[:5]) or "all are too low"))
     rows, dead = without_dark(rows, views, ids, lit_elsewhere, remarks)

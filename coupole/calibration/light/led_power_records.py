@@ -15,7 +15,8 @@ from coupole.calibration.light.acceptance import LED_POWER
 from coupole.calibration.light.frames import LightFrame, LightFrames, channels_of
 from coupole.calibration.light.led_power import LEAST_PRIOR, LedPower, calibrate_led_power, prior_of
 from coupole.calibration.light.led_power_tile import Setting, TileReader
-from coupole.calibration.light.records import Progress, counter, sealed_outcome
+from coupole.calibration.light.radiometric_record import Findings, sealed_outcome
+from coupole.calibration.light.records import Progress, counter
 from coupole.calibration.light.tile_views import TileView, list_of
 from coupole.calibration.record import Parameter
 from coupole.calibration.report import Outcome
@@ -62,22 +63,24 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
         request,
         frames,
         (width, height),
-        parameters,
-        covariance,
+        Findings(
+            parameters,
+            covariance,
+            limits=against_limits(LED_POWER, request.limits, {"power": typical, "unusable": unusable}),
+            files={f"{request.name}.csv": power_table(powers, warm).encode()},
+            fixed_figures={
+                "tile.reflectance": setting.tile_of("G").reflectance,
+                "tile.minnaert": setting.tile.minnaert,
+                "gain_db": frames.gain_db,
+                READ_WITH + "response": float(setting.response is not None),
+                READ_WITH + "flat-field": float(setting.flat is not None),
+                **({} if setting.glare is None else {READ_WITH + GLARE: 1.0}),
+            },
+            remarks=(f"emission profile `{setting.emission}`", *remarks),
+            more_inputs=setting.inputs,
+            artefacts=setting.artefacts(channels),
+        ),
         partial(pictures.draw_led_power, powers, setting.positions),
-        limits=against_limits(LED_POWER, request.limits, {"power": typical, "unusable": unusable}),
-        files={f"{request.name}.csv": power_table(powers, warm).encode()},
-        fixed_figures={
-            "tile.reflectance": setting.tile_of("G").reflectance,
-            "tile.minnaert": setting.tile.minnaert,
-            "gain_db": frames.gain_db,
-            READ_WITH + "response": float(setting.response is not None),
-            READ_WITH + "flat-field": float(setting.flat is not None),
-            **({} if setting.glare is None else {READ_WITH + GLARE: 1.0}),
-        },
-        remarks=(f"emission profile `{setting.emission}`", *remarks),
-        more_inputs=setting.inputs,
-        artefacts=setting.artefacts(channels),
     )
 
 

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.acceptance import against_limits
-from coupole.calibration.artefact import UsedArtefact
 from coupole.calibration.earlier import read_accepted, read_earlier
 from coupole.calibration.light import drawing as pictures
 from coupole.calibration.light.acceptance import DARK, RESPONSE
@@ -26,22 +25,18 @@ from coupole.calibration.light.dark import Dark, DarkFrame, calibrate_dark, warm
 from coupole.calibration.light.frames import (
     LightFrame,
     LightFrames,
-    PlainSources,
     channel_mask,
     channels_of,
 )
 from coupole.calibration.light.linearity import Linearity, linearity
 from coupole.calibration.light.pairs import Pair
 from coupole.calibration.light.photon_transfer import PhotonTransfer, photon_transfer
+from coupole.calibration.light.radiometric_record import Findings, sealed_outcome
 from coupole.calibration.record import (
-    Input,
     Kind,
     Limit,
     Noise,
     Parameter,
-    Record,
-    rows_of,
-    seal_record,
 )
 from coupole.calibration.report import Outcome
 from coupole.calibration.request import Request
@@ -52,45 +47,6 @@ from coupole.plan.shot_id import Light
 Progress = Callable[[int, int], None]
 _MOST_PIXELS = 200_000
 """Greatest number of pixels of a channel that are used for the response."""
-
-
-def sealed_outcome(
-    kind: str,
-    request: Request,
-    frames: LightFrames | PlainSources,
-    size_px: tuple[int, int],
-    parameters: Sequence[Parameter],
-    covariance: Floats,
-    draw: Callable[[Record, Any], None],
-    *,
-    limits: Sequence[Limit],
-    files: Mapping[str, bytes] | None = None,
-    noise: Sequence[Noise] = (),
-    fixed_figures: Mapping[str, float] | None = None,
-    remarks: Sequence[str] = (),
-    more_inputs: Sequence[tuple[str, str]] = (),
-    artefacts: Sequence[UsedArtefact] = (),
-) -> Outcome:
-    """Return a record of a calibration with its files. `draw` gets the record and an empty figure."""
-    contents = files or {}
-    record = seal_record(
-        kind=kind,
-        **request.head(),
-        simulated=frames.about.is_simulated,
-        validity=request.validity(frames.about, size_px, frames.temperature_range_c),
-        transforms={},
-        parameters=tuple(parameters),
-        fixed=dict(fixed_figures or {}),
-        covariance=rows_of(covariance),
-        files=tuple(Input(name=n, sha256=hashlib.sha256(content).hexdigest()) for n, content in contents.items()),
-        noise=tuple(noise),
-        images=(),
-        limits=tuple(limits),
-        remarks=tuple(remarks),
-        artefacts=tuple(artefacts),
-        inputs=tuple(Input(name=name, sha256=digest) for name, digest in (*frames.inputs, *more_inputs)),
-    )
-    return Outcome(record, partial(draw, record), contents)
 
 
 # -- dark -----------------------------------------------------------------------------------------------------
@@ -134,13 +90,15 @@ def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> O
         request,
         frames,
         (width, height),
-        parameters,
-        _of_means(dark, np.array([p.u for p in parameters])),
+        Findings(
+            parameters,
+            _of_means(dark, np.array([p.u for p in parameters])),
+            limits=against_limits(DARK, request.limits, {"hot": len(dark.hot) / dark.offset_dn.size}),
+            files={f"{request.name}.h5": content},
+            fixed_figures=fixed_figures,
+            remarks=(f"{len(dark.hot)} hot pixels of {height * width}; the list is in {request.name}.h5",),
+        ),
         partial(pictures.draw_dark, dark),
-        limits=against_limits(DARK, request.limits, {"hot": len(dark.hot) / dark.offset_dn.size}),
-        files={f"{request.name}.h5": content},
-        fixed_figures=fixed_figures,
-        remarks=(f"{len(dark.hot)} hot pixels of {height * width}; the list is in {request.name}.h5",),
     )
 
 
@@ -238,14 +196,16 @@ def response_outcome(
         request,
         frames,
         (width, height),
-        parameters,
-        covariance,
+        Findings(
+            parameters,
+            covariance,
+            limits=against_limits(RESPONSE, request.limits, {"linearity": worst, "flicker": flicker}),
+            noise=noise,
+            fixed_figures={"range_dn": range_dn, **_saturation_figures(transfers)},
+            remarks=remarks,
+            more_inputs=record_input(dark_record),
+        ),
         partial(pictures.draw_response, transfers, lines),
-        limits=against_limits(RESPONSE, request.limits, {"linearity": worst, "flicker": flicker}),
-        noise=noise,
-        fixed_figures={"range_dn": range_dn, **_saturation_figures(transfers)},
-        remarks=remarks,
-        more_inputs=record_input(dark_record),
     )
 
 

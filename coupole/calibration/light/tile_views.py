@@ -50,12 +50,29 @@ class TileView:
 
 
 @dataclass(frozen=True)
+class Emitter:
+    """The light-emitting square of an LED: its emission profile, and its side."""
+
+    emission: Emission = "lambertian"
+    side_mm: float = LED_SIDE_MM
+
+
+LAMBERTIAN = Emitter()
+
+
+@dataclass(frozen=True)
 class Positions:
     """LEDs' places and normals in the base frame, by id."""
 
     ids: NDArray[np.int64]
     centres_mm: Floats
+    """[n, 3]"""
     normals: Floats
+    """[n, 3]"""
+
+    def only(self, ids: NDArray[np.int64]) -> Positions:
+        """Return the positions of some LEDs, in the order of `ids`."""
+        return Positions(ids, *self.of(ids))
 
     def of(self, ids: NDArray[np.int64]) -> tuple[Floats, Floats]:
         row = {int(led): i for i, led in enumerate(self.ids)}
@@ -78,19 +95,28 @@ class Row:
     reflectance and Minnaert's k."""
 
 
+@dataclass(frozen=True)
+class ViewRows:
+    """The observations of one view."""
+
+    rows: list[Row]
+    unused_leds: set[int]
+    """LEDs that are lit in the view although their frames cannot be used."""
+    remarks: list[str]
+    """Sentences: frames that cannot be used, and why."""
+
+
 def transfer(
     view: TileView,
-    centres_mm: Floats,
-    normals: Floats,
+    leds: Positions,
     tile: Tile,
+    emitter: Emitter = LAMBERTIAN,
     *,
     tilt_deg: Floats | None = None,
     height_mm: float = 0.0,
     minnaert: float | None = None,
-    emission: Emission = "lambertian",
-    side_mm: float = LED_SIDE_MM,
 ) -> tuple[Floats, Floats]:
-    """Return h [n, m] = f E/Phi of each patch under each LED, and the cosine of incidence [n, m].
+    """Return h [n, m] = f E/Phi of each patch under each of the LEDs, and the cosine of incidence [n, m].
 
     The pixels that see a patch define it. At another height of the tile, they see another part of it.
     """
@@ -98,13 +124,12 @@ def transfer(
     normal = view.base_from_tile[:3, :3] @ np.array([np.sin(y), -np.sin(x) * np.cos(y), np.cos(x) * np.cos(y)])
     rays = view.points_mm - view.camera_mm
     points = (view.points_mm + rays * (height_mm / (rays @ view.base_from_tile[:3, 2]))[:, None])[None]
-    towards = centres_mm[:, None] - points
+    towards = leds.centres_mm[:, None] - points
     cos_in = (towards @ normal) / np.linalg.norm(towards, axis=-1)
     away = view.camera_mm - points[0]
     cos_out = (away @ normal) / np.linalg.norm(away, axis=-1)
-    lit = irradiance_per_flux(
-        points, normal, centres_mm[:, None], normals[:, None], side_mm=side_mm, emission=emission
-    )
+    places, axes = leds.centres_mm[:, None], leds.normals[:, None]
+    lit = irradiance_per_flux(points, normal, places, axes, side_mm=emitter.side_mm, emission=emitter.emission)
     h: Floats = tile.brdf(np.maximum(cos_in, 1e-6), cos_out[None], minnaert=minnaert) * lit
     return h, cos_in
 
@@ -114,27 +139,26 @@ def rows_of(
     view: TileView,
     positions: Positions,
     tile: Tile,
-    emission: Emission,
+    emitter: Emitter,
     *,
-    side_mm: float = LED_SIDE_MM,
     place: int = 0,
     figures: int = 5,
-    remarks: list[str],
-) -> tuple[list[Row], set[int]]:
-    """Return observations of view `number`, and the LEDs that are lit in it although their frames cannot be used.
+) -> ViewRows:
+    """Return observations of view `number`.
 
     All LEDs share `figures`: two tilts and the height for each place of the tile, ln reflectance, and Minnaert's
-    k. The view's place has the number `place`. Views that cannot be used are added to `remarks`.
+    k. The view's place has the number `place`.
     """
-    centres, normals = positions.of(view.leds)
-    h, cos_in = transfer(view, centres, normals, tile, emission=emission, side_mm=side_mm)
+    leds = positions.only(view.leds)
+    h, cos_in = transfer(view, leds, tile, emitter)
     slopes = np.zeros((len(view.leds), figures))
     of_place = slice(OF_PLACE * place, OF_PLACE * (place + 1))
-    slopes[:, of_place], slopes[:, -2:] = _slopes(view, centres, normals, tile, emission, side_mm)
+    slopes[:, of_place], slopes[:, -2:] = _slopes(view, leds, tile, emitter)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio, u_ratio = view.signal / h, view.u_signal / h
     usable = (cos_in.min(axis=1) > _LOWEST_COSINE) & (h > 0).all(axis=1) & np.isfinite(view.signal).all(axis=1)
     rows: list[Row] = []
+    remarks: list[str] = []
     shaded_leds: list[int] = []
     for n in np.flatnonzero(usable & ~view.saturation_mask):
         middle = float(np.median(ratio[n]))
@@ -150,27 +174,15 @@ def rows_of(
         remarks.append(f"view {view.name}: the tile is partly in shadow under {list_of(shaded_leds)}; not used")
     if (full := view.leds[view.saturation_mask & usable]).size:
         remarks.append(f"view {view.name}: the tile is saturated under {list_of(full)}; not used, expose less")
-    return rows, {*shaded_leds, *map(int, full)}
+    return ViewRows(rows, {*shaded_leds, *map(int, full)}, remarks)
 
 
-def _slopes(
-    view: TileView, centres: Floats, normals: Floats, tile: Tile, emission: Emission, side_mm: float
-) -> tuple[Floats, Floats]:
+def _slopes(view: TileView, leds: Positions, tile: Tile, emitter: Emitter) -> tuple[Floats, Floats]:
     """Return derivatives of ln h by the tile's two tilts and its height [n, 3], and by ln reflectance and
     Minnaert's k [n, 2], as central differences."""
 
     def log_h(tilt_deg: Floats | None = None, height_mm: float = 0.0, minnaert: float | None = None) -> Floats:
-        h, _ = transfer(
-            view,
-            centres,
-            normals,
-            tile,
-            tilt_deg=tilt_deg,
-            height_mm=height_mm,
-            minnaert=minnaert,
-            emission=emission,
-            side_mm=side_mm,
-        )
+        h, _ = transfer(view, leds, tile, emitter, tilt_deg=tilt_deg, height_mm=height_mm, minnaert=minnaert)
         mean: Floats = np.log(np.maximum(h.mean(axis=1), 1e-300))
         return mean
 
@@ -178,7 +190,7 @@ def _slopes(
     height = (log_h(height_mm=_STEP_MM) - log_h(height_mm=-_STEP_MM)) / (2 * _STEP_MM)
     more, less = (log_h(minnaert=tile.minnaert + step) for step in (_STEP, -_STEP))
     by_minnaert = (more - less) / (2 * _STEP)
-    return np.column_stack([*tilts, height]), np.column_stack([np.ones(len(centres)), by_minnaert])
+    return np.column_stack([*tilts, height]), np.column_stack([np.ones(len(leds.ids)), by_minnaert])
 
 
 def arrays_of(

@@ -43,6 +43,8 @@ class StickerImages:
     """Number of the image with most stickers."""
     picture: Floats
     """[H, W] the shown image."""
+    depth_mm: tuple[float, float]
+    """Least and greatest distance from the camera at which stickers were looked for."""
 
 
 def read_scan(folder: Path) -> Scan:
@@ -93,4 +95,4 @@ def find_all_stickers(
             "than their borders, and as large as --diameter-mm says?"
         )
     names = tuple(source.name for source in sources.images)
-    return StickerImages(tuple(stickers_of), names, size_px, shown_number, picture)
+    return StickerImages(tuple(stickers_of), names, size_px, shown_number, picture, depth_mm)

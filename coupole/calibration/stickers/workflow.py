@@ -9,9 +9,8 @@ import numpy as np
 
 from coupole.calibration import optics
 from coupole.calibration.acceptance import against_limits
-from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
+from coupole.calibration.calibrated_arm import CalibratedArm, CarriedCamera, calibrated_poses
 from coupole.calibration.multi_view import seen_points
-from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.record import (
     ImageResidual,
     Input,
@@ -66,18 +65,17 @@ def mesh_from(
     images: StickerImages,
     sources: Sources,
     scan: Scan,
-    prior: CameraPrior,
+    camera: CarriedCamera,
     request: Request,
     *,
     stated_noise: Stated,
-    depth_mm: tuple[float, float],
     base_from_support: Transform | None = None,
-    arm: CalibratedArm | None = None,
 ) -> MeshFound:
     """Calibrate the pose of a scanned mesh. Raises InputError if its stickers do not match those in the images."""
     if sources.poses is None:
         raise InputError("mesh: the images have no poses; give runs, or a folder with poses")
     base_from_flange = sources.poses.base_from_flange
+    prior, arm, depth_mm = camera.prior, camera.arm, images.depth_mm
     if arm is not None:
         joints_deg = np.array([source.joints_deg for source in sources.images])
         base_from_flange, prior = calibrated_poses(base_from_flange, joints_deg, arm, prior)

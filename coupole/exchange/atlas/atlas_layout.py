@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
@@ -23,6 +22,7 @@ from coupole.exchange.atlas.charts import (
     parts_of,
     split_off,
 )
+from coupole.kernels import kernel
 
 PADDING_PX = 4
 """Texels around a chart that continue it: mipmaps of three levels see nothing else."""
@@ -228,7 +228,7 @@ def _pack(sizes_px: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
         side += max(side // 64, 4)
 
 
-@numba.njit(cache=True)
+@kernel
 def _shelves(sizes_px, side_px):  # type: ignore[no-untyped-def]
     """Left upper corners of rectangles in rows; none if they do not fit."""
     origins = np.empty((len(sizes_px), 2), np.int64)
@@ -244,7 +244,7 @@ def _shelves(sizes_px, side_px):  # type: ignore[no-untyped-def]
     return origins
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _rasterise(corners_px, triangle_of_texel, is_expelled):  # type: ignore[no-untyped-def]
     """Write each triangle into the texels whose centres it contains; mark triangles that meet others there."""
     side = len(triangle_of_texel)
@@ -287,7 +287,7 @@ def nearest_known(numbers: Integers) -> tuple[Integers, NDArray[np.float32]]:
     return nearest, distance_px
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=False)
+@kernel(error_model="numpy")
 def _places(texels, triangle_of_texel, corners_px, corners_mm, places_mm):  # type: ignore[no-untyped-def]
     side = triangle_of_texel.shape[1]
     for number in range(len(texels)):

@@ -13,6 +13,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
+
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int32]
 
@@ -106,7 +108,7 @@ def _mean_normals(corners_mm: Floats, neighbours: Integers) -> Floats:
     return unit(sums)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _grow(normals, means, neighbours, seeds, most):  # type: ignore[no-untyped-def]
     """Charts [n] of triangles, and the directions [charts, 3] along which they grew: from all seeds together, and
     then one by one from what is left, each up to `most` triangles."""
@@ -125,7 +127,7 @@ def _grow(normals, means, neighbours, seeds, most):  # type: ignore[no-untyped-d
     return chart, axes[:charts].copy()
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _begin(seed, number, normals, means, chart, axes, queue, last):  # type: ignore[no-untyped-def]
     """Begin a chart with a triangle; the length of the queue."""
     axes[number] = means[seed]
@@ -135,7 +137,7 @@ def _begin(seed, number, normals, means, chart, axes, queue, last):  # type: ign
     return last + 1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _fill_charts(normals, means, neighbours, chart, axes, queue, last, most):  # type: ignore[no-untyped-def]
     """Give the neighbours of queued triangles to their charts, until `most` have been queued."""
     first = 0
@@ -152,7 +154,7 @@ def _fill_charts(normals, means, neighbours, chart, axes, queue, last, most):  #
                 last += 1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _merge(normals, neighbours, chart, axes):  # type: ignore[no-untyped-def]
     """Give triangles of small charts to the largest neighbouring chart that they face."""
     for _ in range(_MERGE_PASSES):
@@ -170,7 +172,7 @@ def _merge(normals, neighbours, chart, axes):  # type: ignore[no-untyped-def]
             chart[triangle] = best
 
 
-@numba.njit(cache=True)
+@kernel
 def _numbered_parts(neighbours, chart):  # type: ignore[no-untyped-def]
     """[n] charts from 0, where each part of one that hangs together is one."""
     parts = np.full(len(chart), -1, np.int32)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.exchange.of_results.measured_surface import Floats, MeasuredSurface
+from coupole.kernels import kernel
 from coupole.reflectance.cluster_file import CLUSTERS
 from coupole.reflectance.ggx import lobe
 
@@ -71,7 +71,7 @@ def chosen_triangles(surface: MeasuredSurface, *, optional: bool = False) -> NDA
     return np.array(surface.options.triangles, np.int64)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _lobes(ways_in, ways_out, alpha, values):  # type: ignore[no-untyped-def]
     for n in range(len(values)):
         nl, nv = ways_in[n, 2], ways_out[n, 2]

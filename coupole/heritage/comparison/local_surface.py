@@ -97,7 +97,9 @@ def fit_locally(
     )
     for first in range(0, len(places_mm), _BATCH):
         part = slice(first, first + _BATCH)
-        _fit_batch(tree, surface, values, places_mm[part], normals[part], reach_mm, part, fits)
+        batch = _fit_batch(tree, surface, values, places_mm[part], normals[part], reach_mm)
+        fits.values[part], fits.scatter[part] = batch.values, batch.scatter
+        fits.leverage[part], fits.is_seen[part] = batch.leverage, batch.is_seen
     around = cKDTree(places_mm)
     alone = fits.scatter.copy()
     for first in range(0, len(places_mm), _BATCH):
@@ -116,9 +118,8 @@ def _fit_batch(
     places: Floats,
     normals: Floats,
     reach_mm: float,
-    part: slice,
-    local_fits: LocalFits,
-) -> None:
+) -> LocalFits:
+    """Fit near places [n, 3] alone; the scatter is that of each place by itself."""
     away, near = tree.query(places, NEIGHBOURS)
     offsets = np.asarray(tree.data)[near] - places[:, None]
     tangent, bitangent = _tangents(normals)
@@ -127,7 +128,7 @@ def _fit_batch(
     there = (away[:, 0] < reach_mm) & (extent > 0)
     beside = np.hypot(x.mean(axis=1), y.mean(axis=1)) / np.where(extent > 0, extent, 1.0)
     there &= beside < _MOST_BESIDE
-    local_fits.is_seen[part] = surface.is_seen(near, np.hypot(x, y), normals)
+    is_seen = surface.is_seen(near, np.hypot(x, y), normals)
     scale = np.where(extent > 0, extent, 1.0)[:, None]
     x, y = x / scale, y / scale
     design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=2)
@@ -136,11 +137,15 @@ def _fit_batch(
     if values is not None:
         fits.append(_least_squares(design[:, :, :_PLANE_TERMS], values[near]))
     there_values, residuals = (np.concatenate([fit[k] for fit in fits], axis=-1) for k in (0, 1))
-    local_fits.values[part] = np.where(there[:, None], there_values, np.nan)
     scatter = np.einsum("nkc,nkd->ncd", residuals, residuals) / _FREEDOM_ALONE
-    local_fits.scatter[part] = np.where(there[:, None, None], scatter, np.nan)
-    local_fits.leverage[part, 0] = np.where(there, fits[0][2], np.nan)
-    local_fits.leverage[part, 1:] = np.where(there, fits[-1][2], np.nan)[:, None]
+    leverage = np.repeat(fits[-1][2][:, None], there_values.shape[1], axis=1)
+    leverage[:, 0] = fits[0][2]
+    return LocalFits(
+        np.where(there[:, None], there_values, np.nan),
+        np.where(there[:, None, None], scatter, np.nan),
+        np.where(there[:, None], leverage, np.nan),
+        is_seen,
+    )
 
 
 def _least_squares(design: Floats, observations: Floats) -> tuple[Floats, Floats, Floats]:

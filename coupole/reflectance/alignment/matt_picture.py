@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.kernels import kernel
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import RANGE_LEFT_OUT, Radiometry
 
@@ -65,7 +65,7 @@ def matt_picture(
     return np.asarray(np.where(np.isfinite(mean), mean, np.nan), np.float32)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _green_blocks(raw, dark, flat, green, top_dn, exposure_us, means):  # type: ignore[no-untyped-def]
     """Fill `means` [h / 2, w / 2] with the green signal of blocks, where `means` is infinite and the frame is
     below `top_dn`. The two greens of a block lie evenly about its middle."""

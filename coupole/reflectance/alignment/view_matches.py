@@ -13,10 +13,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from itertools import product
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.alignment.view_surface import ViewSurface
 
 Floats = NDArray[np.float64]
@@ -188,7 +188,7 @@ def _shift(
     return np.array([x, y]), covariance
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _warped_picture(points, row, column, half, other_picture, other_points, pose, lens):  # type: ignore[no-untyped-def]
     """[side, side] values of the other view at the places of the first view's blocks; NaN where it has none."""
     side = 2 * half + 1
@@ -220,7 +220,7 @@ def _warped_picture(points, row, column, half, other_picture, other_points, pose
     return values
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _cubic(values, x, y):  # type: ignore[no-untyped-def]
     """Interpolate by Keys' kernel (IEEE Trans. ASSP 29, 1981; a = -1/2) from 4 x 4 values."""
     left_column, top = int(np.floor(x)) - 1, int(np.floor(y)) - 1
@@ -233,7 +233,7 @@ def _cubic(values, x, y):  # type: ignore[no-untyped-def]
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _keys(far):  # type: ignore[no-untyped-def]
     s = abs(far)
     if s <= 1.0:
@@ -241,7 +241,7 @@ def _keys(far):  # type: ignore[no-untyped-def]
     return ((-0.5 * s + 2.5) * s - 4.0) * s + 2.0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _best_shift(template, reference_points_mm, warped_picture, reach):  # type: ignore[no-untyped-def]
     """Return the greatest correlation over whole shifts, and its shift."""
     side = len(template)
@@ -267,7 +267,7 @@ def _best_shift(template, reference_points_mm, warped_picture, reach):  # type: 
     return best, right, down
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _finer(template, reference_points_mm, warped_picture, reach, right, down):  # type: ignore[no-untyped-def]
     """Refine a whole shift; return whether the steps converged, the shift, and its covariance [2, 2]."""
     side, first = len(template), _MARGIN + reach
@@ -306,7 +306,7 @@ def _finer(template, reference_points_mm, warped_picture, reach, right, down):  
     return False, x, y, np.zeros((2, 2))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _invert(matrix):  # type: ignore[no-untyped-def]
     """Invert a positive definite matrix in place (Gauss and Jordan); False if it is not."""
     for k in range(len(matrix)):

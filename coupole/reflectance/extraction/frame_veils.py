@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.light.glare_correction import GlareCorrection
 from coupole.calibration.light.veil import light_of_blocks
+from coupole.kernels import kernel
 
 Floats = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ def dark_of_blocks(
     return np.asarray(sums / np.maximum(counts, 1e-9), np.float32)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _add_light(frames, times_s, darks, channel, curve, top_dn, block_px, light, clipped_light):  # type: ignore[no-untyped-def]
     """Add each pixel's linear signal, DN/s, to its block of `light` [channels, block rows, block columns]. Add the
     signal of pixels that all exposures clip to `clipped_light` [channels] too."""

@@ -12,12 +12,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import h5py
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.light.frames import LightFrame
 from coupole.calibration.light.veil import at_pixels
+from coupole.kernels import kernel
 from coupole.reflectance.extraction.frame_veils import FrameVeils
 from coupole.reflectance.extraction.measured_run import MeasuredView
 from coupole.reflectance.extraction.radiance import RANGE_LEFT_OUT, Radiometry
@@ -118,7 +118,7 @@ def _veil_picture(
     return share / np.float32(radiometry.white_dn - radiometry.black_dn)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _blocks(raw, dark, place_of_pixel, is_lit, offsets, flat, curve, noise, top_dn, range_dn, share, deviation):  # type: ignore[no-untyped-def]
     for row in range(share.shape[0]):
         for column in range(share.shape[1]):

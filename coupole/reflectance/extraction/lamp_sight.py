@@ -10,12 +10,12 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.light.irradiance import LED_SIDE_MM, led_corners_mm
 from coupole.calibration.light.tile_views import Positions
+from coupole.kernels import kernel
 from coupole.motion.occlusion import RAY_START_MM
 from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.extraction.sample_codes import AWAY, PENUMBRA, REACHED, SHADED
@@ -76,7 +76,7 @@ def _codes_of_led(mesh: PacketMesh, facets: Facets, leds: Positions, led: int) -
     return codes
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _darken_beside(triangles, neighbours, codes):  # type: ignore[no-untyped-def]
     """Give the lit neighbours of some triangles the code of a penumbra, and return these neighbours."""
     dark_neighbours = np.empty(3 * len(triangles), np.int64)
@@ -90,7 +90,7 @@ def _darken_beside(triangles, neighbours, codes):  # type: ignore[no-untyped-def
     return dark_neighbours[:count]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _away(centres, normals, led_centre, led_normal, least_cosine, codes):  # type: ignore[no-untyped-def]
     for triangle in range(len(centres)):
         x = led_centre[0] - centres[triangle, 0]
@@ -102,7 +102,7 @@ def _away(centres, normals, led_centre, led_normal, least_cosine, codes):  # typ
         codes[triangle] = REACHED if facing > least_cosine and from_led > 0.0 else AWAY
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def lit_by(centre, led_centre, led_normal, paper, towards):  # type: ignore[no-untyped-def]
     """E / Phi in m^-2 on a surface at `centre` that faces the LED. The direction to the LED is written to
     `towards` [3].
@@ -122,7 +122,7 @@ def lit_by(centre, led_centre, led_normal, paper, towards):  # type: ignore[no-u
     return lit * cosine if paper else lit
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def lit_on(centres, led_centres, led_normals, paper):  # type: ignore[no-untyped-def]
     """[triangles, leds] values of `lit_by`."""
     lit, towards = np.empty((len(centres), len(led_centres))), np.empty(3)

@@ -7,7 +7,6 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +14,7 @@ from coupole.calibration.earlier import read_earlier
 from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask
 from coupole.calibration.light.glare_correction import GlareCorrection, read_glare
 from coupole.calibration.light.records import dark_signal, linearise, map_beside
+from coupole.kernels import kernel
 from coupole.reflectance.extraction.frame_veils import FrameVeils, dark_of_blocks
 from coupole.reflectance.extraction.measured_run import MeasuredRun
 from coupole.reflectance.extraction.seen_surface import SeenSurface
@@ -167,7 +167,7 @@ def _flat_field(measured_run: MeasuredRun) -> tuple[NDArray[np.float32], float]:
     return fall_off * response, float(record.fixed.get("u_pixel_response", np.std(response)))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _count(triangle, channel, pixels):  # type: ignore[no-untyped-def]
     for row in range(triangle.shape[0]):
         for column in range(triangle.shape[1]):
@@ -175,7 +175,7 @@ def _count(triangle, channel, pixels):  # type: ignore[no-untyped-def]
                 pixels[triangle[row, column], channel[row, column]] += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _list(triangle, channel, channels, next_place, places):  # type: ignore[no-untyped-def]
     """Fill `places` with the numbers of pixels; `next_place` [triangles channels] is the place at which each list
     continues."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.extraction.frame_veils import NO_VEILS, Veils
 from coupole.reflectance.extraction.sample_codes import REACHED
 from coupole.reflectance.lanes import (
@@ -66,7 +66,7 @@ class Lamps(NamedTuple):
     """True if the emitter's cosine counts twice (seed 003, Eq. 2)."""
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normals, codes, f, u_own, glare):  # type: ignore[no-untyped-def]
     """Fill `f` and `u_own` [b, leds, channels], bits of float16, with the samples of b triangles from the `first`
     on, where `codes` [b, 8] say that light has reached them. Fill `glare` [b, leds, channels], which may be empty,
@@ -97,7 +97,7 @@ def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normal
                     glare[row, led, channel] = bits[2, led]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def fill_pixels(  # type: ignore[no-untyped-def]
     first_entry, entry_ends, lists, response, darks, shots, lamps, places_mm, codes, direct, values, root_share
 ):
@@ -132,7 +132,7 @@ def fill_pixels(  # type: ignore[no-untyped-def]
                 pixel += 1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _lost_by_root(u_signal):  # type: ignore[no-untyped-def]
     """Return the share of a signal that must be added because noise lowers the mean of its square root. It is u^2
     / 4 to second order, and less if noise is as large as the signal; 0 if noise is not known."""
@@ -141,7 +141,7 @@ def _lost_by_root(u_signal):  # type: ignore[no-untyped-def]
     return np.float32(0.25) * if_less(u_signal, np.float32(1e6), smaller, none)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _per_normal_irradiance(place_mm, lamps):  # type: ignore[no-untyped-def]
     """Return 1 over E / Phi of the lamps on a surface that faces them."""
     square, leaving = lanes(np.float32(0.0)), lanes(np.float32(0.0))
@@ -157,7 +157,7 @@ def _per_normal_irradiance(place_mm, lamps):  # type: ignore[no-untyped-def]
     return np.float32(1.0) / lit
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _per_irradiance(centre_mm, normal, lamps):  # type: ignore[no-untyped-def]
     """Return 1 over cos_i E / Phi (`lit_by` of lamp_sight) of the lamps."""
     square, leaving, arriving = lanes(np.float32(0.0)), lanes(np.float32(0.0)), lanes(np.float32(0.0))
@@ -173,7 +173,7 @@ def _per_irradiance(centre_mm, normal, lamps):  # type: ignore[no-untyped-def]
     return np.float32(1.0) / lit
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _signal(begin, end, channel, lists, response, darks, shots):  # type: ignore[no-untyped-def]
     """Return the mean of linear signal over the flat field, DN/s, without glare; its relative uncertainty from
     noise; and the glare. Passes are weighted by their variances, or by their times if noise is not known."""
@@ -193,7 +193,7 @@ def _signal(begin, end, channel, lists, response, darks, shots):  # type: ignore
     return mean, u_mean, veil
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _veil(begin, end, channel, lists, veils):  # type: ignore[no-untyped-def]
     """Return the mean over pixels of the veil over the flat field, DN/s. The veil is linear between the middles of
     blocks; 0 without a veil."""
@@ -219,7 +219,7 @@ def _veil(begin, end, channel, lists, veils):  # type: ignore[no-untyped-def]
     return total * (unity / np.float32(end - begin))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _mean(begin, end, channel, lists, response, darks, shots, number):  # type: ignore[no-untyped-def]
     """Return the mean of one pass, and its variance. They are NaN without pixels, with a pixel at the top of the
     range, or with a mean at its bottom."""

@@ -10,12 +10,12 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.multi_view import unproject
 from coupole.calibration.optics import Intrinsics
+from coupole.kernels import kernel
 from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.parts_in_threads import first_alone
 
@@ -101,7 +101,7 @@ def _circle(
     return focal_mm**2 / (f_number * (focus_mm - focal_mm)), focus_mm, most_px * pitch_mm
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _turn_directions(directions, base_from_camera, ways):  # type: ignore[no-untyped-def]
     """Fill `ways` [rows, width, 3] with the directions as unit vectors of the base frame."""
     for row in range(ways.shape[0]):
@@ -113,7 +113,7 @@ def _turn_directions(directions, base_from_camera, ways):  # type: ignore[no-unt
                 ways[row, column, k] = component / length
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _judge(hit, far, ways, normals, axis, fx, infinite_mm, focus_mm, most_mm, first, pixel_in_use):  # type: ignore[no-untyped-def]
     """Mark the usable pixels of a band of rows: in focus, not at a silhouette, and not at a grazing angle."""
     for row in range(first, min(first + _ROWS, hit.shape[0] - 1)):

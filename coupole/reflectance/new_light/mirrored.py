@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from coupole.kernels import kernel
 from coupole.motion.occlusion import RAY_START_MM
 from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.ggx import lobe_density, sample_reflection, shine
@@ -60,7 +60,7 @@ def add_mirrored(
     in_strips(len(picture), add)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _mirror(  # type: ignore[no-untyped-def]
     pixels, first_row, triangle_of_pixel, places_mm, camera_mm, faces, coats, near, axes, centre_mm,
     halves_mm, radiance, density, ray, lobe_rays, hit_pixels, gains, ways_mm
@@ -102,7 +102,7 @@ def _mirror(  # type: ignore[no-untyped-def]
     return count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _asking(triangle_of_pixel, places_mm, camera_mm, coats, near, axes, centre_mm, density, lobe_rays, asking):  # type: ignore[no-untyped-def]
     """Mark the pixels for which rays are drawn. None are drawn for an area that is at most as large as the lobe.
     This is so if the largest solid angle of the area at its distance, times the largest density of the lobe's
@@ -123,7 +123,7 @@ def _asking(triangle_of_pixel, places_mm, camera_mm, coats, near, axes, centre_m
             asking[row, column] = nv > 0.0 and not (near and density * above * above * 1e-6 >= peak)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _two_numbers(row, column, ray):  # type: ignore[no-untyped-def]
     """Return two numbers from 0 to 1: element `ray` of a sequence, shifted for each pixel (Wang's hash)."""
     seed = np.uint32(row * 65536 + column)
@@ -137,7 +137,7 @@ def _two_numbers(row, column, ray):  # type: ignore[no-untyped-def]
     return (first + ray * _R2[0]) % 1.0, (second + ray * _R2[1]) % 1.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _on_area(place, way, axes, centre_mm, halves_mm, density):  # type: ignore[no-untyped-def]
     """Return the distance to the area along a direction, the beams per sr there, and the area's pixel. The beams
     are 0 if the direction does not meet the area's bright side."""
@@ -157,7 +157,7 @@ def _on_area(place, way, axes, centre_mm, halves_mm, density):  # type: ignore[n
     return far_mm, density * far_mm * far_mm * 1e-6 / -slope, 0, 0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _in_environment(way, axes, radiance, density):  # type: ignore[no-untyped-def]
     """Return the distance up to which objects cast shadows of an environment, its beams per sr in a direction, and
     its pixel there."""

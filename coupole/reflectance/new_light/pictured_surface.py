@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import h5py
-import numba
 import numpy as np
 from numpy.polynomial.polynomial import polyval2d
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.geometry import apply
+from coupole.kernels import kernel
 from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.run_result import RunResult, ViewSamples
@@ -265,7 +265,7 @@ def _polynomial(given: Floats, wanted: Floats, weights: Floats) -> tuple[Floats,
     return np.append(middle, scale), coefficients
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _meet(  # type: ignore[no-untyped-def]
     first_row, triangle_of_pixel, pixel_scale, coefficients, frame, camera_mm, centres_mm, normals, places_mm
 ):

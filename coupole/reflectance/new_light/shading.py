@@ -14,10 +14,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.ggx import lobe_density
 from coupole.reflectance.lanes import (
     LANES,
@@ -135,7 +135,7 @@ def add_values(picture: Picture, surface: Surface, values: NDArray[np.float32], 
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _towards(near, place, axis, exponent, x, y, z, way):  # type: ignore[no-untyped-def]
     """Fill `way` [3] with the direction from a pixel's place to the beam's place. Return cos^k / d^2 in m^-2, or 1
     for distant light."""
@@ -153,7 +153,7 @@ def _towards(near, place, axis, exponent, x, y, z, way):  # type: ignore[no-unty
     return reach
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _reach(near, exponent, places, axes, x, y, z):  # type: ignore[no-untyped-def]
     """Do the same as `_towards` for eight beams: return three coordinates of their directions, and cos^k / d^2."""
     dx, dy, dz = load_row(places, 0), load_row(places, 1), load_row(places, 2)
@@ -168,7 +168,7 @@ def _reach(near, exponent, places, axes, x, y, z):  # type: ignore[no-untyped-de
     return dx, dy, dz, reach
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _add_beams(  # type: ignore[no-untyped-def]
     first_row, triangle_of_pixel, places_mm, codes, camera_mm, coats, near, exponent, places, axes, strengths,
     densities,
@@ -213,7 +213,7 @@ def _add_beams(  # type: ignore[no-untyped-def]
                 picture[row, column, channel] += coat[KD + channel] * total(light) + shining
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _add_beam(  # type: ignore[no-untyped-def]
     triangle_of_pixel, places_mm, codes, coats, camera_mm, near, place, axis, exponent, strength, picture
 ):
@@ -247,7 +247,7 @@ def _add_beam(  # type: ignore[no-untyped-def]
             add_in_turns(first, second, third, picture, eight)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _reach_from(near, place, axis, exponent, x, y, z):  # type: ignore[no-untyped-def]
     """Do the same as `_reach` for one beam, from eight places."""
     if not near:
@@ -260,7 +260,7 @@ def _reach_from(near, place, axis, exponent, x, y, z):  # type: ignore[no-untype
     return dx, dy, dz, reach
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _lobe(n0, n1, n2, h0, h1, h2, nl, nv, alpha):  # type: ignore[no-untyped-def]
     """Return D V of eight pixels, by the sines of `_facets`; 0 where the normal points away from the camera."""
     unity, none = np.float32(1.0), np.float32(0.0)
@@ -274,7 +274,7 @@ def _lobe(n0, n1, n2, h0, h1, h2, nl, nv, alpha):  # type: ignore[no-untyped-def
     return if_less(none, nv, lobe, none)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _across(places, axes, place):  # type: ignore[no-untyped-def]
     """Return the squared distances, m^2, of a pixel's place from the planes of eight emitters."""
     above = (load_row(places, 0) - place[0]) * load_row(axes, 0) + (load_row(places, 1) - place[1]) * load_row(
@@ -284,7 +284,7 @@ def _across(places, axes, place):  # type: ignore[no-untyped-def]
     return np.float32(1e-6) * above * above
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _facets(n0, n1, n2, h0, h1, h2, nv, alpha):  # type: ignore[no-untyped-def]
     """Return GGX's distribution divided by 2 for eight half vectors of any length, and the view's part of the
     masking. Both are computed from sines, because the cosine of a small angle is inexact in single precision."""
@@ -295,7 +295,7 @@ def _facets(n0, n1, n2, h0, h1, h2, nv, alpha):  # type: ignore[no-untyped-def]
     return (0.5 / math.pi * alpha2) / (t * t), math.sqrt(alpha2 + (1.0 - alpha2) * nv * nv)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _add_values(triangle_of_pixel, places_mm, codes, values, near, place, axis, exponent, strength, picture):  # type: ignore[no-untyped-def]
     way = np.empty(3)
     for row in range(triangle_of_pixel.shape[0]):
@@ -310,7 +310,7 @@ def _add_values(triangle_of_pixel, places_mm, codes, values, near, place, axis, 
                 )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def shines(coat):  # type: ignore[no-untyped-def]
     """Tell whether a material has a lobe."""
     any_coat = False

@@ -7,10 +7,10 @@ shadow is missed if it lies between four rays and touches no edge that was found
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.motion.occlusion import RAY_START_MM
 from coupole.motion.packet_rays import ARGUMENTS, FAR, LANES, PacketMesh, blocked16, packet, trace
 from coupole.reflectance.new_light.beams import Beam
@@ -55,7 +55,7 @@ def _trace(mesh: PacketMesh, surface: Surface, beam: Beam, pixels: NDArray[np.in
     in_threads(some, len(pixels), part=_RAYS)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _trace_rays(  # type: ignore[no-untyped-def]
     function, scene, arguments, pixels, triangle_of_pixel, places_mm, normals, near, place, codes
 ):
@@ -75,7 +75,7 @@ def _trace_rays(  # type: ignore[no-untyped-def]
             codes[pixels[first + lane]] = SHADED if rays[FAR, lane] < 0.0 else LIT
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _asked_on_grid(codes):  # type: ignore[no-untyped-def]
     """Return the pixels of the grid that need a ray, in squares whose rays are traced together."""
     (height, width), side = codes.shape, _PACKET * CELL_PX
@@ -98,7 +98,7 @@ def _facing(surface: Surface, beam: Beam) -> NDArray[np.bool_]:
     return surface.normals @ beam.place > surface.offsets_mm
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _begin(triangle_of_pixel, places_mm, facing, place, axis, exponent, codes):  # type: ignore[no-untyped-def]
     """Fill the codes that follow from the normals of triangles and emitter alone."""
     for row in range(triangle_of_pixel.shape[0]):
@@ -115,7 +115,7 @@ def _begin(triangle_of_pixel, places_mm, facing, place, axis, exponent, codes): 
                 codes[row, column] = min(codes[row, column], AWAY)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _close_cells(codes, first, open_cells):  # type: ignore[no-untyped-def]
     """Close cells in rows [n, cells across] from the `first` one on, if they have cells below and to the right. A
     cell stays open if rays at its corners are missing or differ, or if the surface ends there.
@@ -136,7 +136,7 @@ def _close_cells(codes, first, open_cells):  # type: ignore[no-untyped-def]
             open_cells[i, j] = ends
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _asked_in(codes, cells):  # type: ignore[no-untyped-def]
     """Return the pixels in cells [n, 2] that need a ray."""
     height, width = codes.shape
@@ -152,7 +152,7 @@ def _asked_in(codes, cells):  # type: ignore[no-untyped-def]
     return pixels[:count]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _open_neighbours(codes, open_cells, fresh):  # type: ignore[no-untyped-def]
     """Open each closed neighbour of the cells [n, 2] that has a different pixel at the common side; return the
     opened
@@ -173,7 +173,7 @@ def _open_neighbours(codes, open_cells, fresh):  # type: ignore[no-untyped-def]
     return opened_cells[:count]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _differs(codes, row, column, down, across, expected_code):  # type: ignore[no-untyped-def]
     """Tell whether a pixel at the side of a cell is shaded although `expected_code` is lit, or the reverse."""
     height, width = codes.shape
@@ -186,7 +186,7 @@ def _differs(codes, row, column, down, across, expected_code):  # type: ignore[n
     return False
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill(codes, first, end):  # type: ignore[no-untyped-def]
     """Fill the pixels of some rows that still need a code. They lie in closed cells and have the code of the
     cell's corners."""

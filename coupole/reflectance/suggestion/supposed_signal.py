@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from coupole.calibration.light.irradiance import irradiance_per_flux
 from coupole.calibration.record import Record
 from coupole.errors import InputError
 from coupole.geometry import apply, inverse
+from coupole.kernels import kernel
 from coupole.motion.occlusion import REACHED, Occlusion, Occlusions, Sight, sight_of
 from coupole.motion.patches import Patches
 from coupole.plan.rig import Sensor
@@ -240,7 +240,7 @@ def signal_quantile(
     return float(np.quantile(all_signals, quantile)) if len(all_signals) else np.nan
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill_reflectances(points_mm, normals, camera_mm, pixels, leds_mm, is_lit, material, f, cosines):  # type: ignore[no-untyped-def]
     kd, ks, alpha = material
     light, view, half = np.empty(3), np.empty(3), np.empty(3)

@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.ggx import UNKNOWNS, root_by_unknowns, tangents
 from coupole.reflectance.material_uncertainty import LEAST_KNOWN
 from coupole.reflectance.normal_fit import CAUCHY, SPREAD_KS
@@ -102,7 +102,7 @@ def information_of(
     return ViewInformation(parts, bread.cumsum(axis=0), meat.cumsum(axis=0))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill(  # type: ignore[no-untyped-def]
     points_mm, normals, camera_mm, leds_mm, variances, material, led_rows, numbers, bread, meat
 ):

@@ -10,10 +10,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.new_light.pictured_surface import Surface, pixels_of_places, surface_of_view
 from coupole.reflectance.parts_in_threads import in_threads
 from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples
@@ -121,7 +121,7 @@ def _add_view(
     in_threads(look, len(places_mm), part=_PART)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _look_up(  # type: ignore[no-untyped-def]
     pixels, places_mm, texel_of_pixel, seen_mm, reach_mm, texel_normals, kd, ks, alpha, covariance, normals, logs,
     information
@@ -154,7 +154,7 @@ def _look_up(  # type: ignore[no-untyped-def]
             logs[n, number] += variances[2 + min(number // channels, 2)] * means[3 + number]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _corners(pixel, place_mm, texel_of_pixel, seen_mm, reach_mm, texels, weights):  # type: ignore[no-untyped-def]
     """Fill the texels [4] around a pixel's place and their weights, which sum to 1. Return whether enough of them
     see the place."""

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from coupole.kernels import kernel
 from coupole.reflectance.ggx import lobe
 from coupole.reflectance.normal_fit import colour_weight
 from coupole.reflectance.parts_in_threads import in_threads
@@ -164,7 +164,7 @@ def colours_of(
         return np.log(kd / mean), np.sqrt(np.mean((u_kd / kd) ** 2, axis=1))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _colours(values, places_mm, led_mm, camera_mm, normals, grey, shine, kd, u_kd):  # type: ignore[no-untyped-def]
     """Fill `kd` with each channel's kd by least squares, and `u_kd` with its uncertainty from the residuals. The
     fit uses the difference of a channel's values from their mean over the channels, because the error of a lobe
@@ -192,7 +192,7 @@ def _colours(values, places_mm, led_mm, camera_mm, normals, grey, shine, kd, u_k
             kd[texel] = np.nan
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _weigh(sample, place_mm, led_mm, camera_mm, normal, grey, cosines, lobes, weights):  # type: ignore[no-untyped-def]
     """Fill, for each LED, the cosine of incidence, the value of the mean's lobe, and the weight of its values
     [channels, leds]. The weight is 0 if one of them is missing or the LED is behind the surface."""

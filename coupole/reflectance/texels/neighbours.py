@@ -10,11 +10,11 @@ samples near a highlight; kd and normal follow by their covariance with these.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from coupole.kernels import kernel
 from coupole.reflectance.ggx import UNKNOWNS, tangents
 from coupole.reflectance.kernel_arrays import assign_rows
 from coupole.reflectance.new_light.pictured_surface import in_strips
@@ -130,7 +130,7 @@ def _window_sum(plane: Singles, side_px: int) -> Singles:
     return np.asarray(uniform_filter(plane, side_px, mode="mirror"), np.float32) * np.float32(side_px**2)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _draw(deviation, covariance, surface, is_fitted, centre):  # type: ignore[no-untyped-def]
     """Update each pixel's deviation and covariance by Kalman's equations, with the `surface`'s variances about 0.
     The covariance includes the uncertainty of the centre, as far as the pixel was shrunk towards it."""
@@ -165,7 +165,7 @@ def _draw(deviation, covariance, surface, is_fitted, centre):  # type: ignore[no
                     place += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def tilts_from(normals, prior, tilts):  # type: ignore[no-untyped-def]
     """Fill `tilts` [n, 2] with the tilts of `normals` [n, 3] against `prior`, along the tangents of `normals`."""
     for n in range(len(normals)):

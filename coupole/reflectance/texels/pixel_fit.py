@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.ggx import UNKNOWNS, lobe
 from coupole.reflectance.ggx_fit import ROWS, fit_packs, pack
 from coupole.reflectance.kernel_arrays import assign, assign_rows
@@ -94,7 +94,7 @@ def fit_pixels(
     return PixelMaterials(normals, logs, covariance)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _fit_part(  # type: ignore[no-untyped-def]
     values, places_mm, led_mm, group, camera_mm, prior_normals, prior_kd, prior_ks, prior_alpha, normals, logs,
     covariance
@@ -147,7 +147,7 @@ def _fit_part(  # type: ignore[no-untyped-def]
             assign_rows(covariance[pixel], inverse @ meat @ inverse.T)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _begin(unknowns, roots, good, lights, half, view, prior):  # type: ignore[no-untyped-def]
     """Set the start to the prior's material (kd, ks, alpha), with the brightness of the samples."""
     kd, ks, alpha = prior[0], prior[1], prior[2]

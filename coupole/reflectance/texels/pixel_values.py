@@ -102,28 +102,35 @@ class PixelReader:
         with closing(batches), ThreadPoolExecutor(threads) as pool, h5py.File(self._samples.path, "r") as file:
             for part, batch in zip(self._pass.parts, batches, strict=True):
                 light = light_of(file, rows, part, channels)
-                fill_rows(
-                    pool, rows, self._reader, self._response, batch, places_mm, light, values[:, part],
-                    np.float32(1.0),
-                )  # fmt: skip
+                lit_pixels = LitPixels(rows, places_mm, light, values[:, part])
+                fill_rows(pool, self._reader, self._response, batch, lit_pixels, np.float32(1.0))
         return PixelBlock(pixels, triangle, channel, places_mm, values.view(np.float16))
+
+
+@dataclass(frozen=True)
+class LitPixels:
+    """The pixels of some rows under some LEDs."""
+
+    rows: slice
+    places_mm: NDArray[np.float32]
+    """[pixels, 3] that they see."""
+    light: tuple[NDArray[np.uint8], NDArray[np.float32]]
+    """Codes, and shares of direct light, of the rows under the LEDs (`light_of`)."""
+    values: NDArray[np.uint16]
+    """[pixels, leds] to be filled."""
 
 
 def fill_rows(
     pool: ThreadPoolExecutor,
-    rows: slice,
     reader: SignalReader,
     response: Response,
     batch: tuple[Shots, Lamps],
-    places_mm: NDArray[np.float32],
-    light: tuple[NDArray[np.uint8], NDArray[np.float32]],
-    values: NDArray[np.uint16],
+    pixels: LitPixels,
     root_share: np.float32,
 ) -> None:
-    """Fill `values` [pixels, leds] of the pixels of some rows, which see `places_mm` [pixels, 3], from the frames
-    of some LEDs. `light` tells how the LEDs' light has reached the rows (`light_of`). Noise lowers the mean of
-    square roots; `root_share` of this loss is added, which is 1 if each pixel is fitted alone."""
-    lists, (codes, direct) = reader.lists, light
+    """Fill the values of pixels from the frames of their LEDs. Noise lowers the mean of square roots; `root_share`
+    of this loss is added, which is 1 if each pixel is fitted alone."""
+    lists, (codes, direct), rows = reader.lists, pixels.light, pixels.rows
     channels = reader.pixels.shape[1]
     first = int(lists.starts[rows.start * channels])
 
@@ -133,8 +140,8 @@ def fill_rows(
         of_rows = slice(some.start - rows.start, some.stop - rows.start)
         of_pixels = slice(begin - first, int(ends[-1]) - first)
         fill_pixels(
-            begin, ends.reshape(-1, channels), lists, response, reader.darks, *batch, places_mm[of_pixels],
-            codes[of_rows], direct[of_rows], values[of_pixels], root_share,
+            begin, ends.reshape(-1, channels), lists, response, reader.darks, *batch, pixels.places_mm[of_pixels],
+            codes[of_rows], direct[of_rows], pixels.values[of_pixels], root_share,
         )  # fmt: skip
 
     starts = range(rows.start, rows.stop, _TRIANGLES)

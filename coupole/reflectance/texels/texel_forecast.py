@@ -35,7 +35,7 @@ from coupole.reflectance.run_job import RunRequest, forget, prepare_run, read_ru
 from coupole.reflectance.texels.neighbours import settle
 from coupole.reflectance.texels.pixel_file import FOLDER, refuse_other_size
 from coupole.reflectance.texels.pixel_fit import Lights, Prior, fit_pixels
-from coupole.reflectance.texels.pixel_values import fill_rows
+from coupole.reflectance.texels.pixel_values import LitPixels, fill_rows
 from coupole.reflectance.texels.texel_size import TexelSize
 from coupole.reflectance.texels.texel_values import texel_bytes
 
@@ -262,10 +262,8 @@ def _batch_s(
         for part, _ in zip(work.parts, range(2), strict=False):
             begun_s, leds = time.perf_counter(), part.stop - part.start
             batch, light = next(batches), (codes, np.ones((rows.stop, leds, channels), np.float32))
-            fill_rows(
-                pool, rows, work.reader, work.reader.response, batch, places_mm, light, values[:, :leds],
-                np.float32(1.0),
-            )  # fmt: skip
+            lit_pixels = LitPixels(rows, places_mm, light, values[:, :leds])
+            fill_rows(pool, work.reader, work.reader.response, batch, lit_pixels, np.float32(1.0))
             taken_s = time.perf_counter() - begun_s
     return taken_s, leds
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 
 _SAMPLED = 1_000_000
@@ -67,7 +67,7 @@ def texel_grid(surface: Surface, side_px: int) -> TexelGrid:
     return TexelGrid(side_px, triangle, texel_of_pixel, places_mm)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _cut_rows(  # type: ignore[no-untyped-def]
     first, end, side_px, most_mm, triangle_of_pixel, seen_mm, centres_mm, normals, triangle, places_mm,
     texel_of_pixel
@@ -91,7 +91,7 @@ def _cut_rows(  # type: ignore[no-untyped-def]
                 triangle[row, column] = most
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _gather(triangle, seen_mm, centre_mm, normal, most_mm, texel, place_mm, texel_of_pixel):  # type: ignore[no-untyped-def]
     """Give a square's pixels to its texel, and find the mean of the places that they see. Return the number of
     these pixels."""
@@ -111,7 +111,7 @@ def _gather(triangle, seen_mm, centre_mm, normal, most_mm, texel, place_mm, texe
     return members
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _most_frequent(numbers):  # type: ignore[no-untyped-def]
     """Return the most frequent number; the lowest of several. `numbers` [n] are sorted in place."""
     numbers.sort()

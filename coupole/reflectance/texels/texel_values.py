@@ -12,10 +12,10 @@ from contextlib import closing
 from dataclasses import dataclass
 
 import h5py
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels import kernel
 from coupole.reflectance.extraction.extraction import Geometry
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
@@ -27,7 +27,7 @@ from coupole.reflectance.lanes import LANES
 from coupole.reflectance.new_light.pictured_surface import Surface
 from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.run_result import ViewSamples
-from coupole.reflectance.texels.pixel_values import fill_rows, light_of
+from coupole.reflectance.texels.pixel_values import LitPixels, fill_rows, light_of
 from coupole.reflectance.texels.texel_grid import TexelGrid
 
 _TEXELS = 1 << 13
@@ -108,9 +108,8 @@ class TexelReader:
                 codes, direct = light_of(file, entries.rows, part, channels)
                 of_pixels[:] = NO_VALUE
                 of_leds = of_pixels[:, : part.stop - part.start]
-                fill_rows(
-                    pool, entries.rows, reader, response, batch, seen_mm, (codes, direct), of_leds, root_share
-                )
+                lit_pixels = LitPixels(entries.rows, seen_mm, (codes, direct), of_leds)
+                fill_rows(pool, reader, response, batch, lit_pixels, root_share)
                 is_reached = codes[:, : part.stop - part.start] == REACHED
 
                 def mean(first: int, part: slice = part, is_reached: NDArray[np.bool_] = is_reached,
@@ -195,7 +194,7 @@ class _Entries:
         return means
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _mean(starts, channel, is_reached, values, means):  # type: ignore[no-untyped-def]
     """Fill `means` [texels, channels, leds] from values [pixels, leds]. A mean is over the pixels that light has
     reached, if these are at least half of all; it is NaN if one of them has no value."""

@@ -173,8 +173,22 @@ def _on_a_line(points_mm: Floats) -> bool:
     return bool(extents[1] < _THINNEST * extents[0])
 
 
-def read_sightings(targets: Path | None, control: Path | None, names: Sequence[str], unit: str) -> Sightings:
-    """Tables of targets and control points; `names` are the scans', in order. Raises InputError with the line."""
+@dataclass(frozen=True)
+class TargetTables:
+    """Files with the places of targets."""
+
+    targets: Path | None = None
+    """Places in the scans."""
+    control: Path | None = None
+    """Places on the site, of targets whose places are known."""
+
+
+NO_TARGETS = TargetTables()
+
+
+def read_sightings(tables: TargetTables, names: Sequence[str], unit: str) -> Sightings:
+    """Read both tables; `names` are the scans', in order. Raises InputError with the line."""
+    targets, control = tables.targets, tables.control
     if control is not None and targets is None:
         raise InputError(
             f"--control {control}: needs --targets, which give the places of these points in the scans"

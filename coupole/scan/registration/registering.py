@@ -11,7 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from coupole.errors import InputError
-from coupole.scan.registration.control import Sightings, motions_by_targets, read_sightings
+from coupole.scan.registration.control import (
+    NO_TARGETS,
+    Sightings,
+    TargetTables,
+    motions_by_targets,
+    read_sightings,
+)
 from coupole.scan.registration.joining import Groups, join, spheres_meet
 from coupole.scan.registration.joint_fit import JointFit, adjust
 from coupole.scan.registration.loop_errors import Loop, find_loops, pairs_alone, sliding_pairs, with_loops
@@ -97,8 +103,7 @@ def register(
     unit: str,
     *,
     stand: Stand | None = None,
-    targets: Path | None = None,
-    control: Path | None = None,
+    tables: TargetTables = NO_TARGETS,
     trust_poses: bool = False,
     processes: int | None = None,
     say: Say,
@@ -112,7 +117,7 @@ def register(
     if len(sources) < 2:
         raise InputError(f"expected two scans or more, found {len(sources)}")
     names = [source.name for source in sources]
-    sightings = read_sightings(targets, control, names, unit)
+    sightings = read_sightings(tables, names, unit)
     scans = _prepared_scans(sources, unit, stand, say)
     if trust_poses and not any(scan.stated_pose is not None for scan in scans):
         raise InputError("--trust-poses: no scan states a pose; only PTX and E57 can")

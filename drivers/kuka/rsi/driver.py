@@ -29,6 +29,7 @@ from coupole.kinematics import Arm, forward, move_duration_s
 from coupole.supervision import ASKS_FROM_S, LOOK_S, Attention, Silence
 from drivers.arm_motion import (
     MessageTime,
+    StateReader,
     checked_speed,
     checked_target,
     longest_stop_s,
@@ -258,12 +259,8 @@ class KukaRsi:
         *,
         faults: bool = True,
     ) -> None:
-        wait_for(
+        reader = StateReader(
             self._state,
-            is_done,
-            deadline,
-            expectation,
-            check=self._raise_fault if faults else None,
             pause=lambda: self._clock.sleep(_POLL_S, LOOK_S),
             describe=lambda state: (
                 f"axes measured at {np.round(state.measured_deg, 3).tolist()} deg, "
@@ -271,6 +268,7 @@ class KukaRsi:
             ),
             remedy="See the controller's messages; its override must be at 100 %",
         )
+        wait_for(reader, is_done, deadline, expectation, check=self._raise_fault if faults else None)
 
     def _is_settled(self, state: shared_state.State, command: shared_state.Command) -> bool:
         if self._command is not command:

@@ -22,7 +22,7 @@ from drivers.kuka.rsi.cycle import CycleMeter
 from drivers.kuka.rsi.pose import Geometry
 from drivers.kuka.rsi.trajectory import Motion
 from drivers.kuka.rsi.wire import Packet, answer_template, controller_type, packet_parser, stop_element
-from drivers.kuka.rsi.witness import ArmWitness
+from drivers.kuka.rsi.witness import ArmWitness, LagBounds
 
 _GAP_STEPS = 25
 """A jump of the IPOC by more than this many steps does not continue the session. Such a packet is old, belongs to
@@ -305,12 +305,11 @@ class RsiSession:
         """Return a new witness. `is_simulated` says that the world waits for answers or for its machine, so that
         the clock says nothing about silences."""
         config = self._config
+        follow = follow_bounds(config.corrects, config.follow_deg, config.geometry)
         return ArmWitness(
             self._corrections.place,
             self._corrections.between,
-            follow=follow_bounds(config.corrects, config.follow_deg, config.geometry),
-            step=self._bounds.farthest,
-            lag_s=config.follow_lag_s,
+            LagBounds(follow, self._bounds.farthest, config.follow_lag_s),
             cycle_s=config.cycle_s,
             counts_in_a_row=config.delay_counts == "consecutive",
             unaccounted_s=0.0 if is_simulated else config.unaccounted_s,

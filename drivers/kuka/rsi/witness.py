@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import ceil
 from typing import Any
 
@@ -38,6 +39,18 @@ _ROUNDING = 2e-5
 _NOWHERE: Six = (0.0,) * 6
 
 
+@dataclass(frozen=True)
+class LagBounds:
+    """Bounds of an answer's distance from the arm."""
+
+    follow: Six
+    """Allowed distance of the arm from the places to which it was led."""
+    step: Six
+    """One cycle's step."""
+    lag_s: float
+    """Time within which the arm comes to a place to which it was led."""
+
+
 class ArmWitness:
     """Checks the invariant. A `place` is the arm's position: its axes, or the flange's pose."""
 
@@ -45,23 +58,20 @@ class ArmWitness:
         self,
         place_at: Callable[[Six], Any],
         between: Callable[[Any, Any], Six],
+        bounds: LagBounds,
         *,
-        follow: Six,
-        step: Six,
-        lag_s: float,
         cycle_s: float,
         counts_in_a_row: bool,
         unaccounted_s: float,
     ) -> None:
         """`place_at` gives the place at reported axes; `between` gives the correction from one place to another.
-        `follow` is the allowed distance of the arm from the place to which it was led, `step` is one cycle's step.
         `counts_in_a_row` says that an answer in time sets the counter of late answers to 0. `unaccounted_s` is the
         silence that ends the session; 0: never."""
         self._reported, self._between = place_at, between
-        self._follow = follow
-        self._follow_and_step: Six = tuple(map(float.__add__, follow, step))
+        self._follow = bounds.follow
+        self._follow_and_step: Six = tuple(map(float.__add__, bounds.follow, bounds.step))
         self._cycle_s, self._in_a_row, self._unaccounted_s = cycle_s, counts_in_a_row, unaccounted_s
-        self._led: deque[Any] = deque(maxlen=2 + ceil(lag_s / cycle_s))
+        self._led: deque[Any] = deque(maxlen=2 + ceil(bounds.lag_s / cycle_s))
         """Places to which the last answers led, the newest last."""
         self._last: Packet | None = None
         """The last answered packet."""

@@ -12,7 +12,7 @@ from coupole.geometry import inverse
 from sim.objects.charuco import Charuco, charuco_board, opencv_board
 from sim.optics import blur
 from sim.optics.objective import Objective, vignetting
-from sim.optics.sensor import electrons, expose, expose_electrons
+from sim.optics.sensor import electrons, expose_electrons, mosaic_electrons
 from sim.optics.sensor_model import SensorModel
 from sim.render.camera_view import View, Viewer, slopes
 from sim.render.lens import Lens, sight
@@ -76,7 +76,8 @@ def test_corners_of_a_supersampled_frame_are_found_to_a_tenth_of_a_pixel(
     view = view_of_board(base_from_camera, 4)
     frame = np.empty((768, 1024), np.uint16)
     light = (view.site, view.diffuse, falloff)
-    expose(frame, *light, model=MONO, electrons_per_radiance=WHITE_E, frame=1)
+    mean_e = mosaic_electrons(*light, model=MONO, electrons_per_radiance=WHITE_E)
+    expose_electrons(frame, mean_e, model=MONO, frame=1)
     misses = misses_px(frame, base_from_camera)
     assert np.sqrt(np.mean(misses**2)) < 0.14
     assert np.abs(misses.mean(axis=0)).max() < 0.06

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import special, stats
 
+from coupole.kernels import kernel
 from sim.optics import noise
 
 FRAME = 3
 TABLES = (noise.INVERSE_NORMAL, noise.SMALL_MEANS, noise.SMALL_STARTS)
 
 
-@numba.njit(cache=True)
+@kernel
 def words(n: int, frame: int, key: int) -> NDArray[np.uint32]:
     out = np.empty((n, 2), np.uint32)
     for i in range(n):
@@ -24,7 +24,7 @@ def words(n: int, frame: int, key: int) -> NDArray[np.uint32]:
     return out
 
 
-@numba.njit(cache=True)
+@kernel
 def normals(random: NDArray[np.uint32], table: NDArray[np.float32]) -> NDArray[np.float32]:
     out = np.empty(len(random), np.float32)
     for i in range(len(random)):
@@ -32,7 +32,7 @@ def normals(random: NDArray[np.uint32], table: NDArray[np.float32]) -> NDArray[n
     return out
 
 
-@numba.njit(cache=True)
+@kernel
 def counts(
     mean: float,
     random: NDArray[np.uint32],

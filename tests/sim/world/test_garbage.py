@@ -70,14 +70,7 @@ LINES = (b"ID\n", b"LED 12 ON 100\n", b"LED 12 OFF\n", b"ALL OFF\n")
 
 
 def scpi_box(reactor: Reactor) -> ledbox_firmware.LedBoxFirmware:
-    return ledbox_firmware.LedBoxFirmware(
-        reactor,
-        ledbox_firmware.Settings(baud=0, block_timeout_s=0.05),
-        on_edge=lambda t_ns: None,
-        on_light=lambda led, on_ns, off_ns: None,
-        on_dark=lambda t_ns: None,
-        on_panel=lambda panel, on, t_ns: None,
-    )
+    return ledbox_firmware.LedBoxFirmware(reactor, ledbox_firmware.Settings(baud=0, block_timeout_s=0.05))
 
 
 def lines_box(reactor: Reactor) -> text_box.TextBox:

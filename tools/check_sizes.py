@@ -14,15 +14,16 @@ from pathlib import Path
 FOLDERS = ("coupole", "drivers", "sim", "tools")
 MOST_MODULE_LINES = 400
 MOST_FUNCTION_LINES = 60
-"""Most lines of a function, from the first decorator or `def` to the last line, including the docstring."""
+"""Greatest number of lines of a function, from the first decorator or `def` to the last line, including the
+docstring."""
 MOST_ROOMS, MOST_TOP_FILES = 19, 9
-"""Packages and top-level files in coupole/."""
+"""Greatest numbers of packages and of top-level files in coupole/."""
 SHARED_NAMES = {"__init__", "records", "report", "settings"}
-"""Names that modules of several packages may have."""
+"""Names that modules of several packages may share."""
 
 
 def violations(root: Path) -> Iterator[str]:
-    """Functions that are too large, or modules named twice, under `root`, one line each."""
+    """Yield functions that are too large, and module names that occur twice, under `root`, one line each."""
     for folder in FOLDERS:
         for path in sorted((root / folder).rglob("*.py")):
             yield from _large(path, path.relative_to(root))

@@ -21,7 +21,7 @@ _LIMIT_TOLERANCE_DEG = 1e-9
 
 
 def refusal(expectation: str, observation: str) -> DeviceRefused:
-    """Return the error for a refused motion, or for a wait for it."""
+    """Return the error for a refused motion, or for a refused wait for a motion."""
     return DeviceRefused("robot", expected=expectation, happened=observation, remedy="Ask for another pose")
 
 

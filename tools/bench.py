@@ -1,6 +1,7 @@
 """Benchmarks against peers, one JSON line each: `python tools/bench.py [check|sequencing|store|matching|rsi ...]`.
 
-`--smallest` runs one round of each at a size of seconds, which shows that it runs, not how fast Coupole is.
+`--smallest` runs one round of each at a size of seconds. This shows only that the benchmark runs, not how fast
+Coupole is.
 
 Each line has `name`, `value`, `unit`, `peer` (a program measured in the same run, or the limit) and `ratio`
 (Coupole's figure over the peer's; above 1 is better). Values are medians of interleaved rounds; ratios are given
@@ -29,12 +30,12 @@ from smallest import add_smallest
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL_DEMO = {"lights": {"kind": "every", "every": 40}}
-"""Entries of the demo's plan at the smallest size."""
+"""Changes of the demo's plan for the smallest size."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """Request: how often and how much is measured."""
+    """The request: number of rounds, size of the measurement."""
 
     rounds: int
     frames: int | None
@@ -57,8 +58,8 @@ def cpu_s() -> float:
 
 
 def bench_check(options: Asked) -> None:
-    """`coupole check --no-paths` of 30 views x 1080 LEDs x 3 exposures, against the limit of 3 s and against a
-    Python process that only imports numpy, pydantic and h5py."""
+    """Measure `coupole check --no-paths` of 30 views x 1080 LEDs x 3 exposures, against the limit of 3 s, and
+    against a Python process that only imports numpy, pydantic and h5py."""
     command = [
         sys.executable,
         "-m",
@@ -84,8 +85,8 @@ def bench_check(options: Asked) -> None:
 
 
 def bench_sequencing(options: Asked) -> None:
-    """A burst of 1080 LEDs at 100 frames/s, from INITiate to the last proven frame, against the table's own
-    duration; on the world's clock and on the machine's."""
+    """Measure a burst of 1080 LEDs at 100 frames/s, from INITiate to the last proven frame, against the table's
+    own duration; on the world's clock and on the machine's."""
     from coupole.acquisition.opened_cell import open_cell
     from coupole.acquisition.recorder import RunRecorder
     from coupole.acquisition.run_description import about_run, metadata_of_views
@@ -129,7 +130,8 @@ def bench_sequencing(options: Asked) -> None:
 
 
 def bench_store(options: Asked) -> None:
-    """Full-size frames to disk: the view writer and others, and the whole data path of a run."""
+    """Measure the writing of full-size frames to disk: the view writer and others, and the whole data path of a
+    run."""
     from bench_store import figures
 
     for figure in figures(ROOT, options.rounds, smallest=options.smallest):
@@ -140,7 +142,7 @@ def bench_store(options: Asked) -> None:
 
 
 def bench_live(options: Asked) -> None:
-    """Whole runs of full-size frames with processing beside them, against the same runs without it."""
+    """Measure whole runs of full-size frames with simultaneous processing, against the same runs without it."""
     from bench_live import figures
 
     for figure in figures(ROOT, options.rounds, smallest=options.smallest):
@@ -151,8 +153,8 @@ def bench_live(options: Asked) -> None:
 
 
 def bench_matching(options: Asked) -> None:
-    """Proof of a whole burst of 1092 frames, 2 % of them lost, against numpy's nearest-neighbour pairing, which
-    is given the clocks' offset and proves nothing; and against the 10 ms per frame at 100 frames/s."""
+    """Measure the proof of a whole burst of 1092 frames, 2 % of them lost. The peers are numpy's nearest-neighbour
+    pairing, which gets the clocks' offset and proves nothing, and the 10 ms of a frame at 100 frames/s."""
     from coupole.acquisition.frame_matching import compile_now, match
     from coupole.devices import STEP_RECORD_DTYPE
     from coupole.preflight.job import read_job
@@ -191,7 +193,7 @@ def bench_matching(options: Asked) -> None:
 
 
 def bench_rsi(options: Asked) -> None:
-    """Latency of answers to a KUKA controller at 4 ms, against a minimal program in C."""
+    """Measure the latency of answers to a KUKA controller at 4 ms, against a minimal program in C."""
     from bench_rsi import figures
 
     for figure in figures(options.rounds, smallest=options.smallest):
@@ -199,7 +201,7 @@ def bench_rsi(options: Asked) -> None:
 
 
 def bench_collisions(options: Asked) -> None:
-    """Collision check of one pose of the arm, against python-fcl."""
+    """Measure the collision check of one pose of the arm, against python-fcl."""
     from bench_collisions import figures
 
     for figure in figures(ROOT, options.rounds, smallest=options.smallest):
@@ -207,7 +209,8 @@ def bench_collisions(options: Asked) -> None:
 
 
 def bench_archive(options: Asked) -> None:
-    """Compression ratio and speed of archiving a view, and reading from it, against h5py and the file before."""
+    """Measure compression ratio and speed of archiving a view, and of reading from it. The peers are h5py and the
+    file before archiving."""
     from bench_archive import figures
 
     for figure in figures(ROOT, options.rounds, smallest=options.smallest):
@@ -215,7 +218,8 @@ def bench_archive(options: Asked) -> None:
 
 
 def bench_codecs(options: Asked) -> None:
-    """Packing, compression and Exif against libraries with the same functions: equality of output, and speed."""
+    """Compare packing, compression and Exif with libraries that have the same functions: equality of output, and
+    speed."""
     from bench_codecs import figures
 
     for figure in figures(ROOT, options.rounds, smallest=options.smallest):
@@ -223,7 +227,8 @@ def bench_codecs(options: Asked) -> None:
 
 
 def bench_mesh(options: Asked) -> None:
-    """Reading a scan of 10 million triangles against numpy and trimesh; memory for 40 million."""
+    """Measure the reading of a scan of 10 million triangles against numpy and trimesh, and the memory for 40
+    million."""
     from bench_mesh import figures
 
     for figure in figures(ROOT, options.rounds, smallest=options.smallest):
@@ -231,7 +236,8 @@ def bench_mesh(options: Asked) -> None:
 
 
 def bench_calibration(options: Asked) -> None:
-    """PigmentFinding a board, and the adjustments of hand-eye and LEDs, against plain use of OpenCV and scipy."""
+    """Measure the search for a board and the adjustments of hand-eye and LEDs, against plain use of OpenCV and
+    scipy."""
     from bench_calibration import figures
 
     for figure in figures(ROOT, options.rounds, smallest=options.smallest):
@@ -239,7 +245,8 @@ def bench_calibration(options: Asked) -> None:
 
 
 def bench_render(options: Asked) -> None:
-    """Pictures of the simulated dome, against Open3D, Embree and Mitsuba, and memory for a large scan."""
+    """Measure pictures of the simulated dome, against Open3D, Embree and Mitsuba, and the memory for a large
+    scan."""
     from bench_render import figures
 
     for figure in figures(ROOT, options.rounds, smallest=options.smallest):
@@ -247,8 +254,8 @@ def bench_render(options: Asked) -> None:
 
 
 def bench_reflectance(options: Asked) -> None:
-    """Frames to samples, fits and relit pictures, against the disk, BLAS, SciPy, Mitsuba and published figures. It
-    takes 12 GB of disk and some minutes; `--frames` makes it smaller."""
+    """Measure the steps from frames to samples, fits and relit pictures, against the disk, BLAS, SciPy, Mitsuba
+    and published figures. This takes 12 GB of disk and some minutes; `--frames` makes it smaller."""
     from bench_reflectance import figures
 
     for figure in figures(ROOT, options.rounds, options.frames, smallest=options.smallest):
@@ -256,8 +263,8 @@ def bench_reflectance(options: Asked) -> None:
 
 
 def bench_console(options: Asked) -> None:
-    """The demo's efficiency while ten people watch it at a console, against that with nobody there; wants an idle
-    machine."""
+    """Measure the demo's efficiency while ten people watch it at a console, against that without watchers. It
+    needs an idle machine."""
     from bench_console import figures
 
     for figure in figures(ROOT, options.rounds, smallest=options.smallest):
@@ -265,8 +272,8 @@ def bench_console(options: Asked) -> None:
 
 
 def bench_workers(options: Asked) -> None:
-    """Fits of the demo's samples by two workers of a cluster, against one; for two idle cores. It acquires the
-    demo first, and takes 3 GB of disk."""
+    """Measure fits of the demo's samples by two workers of a cluster, against one. It needs two idle cores. It
+    acquires the demo first, and takes 3 GB of disk."""
     from bench_workers import figures
 
     for figure in figures(ROOT, options.rounds, smallest=options.smallest):
@@ -274,7 +281,7 @@ def bench_workers(options: Asked) -> None:
 
 
 def bench_urushi(options: Asked) -> None:
-    """Sphere maps of gold under ten lights, made anew for each place of the lights."""
+    """Measure sphere maps of gold under ten lights, computed again for each position of the lights."""
     from bench_urushi import figures
 
     for figure in figures(options.rounds, smallest=options.smallest):
@@ -282,7 +289,8 @@ def bench_urushi(options: Asked) -> None:
 
 
 def bench_watching(options: Asked) -> None:
-    """The look at a full-size frame and the judging of a burst, against a frame's time at 100 frames/s."""
+    """Measure the examination of a full-size frame and the judgement of a burst, against a frame's time at 100
+    frames/s."""
     from bench_watching import figures
 
     for figure in figures(ROOT, options.rounds, smallest=options.smallest):

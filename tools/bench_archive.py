@@ -1,8 +1,8 @@
-"""Archiving a view: compression ratio, speed, and reading from the archive against the file before.
+"""Archiving a view: compression ratio, speed, and reading from the archive against reading from the file before.
 
-Full-size frames of a dim object on a dark ground, with the shot and read noise of the simulated sensor; eight
-different frames, repeated. Speed is measured on a view of 40 frames, reading on one with up to 1080 frames, as the
-disk has room, with the page cache emptied of the file.
+The frames are full-size pictures of a dim object on a dark ground, with the shot and read noise of the simulated
+sensor; eight different frames are repeated. Speed is measured on a view of 40 frames. Reading is measured on a
+view of up to 1080 frames, as the disk allows; the file is first removed from the page cache.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ FRAMES, FEW_FRAMES, DISTINCT = 1080, 40, 8
 SMALLEST_FRAMES = 16
 _DATA = "entry/instrument/detector/data"
 TILE_PX, TILE_AT = 256, (1900 / 4096, 1100 / 3072)
-"""A window of 256 x 256 that is not aligned with any tile; its first corner as shares of width and height."""
+"""A window of 256 x 256 that is not aligned with any tile; position of its first corner, as shares of width and
+height."""
 
 
 def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
@@ -99,7 +100,7 @@ def _cpu_s() -> float:
 
 def pictures(count: int, size_px: tuple[int, int] = SIZE_PX) -> NDArray[np.uint16]:
     """Frames [count, H, W] in page-aligned memory: photons and 13 electrons of read noise at 3.35 electrons per
-    DN, 64 DN black; the light comes from another side in each. Smaller ones show the object smaller."""
+    DN, 64 DN black. The light comes from a different side in each. Smaller frames show the object smaller."""
     width_px, height_px = size_px
     memory = mmap.mmap(-1, count * width_px * height_px * 2)
     images = np.frombuffer(memory, np.uint16).reshape(count, height_px, width_px)
@@ -143,8 +144,8 @@ def _write_view(path: Path, pictures: NDArray[np.uint16], frames: int) -> list[A
 
 
 def _plain_h5py_mb_s(path: Path, before: Path, codec: Any) -> float:
-    """Speed of plain h5py: frame by frame read and assigned to a dataset of the same chunks and filter, then
-    synced, without comparison."""
+    """Return the speed of plain h5py. Each frame is read and assigned to a dataset with the same chunks and
+    filter; then the file is synced, without a comparison."""
     from coupole.storage.bitshuffle import tile_shape
 
     _forget(before)

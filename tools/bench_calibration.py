@@ -1,7 +1,7 @@
 """Speed of board detection and of adjustments, against plain use of OpenCV and scipy's sparse least squares.
 
-The peers solve the same problem from the same start: `least_squares` with the sparsity of its Jacobian and
-numerical derivatives; without noise estimate and covariance, which are included in Coupole's time.
+The peers solve the same problem from the same start, by `least_squares` with the sparsity of its Jacobian and
+numerical derivatives. They have no noise estimate and no covariance; Coupole's time includes both.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ PIXEL_PX, ROBOT_MM, ROBOT_DEG, TOLERANCE_MM = 0.05, 0.03, 0.003, 0.05
 
 @dataclass(frozen=True)
 class Size:
-    """Size of what is adjusted."""
+    """Size of the adjustments."""
 
     scale: float = 1.0
-    """Scale of the image of a board, over 4096 x 3072 pixels."""
+    """Scale of the image of a board, relative to 4096 x 3072 pixels."""
     images: int = 45
     boards: int = 180
     """Number of boards of six LEDs."""
     views: int = 150
     """Number of views of the dome."""
     peers_steps: int | None = None
-    """Most steps of the peer; None: until it has converged."""
+    """Greatest number of steps of the peer; None: until it has converged."""
 
 
 SMALLEST = Size(scale=0.25, images=8, boards=12, views=40, peers_steps=3)
@@ -264,7 +264,8 @@ def _dome(boards: int, views: int) -> _Scene:
 
 
 def _plain(scene: _Scene, offsets: bool, steps: int | None) -> Any:
-    """The same unknowns in scipy: bodies, views, hand-eye, eight of the lens; offsets of points if requested."""
+    """Solve for the same unknowns in scipy: bodies, views, hand-eye, eight parameters of the lens, and offsets of
+    points if requested."""
     bodies, views, points = len(scene.base_from_body), len(scene.base_from_flange), len(scene.places_mm)
     at_view = 6 * bodies
     at_camera = at_view + 6 * views

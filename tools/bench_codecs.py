@@ -1,7 +1,7 @@
 """Coupole's codecs against libraries: equality of output, and speed.
 
-One full-size 12-bit frame on one core and, for the compression, on two threads at once; the small DNG of the
-conformance tests for the Exif reader. The libraries are those of the dependency group `bench`.
+The data are one full-size 12-bit frame, on one core and, for the compression, on two threads at once. The Exif
+reader gets the small DNG of the conformance tests. The libraries are those of the dependency group `bench`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FEWEST_ROUNDS = 9
 
 
 def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
-    """`same_output` is true if the peer's bytes or pixels equal Coupole's."""
+    """Yield figures. `same_output` is true if the peer's bytes or pixels equal Coupole's."""
     from bench_archive import SIZE_PX, SMALLEST_PX, pictures
 
     if missing := [name for name in ("imagecodecs", "exifread") if importlib.util.find_spec(name) is None]:
@@ -38,7 +38,7 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
 
 
 def _packing(frame: NDArray[np.uint16], rounds: int) -> Iterator[dict[str, Any]]:
-    """Twelve bits a pixel into reused memory and back, in both orders."""
+    """Pack twelve bits per pixel into reused memory, and unpack them, in both orders."""
     import imagecodecs
 
     from coupole.storage.packing import pack12, unpack12
@@ -61,7 +61,7 @@ def _packing(frame: NDArray[np.uint16], rounds: int) -> Iterator[dict[str, Any]]
 
 
 def _bitshuffle(frame: NDArray[np.uint16], rounds: int) -> Iterator[dict[str, Any]]:
-    """Compression of all tiles of a frame, by one thread and by two with a frame each."""
+    """Compress all tiles of a frame, by one thread and by two threads with a frame each."""
     from coupole.storage.bitshuffle import CODECS, compressed_tiles, tile_shape
 
     tile = tile_shape(*frame.shape)
@@ -89,7 +89,8 @@ def _tiles(frame: NDArray[np.uint16], tile: tuple[int, int]) -> Iterator[NDArray
 
 
 def _imagecodecs_tile(part: NDArray[np.uint16], codec: Any) -> bytes:
-    """HDF5's filter 32008 composed from imagecodecs' functions, which provide the shuffle but not the format."""
+    """Compress by HDF5's filter 32008, composed of functions of imagecodecs, which has the shuffle but not the
+    format."""
     import imagecodecs
 
     from coupole.storage.bitshuffle import BLOCK_PIXELS
@@ -111,7 +112,7 @@ def _imagecodecs_tile(part: NDArray[np.uint16], codec: Any) -> bytes:
 
 
 def _exif(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
-    """Capture time and exposure of one file."""
+    """Read capture time and exposure of one file."""
     import exifread
 
     sys.path.insert(0, str(root / "tests/conformance"))
@@ -144,7 +145,8 @@ def _at_once(work: Callable[[], object], threads: int) -> None:
 def _medians_s(
     rounds: int, run_coupole: Callable[[], object], run_peer: Callable[[], object]
 ) -> tuple[float, float]:
-    """Medians of interleaved rounds, without the first of each: numba compiles, memory is allocated."""
+    """Return medians of interleaved rounds. The first round of each is left out, because numba compiles and memory
+    is allocated then."""
     times: tuple[list[float], list[float]] = ([], [])
     for number in range(-1, rounds):
         for work, seconds in zip((run_coupole, run_peer), times, strict=True):

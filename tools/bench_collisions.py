@@ -1,7 +1,7 @@
 """Time of the collision check of one pose of the arm, against python-fcl through trimesh.
 
 Coupole computes the distance of every pair of bodies: arm, camera, object, support, dome, keep-out volumes. The
-peer only tests whether any of the arm's capsules, as meshes, touches the object's mesh or the support.
+peer only tests whether a capsule of the arm, as a mesh, touches the object's mesh or the support.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ POSES, SMALLEST_POSES = 100, 4
 
 
 def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
-    """Microseconds per pose, for random poses in the demo's cell."""
+    """Yield microseconds per pose, for random poses in the demo's cell."""
     from coupole.preflight.job import read_job
 
     job = read_job(root / "configs/plans/demo.yaml")
@@ -37,7 +37,7 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
             start_s = time.perf_counter()
             work()
             times.append((time.perf_counter() - start_s) / poses * 1e6)
-    medians_us = [float(np.median(times[1:])) for times in times_us]  # the first round compiles
+    medians_us = [float(np.median(times[1:])) for times in times_us]  # numba compiles in the first round
     name, peer_us = ("trimesh_fcl", medians_us[1]) if len(works) > 1 else ("frame_period_at_100_hz", 10_000.0)
     yield {
         "name": "collision_check_per_pose",
@@ -50,7 +50,7 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
 
 
 def fcl_check(job: Any, poses_deg: NDArray[np.float64]) -> Callable[[], None] | None:
-    """The peer's work on all poses; None if python-fcl is not installed."""
+    """Return a function that does the peer's work on all poses; None if python-fcl is not installed."""
     try:
         import fcl  # noqa: F401  required by trimesh's collision manager
     except ImportError:
@@ -86,7 +86,7 @@ def fcl_check(job: Any, poses_deg: NDArray[np.float64]) -> Callable[[], None] | 
 
 
 def capsule_mesh(capsule: Any) -> Any:
-    """A capsule as a mesh, in its link's frame."""
+    """Return a capsule as a mesh, in its link's frame."""
     import trimesh
 
     start, end = np.array(capsule.start_mm, dtype=float), np.array(capsule.end_mm, dtype=float)

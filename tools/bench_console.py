@@ -1,8 +1,8 @@
-"""Cost of ten watchers at a console: efficiency of the acquisition with them over that without.
+"""Cost of ten watchers at a console: efficiency of the acquisition with watchers, divided by that without.
 
-Watchers are clients of the Run screen that speak the screens' own protocol (socket.io over WebSocket) and fetch
-each new picture, as browsers do; they draw nothing, as browsers on other machines cost this one nothing. All is on
-one machine all the same: the cell, the console, the run and the watchers.
+Watchers are clients of the Run screen. They speak the screens' own protocol (socket.io over WebSocket) and fetch
+each new picture, as browsers do. They draw nothing, because browsers on other machines would cost this machine
+nothing. Cell, console, run and watchers are all on one machine.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from demo_plan import write_demo_plan
 
 WATCHERS, SMALLEST_WATCHERS = 10, 2
 SMALLEST = {"kind": "every", "every": 40}
-"""Lights of its plan."""
+"""Lights of the plan for the smallest size."""
 _PASSWORD = "a long password"
 _RUNS_TAKE_S = 900.0
 
 
 @dataclass
 class Console:
-    """A served cell, asked as its command line does and as people do."""
+    """A served cell. Requests go to it as from the command line, and as from people."""
 
     root: Path
     rig: Path
@@ -46,7 +46,8 @@ class Console:
         return call(read_cell(self.rig), method, path, body)
 
     def acquire(self, plan: Path) -> dict[str, Any]:
-        """Its figures, when it has ended. Raises RuntimeError: not all was proven."""
+        """Acquire a plan; return its figures when it has ended. Raises RuntimeError if not all shots were
+        proven."""
         entry = self.ask("POST", "/api/v1/queue", {"plan": str(plan), "now": True})["id"]
         end_s = time.monotonic() + _RUNS_TAKE_S
         while time.monotonic() < end_s:
@@ -62,7 +63,7 @@ class Console:
 
 @dataclass
 class Seen:
-    """Counts of what a watcher got, and the addresses (`shots`) that it fetched."""
+    """Counts of a watcher's messages, and the addresses (`shots`) that it fetched."""
 
     connections: int = 0
     updates: int = 0
@@ -99,7 +100,7 @@ async def _watch(url: str, cookies: dict[str, str], until: asyncio.Event, traffi
         async def on_connect() -> None:
             traffic.connections += 1
             assert await client.call("handshake", query), "the screen did not take the watcher"
-            query["next_message_id"] = None  # of a connection that was lost: go on with what is next
+            query["next_message_id"] = None  # after a lost connection, go on with the next message
 
         client.on("update", update)
         client.on("connect", on_connect)
@@ -116,7 +117,7 @@ def _first_match(pattern: str, text: str) -> str:
 
 
 def _watchers(url: str, count: int) -> None:
-    """So many, until this process is told to end; what they saw is printed then."""
+    """Run this number of watchers until this process is told to end; then print their counts."""
 
     async def work() -> None:
         import aiohttp
@@ -176,7 +177,7 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
 
 
 def _cell(root: Path, folder: Path, entries: dict[str, Any]) -> tuple[Path, Path]:
-    """The demo's cell with a storage folder of its own; its plan with other entries."""
+    """Return the demo's cell with its own storage folder, and its plan with other entries."""
     from ruamel.yaml import YAML
 
     rig = YAML(typ="safe", pure=True).load(root / "configs/rigs/sim.yaml")

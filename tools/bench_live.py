@@ -1,8 +1,8 @@
-"""Frame rate of whole runs with and without processing beside them (`coupole acquire --reflectance`), in turn.
+"""Frame rate of whole runs with and without simultaneous processing (`coupole acquire --reflectance`), in turn.
 
-Each run is the command itself, in a process of its own: full-size frames at the camera's full rate, three views
-with moves between them. The camera sends pictures rendered beforehand; in the first view its memory is filled with
-them, so the rate is that of the others. Times are those of the journal.
+Each run is the command itself, in a separate process: full-size frames at the camera's full rate, three views with
+moves between them. The camera sends pictures that were rendered before. In the first view its memory is filled
+with them, so the rate is that of the other views. Times are those of the journal.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ class LiveRun:
     """Figures of one run."""
 
     frames_per_s: float
-    """Median of the views after the first, from first to last proven frame of each."""
+    """Median over the views after the first, from the first to the last proven frame of each."""
     frames: int
     lost_count: int
     """Frames that did not arrive, or shots that were taken again."""
     move_s: float
     """Longest time from a view's last frame to the next one's first."""
     result_figures: dict[str, Any]
-    """Figures of `--json` that tell of the result; empty without."""
+    """Figures of `--json` about the result; empty without a result."""
 
 
 def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
-    """Both kinds of runs in turn, `rounds` of each."""
+    """Yield figures of both kinds of runs in turn, `rounds` of each."""
     size = SMALLEST if smallest else Size()
     alone_runs, beside_runs = [], []
     for _ in range(rounds):

@@ -1,8 +1,8 @@
 """A run of full-size frames for the benchmark of reflectance: a relief in the demo's dome, seen from above.
 
 Frames are rendered by the simulator, one for each LED, and written by the store of real runs with their journal.
-What calibrations would tell is known here without any record: lens, poses and places of the LEDs are the
-simulator's own, powers are equal, noise is that of a usual sensor.
+No calibration record is needed: lens, poses and positions of the LEDs are the simulator's own, powers are equal,
+and noise is that of a usual sensor.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from bench_render import (
 
 @dataclass(frozen=True)
 class Size:
-    """Size of frames, width and height, and of the relief, of which about nine tenths are seen."""
+    """Width and height of frames, and size of the relief, about nine tenths of which are seen."""
 
     size_px: tuple[int, int] = FULL
     triangles: int = 1_150_000
 
 
 LIFT_MM = 6.0
-"""Above the dome's support; the camera is as much higher."""
+"""Height of the relief above the dome's support; the camera is raised by the same height."""
 VIEW, MESH, DARK_FRAMES = "top", "relief.ply", 2
 EXPOSURE_US = 8000
 POWER = 1.2e7
@@ -45,7 +45,7 @@ NOISE = (6.0, 0.4)
 
 
 def make_run(root: Path, folder: Path, frames: int, size: Size) -> Any:
-    """A run with frames under `frames` LEDs, spread over the dome, and some in the dark."""
+    """Make a run with frames under `frames` LEDs, spread over the dome, and some dark frames."""
     import trimesh
 
     from coupole.acquisition.recorder import RunRecorder
@@ -118,7 +118,7 @@ def _keep(recorder: Any, pixels: NDArray[np.uint16], number: int, shot: Any, led
 
 
 def read_run(folder: Path) -> tuple[Any, Any]:
-    """The run as extraction takes it (`MeasuredRun`), and its radiometry."""
+    """Return the run in the form that extraction needs (`MeasuredRun`), and its radiometry."""
     from coupole.calibration.light.frames import channels_of, open_light_frames
     from coupole.calibration.light.tile_views import Positions
     from coupole.calibration.optics import Intrinsics

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 MILLIONS, MOST_MILLIONS = 10.0, 40.0
-"""Triangles."""
+"""Numbers of triangles, in millions."""
 SMALLEST_MILLIONS = 0.002
 MOST_MEMORY_GB = 8.0
 _FACE = np.dtype([("corners", "u1"), ("indices", "<i4", (3,))])
@@ -36,7 +36,7 @@ def _times(path: Path, millions: float, rounds: int) -> Iterator[dict[str, Any]]
     from coupole.scan.scanner_export import read_scan
 
     vertices = _write_sheet(path, round(1e6 * millions))
-    read_mesh(path)  # compiles
+    read_mesh(path)  # numba compiles
     works: dict[str, Callable[[], Any]] = {
         "coupole": lambda: read_mesh(path),
         "numpy": lambda: _plain_numpy(path, vertices),
@@ -85,7 +85,8 @@ def _figure(name: str, ours_s: float, peer: str, peer_s: float) -> dict[str, Any
 
 
 def _sheet(triangles: int) -> tuple[int, Any, Any]:
-    """Vertices per row, and functions of first and last row that give vertices and triangles of a strip."""
+    """Return the number of vertices in a row, and functions of the first and the last row that return the vertices
+    and the triangles of a strip."""
     side = int(np.sqrt(triangles / 2)) + 1
 
     def rows(first: int, last: int) -> Any:
@@ -147,7 +148,7 @@ def _trimesh(path: Path) -> Any:
 
 
 def _in_a_process(path: Path) -> tuple[float, float]:
-    """Seconds and peak memory (GB) for reading and checking a scan, in a separate process."""
+    """Return seconds and peak memory (GB) for reading and checking a scan, in a separate process."""
     code = (
         "import json, resource, sys, time; from pathlib import Path; "
         "from coupole.scan.scanner_export import read_scan; "

@@ -1,7 +1,7 @@
 """Speed and memory of reflectance: full-size frames to samples, fits of triangles, relit pictures.
 
-The run is that of `bench_measured_run`. Peers: a read of the same bytes past the page cache, BLAS, SciPy, Mitsuba,
-and what was published of La Coupole (seed 003, 6.2 and 6.3: half a million triangles, ten cores).
+The run is that of `bench_measured_run`. The peers are a read of the same bytes past the page cache, BLAS, SciPy,
+Mitsuba, and the published figures of La Coupole (seed 003, 6.2 and 6.3: half a million triangles, ten cores).
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from reflectance_peers import scipy_ggx, scipy_harmonics, sgemm_products
 FRAMES = 300
 LIMIT_S, LIMIT_OVER_READ = 60.0, 1.5
 PAPER_S = 150.0
-"""100 to 200 s with ten cores."""
+"""Seconds of the paper: 100 to 200 s with ten cores."""
 PAPER_BYTES = {"ggx_normal": 14e6, "sh": 600e6, "rbf": 600e6}
 PAPER_TRIANGLES = 500_000
 PAPER_TIMES = {"ggx_normal": 1.0, "sh": 2.0, "rbf": 6.0}
-"""Times of making a picture, over that of GGX."""
+"""Times of making a picture, relative to that of GGX."""
 _CHUNK = 16 << 20
 FULL_RUN = Size()
 
@@ -51,7 +51,7 @@ class Scope:
     few_frames: int = 10
     """Frames of the run whose memory is compared with that of all frames."""
     fitted_count: int = 16_384
-    """Triangles."""
+    """Number of fitted triangles."""
     by_scipy: int = 256
 
 
@@ -84,7 +84,7 @@ def _elapsed_s(work: Callable[[], Any]) -> float:
 
 
 def _medians(works: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
-    """Seconds of interleaved functions, that have been called before."""
+    """Return the seconds of interleaved functions, each of which has been called before."""
     times: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(rounds):
         for name, work in works.items():
@@ -110,7 +110,7 @@ print(json.dumps(int(peak.split()[1]) * 1024))
 
 
 def _memory(root: Path, folder: Path, scope: Scope) -> Iterator[dict[str, Any]]:
-    """Peak memory of a process that extracts a run of few frames, and of many."""
+    """Measure the peak memory of a process that extracts a run of few frames, and of one with many frames."""
     peaks = []
     for count in (scope.few_frames, scope.frames):
         shutil.rmtree(folder / "runs", ignore_errors=True)
@@ -125,7 +125,7 @@ def _memory(root: Path, folder: Path, scope: Scope) -> Iterator[dict[str, Any]]:
 
 
 def extract(folder: Path, say: Callable[[str, int, int], None]) -> dict[str, Any]:
-    """The whole of it: what a view sees, shadows, samples, into a file."""
+    """Extract samples completely: visibility, shadows, samples, into a file."""
     from coupole.reflectance.extraction.extraction import extract_view, geometry_of
 
     measured_run, radiometry = read_run(folder)
@@ -161,7 +161,7 @@ def _extraction(folder: Path, rounds: int) -> Iterator[dict[str, Any]]:
             for first in range(0, len(work.leds), work.together):
                 codes_of(slice(first, min(first + work.together, len(work.leds))), pool)
 
-    next(work.samples(all_reached, 1))  # compiles
+    next(work.samples(all_reached, 1))  # numba compiles
     works: dict[str, Callable[[], Any]] = {
         "read": lambda: _read_direct(
             path, frames * measured_run.frames.size_px[0] * measured_run.frames.size_px[1] * 2
@@ -224,7 +224,7 @@ def _some_samples(folder: Path, count: int) -> Any:
 
 
 def _fits(samples: Any, rounds: int, by_scipy: int) -> Iterator[dict[str, Any]]:
-    """Microseconds a triangle with all cores, three channels."""
+    """Measure microseconds per triangle with all cores, for three channels."""
     from coupole.reflectance.slice_basis import HARMONICS, RADIAL
     from coupole.reflectance.slice_fit import fit_slices
     from coupole.reflectance.triangle_fit import fit_triangles
@@ -263,7 +263,8 @@ def _fits(samples: Any, rounds: int, by_scipy: int) -> Iterator[dict[str, Any]]:
 
 
 def _representations(samples: Any, rounds: int) -> Iterator[dict[str, Any]]:
-    """Bytes of half a million triangles on disk, and times of making values from them, over GGX's."""
+    """Measure the bytes of half a million triangles on disk, and the times of computing values from them, relative
+    to GGX."""
     from coupole.reflectance.run_result import FIELDS
     from coupole.reflectance.slice_basis import COUNT, HARMONICS, RADIAL
     from coupole.reflectance.slice_fit import fit_slices, slice_values
@@ -295,9 +296,13 @@ def _representations(samples: Any, rounds: int) -> Iterator[dict[str, Any]]:
 def _relit(
     root: Path, folder: Path, samples: Any, rounds: int, size_px: tuple[int, int]
 ) -> Iterator[dict[str, Any]]:
-    """A full-size picture under a new light, with shadows, from the materials of some triangles, repeated, in the
-    memory of the one before; Mitsuba has one sample for each pixel, and its scene loaded. How long a picture takes
-    in new memory is told too: the operating system may need most of that time to clear it."""
+    """Measure a full-size picture under a new light, with shadows, from the materials of some triangles, which are
+    repeated.
+
+    The picture is written into the memory of the one before. Mitsuba has one sample for each pixel, and its scene
+    is loaded. The time for a picture in new memory is measured too, because the operating system may need most of
+    it to clear that memory.
+    """
     from bench_measured_run import MESH
     from bench_render import mitsuba_frame, photographer
     from coupole.reflectance.material_uncertainty import MaterialUncertainty

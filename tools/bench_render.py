@@ -56,8 +56,8 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
 
 
 def relief(triangles: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Vertices and faces of a bumpy rectangle, z up, in mm: 3:4, with the 0.2 mm cells of a scan from 1.4 million
-    triangles on, and never smaller than the field of view."""
+    """Return vertices and faces of a bumpy rectangle 3:4, z up, in mm. From 1.4 million triangles on it has the
+    0.2 mm cells of a scan; it is never smaller than the field of view."""
     down = round((triangles / 2 * 3 / 4) ** 0.5)
     across, half_y = down * 4 // 3, max(75.0, 0.1 * down)
     x, y = np.meshgrid(
@@ -71,7 +71,7 @@ def relief(triangles: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
 
 
 def corners_of_relief(triangles: int) -> NDArray[np.float32]:
-    """[about `triangles`, 3, 3]."""
+    """Return [about `triangles`, 3, 3] corners of triangles."""
     vertices, faces = relief(triangles)
     return vertices[faces]
 
@@ -84,14 +84,14 @@ def write_relief(path: Path, triangles: int) -> None:
 
 
 def camera_pose() -> NDArray[np.float64]:
-    """A camera that looks straight down from the working distance."""
+    """Return the pose of a camera that looks straight down from the working distance."""
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = WORKING_DISTANCE_MM
     return pose
 
 
 def times_s(works: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
-    """Median times of interleaved functions, without the first round, which compiles."""
+    """Return median times of interleaved functions. The first round is left out, because numba compiles then."""
     times: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(1 + rounds):
         for name, work in works.items():
@@ -136,7 +136,8 @@ def gbuffer_figures(rounds: int, size: Size) -> Iterator[dict[str, Any]]:
 def ray_tracers(
     corners: NDArray[np.float32], lens: Any, pose: NDArray[np.float64]
 ) -> dict[str, Callable[[], Any]]:
-    """Primary rays of an undistorted camera with other programs; trees and rays are prepared before."""
+    """Return functions that trace the primary rays of an undistorted camera with other programs; trees and rays
+    are prepared before."""
     columns, rows = np.meshgrid(np.arange(lens.width_px), np.arange(lens.height_px))
     x, y = (columns - lens.centre_px[0]) / lens.focal_px, (rows - lens.centre_px[1]) / lens.focal_px
     ways = (np.stack([x, y, np.ones_like(x)], axis=-1) @ pose[:3, :3].T).astype(np.float32).reshape(-1, 3)
@@ -164,8 +165,8 @@ def ray_tracers(
 
 
 def photographer(root: Path, mesh: Path, size: tuple[int, int], **settings: Any) -> Any:
-    """The demo's dome around one mesh, and the flange pose that looks straight down at it; `settings` are those of
-    the world, `flat` if they do not say."""
+    """Return the demo's dome around one mesh, and the flange pose that looks straight down at it. `settings` are
+    those of the world, by default `flat`."""
     from coupole.preflight.job import read_job
     from coupole.preflight.simulated_world import world_config
     from sim.optics.photographer import Photographer
@@ -197,8 +198,9 @@ def render_leds(by: Any, pose: NDArray[np.float64], out: NDArray[np.uint16], led
 
 
 def frame_figures(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
-    """Frames per second: each LED's first frame, with its shadow rays; again with cached shadows, in another view
-    of the same triangles; again from the same pose, with cached radiance as far as memory allows."""
+    """Yield frames per second of three cases: the first frame of each LED, with its shadow rays; again with cached
+    shadows, in another view of the same triangles; again from the same pose, with cached radiance as far as memory
+    allows."""
     for size_px, millions in ((size.full_px, size.medium), (size.small_px, size.small)):
         label = f"{size_px[0]}x{size_px[1]}_{millions:g}_M_triangles"
         with tempfile.TemporaryDirectory() as folder:
@@ -221,7 +223,7 @@ def frame_figures(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any
             first = 1 + turn * size.leds_of_a_round
             leds = range(first, first + size.leds_of_a_round)
             for times, place in zip(per_frame.values(), (pose, nudged_pose, nudged_pose), strict=True):
-                render_leds(by, place, out, range(1))  # rasterises the new pose, which is not timed here
+                render_leds(by, place, out, range(1))  # the new pose is rasterised here, which is not timed
                 start_s = time.perf_counter()
                 render_leds(by, place, out, leds)
                 times.append((time.perf_counter() - start_s) / len(leds))
@@ -239,9 +241,11 @@ def frame_figures(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any
 
 
 def pixel_figures(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
-    """Frames per second at full size with light and shadow on each pixel, each under another LED: the light alone,
-    with blur, and with interreflection too, against Mitsuba's and against one radiance for each triangle. Then the
-    time of blur alone, against a second."""
+    """Yield frames per second at full size with light and shadow on each pixel, each frame under another LED.
+
+    The cases are the light alone, with blur, and with interreflection too. The peers are Mitsuba, and one radiance
+    for each triangle. Then follows the time of blur alone, against a second.
+    """
     ways: dict[str, dict[str, Any]] = {
         "flat": {"shading": "flat"},
         "pixel_direct": {
@@ -266,7 +270,7 @@ def pixel_figures(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any
         leds = range(first, first + size.pixel_leds_of_a_round)
         for name, (by, pose) in photographers.items():
             if turn == 0:
-                render_leds(by, pose, out, range(1))  # rasterises, and prepares what a pose needs
+                render_leds(by, pose, out, range(1))  # rasterises, and prepares all that depends on the pose
             start_s = time.perf_counter()
             render_leds(by, pose, out, leds)
             times[name].append((time.perf_counter() - start_s) / len(leds))
@@ -291,7 +295,7 @@ def pixel_figures(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any
 
 
 def _blur_figure(by: Any, pose: NDArray[np.float64], rounds: int, size: Size) -> dict[str, Any]:
-    """Seconds of blur alone."""
+    """Return the seconds of blur alone."""
     from sim.optics.blur import through
     from sim.optics.sensor import electrons
 
@@ -305,7 +309,7 @@ def _blur_figure(by: Any, pose: NDArray[np.float64], rounds: int, size: Size) ->
 
 
 def mitsuba_frame(mesh: Path, by: Any, size_px: tuple[int, int]) -> Callable[[int], None] | None:
-    """A function that moves Mitsuba's LED and renders a frame; None if Mitsuba is not installed."""
+    """Return a function that moves Mitsuba's LED and renders a frame; None if Mitsuba is not installed."""
     try:
         import mitsuba
     except ImportError:
@@ -360,8 +364,8 @@ print(json.dumps([int(peak.split()[1]) / 2**20, read_s]))
 
 
 def memory_figure(root: Path, size: Size) -> dict[str, Any]:
-    """Peak memory of a process that reads a binary PLY of 10 million triangles and renders one LED at full size
-    by pixel, with blur and interreflection, against the 16 GiB of a laboratory's computer."""
+    """Measure the peak memory of a process that reads a binary PLY of 10 million triangles and renders one LED at
+    full size by pixel, with blur and interreflection, against the 16 GiB of a laboratory's computer."""
     with tempfile.TemporaryDirectory() as folder:
         mesh = Path(folder) / "mesh.ply"
         write_relief(mesh, int(size.large * 1e6))

@@ -25,7 +25,7 @@ from drivers.kuka.rsi.settings import Settings
 
 CYCLE_S = 0.004
 BLOCK_CYCLES, BLOCKS = 250, 8
-"""The responders alternate every second; number of seconds per round."""
+"""Cycles of a block, and number of blocks in a round; the responders alternate after each block of a second."""
 SMALLEST_CYCLES = 50
 _SOURCE = Path(__file__).with_name("bench_rsi_responder.c")
 
@@ -41,7 +41,7 @@ def our_responder() -> Iterator[tuple[StandInController, bool]]:
 
 @contextmanager
 def c_responder(folder: Path) -> Iterator[tuple[StandInController, bool] | None]:
-    """The program in C, compiled here; None without compiler."""
+    """Return the compiled program in C; None without a compiler."""
     compiler, port = shutil.which("cc"), free_port()
     if compiler is None:
         yield None
@@ -60,7 +60,7 @@ def c_responder(folder: Path) -> Iterator[tuple[StandInController, bool] | None]
 
 @contextmanager
 def neighbours(count: int) -> Iterator[None]:
-    """Processes that keep a core busy."""
+    """Run processes that keep a core busy."""
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
     try:
         yield
@@ -71,9 +71,9 @@ def neighbours(count: int) -> Iterator[None]:
 
 
 def figures(rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
-    """Latencies in us and fractions of late answers, each with its peer."""
+    """Yield latencies in us and fractions of late answers, each with its peer."""
     cycles, blocks = (SMALLEST_CYCLES, 1) if smallest else (BLOCK_CYCLES, BLOCKS)
-    with tempfile.TemporaryDirectory() as folder, above_the_loop():  # busy neighbours have normal priority
+    with tempfile.TemporaryDirectory() as folder, above_the_loop():  # busy processes have normal priority
         for load, count in (("idle", 0), ("two_busy_neighbours", 2)):
             with our_responder() as our_side, c_responder(Path(folder)) as peer_side, neighbours(count):
                 responders = [our_side] if peer_side is None else [our_side, peer_side]
@@ -88,7 +88,7 @@ def load_figures(
     coupole_session: tuple[StandInController, bool],
     peer_session: tuple[StandInController, bool] | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Figures for one load. Without a peer they are compared with the cycle."""
+    """Yield the figures for one load. Without a peer they are compared with the cycle."""
     peer = "c_responder" if peer_session else "cycle"
     more: dict[str, Any] = {"answers": len(coupole_session[0].latencies_us), "sched_fifo": coupole_session[1]}
     if peer_session:
@@ -118,7 +118,7 @@ def load_figures(
 
 
 def quantile_us(controller: StandInController, share: float) -> float:
-    """A quantile of the latency; late answers count as one cycle."""
+    """Return a quantile of the latency; late answers count as one cycle."""
     return float(np.quantile(np.minimum(controller.latencies_us, CYCLE_S * 1e6), share))
 
 

@@ -1,8 +1,8 @@
 """Speed of full-size frames to disk: the view writer against other writers, and the whole data path of a run.
 
-All write the same frames, with the noise of a dim picture, to the same disk, and sync them. The whole data path is
-a run as an operator would start it: world, camera, LED box, proof, journal; its camera sends pictures rendered
-beforehand, at twice the frame rate of the real one.
+All writers write the same frames, with the noise of a dim picture, to the same disk, and sync them. The whole data
+path is a run as an operator would start it: world, camera, LED box, proof, journal. Its camera sends pictures that
+were rendered before, at twice the frame rate of the real camera.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from numpy.typing import NDArray
 
 STREAM_FRAMES_PER_S = 200
 Writer = Callable[[Path, NDArray[np.uint16], int], None]
-"""Writes n frames (the given ones in turn) into a folder, and syncs them."""
+"""Function that writes n frames (the given ones in turn) into a folder, and syncs them."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """Size of what is written."""
+    """Size of the written data."""
 
     height_px: int = 3072
     width_px: int = 4096
     frames: int = 48
     distinct: int = 8
-    """Different frames, which are written in turn."""
+    """Number of different frames, which are written in turn."""
     stream_frames: int = 520
-    """Frames of one burst; the view has two bursts, and its disk space is reused in the next round."""
+    """Number of frames of one burst. The view has two bursts; its disk space is reused in the next round."""
 
 
 SMALLEST = Size(height_px=192, width_px=256, frames=4, distinct=2, stream_frames=20)
@@ -126,7 +126,7 @@ def _coupole(folder: Path, pixels: NDArray[np.uint16], frames: int, *, is_packed
     create(view, frames, FrameFormat(height_px, width_px, 12, "GBRG", 64, 4095), metadata, is_packed=is_packed)
     writer = ViewWriter(view, {})
     keep = partial(writer.store, camera_ns=0, exposure_us=8000)
-    with ThreadPoolExecutor(3) as pool:  # as `coupole.acquisition.frame_grabber` does
+    with ThreadPoolExecutor(3) as pool:  # like `coupole.acquisition.frame_grabber`
         slots = [pool.submit(keep, pixels[k % len(pixels)], frame_id=k) for k in range(frames)]
         for k, slot in enumerate(slots):
             writer.prove(slot.result(), f"view/led{k:04d}/e0", led=k)
@@ -231,7 +231,8 @@ def _sync(path: Path) -> None:
 
 
 def stream(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
-    """Whole bursts of a run, from the first frame to the last proof, and a plain copy of as many bytes."""
+    """Measure whole bursts of a run, from the first frame to the last proof, and a plain copy of the same number
+    of bytes."""
     bursts: list[Burst] = []
     peers: list[float] = []
     pixels = _pictures(size)
@@ -266,13 +267,14 @@ class Burst:
     frames_per_s: float
     cpu_ms_per_frame: float
     lost_count: int
-    """Frames, or shots that were taken again."""
+    """Number of lost frames, or of shots that were taken again."""
     grown_mb: float
-    """Memory of the process."""
+    """Growth of the process's memory, MB."""
 
 
 def _burst(root: Path, folder: Path, size: Size) -> Burst:
-    """Figures of the second burst of a run; in the first one the camera's memory is filled with pictures."""
+    """Return the figures of the second burst of a run. In the first burst, the camera's memory is filled with
+    pictures."""
     from ruamel.yaml import YAML
 
     from coupole.acquisition.observer import Unwatched
@@ -294,7 +296,7 @@ def _burst(root: Path, folder: Path, size: Size) -> Burst:
     rig["dome"]["leds"] = str(root / "configs/domes/coupole.csv")
     rig["led_limits"] |= {"cooldown_ratio": 0.0}
     rig["world"]["settings"] |= {"camera": {"render_once": True}}
-    # The box's own clock sets the rate, so that a delay of the arm by a frame's rendering has no effect.
+    # The box's own clock sets the rate, so a delay of the arm by the rendering of a frame has no effect.
     rig["robot"]["settings"] = {"link_timeout_s": 30.0}
     (folder / "rig.yaml").write_text(json.dumps(rig))
     plan = {

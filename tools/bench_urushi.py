@@ -1,6 +1,6 @@
-"""Sphere maps of gold under ten lights: time to make one anew when lights move, and what it misses.
+"""Sphere maps of gold under ten lights: time to compute a map again when lights move, and its error.
 
-The limit is 2 ms; the paper (seed 002, section 3.3) had a few tens of milliseconds for ten lights in 2002.
+The limit is 2 ms; the paper (seed 002, section 3.3) needed a few tens of milliseconds for ten lights in 2002.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def figures(rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
 
 
 def direct(source: brdf.Brdf, normals: np.ndarray, eye: np.ndarray, lights: np.ndarray, power: np.ndarray) -> Any:
-    """Radiance [n, bands] by the BRDF itself."""
+    """Return the radiance [n, bands] by the BRDF itself."""
     first = _unit(np.cross(np.where(np.abs(normals[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]), normals))
     local = np.stack([first, np.cross(normals, first), normals], axis=1)
     total = np.zeros((len(normals), power.shape[1]))

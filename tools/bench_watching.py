@@ -1,4 +1,4 @@
-"""Cost of looking at a full-size frame, and of judging a burst: against the time of a frame at 100 frames/s."""
+"""Cost of examining a full-size frame and of judging a burst, relative to the time of a frame at 100 frames/s."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from demo_plan import write_demo_plan
 FULL = FrameFormat(3072, 4096, 12, "GBRG", 64, 4095)
 FRAME_MS = 10.0
 BUFFERS = 8
-"""Frames in turn, more than a cache holds."""
+"""Number of frames used in turn; they are larger than a cache."""
 
 
 def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
-    """Figures of one thread; the ratio is a frame's time over the cost."""
+    """Yield figures of one thread; the ratio is a frame's time over the cost."""
     compile_now()
     random = np.random.default_rng(5)
     shape = (BUFFERS, FULL.height_px, FULL.width_px)

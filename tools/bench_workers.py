@@ -1,7 +1,8 @@
-"""Fits of the demo's samples by two workers of a dask cluster, each a process of one thread, against one.
+"""Fits of the demo's samples by two workers of a dask cluster, each a process of one thread, against one worker.
 
-The ratio of seconds means something on two idle cores only. Beside it is what CPU seconds say, which others' work
-disturbs less: what the asking process and the busiest worker used, with one and with two.
+The ratio of wall-clock seconds is meaningful only on two idle cores. CPU seconds are printed as well, because
+other processes disturb them less: those of the calling process and of the busiest worker, with one worker and with
+two.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ import h5py
 from demo_plan import write_demo_plan
 
 SMALLEST = {"kind": "every", "every": 40}
-"""Its lights; with fewer a fit has too few samples."""
+"""Lights of the smallest size; with fewer lights a fit has too few samples."""
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """Time that the fit took."""
+    """Time that the fits took."""
 
     seconds: float
     client_cpu_s: float
@@ -36,7 +37,7 @@ class Fitted:
 
     @property
     def cpu_s(self) -> float:
-        """One after the other."""
+        """CPU seconds if the calling process and the worker compute one after the other."""
         return self.client_cpu_s + max(self.workers_cpu_s)
 
 
@@ -103,7 +104,7 @@ def _cpu_s(pid: int) -> float:
 
 
 def _refuse_others(first_path: Path, second_path: Path) -> None:
-    """Raises RuntimeError if a file of fits or samples has other numbers than the other's."""
+    """Raise RuntimeError if two files of fits or samples have different numbers."""
     for path in sorted(first_path.rglob("*.h5")):
         with h5py.File(path) as file, h5py.File(second_path / path.relative_to(first_path)) as its:
             if wrong := [key for key in file if file[key][()].tobytes() != its[key][()].tobytes()]:

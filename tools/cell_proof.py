@@ -1,7 +1,7 @@
 """Calibrates a random cell from rendered frames to records, and compares the records with the truth.
 
-Frames are rendered by `sim` and evaluated by `coupole.calibration`, which share no code. Compared are the results
-in the records: camera, hand-eye, LEDs, and the pose of a scanned mesh.
+Frames are rendered by `sim` and evaluated by `coupole.calibration`, which share no code. The compared results are
+those in the records: camera, hand-eye, LEDs, and the pose of a scanned mesh.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ STEPS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
 
 @dataclass(frozen=True)
 class Judged:
-    """One parameter of one cell."""
+    """One parameter of one cell, compared with the truth."""
 
     name: str
     error: float
@@ -76,9 +76,10 @@ class Proof:
 
     judged: list[Judged]
     accuracy: dict[str, float]
-    """Distances from the truth in mm and deg, by name; `_in_true_base`: including the arm's common error."""
+    """Distances from the truth in mm and degrees, by name. Names with `_in_true_base` include the arm's common
+    error."""
     refused: str | None = None
-    """Reason why a calibration of this cell was refused or its record missed its limits; None: all were
+    """Reason why a calibration of this cell was refused, or why its record exceeded its limits; None if all were
     accepted."""
 
 
@@ -105,8 +106,8 @@ def prove_cell(
 
 
 def _prove_strange_cell(cell: RandomCell, at: Postures) -> Proof:
-    """Camera and hand-eye, by their rays and by those parameters that have a truth; LEDs if it is they that are
-    strange. A refusal is a result."""
+    """Return camera and hand-eye, by their rays and by the parameters that have a truth; and LEDs if the stranger
+    is theirs. A refusal is a result."""
     request = Request(f"cell{cell.seed}", datetime.now(UTC))
     model: Arm | None = planning_arm(cell.cell.rig) if cell.absolute else None
     try:
@@ -135,7 +136,7 @@ def _missed_limits(record: Record) -> Iterator[str]:
 
 
 def _far(proof: Proof, name: str, cell: RandomCell, found_mm: Floats, true_mm: Floats) -> None:
-    """Median and largest distance of points [n, 3] in the base from their true positions."""
+    """Add median and largest distance of points [n, 3] in the base frame from their true positions."""
     own_from_base = cell.own_base(np.eye(4))
     own_mm = true_mm @ own_from_base[:3, :3].T + own_from_base[:3, 3]
     for suffix, there_mm in (("", own_mm), ("_in_true_base", true_mm)):
@@ -147,7 +148,7 @@ def _far(proof: Proof, name: str, cell: RandomCell, found_mm: Floats, true_mm: F
 def _camera_centres_mm(
     cell: RandomCell, at: Postures, prior: CameraPrior, arm: CalibratedArm | None
 ) -> tuple[Floats, Floats]:
-    """Camera positions at the board's postures, by the records and true, without the arm's repeatability."""
+    """Camera positions at the board's postures: by the records, and true without the arm's repeatability."""
     poses = np.stack([flange_pose(joints) for joints in at.board])
     steady = replace(cell.arm_errors, repeatability_um=0.0, repeatability_deg=0.0)
     true = np.stack([steady.true_flange_pose(joints, 0) for joints in at.board]) @ cell.flange_from_camera
@@ -184,7 +185,7 @@ def _of_camera(cell: RandomCell, record: Record) -> Iterator[Judged]:
 def _of_hand_eye(cell: RandomCell, record: Record) -> Iterator[Judged]:
     true = {
         "flange_from_camera": cell.flange_from_camera,
-        "base_from_board": cell.shifted_base(true_board(cell)),  # A1's zero is in its interval
+        "base_from_board": cell.shifted_base(true_board(cell)),  # the zero of A1 is included in its interval
     }
     by_name = {parameter.name: parameter for parameter in record.parameters}
     for name, pose in record.transforms.items():
@@ -278,7 +279,7 @@ def _scan_of(thing: dict[str, Any], seed: int, folder: Path) -> Scan:
 
 
 def _error(estimate: Floats, true: Floats) -> Floats:
-    """[6] of a transform: mm along the left frame's axes, degrees about the right one's."""
+    """[6] error of a transform: mm along the left frame's axes, degrees about the right frame's axes."""
     turn = Rotation.from_matrix(true[:3, :3].T @ estimate[:3, :3]).as_rotvec(degrees=True)
     return np.array([*(estimate[:3, 3] - true[:3, 3]), *turn])
 

@@ -15,9 +15,10 @@ from pathlib import Path
 FOLDERS = ("coupole", "drivers", "sim", "tools")
 MOST_MODULE_LINES = 400
 MOST_FUNCTION_LINES = 60
-"""Most lines of a function, from the first decorator or `def` to the last line, including the docstring."""
+"""Greatest number of lines of a function, from the first decorator or `def` to the last line, including the
+docstring."""
 MOST_PARAMETERS = 7
-"""Most parameters of a function, without `self` and `cls`. What travels together is one value."""
+"""Greatest number of parameters of a function, without `self` and `cls`. What travels together is one value."""
 KERNELS = {"kernel", "njit"}
 """Decorators of compiled functions, which take arrays and numbers instead of values."""
 COMMANDS = "coupole/commands"
@@ -25,13 +26,13 @@ COMMANDS = "coupole/commands"
 MANY_PARAMETERS = {"coupole/scripting/analyses.py: fit_reflectance"}
 """Functions that may have more parameters: a public name, whose keywords are those of the command's options."""
 MOST_ROOMS, MOST_TOP_FILES = 19, 10
-"""Packages and top-level files in coupole/."""
+"""Greatest numbers of packages and of top-level files in coupole/."""
 SHARED_NAMES = {"__init__", "records", "report", "settings"}
-"""Names that modules of several packages may have."""
+"""Names that modules of several packages may share."""
 
 
 def violations(root: Path) -> Iterator[str]:
-    """Functions that are too large, or modules named twice, under `root`, one line each."""
+    """Yield functions that are too large, and module names that occur twice, under `root`, one line each."""
     for folder in FOLDERS:
         for path in sorted((root / folder).rglob("*.py")):
             yield from _large(path, path.relative_to(root))

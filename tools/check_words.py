@@ -1,10 +1,10 @@
-"""Plainness of names and docstrings, held by bounds that only go down: part of `tools/check`.
+"""Plainness of names and docstrings, limited by bounds that may only go down: part of `tools/check`.
 
     python tools/check_words.py [--show] [ROOM ...]
 
 Two shares are counted in each room (`coupole/*`, `drivers`, `sim`, `tools`):
 
-- *names*: bound names (variables, parameters, fields, functions) that are a bare participle or pronoun, like
+- *names*: bound names (variables, parameters, fields, functions) that are only a participle or pronoun, like
   `found` or `mine`. They do not say what they hold.
 - *fragments*: docstrings that begin with a preposition or a relative word, like "Of a view". Their subject is
   missing.
@@ -35,7 +35,7 @@ FRAGMENT = re.compile(
 
 @dataclass
 class Room:
-    """Counts of one folder, and where each case is."""
+    """Counts of one folder, and the places of all cases."""
 
     names: int = 0
     docstrings: int = 0
@@ -43,7 +43,7 @@ class Room:
     fragments: list[str] = field(default_factory=list)
 
     def shares(self) -> dict[str, float]:
-        """Return both shares, in per cent."""
+        """Return both shares, in percent."""
         return {
             "names": 100.0 * len(self.bare) / max(1, self.names),
             "fragments": 100.0 * len(self.fragments) / max(1, self.docstrings),
@@ -52,12 +52,13 @@ class Room:
 
 @cache
 def words(kind: str) -> frozenset[str]:
-    """`pronouns`, irregular `participles`, or what only looks like one, `no_participles`."""
+    """Return a list of words: `pronouns`, irregular `participles`, or `no_participles`, which only look like
+    participles."""
     return frozenset(tomllib.loads(WORDS.read_text(encoding="utf-8"))["words"][kind].split())
 
 
 def is_bare(name: str) -> bool:
-    """Tell whether a name is one participle or pronoun, and nothing else."""
+    """Tell whether a name is only one participle or pronoun."""
     word = name.strip("_")
     if word in words("no_participles") or "_" in word:
         return False
@@ -93,7 +94,7 @@ def room_of(path: Path) -> str:
 
 
 def count() -> dict[str, Room]:
-    """All rooms, by name."""
+    """Return the counts of all rooms, by name."""
     rooms: dict[str, Room] = {}
     for top in ("coupole", "drivers", "sim", "tools"):
         for path in sorted((ROOT / top).rglob("*.py")):

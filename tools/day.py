@@ -1,11 +1,11 @@
-"""One run of a day and longer by the rig's clock, and what of it grew.
+"""Runs a plan for a day or longer on the rig's clock, and reports growth of memory and files.
 
     python tools/day.py [--hours H] [--leds N] [--speed N] [--keep FILE]
 
-The real command on disk, at the plan's own pace on the rig's clock; what it waits for passes faster, so that a
-day takes half an hour or more. Prints a table of memory, handles, threads, sockets and sizes of files after its
-warm-up and at its end. Exits with 1 if a label was false, a frame lost, or if memory, handles, threads or sockets
-grew. FILE gets the samples.
+This is the real command on disk, at the plan's own pace on the rig's clock. Waiting times pass faster, so a day
+takes half an hour or more. Prints a table of memory, handles, threads, sockets and sizes of files after its
+warm-up and at its end. Exits with 1 if a label was false, if a frame was lost, or if memory, handles, threads or
+sockets grew. FILE gets the samples.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from long_day import WORLD, Day, Watcher, cell_in, wrong_at_the_end  # noqa: E40
 
 WARM_UP_SHARE = 0.1
 GROWTH_BYTES, GROWTH_OTHER = 50e6, 3
-"""Growth that a process may have after the warm-up; it may have a few handles, threads and sockets more or less,
-since samples are taken at any moment."""
+"""Growth that a process may have after the warm-up. It may have a few handles, threads and sockets more or less,
+because samples are taken at any moment."""
 KEPT_BYTES = 400
-"""Bytes that the controller may keep of each frame besides: which shots are proven, and where."""
+"""Additional bytes that the controller may store for each frame: which shots are proven, and where."""
 WRAP_S = 2**32 / 1e6
 MOST_SESSIONS = 20
 WHO = ("controller", "arm's process", "world")
@@ -63,7 +63,7 @@ def _follow_day(watcher: Watcher, hours: float) -> Day:
 
 
 def report(day: Day, wrong: list[str]) -> int:
-    """Print what grew; 1 if anything was wrong."""
+    """Print the growth; return 1 if anything was wrong."""
     console = Console(soft_wrap=True, highlight=False)
     console.print(
         f"{day.hours:.2f} h of the rig's clock ({day.hours * 3600.0 / WRAP_S:.1f} turns of a counter of 32 bits "

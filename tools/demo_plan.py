@@ -1,4 +1,4 @@
-"""The demo's plan in another folder, for tools that change some of it."""
+"""The demo's plan in another folder, for tools that change it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 
 
 def write_demo_plan(root: Path, folder: Path, **entries: Any) -> Path:
-    """Write `demo.yaml` with other entries to a folder; its path. Files are named by absolute paths."""
+    """Write `demo.yaml` with changed entries to a folder; return its path. Files are named by absolute paths."""
     plans = root / "configs/plans"
     plan = YAML(typ="safe", pure=True).load(plans / "demo.yaml")
 

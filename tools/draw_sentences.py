@@ -1,4 +1,4 @@
-"""Sentences of the project, drawn by seed, for a reader who has not seen them: how many need a second reading?
+"""Draws sentences of the project by seed, for a reader who counts those that need a second reading.
 
     python tools/draw_sentences.py --of docs|messages|docstrings [--seed N] [--number 40] [PATH ...]
 
@@ -6,8 +6,8 @@
 - *messages*: help of commands and options, and strings of at least five words in `coupole`, `drivers` and `sim`.
 - *docstrings*: those of `coupole`, `drivers` and `sim` that are not the help of a command.
 
-PATH keeps to files and folders below it, relative to the project. Each sentence is equally likely, and is drawn
-once. `docs/reference/plain-english.md` has the rules and the counts.
+With PATH, only files below it are used (relative to the project). Each sentence is equally likely, and is drawn at
+most once. `docs/reference/plain-english.md` has the rules and the counts.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""Drawn cells for LED positions: spots by a forward model of its own, with one cause that a calibration may lack.
+"""Random cells for LED positions: spots from a separate forward model, with one effect that a calibration may not
+model.
 
-Lens by Brown's formulas, dies as squares of many points, the primary lens of `sim.strangers`. All else is drawn:
-boards that are not where the table says, an arm with noise, records that are off by what they say of themselves.
-The causes are those of `prove_led_positions`.
+The lens follows Brown's formulas, dies are squares of many points, and the primary lens is that of
+`sim.strangers`. All else is drawn at random: boards that are not where the table says, an arm with noise, and
+records with errors of their stated size. The effects are those of `prove_led_positions`.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ PIXEL_PX, TOLERANCE_MM = 0.05, 0.05
 
 @dataclass(frozen=True)
 class DrawnLeds:
-    """A drawn cell: what a calibration knows, and the truth."""
+    """A random cell: what a calibration knows, and the truth."""
 
     table: LedTable
     images: LedImages
@@ -44,7 +45,7 @@ class DrawnLeds:
 
 
 def draw_leds(seed: int, boards: int, views: int, cause: str, strength: float) -> DrawnLeds:
-    """A cell with one cause of this strength; of one seed all else is alike."""
+    """Return a cell with one effect of this strength. For one seed, all else is the same."""
     random, random_of_dies = np.random.default_rng((seed, 1)), np.random.default_rng((seed, 2))
     table = _table(boards, random)
     true_mm, frames = _as_built(table, random)
@@ -84,7 +85,7 @@ def draw_leds(seed: int, boards: int, views: int, cause: str, strength: float) -
 
 
 def _table(boards: int, random: np.random.Generator) -> LedTable:
-    """Boards of 2 x 3 LEDs around one direction of the dome, z of the base pointing down."""
+    """Return the table of boards of 2 x 3 LEDs around one direction of the dome; z of the base points down."""
     towards = Rotation.from_rotvec([0.0, 0.0, random.uniform(0.0, 2 * np.pi)]).apply([0.8, 0.0, -0.6])
     spiral = np.arange(180)
     heights = np.sin(np.radians(8)) + (np.sin(np.radians(70)) - np.sin(np.radians(8))) * (spiral + 0.5) / 180
@@ -106,7 +107,8 @@ def _table(boards: int, random: np.random.Generator) -> LedTable:
 
 
 def _as_built(table: LedTable, random: np.random.Generator) -> tuple[Floats, Floats]:
-    """True centres [n, 3] and frames of the dies [n, 3, 3]: x and y along the board's sides, z its normal."""
+    """Return true centres [n, 3] and frames of the dies [n, 3, 3]: x and y along the board's sides, z along its
+    normal."""
     true_mm, frames = table.positions_mm.copy(), np.empty((len(table.ids), 3, 3))
     for board in np.unique(table.boards):
         rows = np.flatnonzero(table.boards == board)
@@ -122,7 +124,7 @@ def _as_built(table: LedTable, random: np.random.Generator) -> tuple[Floats, Flo
 
 
 def _eyes(count: int, table: LedTable, random: np.random.Generator) -> Floats:
-    """Poses [count, 4, 4] of the camera within the arm's reach, each towards one of the boards."""
+    """Return poses [count, 4, 4] of the camera within the arm's reach, each towards one of the boards."""
     middles_mm = table.positions_mm.reshape(-1, 6, 3).mean(axis=1)
     poses = np.tile(np.eye(4), (count, 1, 1))
     for number, pose in enumerate(poses):
@@ -155,7 +157,7 @@ ImageOf = Callable[[Emitter, Floats, int], Emitter]
 
 
 def _image(cause: str, strength: float, leds: int, random: np.random.Generator) -> ImageOf:
-    """Return the image of a die: `image_of(die, eye_mm, led)`."""
+    """Return the function that gives the image of a die: `image_of(die, eye_mm, led)`."""
     if cause in ("primary", "each"):
         sizes_mm = strength * (1.0 + (0.3 * random.standard_normal(leds) if cause == "each" else np.zeros(leds)))
         lenses = [LightStranger(primary_lens_mm=float(size)) for size in sizes_mm]
@@ -174,7 +176,7 @@ def _through_oval(die: Emitter, eye_mm: Floats, strength_mm: float) -> Emitter:
 
 
 def _through_window(die: Emitter, eye_mm: Floats, thick_mm: float) -> Emitter:
-    """The die lies under a flat layer: its image is raised along the normal, more at slanted views."""
+    """Return a die under a flat layer: its image is raised along the normal, more for oblique views."""
     away = (eye_mm - die.centre_mm) / np.linalg.norm(eye_mm - die.centre_mm)
     cosine = float(away @ die.normal)
     tangent = np.sqrt(1.0 - cosine**2) / cosine
@@ -185,7 +187,8 @@ def _through_window(die: Emitter, eye_mm: Floats, thick_mm: float) -> Emitter:
 
 
 def _of_field(cause: str, strength: float) -> tuple[float, float]:
-    """Relative growth of the picture, and that at a distance of 1 m in proportion to the nearness."""
+    """Return the relative growth of the picture, and the growth in proportion to the nearness (at a distance of 1
+    m)."""
     return (
         1e-4 * strength if cause == "field" else 0.0,
         1e-4 * strength if cause == "near" else 0.0,
@@ -193,7 +196,7 @@ def _of_field(cause: str, strength: float) -> tuple[float, float]:
 
 
 def _spot(die: Emitter, eye: Floats, lens: Floats, of_field: float, of_near: float) -> Floats:
-    """Middle of a die's picture: many places on it, weighted by their area in the picture."""
+    """Return the middle of a die's picture: many points on it, weighted by their area in the picture."""
     steps = (np.arange(5) - 2.0) / 2.5
     a, b = (axis.ravel() for axis in np.meshgrid(steps, steps))
     there = die.centre_mm + a[:, None] * die.half_u_mm + b[:, None] * die.half_v_mm
@@ -221,7 +224,7 @@ def _pose(translation_mm: Sequence[float], turn_deg: Floats) -> Floats:
 
 
 def _records(lens: Floats, flange_from_camera: Floats, random: np.random.Generator) -> CameraPrior:
-    """Records of lens and hand-eye that are off by what they say of themselves."""
+    """Return records of lens and hand-eye with errors of their stated size."""
     sigma = np.concatenate([LENS_U, np.full(3, HAND_EYE_MM), np.radians(np.full(3, HAND_EYE_DEG))])
     off = sigma * random.normal(size=len(sigma))
     values = lens.copy()

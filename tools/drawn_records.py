@@ -1,9 +1,10 @@
-"""Calibration records of the simulated cell whose errors are drawn anew: the truth, and a draw from the covariance
-that the shipped records (`configs/calibrations`) state.
+"""Calibration records of the simulated cell with random errors: the truth, plus a draw from the covariance that
+the shipped records (`configs/calibrations`) state.
 
-Drawn are lens, hand-eye and axis zeros together, places and normals of the LEDs (with the part that neighbours
-share), and their powers: each LED's own error, and those of the tile that all share, by their sensitivities. The
-records of the flat field and of the response are the shipped ones, which hold their own errors.
+The draw has lens, hand-eye and axis zeros together; positions and normals of the LEDs, with the part that
+neighbours share; and their powers. A power has its own error, and the errors of the tile that all LEDs share, by
+the tile's sensitivities. The records of the flat field and of the response are the shipped ones, which contain
+their own errors.
 """
 
 from __future__ import annotations
@@ -42,17 +43,18 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Scale:
-    """Differences from the shipped records, for cells that are known worse or better, or have another camera."""
+    """Differences from the shipped records, for cells that are known less or more accurately, or that have another
+    camera."""
 
     led_mm: float | None = None
-    """Standard uncertainty of each coordinate of an LED; None: as the record has it."""
+    """Standard uncertainty of each coordinate of an LED; None: that of the record."""
     led_normal_deg: float | None = None
     camera_mm: float | None = None
     """Standard uncertainty of each coordinate of the camera in the flange's frame."""
     pitch_um: float = 44.0
     """Pitch of the pixels."""
     size_px: tuple[int, int] | None = None
-    """Width and height of another sensor; its pixels are alike."""
+    """Width and height of another sensor with equal pixels."""
     sensor: SensorModel = SHIPPED_SENSOR
 
 
@@ -64,8 +66,8 @@ class _NoErrors(np.random.Generator):
 
 
 def draw_records(folder: Path, seed: int | None, scale: Scale | None = None) -> tuple[Path, ...]:
-    """Write records with errors of this seed to a new folder, or the truth for None, with the same stated
-    uncertainties; their paths."""
+    """Write records with errors of this seed to a new folder; for None, write the truth with the same stated
+    uncertainties. Return their paths."""
     folder.mkdir(parents=True)
     scale = scale or Scale()
     for kind in KEPT:
@@ -86,7 +88,7 @@ def draw_records(folder: Path, seed: int | None, scale: Scale | None = None) -> 
 
 
 def write_camera_record(folder: Path) -> None:
-    """Write a camera record that says of the lens what the drawn hand-eye record in a folder says."""
+    """Write a camera record with the lens of the drawn hand-eye record in a folder."""
     hand_eye = read_record(folder / "hand-eye.yaml")
     values = {parameter.name: parameter.value for parameter in hand_eye.parameters}
     content = _content(read_record(SHIPPED / "camera.yaml"))
@@ -97,7 +99,7 @@ def write_camera_record(folder: Path) -> None:
 
 
 def true_powers() -> Floats:
-    """[leds] of the simulated cell, DN s^-1 m^2 sr: alike in all channels."""
+    """[leds] of the simulated cell, DN s^-1 m^2 sr; equal in all channels."""
     table, cell = true_leds(), read_cell(RIG)
     base_from_support = cell.rig.support.base_from_support.matrix()
     emitters = squares(table.positions_mm, table.normals, side_mm=LED_SIDE_MM, fluxes_lm=table.flux_lm)
@@ -112,7 +114,7 @@ def true_leds() -> Leds:
 
 
 def _draw_hand_eye(folder: Path, random: np.random.Generator, scale: Scale) -> None:
-    """Lens, hand-eye and axis zeros by their common covariance; what the record has besides them is not used."""
+    """Draw lens, hand-eye and axis zeros from their common covariance; other parts of the record are not used."""
     record, cell = read_record(SHIPPED / "hand-eye.yaml"), read_cell(RIG)
     width_px, height_px = scale.size_px or (cell.rig.sensor.width_px, cell.rig.sensor.height_px)
     focal_px = 1e3 / scale.pitch_um * _image_mm(cell)
@@ -154,7 +156,7 @@ def _image_mm(cell: Cell) -> float:
 
 
 def _set_sensor(folder: Path, scale: Scale) -> None:
-    """Noise of another sensor, and the lens's fall-off on pixels of another size: not drawn."""
+    """Set the noise of another sensor, and the lens's fall-off on pixels of another size; these are not drawn."""
     cell, record = read_cell(RIG), read_record(SHIPPED / "response.yaml")
     content, sensor = _content(record), scale.sensor
     if sensor != SHIPPED_SENSOR:
@@ -225,7 +227,7 @@ def _draw_leds(folder: Path, random: np.random.Generator, scale: Scale) -> None:
 
 
 def _draw_powers(folder: Path, random: np.random.Generator) -> None:
-    """The true powers, each LED's own error, and those of the tile by the table's sensitivities."""
+    """Return the true powers, plus each LED's own error, plus those of the tile by the table's sensitivities."""
     record = read_record(SHIPPED / "led-power.yaml")
     content, names = _content(record), [parameter.name for parameter in record.parameters]
     text = (SHIPPED / "led-power.csv").read_text()
@@ -250,7 +252,7 @@ def _draw_powers(folder: Path, random: np.random.Generator) -> None:
 
 
 def _write_with_table(folder: Path, kind: str, content: dict[str, Any], text: str) -> None:
-    """A record with its CSV, of which the record keeps the checksum."""
+    """Write a record with its CSV, whose checksum the record contains."""
     (folder / f"{kind}.csv").write_text(text)
     for file in content["files"]:
         if file["name"] == f"{kind}.csv":

@@ -1,13 +1,14 @@
-"""Lets each call of each device of a small run fail, stop or change once in each way, and tells what became of it.
+"""Lets each call of each device of a small run fail, stop or change once in each way, and reports the
+consequences.
 
     python tools/fail_every_call.py [--cases N] [--calls N --skip N] [--kinds WORD ...] [--seed N] [--keep FILE]
     python tools/fail_every_call.py --pairs N [--first KIND] ...
 
-Without `--cases` all of them, for hours; those that FILE holds are not done again, so days may be put together of
-several calls with the same seed and `--calls`; `--skip` leaves out the first of the draw, done elsewhere.
-`--pairs`: so many drawn cases of two failures in one session, the second after the first; `--first` has the
-first at every call in turn. Prints how long after the event lamps were dark and the arm stood, by kind of failure.
-Exits with 1 if anything was wrong in any case.
+Without `--cases` all cases are tried, which takes hours. Cases in FILE are not done again, so several calls over
+days can do them together, with the same seed and `--calls`; `--skip` leaves out the first cases of the draw, which
+are done elsewhere. `--pairs` draws this number of cases with two failures in one session, the second after the
+first; with `--first`, the first failure comes at every call in turn. Prints how long after the event the lamps
+were dark and the arm stood, by kind of failure. Exits with 1 if anything was wrong in any case.
 """
 
 from __future__ import annotations
@@ -46,17 +47,18 @@ Case = tuple[Event, ...]
 
 
 _COLLECTS_EVERY = 10
-"""Cases of a job."""
+"""Number of cases of a job between garbage collections."""
 _number_of_case = itertools.count()
 
 
 def run_one(case: Case) -> dict[str, Any]:
-    """One case, in a folder that is removed."""
+    """Run one case, in a folder that is removed afterwards."""
     begun_s = time.monotonic()
     if next(_number_of_case) % _COLLECTS_EVERY == 0:
-        gc.unfreeze()  # `cells.here` freezes what a session leaves, with the files and memory that it holds
+        # `cells.here` freezes the objects that remain after a session, with the files and memory that they hold
+        gc.unfreeze()
         gc.collect()
-        gc.freeze()  # half a million objects, that each session would go through
+        gc.freeze()  # half a million objects, which each session would otherwise examine
     with tempfile.TemporaryDirectory(prefix="coupole-case-") as folder:
         try:
             if len(case) == 1 and case[0].kind in KINDS:
@@ -70,14 +72,15 @@ def run_one(case: Case) -> dict[str, Any]:
 
 
 def case_of(line: dict[str, Any]) -> Case:
-    """Return the case of a line that was kept."""
+    """Return the case of a line of FILE."""
     second = (Event(line["k2"], line["kind2"]),) if line.get("kind2") else ()
     return (Event(line["k"], line["kind"]), *second)
 
 
 def begin_job(parent_pid: int) -> None:
-    """Have this process fork its worlds, and end soon after the one that started it, also if that is killed."""
-    client._launch = NURSERY.start  # as the tests do
+    """Let this process fork its worlds, and end it soon after the process that started it, also if that is
+    killed."""
+    client._launch = NURSERY.start  # like the tests
 
     def look() -> None:
         while os.getppid() == parent_pid:
@@ -88,12 +91,12 @@ def begin_job(parent_pid: int) -> None:
 
 
 def run_all(cases: list[Case], jobs: int) -> Iterator[dict[str, Any]]:
-    """Cases as they come; each job is a process whose main thread takes the signals."""
+    """Yield the results of cases as they come. Each job is a process, whose main thread gets the signals."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, initializer=begin_job, initargs=(os.getpid(),)) as pool:
         try:
             yield from (future.result() for future in as_completed([pool.submit(run_one, case) for case in cases]))
-        finally:  # Ctrl-C: cases under way are ended, no further one is begun
+        finally:  # Ctrl-C: running cases are ended, and no further one is begun
             pool.shutdown(wait=False, cancel_futures=True)
 
 
@@ -138,7 +141,7 @@ def counted_calls() -> int:
 
 
 def choose_cases(options: argparse.Namespace, calls: int) -> list[Case]:
-    """The cases that are asked for, in an order that the seed gives."""
+    """Return the requested cases, in an order that the seed determines."""
     draw = random.Random(options.seed)
     if options.pairs is not None:
         first = drawn_kind() if options.first == "drawn" else options.first

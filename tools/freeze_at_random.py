@@ -1,11 +1,11 @@
-"""Freezes the processes of small runs (SIGSTOP) at random moments, and tells what the arm and the lamps did.
+"""Freezes the processes of small runs (SIGSTOP) at random moments, and reports how arm and lamps behaved.
 
     python tools/freeze_at_random.py [--freezes N] [--arm rsi|eki|ur ...] [--jobs N] [--seed N] [--keep FILE]
 
-So many freezes of each arm's runs, in real time, some twenty seconds each; those that FILE holds are not done
-again. About half are of the command's process, several in a run; the others of the process that answers the
-arm (RSI, UR), which ends the run. One in four is in a burst, the rest in a motion. Exits with 1 if a promise of
-docs/reference/safety.md was broken.
+N freezes are made in each arm's runs, in real time; a run takes about twenty seconds. Freezes in FILE are not done
+again. About half of the freezes are of the command's process, several in a run. The others are of the process that
+answers the arm (RSI, UR); such a freeze ends the run. One in four is in a burst, the rest are in a motion. Exits
+with 1 if a promise of docs/reference/safety.md was broken.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from fail_every_call import begin_job  # noqa: E402
 
 
 def one_run(arm: str, number: int, seed: int) -> list[dict[str, Any]]:
-    """The freezes of one run; the last one's `wrong` tells too what is wrong with the run."""
+    """Return the freezes of one run. `wrong` of the last one also contains the faults of the whole run."""
     draw, records = random.Random(f"{seed} {arm} {number}"), []
     process_name = FROZEN[int(number % 8 != 0 and arm != "eki")]
     with tempfile.TemporaryDirectory(prefix="coupole-freeze-") as folder:

@@ -2,10 +2,10 @@
 
     python tools/full_proofs.py [--only NAME ...] [--again] [--list | --table]
 
-Each proof is a command that can be run by itself. What has ended well is kept in `runs/proofs/ended.jsonl` and not
-run again without `--again`; Ctrl-C ends after what is kept, and the same command goes on. At the end, and with
-`--table`, all that is kept is printed as docs/reference/proofs.md has it. Exits with 1 if a proof of this run
-failed; its output is in `runs/proofs/<name>.log`.
+Each proof is a command that can be run by itself. The result of a proof that ended well is stored in
+`runs/proofs/ended.jsonl`, and the proof is not run again without `--again`. After Ctrl-C, the same command
+continues. At the end, and with `--table`, all stored results are printed as in docs/reference/proofs.md. Exits
+with 1 if a proof of this run failed; its output is in `runs/proofs/<name>.log`.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ LOGS = ROOT / "runs" / "proofs"
 ENDED = LOGS / "ended.jsonl"
 _PYTEST = "-m pytest --full -q -n 2 --dist loadscope --timeout 3600"
 _APART = {"tests/faults": "tests/faults/test_injection.py", "tests/runs": "tests/runs/test_soak.py"}
-"""Test files that are a proof of their own, by folder."""
+"""Test files that are separate proofs, by folder."""
 
 
 @dataclass(frozen=True)
 class Proof:
-    """A command and what it proves."""
+    """A command, and the claim that it proves."""
 
     name: str
     shows: str
     command: str
-    """Arguments for Python."""
+    """Arguments of Python."""
 
 
 def _rooms() -> list[Proof]:
-    """All tests at full scale, a folder each."""
+    """All tests at full scale, one folder for each proof."""
     folders = sorted(path.name for path in (ROOT / "tests").iterdir() if any(path.rglob("test_*.py")))
     proofs = []
     for folder in folders:
@@ -145,12 +145,12 @@ class Ended:
     name: str
     date: str
     commit: str
-    """Begins with `changed: ` if files differed from it."""
+    """Commit; begins with `changed: ` if files differed from it."""
     machine: str
     minutes: float
     code: int
     figure: str
-    """The last line that the proof printed."""
+    """Last line of the proof's output."""
 
 
 # -- running --------------------------------------------------------------------------------------------------
@@ -187,7 +187,7 @@ def _commit() -> str:
 
 
 def last_ends() -> dict[str, Ended]:
-    """The last end of each proof."""
+    """Return the last result of each proof."""
     lines = ENDED.read_text(encoding="utf-8").splitlines() if ENDED.exists() else []
     ends = [Ended(**json.loads(line)) for line in lines]
     return {ended.name: ended for ended in ends}
@@ -199,7 +199,7 @@ def keep(proof_end: Ended) -> None:
 
 
 def table(ends: dict[str, Ended]) -> str:
-    """Return a table in Markdown of every proof, also of those that were not run."""
+    """Return a table in Markdown of all proofs, including those that were not run."""
     lines = [
         "| proof | shows | date, commit | machine | minutes | ended | last line |",
         "|---|---|---|---|---|---|---|",

@@ -1,4 +1,4 @@
-"""Contracts for import-linter: a package may import what is listed for it and nothing else; no circles."""
+"""Contracts for import-linter: a package may import only what is listed for it; no circles."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class AllowListContract(Contract):
     allowed_modules = fields.SetField(subfield=fields.StringField(), required=False)
 
     def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
-        """One line for each import that is not allowed."""
+        """Yield one line for each import that is not allowed."""
         allow_list = {str(self.package), *map(str, cast(Iterable[object], self.allowed_modules or ()))}
         own_modules = {str(self.package), *graph.find_descendants(str(self.package))}
         wrong = [
@@ -39,10 +39,10 @@ class AllowListContract(Contract):
 
 
 class NoCirclesContract(Contract):
-    """No module imports itself by way of others. Imports inside functions count, and those for types alone."""
+    """No module imports itself through others. Imports inside functions, and imports for types only, count too."""
 
     def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
-        """One line for each circle, with a shortest way round."""
+        """Yield one line for each circle, with a shortest way around it."""
         circles: list[list[str]] = []
         for module in sorted(graph.modules):
             if any(module in circle for circle in circles):
@@ -57,7 +57,7 @@ class NoCirclesContract(Contract):
 
 
 def _way_round(graph: ImportGraph, module: str) -> list[str]:
-    """Modules from `module` by their imports back to it, or nothing."""
+    """Return the modules on a way of imports from `module` back to it; empty if there is none."""
     before: dict[str, str] = {}
     waiting = deque([module])
     while waiting:

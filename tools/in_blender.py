@@ -1,14 +1,14 @@
-"""Renders exports in Blender, in a process of a Python that has the package bpy; `prove_in_blender.py` starts it.
+"""Renders exports in Blender, in a separate Python with the package bpy; `prove_in_blender.py` starts it.
 
     PYTHON_WITH_BPY tools/in_blender.py JOB.json
 
-It imports nothing of Coupole. A job is a list of pictures, each with the `file` to open (`.glb`, `.obj`, `.usdz`),
-the camera (`at_m`, `look_at_m`, `field_of_view_deg` across the width, `size_px`; z up), directions `towards` of
-distant lights, `samples` a pixel and a folder `out`. For each light `out/0.exr` and so on is written: float32,
-linear, R, G, B and A, in which a white diffuser that faces the light is 1. Only light that comes straight from the
-lamp counts. What Blender's importers made of the file is written as `out/imported.json`. With `turns_green` normal
-maps are turned round, with `specular_times` materials are mended by hand (`_mend`). A picture without a file shows
-a smooth unit sphere of one material: `base_color`, `roughness`, `specular_tint`.
+This file imports nothing of Coupole. A job is a list of pictures. Each picture has the `file` to open (`.glb`,
+`.obj`, `.usdz`), the camera (`at_m`, `look_at_m`, `field_of_view_deg` across the width, `size_px`; z up),
+directions `towards` of distant lights, `samples` per pixel and a folder `out`. For each light, `out/0.exr` and so
+on is written: float32, linear, R, G, B and A; a white diffuser that faces the light is 1. Only direct light of the
+lamp counts. The result of Blender's importers is described in `out/imported.json`. With `turns_green`, the green
+channel of normal maps is inverted; with `specular_times`, materials are corrected (`_mend`). A picture without a
+file shows a smooth unit sphere of one material: `base_color`, `roughness`, `specular_tint`.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _open(path: Path) -> None:
 
 
 def _turn_green() -> None:
-    """Turn the green of all normal maps round, as if it pointed down in the map."""
+    """Invert the green channel of all normal maps, as if it pointed down in the map."""
     for material in _materials():
         tree = material.node_tree
         for node in [node for node in tree.nodes if node.type == "NORMAL_MAP"]:
@@ -74,8 +74,11 @@ def _turn_green() -> None:
 
 
 def _mend(folder: Path, specular_times: float) -> None:
-    """Do by hand what Blender's importers of OBJ and USD leave out: `specular_times` makes tints of the specular
-    picture, which is no level; roughness is no colour; and OBJ's normal map is linked."""
+    """Do what Blender's importers of OBJ and USD leave out.
+
+    `specular_times` turns the specular picture into tints, because Blender's importers take it for a level. The
+    roughness map is marked as data, not as colour. OBJ's normal map is linked.
+    """
     for material in _materials():
         tree = material.node_tree
         surface = next(node for node in tree.nodes if node.type == "BSDF_PRINCIPLED")
@@ -98,7 +101,7 @@ def _mend(folder: Path, specular_times: float) -> None:
 
 
 def _add_sphere(picture: dict[str, Any]) -> None:
-    """Blender's own sphere of as many faces takes minutes."""
+    """Add a smooth unit sphere. (Blender's own sphere with as many faces takes minutes.)"""
     rings, around = 192, 384
     places = [
         (math.sin(polar) * math.cos(turn), math.sin(polar) * math.sin(turn), math.cos(polar))
@@ -124,12 +127,12 @@ def _add_sphere(picture: dict[str, Any]) -> None:
 
 
 def _materials() -> list[Any]:
-    """Materials that have nodes."""
+    """Return the materials with nodes."""
     return [material for material in bpy.data.materials if material.node_tree is not None]
 
 
 def _describe_imports() -> dict[str, Any]:
-    """Return place and size of the meshes, and links and values of their materials."""
+    """Return position and size of the meshes, and links and values of their materials."""
     meshes = []
     for solid in (solid for solid in bpy.data.objects if solid.type == "MESH"):
         corners = [solid.matrix_world @ Vector(corner) for corner in solid.bound_box]
@@ -147,7 +150,7 @@ def _describe_imports() -> dict[str, Any]:
 
 
 def _inputs(material: Any) -> dict[str, str]:
-    """Inputs of the material's surface: a value, or the pictures that are behind it."""
+    """Return the inputs of the material's surface: values, or the pictures behind them."""
     value_of_input = {}
     for node in (node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED"):
         for socket in node.inputs:

@@ -3,8 +3,8 @@ describes them by their docstrings (docs/reference/python.md).
 
     python tools/list_public_names.py
 
-Whoever changes the list says what changed in CHANGELOG.md, and ends that line with the words that this prints; a
-test compares them.
+If you change the list, say in CHANGELOG.md what has changed, and end that line with the words that this tool
+prints. A test compares them.
 """
 
 from __future__ import annotations
@@ -41,18 +41,18 @@ def public_names() -> list[str]:
 
 
 def listing() -> str:
-    """The text of the list."""
+    """Return the text of the list."""
     return "".join(f"{line}\n" for name in public_names() for line in _lines(name, getattr(coupole, name)))
 
 
 def page() -> str:
-    """The text of the page."""
+    """Return the text of the page."""
     return HEAD + "".join(_section(name, getattr(coupole, name)) for name in public_names())
 
 
 def undocumented() -> list[str]:
-    """Public names without a docstring, those of fields included. The tests of `coupole.testing` have sentences
-    for names, and the tags of events and lights their values."""
+    """Return the public names without a docstring, including fields. Tests of `coupole.testing` are exempt,
+    because their names are sentences; so are the tags of events and lights, because their values describe them."""
     members = ((name, name.rpartition(".")[2], docstring) for name, docstring in _documented())
     return [
         name for name, last, docstring in members if not (docstring or last in TAGS or last.startswith("test_"))
@@ -72,7 +72,7 @@ def _documented() -> Iterator[tuple[str, str]]:
 
 
 def _lines(name: str, entry: Any) -> Iterator[str]:
-    """A name, and below it the names that belong to it."""
+    """Return a name, and below it the names that belong to it."""
     yield f"coupole.{name}{_signature(entry)}"
     if isinstance(entry, ModuleType):
         yield from (f"    {member}" for member, _ in _classes(entry))
@@ -81,7 +81,7 @@ def _lines(name: str, entry: Any) -> Iterator[str]:
 
 
 def _section(name: str, entry: Any) -> str:
-    """A name's part of the page."""
+    """Return a name's part of the page."""
     text = f"\n## `coupole.{name}`\n\n"
     if signature := _signature(entry):
         text += f"```python\n{name}{signature}\n```\n\n"
@@ -98,7 +98,7 @@ def _section(name: str, entry: Any) -> str:
 
 
 def _as_markdown(docstring: str) -> str:
-    """The docstring with its blocks after `::` and its tables as fenced blocks."""
+    """Return the docstring with its blocks after `::` and its tables as fenced blocks."""
     blocks = re.sub(
         r"^::\n\n((?:(?: {4}.*)?\n)+)",
         lambda block: f"```text\n{textwrap.dedent(block[1]).strip()}\n```\n\n",
@@ -109,7 +109,7 @@ def _as_markdown(docstring: str) -> str:
 
 
 def _classes(module: ModuleType) -> list[tuple[str, type]]:
-    """Classes of a module: those that it lists, or that are written in it."""
+    """Return the classes of a module: those that it lists, or those that are defined in it."""
     if listed_names := getattr(module, "__all__", None):
         values = [(name, getattr(module, name)) for name in sorted(listed_names)]
         return [(name, value) for name, value in values if inspect.isclass(value)]
@@ -118,8 +118,8 @@ def _classes(module: ModuleType) -> list[tuple[str, type]]:
 
 
 def _members(entry: type, *, with_keys: bool = False) -> list[tuple[str, str, str]]:
-    """Name, signature and docstring of each public member that this class has itself; keys of a file's format
-    stand in the reference of that format, and are here only `with_keys`."""
+    """Return name, signature and docstring of each public member that this class itself defines. Keys of a file's
+    format are described in the reference of that format; they are included only `with_keys`."""
     fields = _fields(entry) if with_keys or not issubclass(entry, Model) else {}
     members: dict[str, tuple[str, str]] = {name: ("", docstring) for name, docstring in fields.items()}
     for name, value in vars(entry).items():
@@ -130,7 +130,7 @@ def _members(entry: type, *, with_keys: bool = False) -> list[tuple[str, str, st
 
 
 def _fields(entry: type) -> dict[str, str]:
-    """Docstrings under the annotated names of a class; empty ones for those without."""
+    """Return the docstrings under the annotated names of a class; empty ones for names without."""
     (node,) = ast.parse(textwrap.dedent(inspect.getsource(entry))).body
     assert isinstance(node, ast.ClassDef)
     docstrings: dict[str, str] = {}
@@ -144,7 +144,7 @@ def _fields(entry: type) -> dict[str, str]:
 
 
 def _signature(value: Any) -> str:
-    """Signature of a function as it is written, without quotes."""
+    """Return the signature of a function as it is written, without quotes."""
     function = value.__func__ if isinstance(value, classmethod | staticmethod) else value
     return str(inspect.signature(function)).replace("'", "") if inspect.isfunction(function) else ""
 

@@ -44,7 +44,7 @@ def rooms_in_order() -> list[str]:
 
 
 def room_of(module: str) -> str:
-    """The package of a module."""
+    """Return the package of a module."""
     parts = module.split(".")
     if parts[0] in BESIDE or len(parts) == 1:
         return parts[0]
@@ -54,7 +54,7 @@ def room_of(module: str) -> str:
 
 
 def arrows() -> Counter[tuple[str, str]]:
-    """Number of imports from one package into another."""
+    """Return the number of imports from one package into another."""
     graph = grimp.build_graph("coupole", *BESIDE, cache_dir=None)
     counts: Counter[tuple[str, str]] = Counter()
     for module in graph.modules:
@@ -66,7 +66,7 @@ def arrows() -> Counter[tuple[str, str]]:
 
 
 def purpose(room: str) -> str:
-    """The first sentence of the package's docstring."""
+    """Return the first sentence of the package's docstring."""
     if room == "contracts":
         return "What all rooms agree on: devices, errors, frames of reference, a described arm."
     folder = ROOT / (room if room in BESIDE else f"coupole/{room}")
@@ -84,7 +84,7 @@ def size(room: str) -> int:
 
 
 def drawing() -> str:
-    """The SVG; its `desc` lists the arrows, one per line, for comparison by a test."""
+    """Return the SVG. Its `desc` lists the arrows, one per line, so that a test can compare them."""
     rooms, count_of_arrow = rooms_in_order(), arrows()
     width = _MARGIN * 2 + _STEP_X * (len(rooms) - 1) + _BOX_W
     height = _MARGIN * 2 + _STEP_Y * (len(rooms) - 1) + _BOX_H

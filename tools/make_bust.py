@@ -1,7 +1,9 @@
-"""Makes configs/restorations/bust.ply: a crowned bust, its parts marked by colours, for an example of restoration.
+"""Makes configs/restorations/bust.ply: a crowned bust whose parts are marked by colours, for an example of
+restoration.
 
-`python tools/make_bust.py [--cell-mm 2.8] [--out FILE]`. Nobody's likeness: a sum of rounded bodies whose common
-surface is found by marching cubes (Lorensen and Cline 1987). Lengths are mm; z is up, and the face looks to -y.
+`python tools/make_bust.py [--cell-mm 2.8] [--out FILE]`. It portrays nobody: it is a union of rounded bodies,
+whose common surface is found by marching cubes (Lorensen and Cline 1987). Lengths are mm; z is up, and the face
+looks to -y.
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ def surface(
     """Vertices [n, 3] and triangles [m, 3] of a body, outwards counter-clockwise."""
     from skimage import measure
 
-    marching_cubes: Any = measure.marching_cubes  # without types
+    marching_cubes: Any = measure.marching_cubes  # this library has no types
     corners_mm = zip(LOW_MM.tolist(), HIGH_MM.tolist(), strict=True)
     axes = [np.arange(low, high, cell_mm, dtype=np.float32) for low, high in corners_mm]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
@@ -175,7 +177,7 @@ def _crown(x: Field, y: Field, z: Field) -> Field:
 
 
 def ellipsoid(p: Field, middle: tuple[float, float, float], radii: tuple[float, float, float]) -> Field:
-    """Near its surface a distance (Quilez, Distance functions)."""
+    """Ellipsoid; near its surface the value is a distance (Quilez, Distance functions)."""
     way = (p - np.array(middle, np.float32)) / np.array(radii, np.float32)
     share = np.linalg.norm(way, axis=-1)
     slope = np.linalg.norm(way / np.array(radii, np.float32), axis=-1)
@@ -192,7 +194,7 @@ def _segment(
 
 
 def _smooth_union(a: Field, b: Field, round_mm: float) -> Field:
-    """Both bodies, with a hollow of about `round_mm` between them (Quilez' smooth minimum)."""
+    """Return the union of both bodies, with a fillet of about `round_mm` between them (Quilez' smooth minimum)."""
     share = np.clip(0.5 + 0.5 * (b - a) / round_mm, 0.0, 1.0)
     return np.asarray(b + share * (a - b) - round_mm * share * (1.0 - share))
 
@@ -203,7 +205,7 @@ def smooth_difference(a: Field, b: Field, round_mm: float) -> Field:
 
 
 def _ramp(t: Field, start: float, end: float) -> Field:
-    """0 at `start`, 1 at `end`, and 3 s^2 - 2 s^3 between."""
+    """Return 0 below `start`, 1 above `end`, and 3 s^2 - 2 s^3 between."""
     share = np.clip((t - start) / (end - start), 0.0, 1.0)
     return np.asarray(share * share * (3.0 - 2.0 * share))
 

@@ -1,4 +1,4 @@
-"""Writes the LED table of a simulated dome: 1080 LEDs on 180 flat boards of 6, or as many as are asked for.
+"""Writes the LED table of a simulated dome: 1080 LEDs on 180 flat boards of 6, or another number.
 
     python tools/make_dome.py [--output configs/domes/coupole.csv] [--radius-mm 1500] ...
     python tools/make_dome.py --output configs/domes/text-dome.csv --boards 64 --rows 1 --columns 1

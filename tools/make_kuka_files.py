@@ -81,13 +81,13 @@ def rsi_xml(settings: kuka_rsi.Settings, pc_address: str) -> str:
         f'      <ELEMENT TAG="DEF_{tag}" TYPE="{kind}" INDX="INTERNAL"/>'
         for tag, kind in (("RIst", "DOUBLE"), (settings.measured_tag, "DOUBLE"), (settings.delay_tag, "LONG"))
     )
-    # With HOLDON an absolute correction keeps the arm in place; a relative one would keep moving it.
+    # With HOLDON, an absolute correction keeps the arm in place; a relative correction would keep moving it.
     hold_on = {"absolute": 1, "relative": 0}[settings.mode]
     receive_elements = "\n".join(
         f'      <ELEMENT TAG="{settings.tag}.{name}" TYPE="DOUBLE" INDX="{index}" HOLDON="{hold_on}"/>'
         for index, name in enumerate(NAMES[settings.corrects], start=1)
     )
-    if settings.stop_tag:  # without HOLDON: it must not outlast the program that it ends
+    if settings.stop_tag:  # without HOLDON, because it must not outlast the program that it ends
         receive_elements += (
             f'\n      <ELEMENT TAG="{settings.stop_tag}" TYPE="BOOL" INDX="{STOP_OUTPUT}" HOLDON="0"/>'
         )
@@ -171,8 +171,9 @@ def krl_set() -> str:
 
 
 def correction_rows(settings: kuka_rsi.Settings) -> str:
-    """Rows of the table of objects: the correction and its monitor, and what ends the program. The monitor stops
-    RSI before the correction is clamped: its limits are tighter by a degree or a millimetre."""
+    """Return the rows of the table of objects: the correction, its monitor, and the object that ends the program.
+    The monitor stops RSI before the correction is clamped, because its limits are tighter by a degree or a
+    millimetre."""
     clamp, monitor, inputs = {
         "axes": ("AXISCORR1", "AXISCORRMON1", "CorrA1 to CorrA6"),
         "pose": ("POSCORR1", "POSCORRMON1", "CorrX, CorrY, CorrZ, CorrA, CorrB, CorrC"),
@@ -196,12 +197,12 @@ def correction_rows(settings: kuka_rsi.Settings) -> str:
 
 
 def fill_template(template: str, values: dict[str, str]) -> str:
-    """The template with each @NAME@ replaced; raises KeyError for one without value."""
+    """Return the template with each @NAME@ replaced; raises KeyError for a name without a value."""
     return re.sub(r"@([A-Z_0-9]+)@", lambda match: values[match[1]], template)
 
 
 def files(rsi: kuka_rsi.Settings, eki: kuka_eki.Settings, pc_address: str, load: int) -> Iterable[tuple[str, str]]:
-    """Path below the output folder, and text, of every file."""
+    """Return path below the output folder, and text, of every file."""
     loss_condition = "CP_WAS_ALIVE"
     values = {name: str(getattr(wire, name)) for name in WIRE_NUMBERS} | {
         "ROOT": wire.ROOT,
@@ -249,7 +250,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--eki", default="{}", help="settings of drivers.kuka.eki, JSON")
     parser.add_argument("--load", type=int, default=1, help="number of the camera's LOAD_DATA")
     options = parser.parse_args(arguments)
-    # The files do not say whom the driver listens to.
+    # The files do not contain the sender that the driver accepts.
     arm = {"arm_model": shipped_arm("kr10_r1100_sixx").arm, "any_controller_by": Path(__file__).name}
     rsi = kuka_rsi.Settings.model_validate(arm | json.loads(options.rsi) | {"controller": ""})
     eki = kuka_eki.Settings.model_validate(arm | json.loads(options.eki) | {"controller": ""})

@@ -1,4 +1,4 @@
-"""The pictures of the README: the simulated cell (SVG) and a synthetic frame of the showpiece (PNG).
+"""Makes the pictures of the README: the simulated cell (SVG) and a synthetic frame of the showpiece (PNG).
 
 `python tools/make_pictures.py` writes docs/pictures/cell.svg and docs/pictures/frame.png.
 """
@@ -63,7 +63,7 @@ def joints_of_view(job: Job, number: int) -> NDArray[np.float64]:
 
 
 def draw_cell(job: Job) -> str:
-    """The dome, the disk, the arm in one view of the plan, and what its camera sees."""
+    """Draw the dome, the disk, the arm in one view of the plan, and the camera's field."""
     rig = job.cell.rig
     support_from_base = inverse(rig.support.base_from_support.matrix())
     there = joints_of_view(job, SHOWN_VIEW)
@@ -113,7 +113,8 @@ def draw_cell(job: Job) -> str:
 
 
 def synthetic_frame(job: Job) -> bytes:
-    """One frame of the showpiece at twice its resolution, developed to its resolution, as PNG."""
+    """Return one frame of the showpiece, rendered at twice its resolution and developed at its resolution, as
+    PNG."""
     sensor = job.cell.rig.sensor
     fine = {
         "width_px": 2 * sensor.width_px,

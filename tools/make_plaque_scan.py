@@ -3,9 +3,9 @@
     python tools/make_plaque_scan.py [--output configs/objects/plaque.ply]
 
 The true surface is `sim.objects.plaque`. Points of a jittered grid are measured along z with noise of 30 um.
-Most of it is shared by neighbours, as where a scanner merges its sweeps. The sheet is triangulated by Delaunay. It
-has holes where the black lacquer mirrors, and where curls and fringe hide the ground. Walls go down to the
-support; there is no back. The same code gives the same bytes.
+Neighbours share most of the noise, as after a scanner has merged its sweeps. The sheet is triangulated by
+Delaunay. It has holes where the black lacquer reflects like a mirror, and where curls and fringe hide the ground.
+Walls go down to the support; there is no back. The same code gives the same bytes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ JITTER = 0.22
 NOISE_UM = 30.0
 """Standard deviation of a height."""
 SHARED, SHARED_OVER_MM = 0.95, 0.6
-"""Share of the noise that neighbours have in common, and the standard deviation of the filter that makes it so."""
+"""Share of the noise that neighbours have in common, and standard deviation, mm, of the filter that correlates
+it."""
 HOLES_MM = (
     (-44.6, 17.5, 1.3), (-38.2, -6.4, 1.0), (-41.0, -20.6, 1.6), (-47.3, 28.4, 0.8), (-9.3, 15.8, 0.7),
     (10.8, 18.2, 0.8), (12.6, 8.9, 0.9), (39.3, -25.2, 1.1),
@@ -66,7 +67,7 @@ def scan_ply(pitch_mm: float = PITCH_MM) -> bytes:
 
 
 def _grid(random: np.random.Generator, pitch_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places [rows, columns] of a jittered grid whose border lies on the plaque's edges."""
+    """Return places [rows, columns] of a jittered grid whose border lies on the plaque's edges."""
     columns, rows = (round(length_mm / pitch_mm) for length_mm in PLAQUE_MM)
     half_x, half_y = 0.5 * PLAQUE_MM[0], 0.5 * PLAQUE_MM[1]
     x, y = np.meshgrid(np.linspace(-half_x, half_x, columns + 1), np.linspace(-half_y, half_y, rows + 1))
@@ -112,7 +113,7 @@ def _in_hole(places: NDArray[np.float64]) -> NDArray[np.bool_]:
 def _without_loose_points(
     points: NDArray[np.float64], faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """The mesh without points that no triangle has."""
+    """Return the mesh without points that belong to no triangle."""
     in_use, new_numbers = np.unique(faces, return_inverse=True)
     return points[in_use].astype("<f4"), new_numbers.reshape(-1, 3).astype("<i4")
 

@@ -3,8 +3,8 @@
     python tools/make_relief.py [--output configs/objects/relief.ply]
 
 Object frame: z up, bottom at z = 0, origin below the middle. Seen from above with x to the right, an F is on the
-left, three round bosses of three sizes are on the right, and stairs rise along the lower edge towards +x: no
-rotation or mirror image looks the same. The mesh is closed. The same code gives the same bytes.
+left, three round bosses of three sizes are on the right, and stairs rise along the lower edge towards +x. So no
+rotation and no mirror image looks the same. The mesh is closed. The same code gives the same bytes.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ Heights = NDArray[np.float64]
 
 
 def smooth_step(t: Heights) -> Heights:
-    """0 below 0, 1 above 1, and 3 t^2 - 2 t^3 between: flanks without creases."""
+    """Return 0 below 0, 1 above 1, and 3 t^2 - 2 t^3 between: flanks without creases."""
     t = np.clip(t, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 def bar(x: Heights, y: Heights, place_mm: tuple[float, float, float, float], flank_mm: float) -> Heights:
-    """1 on a rectangle, falling to 0 over its flanks."""
+    """Return 1 on a rectangle, falling to 0 over its flanks."""
     centre_x, centre_y, half_width, half_depth = place_mm
     inside_mm = np.minimum(half_width - np.abs(x - centre_x), half_depth - np.abs(y - centre_y))
     return smooth_step(inside_mm / flank_mm)
@@ -76,7 +76,7 @@ def relief(columns: int = COLUMNS, rows: int = ROWS) -> tuple[NDArray[np.float32
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     faces = [np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, b, c), (a, c, d))]
 
-    # The rim, counter-clockwise seen from above; below it a wall, closed by a fan around the middle.
+    # The rim, counter-clockwise seen from above. Below it there is a wall, closed by a fan around the middle.
     rim = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
     foot = len(top) + np.arange(len(rim))
     middle = np.full(len(rim), len(top) + len(rim))

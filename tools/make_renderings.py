@@ -37,7 +37,7 @@ QUICK = {
     "nashiji-bowl": (48, 360, 40),
     "makie-box": (16, 360, 40),
 }
-"""Samples, width in pixels, nm between bands."""
+"""Number of samples, width in pixels, and nm between bands."""
 BUST, BUST_QUICK = "restored-bust", Choice(samples=18, width_px=400)
 """Bust of configs/restorations/, for docs/pictures/gallery."""
 
@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def _bust() -> None:
-    """Three hypotheses side by side, smaller, with all that the picture says of itself."""
+    """Render three hypotheses side by side, smaller, with all texts of the picture."""
     folder = ROOT / "configs" / "restorations"
     parts, hypotheses = folder / "bust-parts.yaml", folder / "bust.yaml"
     with tempfile.TemporaryDirectory() as out:
@@ -76,7 +76,7 @@ def _quiet(step: str, done_count: int, total: int) -> None: ...
 
 
 def _smaller(path: Path, to: Path) -> None:
-    """The same picture at most 940 pixels wide, with the same texts."""
+    """Write the same picture with at most 940 pixels in width, with the same texts."""
     chunks = PngInfo()
     with Image.open(path) as picture:
         assert isinstance(picture, PngImageFile), f"{path} is no PNG"
@@ -88,7 +88,7 @@ def _smaller(path: Path, to: Path) -> None:
 
 
 def _strip(frames: Path, path: Path) -> None:
-    """Four pictures of a film beside each other, from its first to its last."""
+    """Write four pictures of a film side by side, from its first to its last."""
     pngs = sorted(frames.glob("*.png"))
     pictures = [Image.open(pngs[round(part * (len(pngs) - 1) / 3)]) for part in range(4)]
     width, height = pictures[0].size

@@ -38,7 +38,7 @@ _BUTTONS = '<div class="content-icon-container">'
 
 
 def build(to: Path, *, run: bool) -> list[str]:
-    """Build the site into the folder `to`, which is made anew; what is wrong with it."""
+    """Build the site into the folder `to`, which is made anew; return the faults."""
     from sphinx.application import Sphinx
     from sphinx.util.console import nocolor
 
@@ -66,7 +66,7 @@ def build(to: Path, *, run: bool) -> list[str]:
     application.build(force_all=True)
     if application.statuscode:
         return ["Sphinx found the above"]
-    for page in to.rglob("*.html"):  # Furo's buttons beside the article are in no landmark
+    for page in to.rglob("*.html"):  # Furo's buttons beside the article belong to no landmark
         text = page.read_text(encoding="utf-8")
         page.write_text(
             text.replace(_BUTTONS, f'{_BUTTONS[:-1]} role="region" aria-label="View">'), encoding="utf-8"
@@ -75,7 +75,7 @@ def build(to: Path, *, run: bool) -> list[str]:
 
 
 def main() -> int:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--to", type=Path, default=REPO / "build/site", help="folder of the site; made anew")
     parser.add_argument("--do-not-run", action="store_true", help="show the notebooks without outputs")

@@ -1,10 +1,12 @@
 """Makes configs/examples/statue: a simulated case for the tutorial docs/tutorial/a-statue.md, with its truth.
 
-`python tools/make_statue_case.py [--out FOLDER] [--seed N]`; with `--pictures WALKED` it takes the pictures of the
-tutorial from a folder in which its commands were given, and makes nothing else. The object is the bust of
-`make_bust.py`, weathered: eroded, with a leaf of the crown lost and a flake of the mantle that was still there in
-1998. Scans are rays (Embree) to its surface, with noise; spectra are by `statue_spectra.py`. The same seed gives
-the same files. Lengths are mm; z is up in the frame of the site, and the face looks to -y.
+`python tools/make_statue_case.py [--out FOLDER] [--seed N]` makes the case. With `--pictures WALKED` it only
+copies the pictures of the tutorial, from a folder in which the tutorial's commands were run.
+
+The object is the bust of `make_bust.py`, weathered: it is eroded, a leaf of the crown is lost, and a flake of the
+mantle that was still there in 1998 is lost. Scans are rays (Embree) to its surface, with noise; spectra are made
+by `statue_spectra.py`. The same seed gives the same files. Lengths are mm; z is up in the frame of the site, and
+the face looks to -y.
 """
 
 from __future__ import annotations
@@ -39,16 +41,16 @@ PARTS = ("stone", "mantle", "tunic", "gilding", "flesh", "hair")
 NOISE_MM = 0.1
 """Standard deviation of a scanned point along its ray."""
 FINE_MM, CAST_MM, PAINTED_MM = 1.6, 5.0, 8.0
-"""Cells of the surface that is scanned, of the cast of 1998, and of the mesh on which parts were painted."""
+"""Cells of the scanned surface, of the cast of 1998, and of the mesh whose parts were painted."""
 FLAKE = ((-97.0, -47.0, 118.0), (24.0, 13.0, 30.0))
 """Middle and radii of the ellipsoid that the mantle lost after 1998."""
 STANDS = ((0, 12), (45, 25), (90, 10), (135, 28), (180, 12), (225, 26), (270, 10), (315, 24))
-"""Azimuth (from -y towards +x) and height of the scanner about the bust, degrees."""
+"""Azimuth (from -y towards +x) and height of the scanner's positions around the bust, degrees."""
 DISTANCE_MM = 1100.0
 MIDDLE_MM = np.array([0.0, 0.0, 205.0])
 TRUE_POINTS = 12_000
 SPACING_MM = 2.0
-"""Distance of neighbouring rays at the bust."""
+"""Distance between neighbouring rays at the bust."""
 TARGETS_MM = {
     "A": (-260.0, -190.0, 15.0),
     "B": (260.0, -190.0, 90.0),
@@ -90,7 +92,7 @@ def main() -> None:
 
 
 def weathered_body(seed: int, *, has_flake: bool) -> Callable[[Field], Field]:
-    """The bust after centuries; `has_flake`: before the flake of its mantle was lost, after 1998."""
+    """Return the bust after centuries; with `has_flake` as it was in 1998, before its mantle lost the flake."""
     random = np.random.default_rng(seed + 1)
     waves = random.normal(size=(24, 3)) * (2.0 * np.pi / random.uniform(18.0, 90.0, (24, 1))) / np.sqrt(3.0)
     phases = random.uniform(0.0, 2.0 * np.pi, 24)
@@ -112,7 +114,7 @@ def weathered_body(seed: int, *, has_flake: bool) -> Callable[[Field], Field]:
 
 
 def _scan(mesh: trimesh.Trimesh, out: Path, random: np.random.Generator) -> None:
-    """Scans in frames of their own, a table of targets in them, and one of the targets on the site."""
+    """Write scans in their own frames, a table of the targets in them, and a table of the targets on the site."""
     sightings, poses = ["scan,name,x,y,z,u_mm"], {}
     for number, (azimuth_deg, height_deg) in enumerate(STANDS, 1):
         name = f"scan-{number}.ply"
@@ -136,7 +138,8 @@ def _scan(mesh: trimesh.Trimesh, out: Path, random: np.random.Generator) -> None
 
 
 def _stand(azimuth_deg: float, height_deg: float, random: np.random.Generator) -> Points:
-    """4x4 of a scanner that looks along its -z at the bust, held at any angle."""
+    """Return the 4x4 pose of a scanner that looks along its -z at the bust, with a random rotation about this
+    axis."""
     azimuth, height = np.radians([azimuth_deg + random.uniform(-5, 5), height_deg + random.uniform(-3, 3)])
     back = np.array([np.sin(azimuth) * np.cos(height), -np.cos(azimuth) * np.cos(height), np.sin(height)])
     right = np.cross([0.0, 0.0, 1.0], back)
@@ -152,7 +155,8 @@ def _stand(azimuth_deg: float, height_deg: float, random: np.random.Generator) -
 
 
 def _scanned_points(mesh: trimesh.Trimesh, site_from_scan: Points, random: np.random.Generator) -> Points:
-    """[n, 3] in the scanner's frame; no points at places that are seen flatter than 75 degrees."""
+    """Return [n, 3] in the scanner's frame; places seen at more than 75 degrees from their normal give no
+    points."""
     reach = np.arange(-330.0, 330.0, SPACING_MM) / DISTANCE_MM
     x, y = np.meshgrid(reach, reach)
     rays = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.0)], axis=1)
@@ -190,7 +194,7 @@ def _write_mesh(path: Path, vertices_mm: Points, triangles: NDArray[np.int64], c
 
 
 def _write_cast(body: Callable[[Field], Field], path: Path, random: np.random.Generator) -> None:
-    """A cast of 1998, scanned by somebody else: in a frame of its own."""
+    """Write a cast of 1998, scanned by another person in another frame."""
     vertices_mm, triangles = surface(CAST_MM, body)
     turn = trimesh.transformations.rotation_matrix(np.radians(35.0), [0.3, 0.2, 1.0])[:3, :3]
     noisy_mm = vertices_mm + random.normal(0.0, NOISE_MM, vertices_mm.shape)
@@ -198,7 +202,7 @@ def _write_cast(body: Callable[[Field], Field], path: Path, random: np.random.Ge
 
 
 def part_of(places_mm: Points) -> NDArray[np.int64]:
-    """Rows of `PARTS` [n] of places [n, 3] on the surface."""
+    """Return rows of `PARTS` [n] for places [n, 3] on the surface."""
     distances = bodies(places_mm.astype(np.float32))
     nearest = np.stack(list(distances.values())).argmin(axis=0)
     rows = np.array([PARTS.index(PART_OF_BODY[name]) for name in distances])
@@ -206,7 +210,7 @@ def part_of(places_mm: Points) -> NDArray[np.int64]:
 
 
 def _write_painted(body: Callable[[Field], Field], path: Path) -> None:
-    """Write what the page of `coupole restore pick` saves where all parts are painted."""
+    """Write the file that the page of `coupole restore pick` saves when all parts are painted."""
     vertices_mm, triangles = surface(PAINTED_MM, body)
     rows = part_of(vertices_mm[triangles].mean(axis=1))
     arrays = {"vertices_mm": (vertices_mm, "<f4"), "triangles": (triangles, "<u4"), "parts": (rows + 1, "u1")}

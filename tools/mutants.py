@@ -1,14 +1,16 @@
-"""Mutants: single mistakes in the critical code, each of which the tests that can see it must notice.
+"""Mutants: single mistakes in critical code. The tests that cover the code must notice each of them.
 
-`python tools/mutants.py` applies each mutant of `tools/mutants/*.toml` in a scratch copy of the working tree, runs
-its tests there, and tells which were killed (a test failed) and which survived. Verdicts are kept in
-`.mutants/verdicts.jsonl` and used again as long as mutant, code and tests are the same: a run can be interrupted.
+`python tools/mutants.py` applies each mutant of `tools/mutants/*.toml` in a scratch copy of the working tree and
+runs its tests there. It prints which mutants were killed (a test failed) and which survived. Verdicts are stored
+in `.mutants/verdicts.jsonl`, and used again while mutant, code and tests are the same. So a run can be
+interrupted.
 
-A table names a `path`, the `tests` that can see it (arguments of pytest, with `select` for its `-k`), and for each
-mutant a `name`, the `old` text (once in the file), the `new` text, and the `harm`: what a user would suffer. A
-mutant with `equivalent` behaves like the original for the reason given: it is listed and not run.
+A table names a `path` and the `tests` of that file (arguments of pytest, with `select` for its `-k`). For each
+mutant it has a `name`, the `old` text (once in the file), the `new` text, and the `harm` to a user. A mutant with
+`equivalent` behaves like the original for the reason given: it is listed and not run.
 
-Exit code 1 if fewer than 95 % of the mutants die; 2 if one no longer fits the code, or tests fail without any.
+The exit code is 1 if fewer than 95 % of the mutants are killed; 2 if a mutant no longer fits the code, or if tests
+fail without a mutant.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ TIMEOUT_S = 240.0
 """A mutant that hangs its tests is killed, too."""
 KILLED, SURVIVED, EQUIVALENT = "killed", "survived", "equivalent"
 _PASSED, _FAILED, _INTERRUPTED = 0, 1, 2
-"""Exit codes of pytest; 2 also if a test module cannot be imported."""
+"""Exit codes of pytest; 2 also means that a test module cannot be imported."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class Mutant:
     select: str = ""
     """Pytest's `-k`."""
     equivalent: str = ""
-    """Reason why no test can notice the mutant; empty if one can."""
+    """Reason why no test can notice the mutant; empty if a test can."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +63,13 @@ class Verdict:
     outcome: str
     seconds: float
     key: str
-    """Changes with the mutant, its file and its tests."""
+    """Key that changes with the mutant, its file and its tests."""
     noticed_by: str = ""
     """The first test that failed."""
 
 
 class Stale(Exception):
-    """A mutant does not fit the code, or its tests fail without it."""
+    """A mutant does not fit the code, or its tests fail without the mutant."""
 
 
 def read_mutants(folder: Path) -> list[Mutant]:
@@ -86,7 +88,7 @@ def read_mutants(folder: Path) -> list[Mutant]:
 
 
 def mutated_text(mutant: Mutant, root: Path) -> str:
-    """The text of the mutant's file with the mistake in it. Raises Stale."""
+    """Return the text of the mutant's file with the mistake. Raises Stale."""
     text = (root / mutant.path).read_text(encoding="utf-8")
     count = text.count(mutant.old)
     if count != 1 or mutant.old == mutant.new:
@@ -95,7 +97,8 @@ def mutated_text(mutant: Mutant, root: Path) -> str:
 
 
 def stale(mutants: Iterable[Mutant], root: Path) -> list[str]:
-    """Return what does not fit the tree: mutants without their text, tests that are not there."""
+    """Return the mutants and tests that do not fit the tree: mutants whose text is missing, tests that do not
+    exist."""
     faults = []
     for mutant in mutants:
         try:
@@ -108,7 +111,7 @@ def stale(mutants: Iterable[Mutant], root: Path) -> list[str]:
 
 
 class Bench:
-    """A scratch copy of the tree, in which one mutant at a time is tried."""
+    """A scratch copy of the tree, in which one mutant at a time is tested."""
 
     def __init__(self, root: Path, scratch: Path) -> None:
         self._root, self._scratch = root, scratch
@@ -135,7 +138,7 @@ class Bench:
         return digest.hexdigest()[:16]
 
     def judge(self, mutant: Mutant) -> Verdict:
-        """Try a mutant. Raises Stale."""
+        """Test a mutant. Raises Stale."""
         key = self.key(mutant)
         if mutant.equivalent:
             return Verdict(mutant.name, EQUIVALENT, 0.0, key, mutant.equivalent)
@@ -154,7 +157,7 @@ class Bench:
         return Verdict(mutant.name, outcome, round(time.monotonic() - started_s, 1), key, failing_test)
 
     def _see_healthy(self, mutant: Mutant) -> None:
-        """Its tests must pass without it, else a failure would say nothing."""
+        """Check that the mutant's tests pass without it; otherwise a failure would prove nothing."""
         tests = (mutant.tests, mutant.select)
         if tests in self._healthy:
             return
@@ -166,7 +169,7 @@ class Bench:
         self._healthy.add(tests)
 
     def _run(self, mutant: Mutant) -> tuple[int, str]:
-        """Exit code of pytest, and the first test that failed."""
+        """Return the exit code of pytest, and the first test that failed."""
         command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--no-header"]
         command += ["-k", mutant.select] if mutant.select else []
         # what a mutant does not change is compiled once for all of them (coupole/kernels.py)
@@ -189,7 +192,7 @@ class Bench:
 
 
 def earlier(path: Path) -> dict[str, Verdict]:
-    """Verdicts of earlier runs by key; a torn last line is left out."""
+    """Return verdicts of earlier runs by key; an incomplete last line is left out."""
     verdict_of_key = {}
     for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
         try:
@@ -203,7 +206,7 @@ def earlier(path: Path) -> dict[str, Verdict]:
 def judge_all(
     mutants: Sequence[Mutant], root: Path, results: Path, *, again: bool
 ) -> tuple[list[Verdict], list[str]]:
-    """Verdicts on all mutants, and what could not be judged."""
+    """Return verdicts on all mutants, and the mutants that could not be judged."""
     results.parent.mkdir(parents=True, exist_ok=True)
     earlier_verdicts = {} if again else earlier(results)
     verdicts, troubles = [], []

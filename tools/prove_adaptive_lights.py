@@ -2,12 +2,12 @@
 
     python tools/prove_adaptive_lights.py [--every N] [--keep FILE]
 
-Each object is acquired once, in one view, with each N-th LED. Every tenth LED is held out: nobody may choose it.
-Among the others are chosen, by the frames on the disk: LEDs at random, spread LEDs, LEDs that leave least variance
-if errors were alike everywhere (D-optimal, without feedback), and those of the chooser that runs use. Pictures of
-the held-out LEDs are made by scipy's interpolation, and compared with their frames. Exits with 1 unless the
-chooser has at a third of the LEDs at most 1.05 of the spread LEDs' error on each object, and less on half of them;
-not with `--smallest`.
+Each object is acquired once, in one view, with every N-th LED. Every tenth LED is held out: it cannot be chosen.
+From the other LEDs, four sets are chosen, using the frames on the disk: LEDs at random; spread LEDs; LEDs that
+leave the least variance if errors are equal everywhere (D-optimal, without feedback); and those of the chooser
+that runs use. Pictures of the held-out LEDs are computed by scipy's interpolation, and compared with their frames.
+Exits with 1 unless, at a third of the LEDs, the chooser's error is at most 1.05 times that of the spread LEDs on
+each object, and smaller on half of the objects; not with `--smallest`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from smallest import add_smallest  # noqa: E402
 
 FIRST, BURST, HELD_OUT = 24, 32, 10
 PARTS = (12, 6, 3, 2)
-"""A twelfth of the LEDs that may be chosen, a sixth, ..."""
+"""Shares of the LEDs that are chosen: a twelfth, a sixth, and so on."""
 CHROME = {"diffuse": (0.0, 0.0, 0.0), "f0": (0.55, 0.55, 0.55), "roughness": 0.12}
 MIXED = "mixed"
 Floats = NDArray[np.float64]
@@ -86,7 +86,8 @@ def acquire(folder: Path, material: str, every: int) -> Frames:
 
 
 def without_feedback(directions: Floats, candidates: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """The lights that leave least variance in turn, of a field whose errors are alike everywhere."""
+    """Return the lights in the order in which each leaves the least variance, for a field whose errors are equal
+    everywhere."""
     covariance = np.exp(-np.arccos(np.clip(directions @ directions.T, -1.0, 1.0)) / np.radians(60.0))
     lit_leds: list[int] = []
     variance = np.full(len(directions), -1.0)
@@ -100,7 +101,8 @@ def without_feedback(directions: Floats, candidates: NDArray[np.int64], count: i
 
 
 def judge(material: str, frames: Frames) -> dict[str, Any]:
-    """Errors of each way to choose, by number of LEDs; and the LEDs with which the chooser does as well as all."""
+    """Return the errors of each method by number of LEDs, and the number of LEDs with which the chooser does as
+    well as all LEDs."""
     numbers = np.arange(len(frames.directions))
     held_out = numbers[::HELD_OUT]
     candidates = np.setdiff1d(numbers, held_out)

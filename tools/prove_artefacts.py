@@ -2,11 +2,12 @@
 
     python tools/prove_artefacts.py [--cells 40] [--jobs 2]
 
-Each drawn cell is calibrated with a first board and a first tile, and measures a second board at five positions
-and a second tile at three. Lens, arm, room, boards and tiles are drawn anew for each cell, within what is stated
-of them; corners and signals are drawn by code of the tests' own (`tests/calibration/artefact_cells.py`). Then the
-same cells measure a board whose certificate is 200 ppm wrong and a tile whose certificate is 2 % wrong. Exits with
-1 unless 93 to 98 % of all E_n are at most 1 and the wrong ones are found in nine of ten cells or more.
+Each random cell is calibrated with a first board and a first tile. It then measures a second board at five
+positions and a second tile at three. Lens, arm, room, boards and tiles are drawn for each cell within their stated
+uncertainties; separate code of the tests computes corners and signals (`tests/calibration/artefact_cells.py`).
+Then the same cells measure a board whose certificate is 200 ppm wrong and a tile whose certificate is 2 % wrong.
+Exits with 1 unless 93 to 98 % of all E_n are at most 1, and the wrong artefacts are found in at least nine of ten
+cells.
 """
 
 from __future__ import annotations
@@ -33,11 +34,12 @@ LOW, HIGH = 0.93, 0.98
 LEAST_FOUND = 0.9
 BOARD_PPM, TILE = 200.0, 0.02
 Found = tuple[list[float], list[float], bool]
-"""E_n of all values, errors of positions over their standard uncertainty, and whether the check is accepted."""
+"""E_n of all values; errors of positions, divided by their standard uncertainty; and True if the check is
+accepted."""
 
 
 def checks_of(seed: int) -> dict[str, Found]:
-    """All checks of one cell."""
+    """Return all checks of one cell."""
     sign = 1.0 if seed % 2 else -1.0
     with tempfile.TemporaryDirectory() as folder:
         good_board, bad_board = board_checks(seed, Path(folder), wrong_ppm=(0.0, sign * BOARD_PPM))

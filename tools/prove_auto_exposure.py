@@ -2,13 +2,15 @@
 
     python tools/prove_auto_exposure.py [--every N] [--snr SNR] [--keep FOLDER]
 
-Three runs of one view, with every N-th LED: a reference with a wide bracket, taken twice, from which each pixel's
-rate under each LED and the noise follow; the auto exposure; and the best fixed bracket, found by search in the
-reference: of one to three times, eight to the stop, the one with the shortest tables that leaves no more LEDs
-clipped or noisy than the auto exposure did. Clipped shares and noise are judged by the reference. Durations are
-from the first burst's begin to the last one's end, with all choices. Exits with 1 unless pixels are clipped and
-noisy as asked, and the auto exposure takes at most 1.15 of the bracket's time and stays below preflight's figures
-of light, time and bytes; not with `--smallest`.
+There are three runs of one view, with every N-th LED. The first is a reference with a wide bracket, taken twice;
+it gives each pixel's rate under each LED, and the noise. The second is the auto exposure. The third is the best
+fixed bracket, found by search in the reference. It has one to three times, in steps of an eighth of a stop. Among
+the brackets that leave no more LEDs clipped or noisy than the auto exposure, it has the shortest tables.
+
+Clipped shares and noise are judged by the reference. Durations are from the begin of the first burst to the end of
+the last, with all choices. Exits with 1 unless clipped pixels and noise are within the plan's limits, the auto
+exposure takes at most 1.15 times the bracket's time, and its light, time and bytes are below preflight's figures;
+not with `--smallest`.
 """
 
 from __future__ import annotations
@@ -41,28 +43,28 @@ REFERENCE_US = (250, 2000, 16000, 128000)
 SHORTEST_US, LONGEST_US = REFERENCE_US[0], REFERENCE_US[-1]
 MOST_OF_BEST = 1.15
 ALLOWED_NOISY = 0.03
-"""Share of LEDs whose noise may be judged otherwise by the reference than by the run's own frames."""
+"""Share of LEDs for which the reference may judge the noise differently than the run's own frames."""
 LACQUER = {"diffuse": (0.01, 0.01, 0.01), "f0": (0.04, 0.04, 0.04), "roughness": 0.1}
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The scene under each LED, as the reference run has it."""
+    """The scene under each LED, by the reference run."""
 
     rates: dict[int, Floats]
     """[pixels] DN per us."""
     lit: dict[int, NDArray[np.bool_]]
-    """[pixels] True where the object is, in the LED's light."""
+    """[pixels] True on the object, where the LED's light reaches it."""
     read_dn: float
     gain_dn: float
 
     def clipped_share(self, led: int, times_us: Sequence[float]) -> float:
-        """Share of the pixels that the shortest exposure clips."""
+        """Return the share of the pixels that the shortest exposure clips."""
         return float(np.mean(self.rates[led] * min(times_us) >= FULL_DN))
 
     def reached_share(self, led: int, times_us: Sequence[float], snr: float) -> float:
-        """Share of the lit pixels that reach the ratio in the exposures together."""
+        """Return the share of the lit pixels that reach the ratio with all exposures together."""
         rate = self.rates[led][self.lit[led]]
         weight = np.zeros(len(rate))
         for time_us in times_us:
@@ -72,7 +74,7 @@ class Reference:
 
 
 def scene(folder: Path, every: int) -> cells.CellFolder:
-    """A cell with the gilded wedge and a plate of black lacquer beside it."""
+    """Return a cell with the gilded wedge and a plate of black lacquer beside it."""
     folder.mkdir(parents=True)
     cell = cells.CellFolder(folder, speed=1.0)
     plate = trimesh.creation.box((120.0, 60.0, 8.0))
@@ -89,7 +91,7 @@ def scene(folder: Path, every: int) -> cells.CellFolder:
 
 
 def acquire(cell: cells.CellFolder, **plan: Any) -> tuple[dict[str, cells.Stored], dict[str, Any]]:
-    """Acquire a plan; its frames, and what the command said."""
+    """Acquire a plan; return its frames, and the output of the command."""
     cell.write(**plan)
     result = cell.acquire()
     if result.code:
@@ -98,7 +100,7 @@ def acquire(cell: cells.CellFolder, **plan: Any) -> tuple[dict[str, cells.Stored
 
 
 def signals(frames: dict[str, cells.Stored]) -> dict[int, list[tuple[int, Floats]]]:
-    """Exposure, us, and signal above black, DN, of the frames of each LED."""
+    """Return exposure, us, and signal above black, DN, of the frames of each LED."""
     of_led: dict[int, list[tuple[int, Floats]]] = {}
     for shot, frame in frames.items():
         if cells.is_light(shot):
@@ -108,7 +110,7 @@ def signals(frames: dict[str, cells.Stored]) -> dict[int, list[tuple[int, Floats
 
 
 def reference(cell: cells.CellFolder) -> Reference:
-    """Rates by the longest exposures that do not clip; noise by pairs of frames."""
+    """Return rates by the longest exposures that do not clip, and noise by pairs of frames."""
     bracket = {"kind": "bracket", "exposures_us": list(REFERENCE_US)}
     frames, _ = acquire(cell, exposure=bracket, repeats=2)
     of_led = signals(frames)
@@ -143,14 +145,14 @@ def reference(cell: cells.CellFolder) -> Reference:
 
 
 def failing(truth: Reference, times_of: Mapping[int, Sequence[float]], snr: float) -> tuple[int, int]:
-    """Numbers of LEDs that clip more than allowed, and that are noisier than asked for."""
+    """Return the numbers of LEDs that clip more than allowed, and of LEDs that are too noisy."""
     clipped_leds = sum(truth.clipped_share(led, times_us) > CLIPPED_SHARE for led, times_us in times_of.items())
     noisy_leds = sum(truth.reached_share(led, times_us, snr) < OBJECT_SHARE for led, times_us in times_of.items())
     return clipped_leds, noisy_leds
 
 
 def best_bracket(truth: Reference, period_us: Any, snr: float, most_failing: tuple[int, int]) -> tuple[int, ...]:
-    """The fixed bracket with the shortest tables that leaves no more LEDs failing than `allowed`."""
+    """Return the fixed bracket with the shortest tables that leaves no more LEDs failing than allowed."""
     ladder = [round(SHORTEST_US * 2.0 ** (step / 8)) for step in range(8 * 9 + 1)]
     leds = list(truth.rates)
 
@@ -164,7 +166,7 @@ def best_bracket(truth: Reference, period_us: Any, snr: float, most_failing: tup
     for middle in [(), *((t,) for t in ladder if t > shortest)]:
         longer = [t for t in ladder if t > max((shortest, *middle))]
         low, high = 0, len(longer)
-        while low < high:  # the shortest of the longest times that is enough
+        while low < high:  # the shortest sufficient time among the longest times
             probe = (low + high) // 2
             low, high = (low, probe) if is_enough((shortest, *middle, longer[probe])) else (probe + 1, high)
         for bracket in [(shortest, *middle), *([(shortest, *middle, longer[low])] if low < len(longer) else [])]:
@@ -175,14 +177,14 @@ def best_bracket(truth: Reference, period_us: Any, snr: float, most_failing: tup
 
 
 def bursts_s(cell: cells.CellFolder) -> float:
-    """Time from the first burst's begin to the last one's end, by the journal."""
+    """Return the time from the begin of the first burst to the end of the last, by the journal."""
     begins = [datetime.fromisoformat(event["t"]) for event in cells.events(cell.run_folder, "begin")]
     ends = [datetime.fromisoformat(event["t"]) for event in cells.events(cell.run_folder, "burst")]
     return (ends[-1] - begins[0]).total_seconds()
 
 
 def slowest_choice_s(cell: cells.CellFolder) -> float:
-    """Longest time from the end of a burst to the choice that follows it."""
+    """Return the longest time from the end of a burst to the next choice."""
     slowest_s, end = 0.0, None
     for event in cells.events(cell.run_folder):
         at = datetime.fromisoformat(event["t"])
@@ -193,7 +195,7 @@ def slowest_choice_s(cell: cells.CellFolder) -> float:
 
 
 def prove(folder: Path, every: int, snr: float) -> bool:
-    """Print the figures; True if all are as asked."""
+    """Print the figures; return True if all are within their limits."""
     truth = reference(scene(folder / "reference", every))
     print(
         f"noise: {truth.read_dn:.2f} DN in the dark, {truth.gain_dn:.3f} DN per electron; {len(truth.rates)} LEDs"

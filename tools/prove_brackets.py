@@ -2,12 +2,13 @@
 
     python tools/prove_brackets.py [--cameras N]
 
-A camera's response is a power of 1 to 1/2.6 with a random toe, shoulder and bend, for each channel the same, or
-one of three fixed ones (sRGB, linear, and a wave on a power); noise is one of 0.5, 1 and 2 levels of 8 bits. A
-picture's unit is half of the largest value in one second, and is not fitted here. For each step it prints how many
-pixels are within 1.96 u of the scene, the least and the most of a camera, how far responses are off from 5 to 95 %
-of the values, and how often their 95 % intervals hold. Exits with 1 if a step's share of pixels is outside 93 to
-97 %, but not with `--smallest`.
+A camera's response is a power of 1 to 1/2.6 with a random toe, shoulder and bend, the same for each channel, or
+one of three fixed responses (sRGB, linear, and a wave on a power). The noise is 0.5, 1 or 2 levels of 8 bits. The
+unit of a picture is half of the largest value in one second; it is not fitted here.
+
+For each step this prints the share of pixels that are within 1.96 u of the scene, also for the worst and the best
+camera; the error of responses between 5 and 95 % of the values; and how often their 95 % intervals contain the
+truth. Exits with 1 if a step's share of pixels is outside 93 to 97 %, but not with `--smallest`.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def drawn_curve(rng: np.random.Generator) -> Curve:
 
 
 def scene(rng: np.random.Generator) -> np.ndarray:
-    """[80, 120, 3], over a range of some 500 times, with colours that change."""
+    """[80, 120, 3] radiance over a range of about 1 : 500, with varying colours."""
     y, x = np.mgrid[:80, :120] / 80.0
     phases = rng.uniform(0.0, 2.0 * np.pi, 3)
     colours = [1.0 + 0.3 * np.sin(3.0 * x + 2.0 * y + phase) for phase in phases]
@@ -80,7 +81,8 @@ def scene(rng: np.random.Generator) -> np.ndarray:
 def try_camera(
     curve: Curve, step: float, noise_levels: float, rng: np.random.Generator
 ) -> tuple[float, float, float]:
-    """Share of pixels within their intervals, most that the response is off, and how often its intervals hold."""
+    """Return the share of pixels within their intervals, the greatest error of the response, and how often its
+    intervals contain the truth."""
     times = step ** np.arange(np.ceil(-4.0 / np.log2(step)), 4.0 / np.log2(step) - 1e-9)
     radiance = scene(rng)
     exposures = np.clip(0.5 * radiance * times[:, None, None, None], 0.0, 1.0)

@@ -3,18 +3,19 @@
     python tools/prove_calibrations.py --cells 100 [--width 1024] [--images 20] [--absolute] [--stranger NAME]
         [--keep FILE] [--json]
 
-Each cell (`random_cells`) has its own lens, hand-eye, arm, dome and object. Printed is one line per parameter: the
-fraction of the stated 95 % intervals that contain the truth, and the root mean square of error over standard
-uncertainty, about 1. Then the distances of camera, LEDs and mesh from the truth, as median and 95th percentile
-over the cells. The file `--keep` gets a line for each cell; in a later call only missing cells are computed.
+Each cell (`random_cells`) has its own lens, hand-eye, arm, dome and object. One line is printed for each
+parameter: the fraction of the stated 95 % intervals that contain the truth, and the root mean square of error over
+standard uncertainty, which should be about 1. Then the distances of camera, LEDs and mesh from the truth are
+printed, as median and 95th percentile over the cells. The file `--keep` gets a line for each cell; a later call
+computes only missing cells.
 
-With `--stranger` each cell has one cause that calibrations have no term for (`strange_cells`); judged are camera
-and hand-eye by their rays, and LEDs if the stranger is theirs. Cells whose calibration is refused are counted with
-the reasons; the intervals of all others must hold.
+With `--stranger`, each cell has one effect for which calibrations have no parameter (`strange_cells`). Camera and
+hand-eye are then compared by their rays; LEDs are compared if the effect concerns them. Cells whose calibration is
+refused are counted with the reasons; the intervals of all others must contain the truth.
 
 The exit code is 1 if a cell could not be calibrated, or if a parameter's intervals are wrong: 90 to 99 % must
-contain the truth, and rms(error/u) must be between 0.8 and 1.25; both limits are widened to what chance exceeds
-once in 1000 for the given number of cells.
+contain the truth, and rms(error/u) must be between 0.8 and 1.25; both limits are widened to the values that chance
+exceeds once in 1000 for this number of cells.
 """
 
 from __future__ import annotations
@@ -66,7 +67,8 @@ class Verdict:
 
     @property
     def faults(self) -> list[str]:
-        """Violated limits. Values of one cell are correlated: the number of cells counts, not of values."""
+        """Return the violated limits. Values of one cell are correlated, so the number of cells counts, not that
+        of values."""
         faults = []
         if binom.cdf(round(self.covered * self.cells), self.cells, 0.90) < _CHANCE:
             faults.append(f"{self.name}: {self.covered:.1%} of the intervals hold the truth")
@@ -185,7 +187,7 @@ def tell_accuracies(proofs: Sequence[Proof], *, as_json: bool) -> None:
 
 
 def accuracies(proofs: Sequence[Proof]) -> dict[str, tuple[float, float]]:
-    """Median and 95th percentile over the cells of each figure."""
+    """Return median and 95th percentile over the cells, for each figure."""
     names = proofs[0].accuracy if proofs else ()
     figures = {name: [proof.accuracy[name] for proof in proofs] for name in names}
     return {
@@ -195,7 +197,7 @@ def accuracies(proofs: Sequence[Proof]) -> dict[str, tuple[float, float]]:
 
 
 def verdicts(proofs: Sequence[Proof]) -> list[Verdict]:
-    """Evaluation of the intervals."""
+    """Return the comparison of the intervals with the truth."""
     results = []
     cells = [proof.judged for proof in proofs]
     for name in dict.fromkeys(judgement.name for cell in cells for judgement in cell):

@@ -2,11 +2,11 @@
 
     python tools/prove_chart_pictures.py [--charts 100] [--jobs 2] [--only card]
 
-Each drawn chart has its own paints, measured colours with errors, camera, lamp at a finite distance, vignetting,
-noise, perspective and turn; code of the tests' own draws its picture (`tests/calibration/drawn_charts.py`). The
-true matrix is found by colour-science from the true spectra under even light. Exits with 1 unless 93 to 97 % of
-the coefficients are within their intervals of 95 %, with a picture of a white card and without it, and 93 % or
-more of colours that the chart does not have are within the stated bound.
+Each random chart has its own paints, measured colours with errors, camera, lamp at a finite distance, vignetting,
+noise, perspective and rotation. Separate code of the tests draws its picture
+(`tests/calibration/drawn_charts.py`). The true matrix is found by colour-science from the true spectra under even
+light. Exits with 1 unless 93 to 97 % of the coefficients are within their 95 % intervals, with a picture of a
+white card and without it. At least 93 % of colours that are not on the chart must be within the stated bound.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LOW, HIGH = 0.93, 0.97
 
 
 def judged_chart(with_white: bool, seed: int) -> Judged:
-    """One chart, by its seed."""
+    """Return the comparison of one chart, by its seed."""
     return judge(varied(seed), with_white=with_white)
 
 

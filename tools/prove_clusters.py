@@ -3,16 +3,17 @@ pictures.
 
     python tools/prove_clusters.py [--triangles 400000] [--clusters N ...] [--waves 1|3] [--every 12] [--keep DIR]
 
-A relief is rendered with colours that run over it continuously, in two views: from bright ochre to a third of it
-in one wave, as a patina has it, or each channel by itself in three. By itself it is the shipped one, of which
-16,000 triangles are seen by 512 x 384 pixels. With `--triangles` it is one of about as many that are seen, a fifth
-as high so that it stays in focus, with a camera of the same field whose pixels are finer, 8 for each triangle; its
-records are drawn (`drawn_records`). 400,000 take half an hour, and 5 GB of disk.
+A relief whose colours vary continuously is rendered in two views. With one wave, the colour varies between bright
+ochre and a third of it, like a patina; with three, each channel has its own wave. By default this is the shipped
+relief, of which 16,000 triangles are seen by 512 x 384 pixels. `--triangles` sets the approximate number of
+visible triangles. The relief is then a fifth as high, so that it stays in focus; the camera has the same field
+with finer pixels, 8 for each triangle, and its records are drawn at random (`drawn_records`). 400,000 triangles
+take half an hour, and 5 GB of disk.
 
-1,000 clusters are those of the paper, for 416,859 triangles (seed 003, Fig. 6). One cluster for 417 triangles, the
-paper's share, is told too. Errors are means over blocks of 2 x 2 pixels under LEDs left out, as the paper's. Exits
-with 1 if 1,000 clusters miss more than 1.3 times what the triangles' own materials miss. In the folder `--keep`
-run and result stay, and a later call goes on with what is there.
+1,000 clusters are those of the paper, for 416,859 triangles (seed 003, Fig. 6). The result for one cluster per 417
+triangles, the paper's ratio, is printed too. As in the paper, errors are means over blocks of 2 x 2 pixels under
+LEDs that were left out. Exits with 1 if the error with 1,000 clusters is more than 1.3 times that with the
+triangles' own materials. Run and result stay in the folder `--keep`; a later call continues with them.
 """
 
 from __future__ import annotations
@@ -44,11 +45,11 @@ from smallest import add_smallest  # noqa: E402
 
 CLUSTERS, TRIANGLES_FOR_EACH, MOST_RATIO = 1000, 417, 1.3
 SLOW, PATIENCE_S = 0.5, 60.0
-"""Pace of a world that renders large frames, and how long it may be silent meanwhile."""
+"""Speed of a world that renders large frames, and the time for which it may be silent meanwhile."""
 PIXELS_FOR_EACH = 8.0
 """Pixels for each triangle, with `--triangles`."""
 FLATTER = 0.2
-"""Heights of the finer relief over those of the shipped one: it stays in focus."""
+"""Heights of the finer relief, relative to the shipped one, so that it stays in focus."""
 FINE_VIEWS = tuple(
     {**cells.TOP, "name": name, "target_mm": [0, 0, 5], "azimuth_deg": azimuth_deg}
     for name, azimuth_deg in (("front", -90), ("back", 90))
@@ -57,13 +58,13 @@ COVERED, SEEN = 0.69, 0.97
 """Shares of the frame that show the relief, and of its carved triangles that are seen."""
 MATERIAL = {"diffuse": (0.7, 0.7, 0.7), "f0": (0.05, 0.05, 0.05), "roughness": 0.3}
 WAVES_MM = (90.0, 60.0, 45.0)
-"""Periods of the three colours' waves over the object; of a single one the first."""
+"""Periods of the waves of the three colours over the object; a single wave has the first period."""
 MIDDLE, HALF = np.array([0.60, 0.50, 0.38]), np.array([0.30, 0.25, 0.19])
 
 
 @dataclass(frozen=True)
 class Fine:
-    """A finer relief, and a camera that sees it as finely; the field is the shipped camera's."""
+    """A finer relief, and a camera with correspondingly finer pixels and the field of the shipped camera."""
 
     triangles: int
     """Approximate number of triangles that are seen."""
@@ -133,7 +134,7 @@ def _result(folder: Path, fine: Fine | None, every: int, waves: int) -> Path:
 
 
 def _acquire(folder: Path, fine: Fine | None, every: int, waves: int) -> Path:
-    """The run of the coloured relief."""
+    """Return the run of the coloured relief."""
     mesh = trimesh.load(ROOT / "configs/objects/relief.ply", process=False) if fine is None else fine.relief()
     mesh.visual.vertex_colors = _colours(np.asarray(mesh.vertices), waves)
     mesh.export(folder / "coloured.ply")
@@ -158,7 +159,7 @@ def _acquire(folder: Path, fine: Fine | None, every: int, waves: int) -> Path:
 
 
 def _colours(vertices_mm: NDArray[np.float64], waves: int) -> NDArray[np.uint8]:
-    """[n, 3] of the vertices, sRGB."""
+    """[n, 3] sRGB of the vertices."""
     x, y, z = vertices_mm.T
     along = (x + 0.5 * y, y - 0.3 * x, 0.7 * x + 0.7 * y + 2.0 * z)
     phases = [2 * np.pi * s / w for s, w in zip(along, WAVES_MM, strict=True)]

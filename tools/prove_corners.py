@@ -1,13 +1,13 @@
-"""Proves how far corners of boards are off, without and with noise, beside other detectors.
+"""Measures errors of the corners of boards, without and with noise, beside those of other detectors.
 
     python tools/prove_corners.py [--boards 6] [--pictures FOLDER]
 
-Boards of 36 corners are drawn by code of the tests' own (`tests/calibration/corner_boards.py`) for each kind of
-blur, tilt, contrast and colour pattern. Printed are root mean squares of the error without noise: of our fit, of
-the same fit with one round Gaussian blur ("before"), of OpenCV's `cornerSubPix` and `findChessboardCornersSB`
-(Duda and Frese, BMVC 2018) and of the saddle of a quadratic in the smoothed image (as in Placht, ECCV 2014, and
-Ha, ICCV 2017; written here); in brackets the largest mean by quarter of a pixel; with noise our error over the
-stated u. With `--pictures`, the two diagonal halves of the pixels of grey pictures of a 9 x 6 board (PNG) are
+Separate code of the tests draws boards of 36 corners (`tests/calibration/corner_boards.py`) for each kind of blur,
+tilt, contrast and colour pattern. The rms error without noise is printed for five methods: our fit, the same fit
+with one round Gaussian blur ("before"), OpenCV's `cornerSubPix` and `findChessboardCornersSB` (Duda and Frese,
+BMVC 2018), and the saddle of a quadratic in the smoothed image (as in Placht, ECCV 2014, and Ha, ICCV 2017;
+written here). The largest mean error by quarter of a pixel is in brackets. With noise, our error over the stated u
+is printed. With `--pictures`, the two diagonal halves of the pixels of grey pictures of a 9 x 6 board (PNG) are
 compared. Exits with 1 unless rms(error/u) is 0.8 to 1.25 in each stratum.
 """
 
@@ -56,7 +56,8 @@ METHODS = ("ours", "before", "cornerSubPix", "SB", "saddle")
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors [n, 2] of a stratum without noise by method, their corners' places, and errors over u with noise."""
+    """Errors [n, 2] of a stratum: without noise by method, with the places of the corners; and with noise, divided
+    by u."""
 
     plain_px: dict[str, Floats]
     corners: dict[str, Floats]
@@ -120,7 +121,7 @@ def _corners_by_method(stratum: Stratum, board: Drawn, starts: Floats) -> dict[s
 
 
 def _by_sector_based(grey: Any, corners: Floats) -> Floats:
-    """OpenCV's `findChessboardCornersSB`, its corners in the order of the true ones."""
+    """Return the corners of OpenCV's `findChessboardCornersSB`, in the order of the true ones."""
     picture = np.clip(np.rint(255.0 * grey / grey.max()), 0, 255).astype(np.uint8)
     is_found, seen_px = cv2.findChessboardCornersSB(picture, (CORNERS, CORNERS), flags=cv2.CALIB_CB_ACCURACY)
     if not is_found:
@@ -132,7 +133,7 @@ def _by_sector_based(grey: Any, corners: Floats) -> Floats:
 
 
 def _saddle(grey: Any, start: Floats, half_px: int) -> Floats:
-    """The saddle of the quadratic that fits a window, smoothed by a cone; NaN where it is none."""
+    """Return the saddle of the quadratic that fits a window, smoothed by a cone; NaN if it has no saddle."""
     x, y = np.meshgrid(*2 * [np.arange(-half_px, half_px + 1)])
     cone = np.maximum(half_px + 1.0 - np.hypot(x, y), 0.0)
     first = np.maximum(np.rint(start).astype(int) - 3 * half_px, 0)
@@ -157,7 +158,7 @@ def _rms(values: Floats) -> float:
 
 
 def _by_phase(errors: Floats, corners: Floats) -> float:
-    """Largest mean error of the corners whose coordinate lies in the same quarter of a pixel."""
+    """Return the largest mean error of corners whose coordinate lies in the same quarter of a pixel."""
     quarter = np.floor(PHASES * (corners % 1.0)).astype(int)
     means = [errors[quarter == number].mean() for number in range(PHASES) if (quarter == number).any()]
     return float(np.abs(means).max()) if means else float("nan")

@@ -1,15 +1,15 @@
-"""Losses of exports of a result: pixels are lit anew from each file, and compared with the result it came from.
+"""Measures the losses of exports of a result: pixels are relit from each file, and compared with the result.
 
     python tools/prove_exports.py [RESULT] [--pixels 4000] [--write]
 
-Without a result one is made, of a run of a glossy relief in the simulated cell.
+Without RESULT, a result is made from a run of a glossy relief in the simulated cell.
 
 Pixels of the measured views are lit by a dozen distant lights each. Files are read by tests/export_readers: by
-others' libraries or, where there are none, by their layout; their models (glTF 2.0 appendix B with
-KHR_materials_specular, OpenPBR as MaterialX 1.39 builds it) are written anew there. White under a light from above
-has the value 1. Tables of single materials are made of eight triangles; samples are compared with those of the
-result. `--write` puts the table into docs/reference/exports.md. Exits with 1 if a format loses more than the
-`MOST_LOST` of its reader.
+other libraries or, if there are none, by their documented layout. Their models (glTF 2.0 appendix B with
+KHR_materials_specular, OpenPBR as MaterialX 1.39 builds it) are implemented there independently. White under a
+light from above has the value 1. Tables of single materials are made for eight triangles; samples are compared
+with those of the result. `--write` puts the table into docs/reference/exports.md. Exits with 1 if the loss of a
+format exceeds the `MOST_LOST` of its reader.
 """
 
 from __future__ import annotations
@@ -47,10 +47,11 @@ from smallest import add_smallest  # noqa: E402
 
 TRIANGLES = 8
 ADAPTIVE = {"bsdf": 0.003}
-"""Largest error asked of a second, adaptive table of a format, for 95 % of the directions."""
+"""Wanted error of a second, adaptive table of a format, for 95 % of the directions."""
 DOCUMENT, BEGIN, END = ROOT / "docs/reference/exports.md", "<!-- figures -->\n", "<!-- end of figures -->\n"
 Row = tuple[np.ndarray, np.ndarray, float]
-"""Values found and wanted, [n, 3] or [n, 1], and the relative error that 95 % of them may have."""
+"""Values from the file and expected values, [n, 3] or [n, 1], and the relative error that 95 % of them may
+have."""
 
 
 def main() -> int:
@@ -143,7 +144,8 @@ def _of_table(
 def _of_samples(
     surface: MeasuredSurface, folder: Path, chosen_triangles: tuple[int, ...], reader: Any
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Each value beside the nearest of the result's, as neither file says which LED a sample is from; [n, 1]."""
+    """Return each value beside the nearest value of the result, [n, 1], because neither file says which LED a
+    sample is from."""
     exported_values, true_values = [], []
     for number in chosen_triangles:
         for channel, name in enumerate(("red", "green", "blue")[: surface.result.channels]):

@@ -2,12 +2,12 @@
 
     python tools/prove_finishes.py [--radius-px R] [--noise SHARE]
 
-Mitsuba renders gold of two roughnesses (its own rough conductor, an orthographic camera, directional lights); the
-other spheres are formulas, averaged over 3 x 3 places in each pixel. All have noise. The MERL file is read back,
-and compared with the finish itself at mirror directions, and at half vectors up to 15 degrees from the normal
-with both directions at least 12 degrees above the horizon. The last rows have mistakes of the set-up: a centre or
-a radius half a pixel off, lights one degree off. Exits with 1 if a peak up to 60 degrees is off by more than 3 %
-on a sphere without such a mistake, but not with `--smallest`.
+Mitsuba renders gold of two roughnesses (its own rough conductor, an orthographic camera, directional lights). The
+other spheres are formulas, averaged over 3 x 3 places in each pixel. All have noise. The MERL file is read back
+and compared with the finish itself: at mirror directions, and at half vectors up to 15 degrees from the normal
+with both directions at least 12 degrees above the horizon. The last rows have errors of the set-up: a centre or a
+radius half a pixel off, or lights one degree off. Exits with 1 if the error of a peak up to 60 degrees is more
+than 3 % on a sphere without such an error of the set-up, but not with `--smallest`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _PLACES = (-1.0 / 3.0, 0.0, 1.0 / 3.0)
 
 
 def lights() -> list[np.ndarray]:
-    """Ten ways to lights, 5 to 140 degrees from the camera, round it."""
+    """Return ten directions to lights, 5 to 140 degrees from the camera, around it."""
     angles = enumerate(np.radians(np.arange(5.0, 150.0, 15.0)))
     return [np.array([np.sin(a) * np.cos(n), np.sin(a) * np.sin(n), np.cos(a)]) for n, a in angles]
 
@@ -58,12 +58,12 @@ def two_facets(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
 
 
 def powder(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
-    """GGX facets and a little of a diffuse body."""
+    """GGX facets, with a small diffuse part."""
     return brdf.ggx(wi, wo, roughness=0.25, fresnel=_GOLD) + 0.01
 
 
 class Mitsuba:
-    """A finish of Mitsuba's, which renders its spheres too."""
+    """A finish of Mitsuba, which also renders its spheres."""
 
     def __init__(self, roughness: float, samples: int) -> None:
         import mitsuba
@@ -102,7 +102,8 @@ class Mitsuba:
 
 
 def formula_photograph(finish: Callable[..., np.ndarray], to_light: np.ndarray, radius_px: float) -> np.ndarray:
-    """[side, side, 3]: a frame at each place of the sphere, by angles to the normal and between the two ways."""
+    """[side, side, 3] picture of a finish by a formula of the angles to the normal and between the two
+    directions."""
     side = _side(radius_px)
     total = np.zeros((side * side, 3))
     for du in _PLACES:
@@ -135,7 +136,7 @@ def measure(
     radius_off_px: float,
     light_off_deg: float,
 ) -> Callable[..., np.ndarray]:
-    """The finish as its MERL file has it."""
+    """Return the finish as its MERL file contains it."""
     rng, pictures = np.random.default_rng(1), []
     take = getattr(finish, "photograph", partial(formula_photograph, finish))
     for to_light in lights():
@@ -160,7 +161,7 @@ def measure(
 
 
 def peak_errors(table: Callable[..., np.ndarray], finish: Any) -> np.ndarray:
-    """Relative [angles], of the channel that is most off."""
+    """Relative errors [angles] of the channel with the greatest error."""
     angle = np.radians(np.array(PEAKS_DEG, float))
     zero = np.zeros_like(angle)
     wi = np.stack([np.sin(angle), zero, np.cos(angle)], axis=1)
@@ -169,7 +170,7 @@ def peak_errors(table: Callable[..., np.ndarray], finish: Any) -> np.ndarray:
 
 
 def error_about_peaks(table: Callable[..., np.ndarray], finish: Any) -> float:
-    """99 % of directions whose half vector is within 15 degrees of the normal are off by no more."""
+    """99 % quantile of the relative errors of directions whose half vector is within 15 degrees of the normal."""
     rng = np.random.default_rng(2)
     theta_h, theta_d, phi = (
         np.radians(15.0) * rng.random(3000),

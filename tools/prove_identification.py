@@ -1,8 +1,9 @@
 """Rates of `coupole identify` on published libraries, with 95 % intervals.
 
-`python tools/prove_identification.py PIGMENTS` develops: `KremerHistorical.rs` in the folder PIGMENTS alone, by
-leaving out. `--test` runs the rule on `GamblinConservationColors.rs` and `oilpaint/oilpaint.rs` with Kremer as
-the library: nothing may be chosen by what it prints (docs/decisions/0042-identification.md).
+`python tools/prove_identification.py PIGMENTS` is for development: it uses only `KremerHistorical.rs` in the
+folder PIGMENTS, by leaving out. `--test` applies the rule to `GamblinConservationColors.rs` and
+`oilpaint/oilpaint.rs` with Kremer as the library. Its output must not be used to choose anything
+(docs/decisions/0042-identification.md).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _SEED = 7
 
 
 def develop(references: References, mixtures: int) -> None:
-    """Print rates of the library by itself, and of mixtures of two of its spectra."""
+    """Print the rates of the library with itself, and of mixtures of two of its spectra."""
     first = references.reflectance[0]
     of_bands = references.of_bands("", first)
     rates = of_bands.rates
@@ -55,8 +56,8 @@ def _calibration(references: References) -> None:
 
 
 def _mixtures(references: References, mixtures: int) -> None:
-    """Opaque mixtures of two spectra of different classes, with noise of 0.001; and single ones, each as if the
-    library lacked it, or its class."""
+    """Return opaque mixtures of two spectra of different classes, with noise of 0.001; and single spectra, for
+    which the library lacks the spectrum or its class."""
     random = np.random.default_rng(_SEED)
     of_bands = references.of_bands("", references.reflectance[0])
     values, classes, nm = of_bands.reflectance, of_bands.classes, BANDS_NM[of_bands.bands]
@@ -89,7 +90,7 @@ def _mixtures(references: References, mixtures: int) -> None:
 
 
 def test(references: References, folder: Path) -> None:
-    """Print the four rates of the test set, and each verdict that counts against one."""
+    """Print the four rates of the test set, and each wrong verdict."""
     classes = set(references.class_of)
     inside: list[tuple[Measured, str]] = []
     outside: list[tuple[Measured, str]] = []

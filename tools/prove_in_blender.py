@@ -1,24 +1,24 @@
-"""Opens exports of a result in Blender, and compares its pictures with those of `relight --from`.
+"""Opens exports of a result in Blender, and compares Blender's pictures with those of `relight --from`.
 
     python tools/prove_in_blender.py [RESULT] [--to gltf usd obj] [--install [WHEEL]] [--blender PYTHON]
         [--pictures FOLDER] [--uv MESH]
 
-Without a result one is made: the relief with paint and bumps that its mesh does not have (`detailed_result` of the
-tests), in the simulated cell. Blender's importers open the files, Cycles renders them on the CPU (`in_blender.py`,
-in a process of its own) under five distant lights, with light that comes straight from the lamp only. White is as
-bright as the brightest hundredth, as in `tests/runs/test_texel_maps.py`; compared is what both show lit. What
-the importers of OBJ and USD leave out is then linked by hand, and compared once more. Blender does not read
-MaterialX's documents.
+Without RESULT, a result is made in the simulated cell: the relief with paint and bumps that its mesh does not have
+(`detailed_result` of the tests). Blender's importers open the files. Cycles renders them on the CPU
+(`in_blender.py`, in a separate process) under five distant lights, with direct light only. White is the brightness
+of the brightest hundredth, as in `tests/runs/test_texel_maps.py`. Only pixels that are lit in both pictures are
+compared. The parts that the importers of OBJ and USD leave out are then linked by the tool, and the pictures are
+compared again. Blender does not read MaterialX's documents.
 
-Blender's Principled BSDF is another model than the fit. It is written anew in
-`tests/export_readers/lit_models.py`, held to a sphere of Blender's own, and put on the pixels of our picture: so a
-table tells what the model makes (`ours - model`) and what is left for file and importer (`model - Blender`). Last,
-the green of the normal map is turned round, which must be seen.
+Blender's Principled BSDF differs from the model of the fit. It is implemented independently in
+`tests/export_readers/lit_models.py`, compared with a sphere of Blender, and applied to the pixels of our picture.
+So a table separates the difference of the models (`ours - model`) from that of file and importer (`model -
+Blender`). Last, the green channel of the normal map is inverted, which the comparison must detect.
 
-`--install` makes an environment with the package bpy 5.0.1 under `.tools/blender` (1 GB; it needs Python 3.11), of
-a wheel if one is named. `--blender` names another Python that has the package. Exits with 1 if glTF, or one of
-the others when completed, differs by more than 1.5 (CIEDE2000, mean of the five lights), Blender's sphere from the
-model by more than 0.1, or if a turned normal map is not seen.
+`--install` makes an environment with the package bpy 5.0.1 under `.tools/blender` (1 GB; it needs Python 3.11),
+from a wheel if one is named. `--blender` names another Python that has the package. Exits with 1 in three cases:
+glTF, or another format after completion, differs by more than 1.5 (CIEDE2000, mean of the five lights); Blender's
+sphere differs from the model by more than 0.1; or an inverted normal map is not detected.
 """
 
 from __future__ import annotations
@@ -60,15 +60,16 @@ from smallest import add_smallest  # noqa: E402
 HOME = ROOT / ".tools/blender"
 PACKAGE = "bpy==5.0.1"
 MOST = 1.5
-"""Largest mean CIEDE2000 over the five lights, of glTF as imported, USD and OBJ completed."""
+"""Largest mean CIEDE2000 over the five lights: of glTF as imported, and of USD and OBJ after completion."""
 MOST_OF_SPHERE = 0.1
-"""The same of Blender's sphere and Blender's model as it is written here."""
+"""Largest mean CIEDE2000 between Blender's sphere and Blender's model as implemented here."""
 LEAST_TURNED = 1.5
-"""A turned normal map differs by so many times as much, or the comparison sees nothing."""
+"""Least factor by which an inverted normal map increases the difference; with less, the comparison would be
+blind."""
 LIGHTS = ((-1.0, 0.0, 0.5), (1.0, 0.3, 0.7), (0.0, 1.0, 0.6), (0.2, -1.0, 1.0), (0.0, 0.1, 1.0))
 CAMERA = FreeCamera(np.array([60.0, -120.0, 280.0]), np.array([30.0, 0.0, 5.0]), (240, 180), 20.0)
 MENDED = ("usd", "obj")
-"""Formats of which Blender's importers leave out something that can be linked by hand."""
+"""Formats whose import lacks parts that this tool can link."""
 FILES = {"gltf": "surface.glb", "usd": "surface.usdz", "obj": "surface.obj"}
 Array = np.ndarray
 Vector = tuple[float, float, float]
@@ -153,7 +154,7 @@ _DISTANCE_M, _FIELD_DEG = 100.0, 1.2
 
 
 def _job(out: Path, lights: Sequence[Sequence[float]], samples: int, **words: Any) -> dict[str, Any]:
-    """A picture of the result, or of the sphere if no file is named."""
+    """Return the job of a picture of the result, or of the sphere if no file is named."""
     job = {"out": str(out), "towards": lights, "samples": samples, **words}
     if "file" not in words:
         place = {"at_m": [0.0, 0.0, _DISTANCE_M], "look_at_m": [0.0, 0.0, 0.0], "field_of_view_deg": _FIELD_DEG}
@@ -178,7 +179,7 @@ def _specular_times(path: Path) -> float:
 
 
 def _run_blender(python: Path, jobs: list[dict[str, Any]], folder: Path, console: Console) -> None:
-    """Render, and hand on what Blender says, its importers' warnings too."""
+    """Render, and print Blender's output, including its importers' warnings."""
     (folder / "job.json").write_text(json.dumps(jobs))
     words = [str(python), "-u", str(ROOT / "tools/in_blender.py"), str(folder / "job.json")]
     count, total = 0, sum(len(job["towards"]) for job in jobs)
@@ -211,7 +212,8 @@ def _halve(picture: Array) -> Array:
 
 
 def _difference(blender_rgb: Array, our_rgb: Array) -> tuple[float, float]:
-    """Mean CIEDE2000 where both are lit, and the share of what is lit in ours that is dark in theirs."""
+    """Mean CIEDE2000 of the pixels that are lit in both pictures, and the share of our lit pixels that are dark in
+    Blender's."""
     is_lit, is_lit_there = (our_rgb > 0.0).any(axis=2), (blender_rgb > 0.0).any(axis=2)
     white, lit_in_both = np.percentile(our_rgb[is_lit], 99), is_lit & is_lit_there
     differences = lab_differences(blender_rgb[lit_in_both] / white, our_rgb[lit_in_both] / white)
@@ -223,7 +225,7 @@ def _mean_difference(pictures: list[Array], references: list[Array]) -> float:
 
 
 def _by_blenders_model(scene: RelitScene, towards: Vector) -> Array:
-    """[h, w, 3] our picture, with Blender's model on the materials of its lit pixels."""
+    """[h, w, 3] our picture, with Blender's model for the materials of its lit pixels."""
     picture = scene.picture([DistantLight(towards=towards)])
     if not isinstance(scene.reflecting, Texels):
         raise InputError("the result has no texels")
@@ -246,7 +248,8 @@ def _lit(light: Array, ways: Array) -> Lit:
 
 
 def _sphere_difference(folder: Path, lights: Sequence[Sequence[float]]) -> float:
-    """Mean CIEDE2000 of Blender's sphere and the model, where camera and light are within 75 degrees."""
+    """Mean CIEDE2000 between Blender's sphere and the model, where camera and light are within 75 degrees of the
+    normal."""
     differences = []
     for number, towards in enumerate(lights):
         blender_rgb = _picture(folder / f"{number}.exr")[..., :3]
@@ -274,7 +277,8 @@ def _sphere_difference(folder: Path, lights: Sequence[Sequence[float]]) -> float
 
 
 def _keep(path: Path, our_rgb: list[Array], blender_rgb: list[Array], model_rgb: list[Array]) -> None:
-    """A row for each light: ours, Blender's, its model on our pixels; and ten times Blender's less its model's."""
+    """Write a row for each light: our picture, Blender's, Blender's model on our pixels, and ten times the
+    difference between the last two."""
     rows = []
     for our_picture, blender_picture, model in zip(our_rgb, blender_rgb, model_rgb, strict=True):
         white = np.percentile(our_picture[(our_picture > 0.0).any(axis=2)], 99)

@@ -2,12 +2,14 @@
 
     python tools/prove_layers.py [--rounds N] [--photons N]
 
-Of each kind of films (two grounds, opaque and thin, a series) for several paints it prints how often the 95 %
-interval holds the truth, and of a walk of photons how often that of the reflectance over another ground does. At
-other thicknesses, where two fluxes are a model, it prints for grains of three mean cosines how often the interval
-of the film that `--at-um` predicts holds what photons show, with the model's error and without it. Exits with 1 if
-the mean of a kind is outside 93 to 97 %, or below 93 % at other thicknesses, but not with `--smallest`, whose
-means say nothing.
+For each kind of films (two grounds, opaque and thin, a series) and several paints, this prints how often the 95 %
+interval contains the truth. For a random walk of photons, it prints how often the interval of the reflectance over
+another ground contains the truth. At other thicknesses two-flux theory is only approximate. There it prints, for
+grains of three mean cosines, how often the interval of the film that `--at-um` predicts contains the photons'
+result, with the model's error and without it.
+
+Exits with 1 if the mean of a kind is outside 93 to 97 %, or below 93 % at other thicknesses. With `--smallest` the
+means are not meaningful, and the exit code is 0.
 """
 
 from __future__ import annotations
@@ -32,14 +34,15 @@ from smallest import add_smallest  # noqa: E402
 PAINTS = ((0.2, 20.0), (2.0, 20.0), (10.0, 20.0), (20.0, 20.0), (5.0, 60.0))
 KINDS = ("two grounds", "opaque and thin", "series")
 DEPTHS, ABSORBED = (0.5, 1.0, 2.0, 5.0), (0.002, 0.02, 0.1)
-"""Optical depths and absorption of grains that scatter evenly; other grains diffuse as much."""
+"""Optical depths, and absorption, of grains that scatter isotropically; other grains are scaled to the same
+diffusion."""
 GROUNDS, TIMES, MEAN_COSINES = (cases.BLACK, cases.WHITE), (0.5, 2.0, 4.0), (0.0, 0.5, 0.8)
 DRAWS = 1000
 LEAST, MOST = 0.93, 0.97
 
 
 def coverage(kind: str, rounds: int) -> float:
-    """Mean over the paints of the share of K and S in their intervals, in bands that tell them."""
+    """Mean, over the paints, of the share of K and S within their intervals, in the bands that determine them."""
     rng, shares = np.random.default_rng(21), []
     for k, s in PAINTS:
         inside = []
@@ -60,7 +63,7 @@ def coverage(kind: str, rounds: int) -> float:
 
 
 def photons(count: int) -> float:
-    """Coverage of the reflectance over another ground."""
+    """Return the coverage of the reflectance over another ground."""
     rng, shares = np.random.default_rng(22), []
     for depth in DEPTHS:
         photon_walk = walk(depth, count, 1)
@@ -81,7 +84,7 @@ def noisy_films(exact: dict[float, float], rng: np.random.Generator) -> list[Fil
 
 
 def other_thicknesses(count: int) -> float:
-    """The least coverage of a mean cosine, over all depths, absorptions, thicknesses and grounds."""
+    """Return the least coverage of a mean cosine, over all depths, absorptions, thicknesses and grounds."""
     rng, least = np.random.default_rng(23), 1.0
     for mean_cosine in MEAN_COSINES:
         shares, shares_without, largest = [], [], 0.0
@@ -100,7 +103,7 @@ def other_thicknesses(count: int) -> float:
                     off = film.reflectance - exact[film.thickness_mm][float(film.ground_name)]
                     off, u, u_without = (a[np.isfinite(off)] for a in (off, film.u_reflectance, film.u_measured))
                     if len(off) < DRAWS // 2:
-                        continue  # hides its ground
+                        continue  # the film hides its ground
                     shares.append(np.mean(np.abs(off) < COVERAGE_FACTOR * u))
                     shares_without.append(np.mean(np.abs(off) < COVERAGE_FACTOR * u_without))
                     largest = max(largest, abs(float(np.median(off))))

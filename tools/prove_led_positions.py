@@ -1,11 +1,13 @@
-"""Checks the stated intervals of LED positions in drawn cells with causes that a plain adjustment has no term for.
+"""Checks the stated intervals of LED positions in random cells with effects for which a plain adjustment has no
+term.
 
     python tools/prove_led_positions.py [--cells 100] [--causes primary window ...] [--boards 8] [--views 12]
         [--jobs 1] [--json]
 
-Each cell has its own dome, lens, hand-eye, arm and records that are off by what they say; spots are drawn, not
-rendered. The forward model shares no equation with the calibration: Brown's lens, squares of many points, and the
-primary lens of `sim.strangers`. Causes, each from nothing to where a plain adjustment fails:
+Each cell has its own dome, lens, hand-eye, arm, and records with errors of their stated size. Spots are computed,
+not rendered. The forward model shares no equation with the calibration: it has Brown's lens, squares of many
+points, and the primary lens of `sim.strangers`. Each effect is varied from nothing to a strength at which a plain
+adjustment fails:
 
     primary   lenses on the dies, mm (shift of the image over the sine of the angle to the normal)
     each      the same, of each die another: standard deviation 30 %
@@ -16,10 +18,10 @@ primary lens of `sim.strangers`. Causes, each from nothing to where a plain adju
     arm       positions of the arm too large, 1e-4
     moved     the dome moves between the first half of the views and the second, mm
 
-Printed for each strength, for LEDs of cells that were not refused: how many of the 95 % intervals of coordinates
-hold the truth (`plain`: by an adjustment without suspects), rms(error/u), the share of cells in which fewer than
-80 % hold; then the cells that named a suspect, that were refused, and the median and mean width of u over that of
-the plain adjustment.
+For each strength, figures are printed for the LEDs of cells that were not refused: the share of the 95 % intervals
+of coordinates that contain the truth (`plain`: by an adjustment without suspects), rms(error/u), and the share of
+cells in which fewer than 80 % do so. Then follow the number of cells that named a suspect, the number of refused
+cells, and the median and mean width of u relative to the plain adjustment.
 """
 
 from __future__ import annotations
@@ -63,13 +65,13 @@ SWEEP = {
     "arm": (1.0,),
     "moved": (0.3,),
 }
-"""Strengths of each cause; 0 is drawn once."""
+"""Strengths of each effect; 0 is computed only once."""
 _REQUEST = Request("drawn", datetime(2026, 1, 1, tzinfo=UTC))
 
 
 @dataclass(frozen=True)
 class Judged:
-    """One cell, judged."""
+    """One cell, compared with the truth."""
 
     held_share: float
     held_share_plain: float
@@ -77,7 +79,7 @@ class Judged:
     """Mean of (error/u)^2."""
     square_plain: float
     width: float
-    """Median of u over that of the plain adjustment."""
+    """Median of u, relative to that of the plain adjustment."""
     named_suspects: tuple[str, ...]
     broken_limits: tuple[str, ...]
 
@@ -135,7 +137,7 @@ def tell(cause: str, strength: float, cells: Sequence[Judged], *, as_json: bool)
 
 
 def _of(pairs: Sequence[tuple[float, float]]) -> str:
-    """Share of intervals that hold, rms(error/u), share of cells below 80 %."""
+    """Return the share of intervals that contain the truth, rms(error/u), and the share of cells below 80 %."""
     if not pairs:
         return "-, -, -"
     held_share, square = np.array(pairs).T
@@ -150,7 +152,7 @@ def _counts(names: Sequence[str]) -> str:
 
 
 def judge_cell(seed: int, *, boards: int, views: int, cause: str, strength: float) -> Judged:
-    """Draw a cell and judge its LEDs, with the suspects and without."""
+    """Draw a cell; return the comparison of its LEDs with the truth, with the suspects and without."""
     cell = draw_leds(seed, boards, views, cause, strength)
     calibration = leds_from(cell.images, cell.table, cell.prior, _REQUEST, stated_noise=Stated())
     plain = _plain(cell, calibration)
@@ -174,7 +176,7 @@ def judge_cell(seed: int, *, boards: int, views: int, cause: str, strength: floa
 
 
 _MISSING = "LEDs not found"
-"""A drawn cell has few views, of which some LEDs are in too few."""
+"""Warning that is accepted: a random cell has few views, and some LEDs are in too few of them."""
 
 
 def _plain(cell: DrawnLeds, calibration: LedsFound) -> LedGeometry:
@@ -185,7 +187,8 @@ def _plain(cell: DrawnLeds, calibration: LedsFound) -> LedGeometry:
 
 
 def _against_truth(geometry: LedGeometry, true_mm: Floats, rows: NDArray[np.bool_]) -> tuple[float, float, Floats]:
-    """Share of coordinates in their 95 % intervals, mean of (error/u)^2, and u [n] of the places."""
+    """Return the share of coordinates within their 95 % intervals, the mean of (error/u)^2, and u [n] of the
+    positions."""
     off = (geometry.centres_mm - true_mm)[rows]
     u = np.sqrt(np.einsum("nii->ni", geometry.centre_covariance[rows]))
     k = coverage_factor(geometry.degrees[rows])[:, None]

@@ -1,17 +1,19 @@
-"""White furnace, reciprocity, and sampling against evaluation of every kind of material that a scene may have.
+"""Tests every kind of material of a scene: white furnace, reciprocity, and sampling against evaluation.
 
     python tools/prove_materials.py [--samples N]
 
-Each material is given to Mitsuba as `coupole render` gives it, for four bands from 500 to 515 nm. For the cosines
-0.1, 0.3, 0.6 and 0.95 of the way to the eye it prints three figures, over bands and cosines:
+Each material is passed to Mitsuba as `coupole render` does, for four bands from 500 to 515 nm. Three figures are
+printed, over all bands and over the cosines 0.1, 0.3, 0.6 and 0.95 of the direction to the eye:
 
 - the largest albedo, by evaluation: f times the cosine over the hemisphere. It must not be above 1.
-- the largest difference between that and the mean weight of drawn ways, less three standard errors of the mean.
-- the largest relative difference of f when the ways are exchanged, of values above a thousandth of the largest.
+- the largest difference between this albedo and the mean weight of sampled directions, minus three standard errors
+  of the mean.
+- the largest relative difference of f when the two directions are exchanged, for values above a thousandth of the
+  largest.
 
-Glass has no f and is left out. `worn` is taken at one share; `dusty`, whose shares follow the normals of a mesh,
-is such a blend too and is left out. Exits with 1 if a material creates light, or if drawn ways differ by more than
-0.01, but not with `--smallest`.
+Glass has no f and is left out. `worn` is tested at one share. `dusty` is left out, because it is the same blend
+with shares that follow the normals of a mesh. Exits with 1 if a material creates light, or if sampled directions
+differ by more than 0.01, but not with `--smallest`.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ from smallest import add_smallest  # noqa: E402
 GROUP = [24, 25, 26, 27]
 COSINES = (0.1, 0.3, 0.6, 0.95)
 HIGHEST_ALBEDO, MOST_APART = 1.0 + 2e-3, 0.01
-"""Both with the error of the quadrature."""
+"""Limits of the first two figures; both include the error of the quadrature."""
 _FROM_ABOVE, _AROUND = 160, 160
 _TURN = 0.3
 """Azimuth of the eye."""
@@ -84,7 +86,7 @@ class Loaded:
         self._context = self._mi.BSDFContext()
 
     def place(self, way: np.ndarray) -> Any:
-        """A surface seen from a way."""
+        """A point of a surface, seen from a direction."""
         mi = self._mi
         place = mi.SurfaceInteraction3f()
         place.wi, place.t = mi.Vector3f(*way.tolist()), 1.0
@@ -94,14 +96,14 @@ class Loaded:
         return place
 
     def times_cosine(self, wo: np.ndarray, ways_in: np.ndarray) -> np.ndarray:
-        """f times the cosine of each way in [n, 4]."""
+        """Return f times the cosine, for each direction of incidence [n, 4]."""
         place, mi = self.place(wo), self._mi
         return np.array(
             [np.array(self.bsdf.eval(self._context, place, mi.Vector3f(*way.tolist()))).ravel() for way in ways_in]
         )
 
     def drawn_weights(self, wo: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Weights of drawn ways [n, 4]."""
+        """Return weights [n, 4] of sampled directions."""
         place, mi = self.place(wo), self._mi
         return np.array(
             [
@@ -117,7 +119,8 @@ def ways(cosines: np.ndarray, turns: np.ndarray) -> np.ndarray:
 
 
 def hemisphere_nodes() -> tuple[np.ndarray, np.ndarray]:
-    """Ways [n, 3] and their solid angles [n]: midpoints that crowd at the horizon and at the mirror's azimuth."""
+    """Directions [n, 3] and their solid angles [n]: midpoints that are dense near the horizon and near the
+    mirror's azimuth."""
     t = (np.arange(_FROM_ABOVE) + 0.5) / _FROM_ABOVE
     s = 2.0 * (np.arange(_AROUND) + 0.5) / _AROUND - 1.0
     cosine, turn = np.meshgrid(t**2, _TURN + np.pi + np.pi * s**3)
@@ -126,7 +129,8 @@ def hemisphere_nodes() -> tuple[np.ndarray, np.ndarray]:
 
 
 def figures(material: Loaded, count: int, rng: np.random.Generator) -> tuple[float, float, float]:
-    """Largest albedo, largest difference of drawn ways, largest of exchanged ways."""
+    """Return the largest albedo, the largest difference of sampled directions, and the largest difference of
+    exchanged ones."""
     over, area = hemisphere_nodes()
     albedos, apart, exchange_errors = [], [0.0], [0.0]
     for z in COSINES:

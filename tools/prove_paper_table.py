@@ -3,12 +3,14 @@ uncertainties.
 
     python tools/prove_paper_table.py [--every 20] [--material layered] [--depth 0.8] [--json]
 
-A relief of triangles with edges of 0.36 mm is rendered with pixels of 47 um on it, a part of the real camera's
-field, and evaluated with records whose errors are drawn from the paper's figures: camera 0.3 mm and LEDs 0.7 mm
-(each in all directions), their normals 0.21 degrees, the mesh's place 0.1 mm, its vertices 30 um; then with a
-scanner of 20 um, and with that and a camera of less noise. For each the table at 68 %, by source, and the share
-of samples whose intervals hold the truth. The exit code is 1 if those of 68 % hold less than 63 or more than 73 %,
-or those of 95 % less than 92 or more than 98 %; with `--smallest`, whose shares say nothing, it is 0.
+A relief of triangles with edges of 0.36 mm is rendered with pixels of 47 um, in a part of the real camera's field.
+It is evaluated with records whose errors are drawn from the paper's figures: camera 0.3 mm and LEDs 0.7 mm (each
+in all directions together), their normals 0.21 degrees, the mesh's position 0.1 mm, its vertices 30 um. It is
+evaluated again with a scanner of 20 um, and with this scanner and a camera with less noise.
+
+For each case, the table at 68 % is printed by source, with the share of samples whose intervals contain the truth.
+The exit code is 1 if the intervals of 68 % contain less than 63 or more than 73 %, or those of 95 % less than 92
+or more than 98 %. With `--smallest` the shares are not meaningful, and the exit code is 0.
 """
 
 from __future__ import annotations
@@ -44,20 +46,21 @@ from smallest import add_smallest  # noqa: E402
 
 PITCH_UM, SIZE_MM, TRIANGLES, DEPTH_MM = 5.5, 22.0, 8_600, 0.8
 EACH = 3.0**-0.5
-"""Share, in each direction, of what is stated for all directions."""
+"""Factor from an uncertainty in all directions together to that in each direction."""
 CAMERA_MM, LED_MM, LED_NORMAL_DEG, MESH_MM = 0.3 * EACH, 0.7 * EACH, 0.21 * 2**-0.5, 0.1 * EACH
 QUIET = SensorModel(full_well_e=135_000.0, read_noise_e=3.0)
-"""Ten times the electrons, and a fourth of the noise in the dark."""
+"""Noise of a quieter camera: ten times the electrons, and a fourth of the noise in the dark."""
 LEVELS = {"68": TABLE_QUANTILE, "95": QUANTILE}
 HELD = {"68": (0.63, 0.73), "95": (0.92, 0.98)}
-"""All samples share one draw of lens, camera and mesh, so shares scatter more than their number alone tells."""
+"""Limits of the shares. All samples share one draw of lens, camera and mesh, so shares scatter more than their
+number suggests."""
 VIEW = {**cells.TOP, "target_mm": [0, 0, 2]}
 _SAMPLES = 60_000
 
 
 @dataclass(frozen=True)
 class Case:
-    """A cell of the table, and what the paper has for it."""
+    """A cell of the table, with the paper's value."""
 
     name: str
     vertex_um: float
@@ -113,7 +116,7 @@ def _of(case: Case, folder: Path, acquisition: loop.Acquired, seed: int) -> dict
 
 
 def _acquire(folder: Path, case: Case, options: argparse.Namespace) -> loop.Acquired:
-    side_mm = SIZE_MM * (options.triangles / TRIANGLES) ** 0.5  # the triangles' edges stay as they are
+    side_mm = SIZE_MM * (options.triangles / TRIANGLES) ** 0.5  # the edges of the triangles stay unchanged
     mesh = trimesh.Trimesh(*_weld(relief(side_mm, options.triangles, options.depth, 1)), process=False)
     mesh.export(folder / "object.ply")
     (folder / "cell").mkdir()
@@ -131,13 +134,13 @@ def _acquire(folder: Path, case: Case, options: argparse.Namespace) -> loop.Acqu
 
 
 def _weld(corners_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of triangles [n, 3, 3]."""
+    """Return vertices and faces of triangles [n, 3, 3]."""
     places, faces = np.unique(corners_mm.reshape(-1, 3).round(6), axis=0, return_inverse=True)
     return places, faces.reshape(-1, 3)
 
 
 def _inside_shares(result: RunResult, truth: loop.Truth, vertex_um: float) -> dict[str, float]:
-    """Share of samples of all channels whose intervals hold the truth."""
+    """Return the share of samples of all channels whose intervals contain the truth."""
     (view,) = result.views
     inside = {level: [0, 0] for level in LEVELS}
     for channel in range(result.channels):

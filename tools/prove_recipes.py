@@ -4,9 +4,9 @@
 
 Mixtures of three of the library's paints, their shares drawn evenly from all that sum to 1, are seen in air with
 noise in each band. For each share the Cramer-Rao bound is computed: the least standard deviation of an unbiased
-estimate that is told the three paints. Printed are how many shares come back within 2 %, how many an estimate at
-the bound would, and the errors over the bound. Exits with 1 if the errors are 1.3 times the bound or more where
-the right paints were chosen; not with `--smallest`, whose errors say nothing.
+estimate that knows the three paints. The output is the number of shares that are found within 2 %, the number that
+an estimate at the bound would find, and the errors relative to the bound. Exits with 1 if the errors are at least
+1.3 times the bound where the right paints were chosen; not with `--smallest`, whose errors are not meaningful.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _SEED = 11
 
 
 def mixture_reflectance(shares: np.ndarray, chosen_paints: list[Paint], under: Face) -> np.ndarray:
-    """Return what a mixture shows, with NaN in bands that a paint does not know."""
+    """Return the reflectance of a mixture, with NaN in bands that are missing for a paint."""
     k, s = (
         np.asarray(sum(c * getattr(p, coefficient) for c, p in zip(shares, chosen_paints, strict=True)))
         for coefficient in ("absorption", "scattering")

@@ -1,18 +1,22 @@
-"""Checks the closed loop of reflectance over many simulated cells, whose materials the fit does not know.
+"""Checks the closed loop of reflectance over many simulated cells, with materials whose models the fit does not
+have.
 
     python tools/prove_reflectance.py [--draws 3] [--materials NAME ...] [--every 12] [--keep FILE] [--json]
 
-Each material (`sim.objects.specimens`) is rendered in two views and a further one; each cell has calibrations
-drawn anew from the covariances that records state (`drawn_records`), and a scan with errors of one of three kinds
-(`reflectance_cells.SCANS`). Printed is for each material the share of samples whose 95 % intervals hold the truth,
-by channel and third of the angle of incidence, the fitted normals' error over the scan's, the mean errors of fits
-under LEDs left out, and that of GGX in the further view over that in the others. The file `--keep` gets a line for
-each cell; in a later call only missing cells are computed.
+Each material (`sim.objects.specimens`) is rendered in two views and a further one. Each cell has calibrations that
+are drawn from the covariances of records (`drawn_records`), and a scan with errors of one of three kinds
+(`reflectance_cells.SCANS`).
 
-The exit code is 1 if one of these is not so: intervals hold 90 to 99 %; normals' error (rms over all cells) is at
-most half of the scan's, and of no material larger; radial functions of what GGX leaves miss at most what harmonics
-and radial functions miss; the further view is missed by at most 1.5 times the others. With
-`--smallest`, whose figures say nothing, it is 0.
+For each material, four figures are printed: the share of samples whose 95 % intervals contain the truth, by
+channel and third of the angle of incidence; the error of the fitted normals relative to that of the scan; the mean
+errors of fits under LEDs that were left out; and the error of GGX in the further view relative to that in the
+others. The file `--keep` gets a line for each cell; a later call computes only missing cells.
+
+The exit code is 1 unless all of the following hold: intervals contain the truth in 90 to 99 % of the cases; the
+error of the normals (rms over all cells) is at most half of the scan's, and for no material larger than the
+scan's; radial functions of GGX's residual have at most the error of harmonics and of radial functions; the error
+in the further view is at most 1.5 times that in the others. With `--smallest` the figures are not meaningful, and
+the exit code is 0.
 """
 
 from __future__ import annotations
@@ -76,7 +80,7 @@ def main() -> int:
 
 
 def verdict(material: str, cells: list[dict[str, Any]]) -> dict[str, Any]:
-    """All cells of a material together, and which limits they break."""
+    """Return the figures of all cells of a material together, and the limits that they violate."""
     counts = np.sum([cell["inside"] for cell in cells], axis=0)
     inside = counts[..., 0] / np.maximum(counts[..., 1], 1)
     fitted_deg, scanned_deg = _rms(cells, "fitted_deg"), _rms(cells, "scanned_deg")

@@ -1,14 +1,15 @@
-"""Many scans of a tower, by an independent caster of rays, in any order and with unknown poses: found as they are.
+"""Proves registration: many scans of a tower from an independent ray caster, in random order and with unknown
+poses.
 
     python tools/prove_registration.py [--scans 167] [--across 570] [--seeds 1] [--keep DIR]
 
-167 scans of 570 x 570 rays are 54 million, about as many points as were taken of Notre-Dame's west front (seed
-001). Surfaces hide each other, a third of the material is dark and loses rays, ranges have noise of 0.5 mm.
-Reading, registration and merging are timed, and memory is measured. `--seeds` repeats all of it on other towers,
-with other places and noise: the poses of one registration err together, so only several tell how often regions
-hold.
-Exits with 1 if a scan is placed wrongly or not at all, if fewer than 90 % of the poses lie in their 95 % regions,
-if one registration took more than 30 minutes, or if a process took more than 8 GB.
+167 scans of 570 x 570 rays have 54 million rays, about the number of points of Notre-Dame's west front (seed 001).
+Surfaces hide each other, a third of the material is dark and loses rays, and ranges have noise of 0.5 mm. Reading,
+registration and merging are timed, and memory is measured. `--seeds` repeats this with other towers, positions and
+noise, because the errors of the poses of one registration are correlated. Only several registrations show how
+often 95 % regions contain the truth. Exits with 1 if a scan is placed wrongly or not at all, if fewer than 90 % of
+the poses are in their 95 % regions, if one registration took more than 30 minutes, or if a process took more than
+8 GB.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ class Outcome:
     coverage: float
     """Share of the poses in their 95 % regions."""
     squared_ratio: float
-    """Mean squared error of the poses over the stated one."""
+    """Mean squared error of the poses, relative to the stated one."""
     minutes: float
 
 
@@ -116,9 +117,10 @@ def register_once(folder: Path, arguments: argparse.Namespace, seed: int) -> Out
 
 
 def make_scans(folder: Path, count: int, across: int, seed: int) -> dict[str, np.ndarray]:
-    """Scans round the tower at several heights, shuffled; `world_from_scan` of each by its file's name."""
+    """Return scans around the tower at several heights, shuffled, and `world_from_scan` of each by its file's
+    name."""
     rng = np.random.default_rng(2 + 1000 * seed)
-    scale = (count / SCANS) ** 0.5  # fewer scans, a smaller tower
+    scale = (count / SCANS) ** 0.5  # with fewer scans, the tower is smaller
     radius_mm, whole_mm, statues = scale * RADIUS_MM, scale * HEIGHT_MM, round(scale**2 * STATUES)
     object_scanned = tower(radius_mm, whole_mm, statues, FACETS, 1 + 1000 * seed)
     scanner = RayScanner(object_scanned, noise_mm=NOISE_MM, seed=3 + 1000 * seed)
@@ -139,9 +141,11 @@ def make_scans(folder: Path, count: int, across: int, seed: int) -> dict[str, np
 def compare_with_truth(
     registration: Registration, truth: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, float, float]:
-    """Displacement of each placed scan's points from the truth, in the first one's frame; the share of poses in
-    their 95 % regions, on average over the frames of all scans, as the error of one frame is in all poses; and the
-    mean squared error over the stated one."""
+    """Return three figures: the displacement of each placed scan's points from the truth, in the first scan's
+    frame; the share of poses in their 95 % regions; and the mean squared error relative to the stated one.
+
+    The share is a mean over the frames of all scans, because the error of one frame is contained in all poses.
+    """
     world_from = [truth[registration.names[number]] for number in registration.placed_numbers]
     first_from_world = inverse_of(world_from[0])
     off_mm = [
@@ -155,14 +159,14 @@ def compare_with_truth(
 
 
 def _squared_errors(registration: Registration, world_from: list[np.ndarray], reference: int) -> list[float]:
-    """Squared errors of the poses, seen from one scan, over their covariances."""
+    """Return squared errors of the poses, seen from one scan, relative to their covariances."""
     fit, squared_errors = registration.fit, []
     true_from_world = fit.common_from_scan[reference] @ inverse_of(world_from[reference])
     for k, pose in enumerate(fit.common_from_scan):
         if k == reference:
             continue
         x, y, z = fit.pivots_mm[k] - fit.pivots_mm[reference]
-        transport = np.eye(6)  # of a step about the reference's pivot to one about this scan's
+        transport = np.eye(6)  # converts a step about the reference's pivot to one about this scan's pivot
         transport[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
         jacobian = np.zeros((6, fit.covariance.shape[0]))
         jacobian[:, 6 * k : 6 * k + 6] += np.eye(6)

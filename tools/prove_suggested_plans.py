@@ -2,10 +2,11 @@
 
     python tools/prove_suggested_plans.py [--cases N] [--budget TIME] [--keep FOLDER]
 
-Three meshes, each of one of the supposed materials: a plan is suggested, acquired, and its reflectance is fitted,
-by the commands that a user has. The medians of the uncertainties that the result states are compared with the
-promised ones. The rendered highlights have Fresnel's term, LEDs and arm stand where they do, not where the records
-say. Exits with 1 unless each ratio is within a fifth of 1; not with `--smallest`.
+There are three meshes, each with one of the assumed materials. For each, a plan is suggested and acquired, and its
+reflectance is fitted, by the user's commands. The medians of the stated uncertainties of the result are compared
+with the promised ones. The rendered highlights have Fresnel's term. LEDs and arm are at their true positions,
+which differ from those in the records. Exits with 1 unless each ratio is within a fifth of 1; not with
+`--smallest`.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ FIGURES = ("normal_deg", "kd_percent", "ks_percent", "alpha_percent")
 
 
 def write_cell(folder: Path, mesh: str, material: str) -> None:
-    """The simulated cell with an object of one material, and the object's mesh without colours."""
+    """Write the simulated cell with an object of one material, and the object's mesh without colours."""
     material_values, pi = SUPPOSED[material], 3.141592653589793
     colour, f0 = [round(material_values.kd * pi, 4)] * 3, [material_values.ks] * 3
     settings = f"    material: {{diffuse: {colour}, f0: {f0}, roughness: {material_values.alpha}}}\n"
@@ -49,7 +50,7 @@ def write_cell(folder: Path, mesh: str, material: str) -> None:
 
 
 def coupole(folder: Path, *arguments: str) -> dict[str, Any]:
-    """Run a command there; its JSON."""
+    """Return a function that runs a command in the folder and returns its JSON."""
     command = [sys.executable, "-m", "coupole.commands.cli", *arguments, "--json"]
     process = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     if process.returncode:
@@ -62,7 +63,7 @@ def coupole(folder: Path, *arguments: str) -> dict[str, Any]:
 def rehearse(
     folder: Path, mesh: str, material: str, budget: str, *options: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Promised and stated figures of one case."""
+    """Return the promised and the stated figures of one case."""
     folder.mkdir(parents=True, exist_ok=True)
     write_cell(folder, mesh, material)
     promised_figures = coupole(

@@ -3,14 +3,15 @@
     python tools/prove_texels.py [--sizes auto 0.8 1.6] [--every 24] [--json]
 
 The relief (`tests/runs/relief_cells.py`: waves of paint of 2.4 mm and of bumps of 6 mm, which its mesh does not
-have) is acquired in two views and evaluated; texels of each size are made in a process of their own. Printed is
-for each size: texels and pixels across; how far kd and normals are off the truth (median), which for a texel is
-the mean over its pixels, and the share of 95 % intervals that hold it; the error of pictures under LEDs left out,
-beside that of the best fit of triangles in the same pixels, and the share of their 95 % intervals that hold;
-seconds, memory and disk, and what was foreseen of them.
+have) is acquired in two views and evaluated; texels of each size are made in a separate process.
 
-The exit code is 1 if intervals of kd hold in less than 80 %, or if memory was foreseen less than it was by more
-than half. With `--smallest`, whose figures say nothing, it is 0.
+For each size, the following is printed: the width of texels and pixels; the median error of kd and normals, and
+the share of 95 % intervals that contain the truth, which for a texel is the mean over its pixels; the error of
+pictures under LEDs that were left out, beside that of the best fit of triangles in the same pixels, and the share
+of their 95 % intervals that contain the truth; and seconds, memory and disk, with the forecast of each.
+
+The exit code is 1 if less than 80 % of the intervals of kd contain the truth, or if the forecast of memory was too
+small by more than half. With `--smallest` the figures are not meaningful, and the exit code is 0.
 """
 
 from __future__ import annotations
@@ -119,7 +120,8 @@ def judge(relief_run: Acquired, size: str) -> dict[str, Any]:
 
 
 def _make(relief_run: Acquired, out: Path, size: str) -> dict[str, Any]:
-    """Make texels twice, since the first time compiles, in a process whose memory is theirs alone."""
+    """Make texels twice, because numba compiles the first time, in a separate process so that its memory can be
+    measured."""
     request, texel_size = relief_run.request, read_size(size)
     add_texels(request, out, texel_size)
     shutil.rmtree(out / FOLDER)
@@ -149,15 +151,16 @@ def _make(relief_run: Acquired, out: Path, size: str) -> dict[str, Any]:
 
 
 def _peak_bytes() -> int:
-    """Most memory that this process has had, by Linux; unlike the usage of resources, without its parent's."""
+    """Return the peak memory of this process, from Linux. (The usage of resources would include its parent's
+    memory.)"""
     line = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(encoding="ascii"))
     assert line is not None
     return 1024 * int(line[1])
 
 
 def _against_truth(result: RunResult, view: ViewSamples) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Relative errors of kd, of the channels that a texel has measured itself, and which lie in their intervals;
-    the angles by which normals are off, and which of their tilts lie in theirs."""
+    """Return relative errors of kd, for channels that a texel has measured itself, and which of them are within
+    their intervals; and the angular errors of the normals, and which of their tilts are within their intervals."""
     texels = read_view_texels(result, view)
     truth = seen_by_texels(result, view, texels)
     row, column = np.divmod(texels.pixels, 512)
@@ -175,8 +178,8 @@ def _against_truth(result: RunResult, view: ViewSamples) -> tuple[np.ndarray, np
 
 
 def _pictures_held(result: RunResult) -> tuple[float, float]:
-    """Share of the 95 % intervals of pictures under LEDs left out that hold the frames, and their median half
-    width over the picture; of LEDs by which the widths were not found."""
+    """Return the share of the 95 % intervals of pictures under left-out LEDs that contain the frames, and their
+    median half width relative to the picture. Only LEDs that were not used to find the widths count."""
     held_count, count, widths = 0, 0, []
     for view in result.views:
         scene = scene_of_view(result, view.view, TEXELS)
@@ -204,7 +207,7 @@ def _faults(row: dict[str, Any]) -> list[str]:
 
 
 def _print(rows: list[dict[str, Any]], faults: list[str]) -> None:
-    """The rows of docs/how-to/reflectance-of-a-run.md."""
+    """Print the rows of docs/how-to/reflectance-of-a-run.md."""
     titles = (
         "`--texels`", "texels", "kd off, intervals hold", "normals off, intervals hold",
         "left-out LEDs, triangles", "their intervals hold, half width", "time", "memory", "disk",

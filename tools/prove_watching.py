@@ -1,11 +1,13 @@
-"""Proves the watching of a run: faults found within the view and named, few false alarms, in the simulated cell.
+"""Proves the watching of a run in the simulated cell: faults are found within the view and named, with few false
+alarms.
 
     python tools/prove_watching.py [--faults N] [--clean N] [--every N] [--seed S]
 
-Views of the relief, drawn by a seed: poses, LEDs that differ from their table and flicker, noise. The simulated
-camera's frames of a burst with sentinels, in the table's times, are reduced and judged as in a run. In N views one
-fault of seven kinds happens, at a drawn moment and of a drawn size; N views are clean. Exits with 1 if a fault is
-missed or misnamed, if another LED is named, or if more than one in a hundred clean views has a finding.
+A seed determines the views of the relief: poses, LEDs that differ from their table and flicker, noise. The
+simulated camera's frames of a burst with sentinels, at the times of the table, are reduced and judged as in a run.
+In N views one fault of seven kinds happens, at a random moment and with a random size; N views have no fault.
+Exits with 1 if a fault is missed or misnamed, if a wrong LED is named, or if more than one in a hundred views
+without a fault has a finding.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ from smallest import add_smallest  # noqa: E402
 
 ALLOWED_ALARMS = 0.01
 VIEWS = 10
-"""Poses; pictures of the same pose share what is computed for it, not their noise and their faults."""
+"""Poses. Pictures of the same pose share computations, but not their noise and their faults."""
 
 
 @dataclass
@@ -65,7 +67,7 @@ class Scene:
     def looks(
         self, pose: int, disturber: Disturber, unsteady: dict[int, float], faults: dict[int, list[Any]]
     ) -> list[SeenFrame]:
-        """Looks of a burst from a pose, with faults that happen at steps of its table."""
+        """Yield the looks of a burst from a pose, with faults that happen at steps of its table."""
         flashes = Flashes(self.leds)
         table, frames = self.burst.table, []
         starts_ns = np.concatenate([[0], np.cumsum(table["period_us"][:-1], dtype=np.int64)]) * 1000
@@ -91,12 +93,12 @@ class Scene:
 
 
 def scene(folder: Path, every: int, seed: int) -> Scene:
-    """The small cell of the tests with LEDs that differ and flicker as real ones do."""
+    """Return the small cell of the tests, with LEDs that differ and flicker like real ones."""
     cell = cells.CellFolder(folder)
     cell.write(lights={"kind": "every", "every": every}, watch=True)
     job = read_job(cell.plan)
     config = world_config(job.cell, job, job.cell.rig.sensor)
-    config["settings"]["camera"] |= {"samples_per_side": 3}  # pixels that integrate over their area
+    config["settings"]["camera"] |= {"samples_per_side": 3}  # pixels integrate over their area
     config["settings"]["leds"] = {"seed": seed, "flux_spread": 0.01, "pump_spread_nm": 0.0}
     world = Config.model_validate(config)
     photographer = Photographer(world.scene, world.rendered_camera, world.settings)
@@ -125,7 +127,7 @@ def scene(folder: Path, every: int, seed: int) -> Scene:
 
 
 Drawn = tuple[dict[int, list[Any]], dict[int, float], str]
-"""Faults by the step of the table at which they happen; unsteady LEDs; words."""
+"""Faults by the step of the table at which they happen; unsteady LEDs; expected words of the finding."""
 
 
 def _moment(random: np.random.Generator, burst: Burst, low: float, high: float) -> int:
@@ -193,7 +195,7 @@ def smudge(random: np.random.Generator, burst: Burst) -> Drawn:
 
 
 def exposure_step(random: np.random.Generator, burst: Burst) -> Drawn:
-    """All values above black by 2 to 20 %."""
+    """A step of all values above black by 2 to 20 %."""
     factor = 1.0 + _either_way(random, 0.02, 0.20)
     fault = script.ExposureStep(kind="exposure_step", factor=factor)
     return {_moment(random, burst, 0.05, 0.93): [fault]}, {}, f"x {factor:.2f}"
@@ -240,7 +242,7 @@ def judge_view(
 
 
 def _names_led(found: Found, words: str) -> bool:
-    """True if a finding is of the LED that these words begin with."""
+    """Tell whether a finding is about the LED with which these words begin."""
     named_leds = {f"LED {getattr(label.light, 'id', None)}" for label in found.labels}
     return named_leds == {words.partition(",")[0]}
 

@@ -1,4 +1,4 @@
-"""A random simulated cell: its true parameters, and its rendered frames in the form of a run's."""
+"""A random simulated cell: its true parameters, and its rendered frames in the form of a run."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ROOT = Path(__file__).resolve().parents[1]
 RIG = ROOT / "configs/rigs/sim-imperfect.yaml"
 EXPOSURE_S = 0.001
 LAMPS, LAMPS_ELEVATION_DEG = 6, 62.0
-"""Number of LEDs around board and object that light them; few, as each is shaded separately."""
+"""Number of LEDs around board and object that light them. They are few, because each is rendered separately."""
 SQUARES, SQUARE_MM, MARKER_MM, THICKNESS_MM = (12, 9), 16.0, 9.6, 4.0
 STICKERS, STICKER_MM = 16, 6.0
 LED_BOARDS, MESH_IMAGES = 8, 10
@@ -61,8 +61,8 @@ class Postures:
 
 
 def postures(images: int, *, led_boards: int | None = None, leds: bool = True) -> Postures:
-    """Postures as planned by `coupole plan new`, for `images` images of the calibration board and for the LEDs of
-    `led_boards` neighbouring boards of the dome, or of all; without `leds` for none."""
+    """Return postures as `coupole plan new` plans them: for `images` images of the calibration board, and for the
+    LEDs of `led_boards` neighbouring boards of the dome, or of all; without `leds`, none for LEDs."""
     cell = read_cell(RIG)
     with tempfile.TemporaryDirectory() as folder:
         board, mesh = (_itinerary(Path(folder), TEMPLATES[name]) for name in ("charuco", "mesh"))
@@ -135,7 +135,8 @@ class RandomCell:
     absolute: bool
     """The arm has absolute errors of 0.3 mm and 0.02 deg in addition to its repeatability."""
     stranger: str | None = None
-    """One of `strange_cells.STRANGERS`, or nothing that calibrations have no term for."""
+    """Name of one of `strange_cells.STRANGERS`; empty for a cell without effects that calibrations cannot
+    model."""
 
     @cached_property
     def strangers(self) -> Strangers:
@@ -163,13 +164,13 @@ class RandomCell:
 
     @cached_property
     def lens(self) -> dict[str, float]:
-        """Focus and distortion."""
+        """Focus and distortion of the cell's lens."""
         random = np.random.default_rng((self.seed, 2))
         figures = (random.uniform(330.0, 342.0), random.normal(-0.03, 0.01), *random.normal(0.0, 1e-4, 2))
         return dict(zip(("focus_mm", "k1", "p1", "p2"), map(float, figures), strict=True))
 
     def place(self, purpose: int) -> dict[str, Any]:
-        """Pose of a thing on the support, in the support's frame."""
+        """Return the pose of a thing on the support, in the support's frame."""
         random = np.random.default_rng((self.seed, 3, purpose))
         return {
             "translation_mm": [*random.uniform(-8.0, 8.0, 2), 0.0],
@@ -199,7 +200,7 @@ class RandomCell:
             "flange_from_camera": self.flange_from_camera.tolist(),
             "focus_distance_mm": self.lens["focus_mm"],
         }
-        k4 = self.strangers.lens.rational[0]  # divides what k1 multiplies
+        k4 = self.strangers.lens.rational[0]  # k4 is the coefficient of the denominator that corresponds to k1
         distortion = (self.lens["k1"] + k4, 0.0, self.lens["p1"], self.lens["p2"], 0.0)
         config["settings"] |= {
             "seed": self.seed,
@@ -212,12 +213,12 @@ class RandomCell:
         return config
 
     def shifted_base(self, in_base: Floats) -> Floats:
-        """Poses [..., 4, 4] of the base in a base shifted by the arm's error common to all poses, which no image
-        shows, and no record claims."""
+        """Return poses [..., 4, 4] of the base in a base shifted by the arm's error that all poses share. No image
+        shows this error, and no record claims to know it."""
         return inverse(transform(tuple(self.arm_errors.base_error_mm()), (0.0, 0.0, 0.0))) @ in_base
 
     def own_base(self, in_base: Floats) -> Floats:
-        """The same in the arm's own base, which is also rotated by the zero error of its first axis."""
+        """Return the same in the arm's own base, which is also rotated by the zero error of its first axis."""
         zero_deg = float(self.arm_errors.axis_zero_error_deg()[0])
         first = flange_pose((zero_deg, 0, 0, 0, 0, 0)) @ inverse(flange_pose((0, 0, 0, 0, 0, 0)))
         return inverse(first) @ self.shifted_base(in_base)
@@ -264,7 +265,7 @@ class Photographs:
         return Sources(images, kuka_poses(self.reported), About(is_simulated=True), (("rendered", "0" * 64),))
 
     def leds(self, table: LedTable, lit: Sequence[tuple[int, int]]) -> LedImages:
-        """Spots of LEDs: `lit` gives view and row of the table for each frame."""
+        """Return spots of LEDs; `lit` gives view and row of the table for each frame."""
         spots = []
         for view, row in lit:
             frame = self.frame(view, [int(table.ids[row])])

@@ -1,8 +1,9 @@
-"""Records of camera and hand-eye against a cell whose form no record has: by what they say of rays, not by terms.
+"""Compares records of camera and hand-eye with a cell whose form no record has: by rays, not by parameters.
 
-A lens with terms that its record lacks has no true k1, but each direction has a true pixel, and the record an
-uncertainty of it. Judged are directions up to a rotation of the camera (which the lens alone does not tell),
-places fixed to the flange, and pixels of the board in views that were not taken.
+A lens with terms that its record lacks has no true k1. But each direction has a true pixel, and the record states
+an uncertainty of that pixel. Three kinds of results are compared: directions, up to a rotation of the camera
+(which the lens alone does not determine); positions fixed to the flange; and pixels of the board in views that
+were not taken.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ ARM_STRANGERS = ("backlash", "sag", "ripple")
 LENS_STRANGERS = ("rational", "prism", "stop", "breathing", "coma")
 LIGHT_STRANGERS = ("lobe", "dies", "primary")
 _FIELD = (-0.9, -0.45, 0.0, 0.45, 0.9)
-"""Places in the field, over half its width and height."""
+"""Positions in the field, relative to half its width and height."""
 _DISTANCE_MM = 335.0
 _COMA_CENTROID = float(np.average(np.arange(TAPS) + 0.5, weights=TAPS - (np.arange(TAPS) + 0.5)) / TAPS)
-"""Distance of a comatic spot's centroid from its bright end, over its length."""
+"""Distance of a comatic spot's centroid from its bright end, relative to the spot's length."""
 _NEW_STOPS = 5000
 _NEW_VIEWS = 6
 Vector = tuple[str, float, float, float]
@@ -36,7 +37,7 @@ Vector = tuple[str, float, float, float]
 
 
 def true_lens(cell: RandomCell, down: float) -> Lens:
-    """Return the lens as rendered, where the camera looks with this cosine to straight down."""
+    """Return the lens as rendered, when the cosine between the camera's direction and straight down is `down`."""
     width_px, height_px = cell.size_px
     strange = cell.strangers.lens
     focal_px = cell.true_lens["fx_px"]
@@ -46,14 +47,15 @@ def true_lens(cell: RandomCell, down: float) -> Lens:
 
 
 def true_pixels(cell: RandomCell, in_camera_mm: Floats, down: float) -> Floats:
-    """[n, 2] where points [n, 3] of the camera frame are seen; with coma, the centroids of their spots."""
+    """[n, 2] pixels at which points [n, 3] of the camera frame are seen; with coma, the centroids of their
+    spots."""
     lens = true_lens(cell, down)
     at = distorted_points(in_camera_mm[:, :2] / in_camera_mm[:, 2:], lens.terms) * lens.focal_px + lens.centre_px
     return at + _COMA_CENTROID * cell.strangers.lens.coma_shift_px(at, cell.size_px)
 
 
 def judged_rays(cell: RandomCell, camera: Record, hand_eye: Record, joints_deg: Floats) -> Iterator[Vector]:
-    """Yield what both records say of rays. `joints_deg` [n, 6] are those of the calibration's views."""
+    """Yield the errors of rays by both records. `joints_deg` [n, 6] are those of the calibration's views."""
     down = _mean_down(cell, joints_deg)
     field = _field_mm(cell)
     true_px = true_pixels(cell, field, down)
@@ -80,8 +82,8 @@ def judged_rays(cell: RandomCell, camera: Record, hand_eye: Record, joints_deg: 
 def has_truth(cell: RandomCell, parameter: str) -> bool:
     """Tell whether a hand-eye record's parameter has a true value in a cell with a stranger.
 
-    With another form of lens the camera's turn depends on what counts as its axis; an arm that errs by its posture
-    has no one flange; a bent board has no one plane.
+    With another form of lens, the camera's rotation depends on the definition of its axis. An arm whose error
+    depends on the posture has no unique flange, and a bent board has no unique plane.
     """
     if cell.stranger in ARM_STRANGERS or parameter.startswith("base_from_board"):
         return False
@@ -91,7 +93,8 @@ def has_truth(cell: RandomCell, parameter: str) -> bool:
 def _judge_pixels(
     name: str, record: Record, pixels: Callable[[Floats], Floats], seen_px: Floats, keep: Floats | None = None
 ) -> Iterator[Vector]:
-    """`pixels` [n, 2] by a step of the record's parameters; `keep` [2 n, 2 n] is a projection."""
+    """Compare pixels [n, 2], which `pixels` computes after a step of the record's parameters; `keep` [2 n, 2 n] is
+    a projection."""
     covariance = record.covariance_matrix
     by = _derivatives(pixels, len(covariance), 1e-3 * np.sqrt(np.diag(covariance)))
     off = (pixels(np.zeros(len(covariance))) - seen_px).ravel()
@@ -103,7 +106,8 @@ def _judge_pixels(
 
 
 def _judged_views(cell: RandomCell, record: Record, joints_deg: Floats) -> Iterator[Vector]:
-    """Corners of the board in views between those of the calibration: with the noise of a stop, as recorded."""
+    """Compare corners of the board in views between those of the calibration; the noise of a stop is as
+    recorded."""
     noise = {noise_term.name: noise_term.found for noise_term in record.noise}
     stop = np.array([noise["robot position"]] * 3 + [np.radians(noise["robot orientation"])] * 3)
     steps = np.linspace(0, len(joints_deg) - 2, _NEW_VIEWS).astype(int)
@@ -187,7 +191,7 @@ def _board_points(corners_mm: Floats, base_from_board: Floats, base_from_camera:
 
 
 def _derivatives(pixels: Callable[[Floats], Floats], count: int, size: float | Floats) -> Floats:
-    """[2 n, count] by central differences."""
+    """Return [2 n, count] by central differences."""
     sizes = np.broadcast_to(size, (count,))
     columns = []
     for direction, width in zip(np.eye(count), sizes, strict=True):
@@ -196,7 +200,7 @@ def _derivatives(pixels: Callable[[Floats], Floats], count: int, size: float | F
 
 
 def _degrees(record: Record) -> float:
-    """The fewest of all parameters."""
+    """Return the least number of degrees of freedom of all parameters."""
     return min([1e9, *(parameter.degrees_of_freedom for parameter in record.parameters)])
 
 
@@ -210,7 +214,7 @@ def _field_mm(cell: RandomCell) -> Floats:
 
 
 def _mean_down(cell: RandomCell, joints_deg: Floats) -> float:
-    """Cosine of the camera's axis to straight down, mean of the views."""
+    """Return the cosine between the camera's axis and straight down, as mean of the views."""
     up = cell.base_from_support[:3, 2]
     axes = np.stack([flange_pose(joints) @ cell.flange_from_camera for joints in joints_deg.tolist()])[:, :3, 2]
     return float(np.mean(-axes @ up))

@@ -1,5 +1,5 @@
-"""Cells of the closed loop of reflectance: rendered runs, scans and records with errors drawn anew, and how the
-result compares with the simulator's truth.
+"""Cells for the closed loop of reflectance: rendered runs, scans and records with random errors, and the
+comparison of the result with the simulator's truth.
 
 Frames are rendered by `sim`, acquired and proven as in the real cell, and evaluated by `coupole.reflectance`. The
 truth is the simulator's own table of the material at the true triangles, LEDs and camera.
@@ -38,39 +38,39 @@ from sim.scene.brdf_table import look_up  # noqa: E402
 
 Floats = NDArray[np.float64]
 SCANS = ("normals", "independent", "correlated")
-"""Errors of the scanner: normals off by 2 degrees (rms), vertices by 30 um, the same correlated over 1 mm."""
+"""Errors of the scanner: normals by 2 degrees (rms), vertices by 30 um, and the same correlated over 1 mm."""
 NORMALS_DEG, VERTICES_UM, CORRELATED_MM = 2.0, 30.0, 1.0
 OLD_VIEWS = (cells.TOP, {**cells.TOP, "name": "side", "azimuth_deg": -60, "elevation_deg": 55})
 NEW_VIEW = {**cells.TOP, "name": "third", "azimuth_deg": -130, "elevation_deg": 60}
 THIRDS_DEG = (0.0, 30.0, 60.0, 90.0)
 _SAMPLES = 20_000
-"""Samples of each view and channel that are compared."""
+"""Number of samples of each view and channel that are compared."""
 
 
 @dataclass(frozen=True)
 class Acquired:
-    """Runs of one material: two views, and one that the fit does not see."""
+    """Runs of one material: two views, and one that the fit does not use."""
 
     material: str
     old: Path
     new: Path
     mesh: Path
-    """The true one."""
+    """The true mesh."""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A cell against the truth."""
+    """A cell, compared with the truth."""
 
     inside: NDArray[np.int64]
-    """[channels, thirds of theta, 2] samples in their intervals, and all."""
+    """[channels, thirds of theta, 2] number of samples within their intervals, and of all samples."""
     scanned_deg: float
-    """Rms of the scan's normals off the truth."""
+    """Rms angle between the scan's normals and the truth."""
     fitted_deg: float
     normals_inside: tuple[int, int]
     mae: dict[str, float]
     old_view: float
-    """Mean error of GGX with normal, share of the range, under LEDs left out."""
+    """Mean error of GGX with normal, as a share of the range, under LEDs that were left out."""
     new_view: float
 
     def line(self) -> dict[str, Any]:
@@ -101,7 +101,7 @@ def acquire(folder: Path, material: str, *, every: int = 12, size_mm: float = 36
 
 
 def judge(acquisition: Acquired, scan: str, seed: int, folder: Path, scale: Scale | None = None) -> Judged:
-    """Evaluate the runs of a material with errors of a seed."""
+    """Evaluate the runs of a material with the errors of a seed."""
     records = draw_records(folder / "records", seed, scale)
     scan_path, noise_um = _scan(folder, acquisition.mesh, scan, seed)
     request = RunRequest((acquisition.old,), scan_path, records, scan_noise_um=noise_um)
@@ -132,7 +132,7 @@ def judge(acquisition: Acquired, scan: str, seed: int, folder: Path, scale: Scal
 
 @dataclass(frozen=True)
 class Truth:
-    """Truth that the simulator knows, base frame."""
+    """The simulator's truth, base frame."""
 
     table: NDArray[np.float32]
     corners_mm: Floats
@@ -154,7 +154,7 @@ class Truth:
         return Truth(table, corners, _flat_normals(corners), true_leds().positions_mm, cameras)
 
     def reflectance(self, view: str, triangles: NDArray[np.int64], leds: NDArray[np.int64]) -> Floats:
-        """[n, 3] of samples by their triangles and LEDs' numbers."""
+        """Return [n, 3] reflectance of samples, by their triangles and LEDs' numbers."""
         centres, normals = self.corners_mm[triangles].mean(axis=1), self.normals[triangles]
         lights, eyes = _unit(self.leds_mm[leds] - centres), _unit(self.cameras_mm[view] - centres)
         values = np.full((len(leds), 3), np.nan)
@@ -183,7 +183,8 @@ def _inside(result: RunResult, view: ViewSamples, noise_um: float, truth: Truth)
 
 
 def _new_view_error(fitted_result: RunResult, check_result: RunResult) -> float:
-    """Mean error of GGX with normal, share of the range, in pictures of a view that it was not fitted to."""
+    """Return the mean error of GGX with normal, as a share of the range, in pictures of a view that the fit did
+    not use."""
     (view,) = check_result.views
     places = np.searchsorted(fitted_result.triangles, view.triangles).clip(max=len(fitted_result.triangles) - 1)
     same = fitted_result.triangles[places] == view.triangles
@@ -203,7 +204,7 @@ def _new_view_error(fitted_result: RunResult, check_result: RunResult) -> float:
 
 
 def _scan(folder: Path, mesh: Path, scan: str, seed: int) -> tuple[Path, float]:
-    """The mesh as a scanner with errors gives it, and the noise that is told of its vertices."""
+    """Return the mesh as a scanner with errors measures it, and the stated noise of its vertices."""
     scan_mesh = trimesh.load(mesh, process=False)
     random = np.random.default_rng((seed, SCANS.index(scan)))
     noise_um = VERTICES_UM
@@ -223,7 +224,7 @@ def _scan(folder: Path, mesh: Path, scan: str, seed: int) -> tuple[Path, float]:
 
 
 def _part_of_relief(folder: Path, size_mm: float) -> Path:
-    """A square of the shipped relief, of about 0.7 mm2 a triangle."""
+    """Return a square of the shipped relief, with about 0.7 mm2 for each triangle."""
     relief = trimesh.load(ROOT / "configs/objects/relief.ply", process=False)
     x, y, _ = relief.triangles_center.T
     relief.update_faces((x > 10) & (x < 10 + size_mm) & (np.abs(y) < 0.5 * size_mm))
@@ -240,7 +241,7 @@ def _leds_of(run: Path) -> list[int]:
 
 
 def _off_deg(normals: Floats, truth: Floats) -> float:
-    """Root mean square."""
+    """Return the root mean square angle between the normals and the truth, degrees."""
     chord = np.linalg.norm(normals - truth, axis=1)
     return float(np.degrees(np.sqrt(np.mean((2.0 * np.arcsin(0.5 * chord)) ** 2))))
 

@@ -1,4 +1,4 @@
-"""Fits by libraries, of the same samples as Coupole's: what `bench_reflectance` measures it against."""
+"""Fits of the same samples by other libraries, with which `bench_reflectance` compares Coupole."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 
 def sgemm_products(samples: int, count: int, cores: int) -> None:
-    """The products that the normal equations of as many triangles need: 100 functions with themselves and with
-    three channels."""
+    """Compute the products that the normal equations of the same number of triangles need: 100 functions with
+    themselves and with three channels."""
     from scipy.linalg.blas import sgemm
 
     a = np.asfortranarray(np.random.default_rng(0).random((samples, 100), np.float32))
@@ -26,7 +26,8 @@ def sgemm_products(samples: int, count: int, cores: int) -> None:
 
 
 def _frame_of(samples: Any, triangle: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """[n, 3] directions to the lights in the slice's frame, the axes [3, 3], and which samples are there."""
+    """Return [n, 3] directions to the lights in the slice's frame, the axes [3, 3], and a mask of existing
+    samples."""
     normal, centre = samples.normals[triangle], samples.centres_mm[triangle]
     across = samples.cameras_mm[0] - centre
     across -= normal * (across @ normal)
@@ -38,7 +39,7 @@ def _frame_of(samples: Any, triangle: int) -> tuple[NDArray[np.float64], NDArray
 
 
 def scipy_harmonics(samples: Any) -> None:
-    """The same normal equations, triangle by triangle."""
+    """Solve the same normal equations, triangle by triangle."""
     from scipy.linalg import cho_factor, cho_solve
     from scipy.special import sph_harm_y_all
 
@@ -60,7 +61,7 @@ def scipy_harmonics(samples: Any) -> None:
 
 
 def scipy_ggx(samples: Any) -> None:
-    """The same robust problem from the same three starts, normal fitted, triangle by triangle."""
+    """Solve the same robust problem from the same three starts, with a fitted normal, triangle by triangle."""
     from scipy.optimize import least_squares
 
     for triangle in range(len(samples.values)):

@@ -1,8 +1,8 @@
 """The cell in python-fcl: an independent check of motions that Coupole's own checker has accepted.
 
-Nothing of `coupole.kinematics`, `motion.collisions` or `motion.path_planner` is used, except the sizes of the
-arm's capsules if its meshes are not available: joint chains are from the data sheets, profiles from ruckig,
-bodies are triangle meshes and fcl's own shapes.
+Joint chains are from the data sheets, profiles are from ruckig, and bodies are triangle meshes and fcl's own
+shapes. Nothing of `coupole.kinematics`, `motion.collisions` or `motion.path_planner` is used, except the sizes of
+the arm's capsules if its meshes are not available.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Figures:
 
     joints_mm: tuple[tuple[float, float, float], ...]
     axes: tuple[tuple[int, int, int], ...]
-    """Origins and axes of the joints with all angles 0, each in the frame of the one before."""
+    """Origins and axes of the joints at angles of 0, each in the frame of the joint before."""
     flange_mm: tuple[float, float, float]
     flange_axis: tuple[int, int, int]
     """Step from link 6 to the flange: its position (`flange_mm`), and the axis about which it is rotated by 90
@@ -108,7 +108,7 @@ def arm_of(job: Job) -> Figures:
 
 
 def motion(job: Job, start_deg: Floats, goal_deg: Floats) -> Floats:
-    """[n, 6] the straight motion from rest to rest in steps of 4 ms, by ruckig."""
+    """Return [n, 6] the straight motion from rest to rest in steps of 4 ms, by ruckig."""
     way_deg = goal_deg - start_deg
     is_moving = np.abs(way_deg) > 0
     if not is_moving.any():
@@ -142,7 +142,7 @@ class ReplayCell:
         links = _links_of_meshes(meshes) if meshes else _solids(capsules_of(arm_description))
         self._moving = [*links, *_solids(tool)]
         self._around = self._surroundings(job)
-        least_apart = 2 if meshes else 3  # capsules of links two apart overlap by construction
+        least_apart = 2 if meshes else 3  # capsules of links that are two apart overlap by construction
         self._own = [
             (i, j)
             for i, (_, link, _) in enumerate(self._moving)
@@ -176,7 +176,7 @@ class ReplayCell:
         return around
 
     def touches(self, joints_deg: Floats) -> list[Touch]:
-        """Pairs of bodies that overlap anywhere on [n, 6]; each once, at its first overlap."""
+        """Return pairs of bodies that overlap anywhere on [n, 6]; each once, at its first overlap."""
         touch_of_pair: dict[tuple[str, str], Touch] = {}
         for joints, links in zip(
             joints_deg, self._support_from_base @ link_poses(joints_deg, self._arm), strict=True
@@ -214,7 +214,7 @@ def _links_of_meshes(folder: Path) -> list[tuple[str, int, Any]]:
 
 
 def _solids(capsules: Sequence[Capsule]) -> list[tuple[str, int, Any]]:
-    """Capsules as meshes."""
+    """Return capsules as meshes."""
     solids = []
     for capsule in capsules:
         start, end = np.array(capsule.start_mm, dtype=float), np.array(capsule.end_mm, dtype=float)

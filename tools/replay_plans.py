@@ -4,8 +4,8 @@
 
 `--meshes` is a folder with the links' meshes (base_link.stl, link_1.stl to link_6.stl); without it the replay uses
 meshes of the arm's capsules. With `--check-meshes` preflight uses those meshes too. Prints one JSON line: number
-of accepted plans, reasons for the refusal of the others, number of replayed postures, and collisions. Exits with
-1 if there were any.
+of accepted plans, reasons for the refusal of the others, number of replayed postures, and collisions. Exits with 1
+if there was a collision.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def random_object(random: np.random.Generator) -> tuple[NDArray[np.float64], lis
 
 
 def bunny(random: np.random.Generator, body_mm: float) -> Any:
-    """A dented body, a head, two ears."""
+    """Return a mesh like a rabbit: a dented body, a head, two ears."""
     body = trimesh.creation.icosphere(subdivisions=3, radius=body_mm)
     body.vertices *= 1.0 + 0.1 * np.sin(body.vertices @ random.normal(size=(3, 1)) * 0.1)
     head = trimesh.creation.icosphere(subdivisions=3, radius=0.6 * body_mm)
@@ -83,7 +83,7 @@ def bunny(random: np.random.Generator, body_mm: float) -> Any:
 
 
 def random_view(random: np.random.Generator, name: str, target_mm: list[float], rig: Rig) -> dict[str, Any]:
-    """A view of any kind: mostly of the object, sometimes of another place, or given by joints."""
+    """Return a view of any kind: mostly of the object, sometimes of another place, or given by joints."""
     limits_deg, around_deg = np.array(arm_of(rig).limits_deg).T, np.array(AROUND_DEG[rig.name])
     kind = random.choice(["look_at", "grid", "joints"], p=[0.6, 0.25, 0.15])
     if kind == "joints":
@@ -104,7 +104,7 @@ def random_view(random: np.random.Generator, name: str, target_mm: list[float], 
 
 
 def random_job(random: np.random.Generator, demo: Job) -> Job:
-    """3 to 6 views, or a few more if one is a grid, of an object in the demo's cell."""
+    """Return a job with 3 to 6 views (more if one is a grid) of an object in the demo's cell."""
     corners_mm, at_mm = random_object(random)
     plan = Plan.model_validate(
         {
@@ -131,7 +131,7 @@ def planned(job: Job, meshes: Path | None) -> Itinerary:
 
 
 def replay(job: Job, itinerary: Itinerary, cell: ReplayCell) -> tuple[int, list[Touch]]:
-    """Number of replayed postures, and the collisions found."""
+    """Return the number of replayed postures, and the collisions."""
     here_deg = np.array(job.cell.rig.motion.home_joints_deg)
     places, touches = 0, []
     for index in itinerary.order:

@@ -1,4 +1,5 @@
-"""Checks of the built site: nothing comes from another host, the landing page is light, answers are near."""
+"""Checks of the built site: nothing is loaded from another host, the landing page is small, answers are few clicks
+away."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ QUESTIONS = {
     "What is the format of frames?": r"uint16 \[slots, height, width\], DN",
     "Can I use my own dome?": r"A dome whose LEDs are switched by a microcontroller",
 }
-"""Questions of strangers, and a pattern of the answer's text."""
+"""Questions of new readers, and a pattern of the answer's text."""
 _RESOURCES = {
     "script": ("src",),
     "img": ("src", "srcset"),
@@ -40,7 +41,7 @@ _LINKED = {
     "dns-prefetch",
     "manifest",
 }
-"""Kinds of `<link>` that a browser follows by itself."""
+"""Kinds of `<link>` that a browser loads by itself."""
 _HOST = re.compile(r"(?:https?:)?//[a-z0-9][\w.-]*\.[a-z]{2,}", re.IGNORECASE)
 _STYLE_FETCHES = re.compile(r"url\(\s*[\"']?([^\"')]+)|@import\s+[\"']([^\"']+)")
 _SCRIPT_FETCHES = re.compile(
@@ -51,12 +52,12 @@ _SCRIPT_FETCHES = re.compile(
 
 @dataclass
 class Page(HTMLParser):
-    """One page: what a browser fetches for it, and where its reader can click."""
+    """One page: its resources that a browser loads, and its links."""
 
     path: Path
     resources: list[str] = field(default_factory=list)
     clicks: list[str] = field(default_factory=list)
-    """Targets of links in the article; the sidebar, which has all pages, does not count."""
+    """Targets of links in the article. The sidebar does not count, because it lists all pages."""
     words: list[str] = field(default_factory=list)
     """Text of the article."""
     styles: list[str] = field(default_factory=list)
@@ -98,7 +99,7 @@ class Page(HTMLParser):
 
 
 def findings(site: Path) -> list[str]:
-    """All that is wrong with a built site, a sentence each."""
+    """Return all faults of a built site, one sentence each."""
     pages = {path: Page(path) for path in sorted(site.rglob("*.html"))}
     wrong = foreign_resources(site, pages)
     if (size := landing_bytes(site)) > MOST_LANDING_BYTES:
@@ -112,7 +113,7 @@ def findings(site: Path) -> list[str]:
 
 
 def foreign_resources(site: Path, pages: dict[Path, Page]) -> list[str]:
-    """Resources that a browser would fetch from another host, with the file that names it."""
+    """Return resources that a browser would load from another host, with the file that names each."""
     foreign = []
     for path, page in pages.items():
         targets = [*page.resources, *(target for style in page.styles for target in _style_targets(style))]
@@ -127,7 +128,7 @@ def foreign_resources(site: Path, pages: dict[Path, Page]) -> list[str]:
 
 
 def landing_bytes(site: Path) -> int:
-    """Bytes that a browser fetches for the landing page: the page, its scripts, styles and pictures."""
+    """Return the bytes that a browser loads for the landing page: the page, its scripts, styles and pictures."""
     page = site / LANDING
     files = {page}
     waiting = [_file(page, target) for target in Page(page).resources]
@@ -142,7 +143,8 @@ def landing_bytes(site: Path) -> int:
 
 
 def answers(site: Path, pages: dict[Path, Page]) -> dict[str, int | None]:
-    """Clicks from the landing page to the answer of each question; None if it cannot be reached."""
+    """Return the number of clicks from the landing page to the answer of each question; None if it cannot be
+    reached."""
     away = {site / LANDING: 0}
     waiting = [site / LANDING]
     for path in waiting:
@@ -162,6 +164,6 @@ def _style_targets(style: str) -> list[str]:
 
 
 def _file(page: Path, target: str) -> Path:
-    """The file on the disk that a link on a page leads to."""
+    """Return the file on the disk to which a link on a page leads."""
     name = unquote(re.split(r"[?#]", target)[0])
     return Path(os.path.normpath(page.parent / name)) if name else page

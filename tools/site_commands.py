@@ -1,4 +1,4 @@
-"""Pages of the reference that describe each command by its help: one for each heading of `coupole --help`."""
+"""Reference pages that describe each command by its help: one page for each heading of `coupole --help`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PAGE = "reference/commands.md"
 
 
 def pages() -> dict[str, str]:
-    """Markdown of the pages, by their path in `docs/`."""
+    """Return the Markdown of the pages, by their path in `docs/`."""
     top = typer.main.get_command(app)
     texts = {PAGE: (DOCS / PAGE).read_text(encoding="utf-8")}
     for heading, names in GROUPS.items():

@@ -1,7 +1,7 @@
 """The notebooks of `docs/notebooks` (py:percent), run in a kernel, as pages with their outputs.
 
-They run one after the other in one folder, as a reader would run them: later ones use the run of the first. Only
-the pages, their figures and the notebooks to download are kept of what they write.
+They run one after the other in one folder, as a reader would run them, because later ones use the run of the
+first. Only the pages, their figures and the notebooks for download are kept.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from site_source import DOCS, NOTEBOOKS
 
 ORDER = ("first_acquisition", "frames_to_numbers", "reflectance", "your_own_led_box", "pigment")
 LONGEST_S = 900
-"""Time that one cell may take."""
+"""Longest time for one cell."""
 
 
 def pages(folder: Path, *, run: bool) -> dict[str, str]:
-    """Markdown of the notebooks by their path in `docs/`; what it shows is in the folder `folder`/outputs.
+    """Return the Markdown of the notebooks by their path in `docs/`; their figures are in the folder
+    `folder`/outputs.
 
-    Without `run` they have no outputs. Raises CellExecutionError where a cell fails.
+    Without `run` they have no outputs. Raises CellExecutionError if a cell fails.
     """
     import jupytext
     import nbformat
@@ -53,7 +54,7 @@ def _run(notebook: Any, work: Path, name: str) -> None:
     print(f"notebook {name}", file=sys.stderr, flush=True)
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     where = {"metadata": {"path": str(work)}}
-    with tempfile.TemporaryDirectory() as sockets:  # files that nobody else on this machine reads
+    with tempfile.TemporaryDirectory() as sockets:  # files that no other user of this machine can read
         config = Config({"KernelManager": {"transport": "ipc", "ip": f"{sockets}/kernel"}})
         NotebookClient(
             notebook, timeout=LONGEST_S, kernel_name="python3", config=config, resources=where

@@ -1,8 +1,8 @@
-"""The site's source, made of `docs/` at each build.
+"""The site's source, made from `docs/` at each build.
 
-Pages stay the one source and are readable on a forge. What differs on the site is made here: an index page gets a
-hidden list of contents in the order of its links; a link to a file outside `docs/` becomes a download, one to a
-folder becomes its name; pictures that are large become WebP.
+The pages are the only source, and can be read on a forge. This module makes the differences of the site: an index
+page gets a hidden list of contents in the order of its links; a link to a file outside `docs/` becomes a download;
+a link to a folder becomes the folder's name; and large pictures become WebP.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ INDEX_PAGES = {
     "explanations.md": ("decisions/", "architecture.md", "contributing.md", "neighbours.md"),
     "reference/commands.md": ("reference/commands/",),
 }
-"""Pages or folders that belong to each index page; those of its links that lead there are its contents."""
+"""Pages or folders that belong to each index page. The index page's links to them are its contents."""
 LARGE_BYTES = 150_000
 WIDEST_PX = 1100
 _FENCE = re.compile(r"^([ ]*)(```+|~~~+).*?^\1\2[ ]*$\n?", re.MULTILINE | re.DOTALL)
@@ -42,15 +42,15 @@ _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
 
 @dataclass
 class Source:
-    """The folder for Sphinx, and the links that were found to lead nowhere."""
+    """The folder for Sphinx, and the broken links."""
 
     folder: Path
     broken_links: list[str] = field(default_factory=list)
-    """Links that lead nowhere: file, line and target."""
+    """Links without a target: file, line and target."""
 
 
 def prose(text: str) -> Iterator[tuple[bool, str]]:
-    """Parts of a page in their order: True and text outside of blocks of code, False and a block."""
+    """Return the parts of a page in their order: True with text outside of blocks of code, False with a block."""
     end = 0
     for block in _FENCE.finditer(text):
         yield True, text[end : block.start()]
@@ -60,18 +60,19 @@ def prose(text: str) -> Iterator[tuple[bool, str]]:
 
 
 def links(text: str) -> list[str]:
-    """Targets of a page's links, in their order, without those to other hosts and into the page itself."""
+    """Return the targets of a page's links, in their order, without links to other hosts and into the page
+    itself."""
     targets = [match[3] for is_prose, part in prose(text) if is_prose for match in _LINK.finditer(part)]
     return [target for target in targets if not is_elsewhere(target)]
 
 
 def is_elsewhere(target: str) -> bool:
-    """True for another host, or a place on the same page."""
+    """True for a target on another host, or on the same page."""
     return target.startswith(("http:", "https:", "mailto:", "#"))
 
 
 def with_links(text: str, change: Callable[[str, str, str], str]) -> str:
-    """The page with `change(mark, words, target)` in place of each link (its mark is "!" for a picture)."""
+    """Return the page with `change(mark, words, target)` in place of each link (its mark is "!" for a picture)."""
     parts = []
     for is_prose, part in prose(text):
         parts.append(_LINK.sub(lambda match: change(match[1], match[2], match[3]), part) if is_prose else part)
@@ -81,8 +82,8 @@ def with_links(text: str, change: Callable[[str, str, str], str]) -> str:
 def stage(to: Path, *, made_pages: dict[str, str], made_files: Path) -> Source:
     """Write the site's source into the folder `to`, which is made anew.
 
-    `made_pages` are pages that are no files of `docs/` or differ from them, by their path there; the folder
-    `made_files` has what the notebooks show.
+    `made_pages` are pages that are not files of `docs/`, or differ from them, by their path there. The folder
+    `made_files` has the figures of the notebooks.
     """
     shutil.rmtree(to, ignore_errors=True)
     source = Source(to)
@@ -101,7 +102,7 @@ def stage(to: Path, *, made_pages: dict[str, str], made_files: Path) -> Source:
 
 
 def contents(name: str, text: str) -> list[str]:
-    """Pages that an index page lists, relative to it, in the order of its links."""
+    """Return the pages that an index page lists, relative to it, in the order of its links."""
     folder = os.path.dirname(name)  # noqa: PTH120  a path of the site, not of the disk
     children: list[str] = []
     for target in links(text):
@@ -144,7 +145,7 @@ def _page(source: Source, name: str, text: str, pages: dict[str, str]) -> str:
 
 
 def _as_page(name: str) -> str:
-    """The page of a notebook or of the changelog on the site; any other path as it is."""
+    """Return the page of a notebook or of the changelog on the site; other paths are unchanged."""
     if name == "../CHANGELOG.md":
         return CHANGELOG
     is_notebook = name.startswith(f"{NOTEBOOKS}/") and name.endswith(".py")
@@ -152,7 +153,7 @@ def _as_page(name: str) -> str:
 
 
 def _picture_name(source: Source, name: str) -> str:
-    """The picture that stands in a large one's place."""
+    """Return the name of the picture that replaces a large one."""
     small = Path(name).with_suffix(".webp")
     return str(small) if (source.folder / small).exists() else name
 

@@ -1,7 +1,7 @@
-"""The option that every bench and proof has: `--smallest`, a size of seconds.
+"""The option `--smallest` of every bench and proof: a size of seconds.
 
-It shows that a tool still runs to its end and prints its figures, not what they are worth;
-`tests/tools/test_smallest.py` runs every one of them.
+It shows that a tool still runs to its end and prints its figures, but the figures are not meaningful.
+`tests/tools/test_smallest.py` runs every tool in this way.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 
 class _Smallest(argparse.Action):
-    """Sets the destination to True, and other options to the values that are small."""
+    """Sets the destination to True, and other options to small values."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, values: dict[str, Any], **about: Any) -> None:
         super().__init__(option_strings, dest, nargs=0, default=False, **about)
@@ -29,8 +29,8 @@ class _Smallest(argparse.Action):
 
 
 def add_smallest(parser: argparse.ArgumentParser, **values: Any) -> None:
-    """Give a parser `--smallest`, which sets other options, by their destinations; those that come after it on
-    the command line still count."""
+    """Add `--smallest` to a parser. It sets other options, by their destinations; options that come after it on
+    the command line still apply."""
     destinations = {action.dest for action in parser._actions}
     assert destinations.issuperset(values), f"{sorted(set(values) - destinations)}: the parser has no such option"
     options = " ".join(f"--{name.replace('_', '-')} {_as_text(value)}" for name, value in values.items())

@@ -2,11 +2,10 @@
 
     python tools/soak.py [--shots N] [--faults-per-shot P] [--seed N] [--speed N] [--keep FILE]
 
-Rehearsals that FILE holds are not done again, so that a soak can be done in parts; a part that is cut off loses
-the rehearsal that was running. Prints what happened, with memory and open files of controller and world, and lists
-sessions that ended though no fault had happened that ends one (on a busy machine the controller falls behind the
-world's pace). Exits with 1 if a label was false, a shot was proven twice or lost in silence, or if memory or open
-files have grown.
+Rehearsals in FILE are not done again, so a soak can be done in parts; an interrupted part loses the rehearsal that
+was running. Prints the events, with memory and open files of controller and world. It also lists sessions that
+ended without a fault that ends a session (on a busy machine, the controller may fall behind the world). Exits with
+1 if a label was false, if a shot was proven twice or lost without notice, or if memory or open files have grown.
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ def main() -> int:
 
 
 def report(lines: list[dict[str, Any]]) -> int:
-    """Print all of it; 1 if anything was wrong."""
+    """Print the whole report; return 1 if anything was wrong."""
     console = Console(soft_wrap=True, highlight=False)
     table = Table(box=None, show_header=False)
     for name in ("shots", "frames", "proven", "sessions", "reshot"):

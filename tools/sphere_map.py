@@ -1,14 +1,15 @@
 """The sphere map of a glossy finish under several lights, on meshes that follow its lobes (seed 002, section 3.3).
 
-For an eye and lights far away, reflected radiance depends on the normal alone: the map gives it for each, as a
-sphere shows it. Each light has a mesh of its own, and the maps are added. Its lines have constant angles theta
-and phi of the table (`tabulated`): with s' at theta and phi about the eye's direction, the normal halves the
-angle between s' and the light. The lines of theta are the table's own, dense where the lobe is steep, so that
-nothing is interpolated over theta when a map is made. Both halves of a mesh are alike, on either side of the
-plane through eye and light.
+For a distant eye and distant lights, reflected radiance depends only on the normal. The map gives it for each
+normal, as a sphere shows it. Each light has its own mesh, and the maps are added. Its lines have constant angles
+theta and phi of the table (`tabulated`): with s' at theta and phi about the eye's direction, the normal bisects
+the angle between s' and the light. The lines of theta are those of the table, which are dense where the lobe is
+steep. So nothing is interpolated over theta when a map is made. Both halves of a mesh, on either side of the plane
+through eye and light, are the same.
 
-Nodes have what the finish makes of its light; the cosine to the light, which bends more, is taken at each
-normal. Within 6 degrees of a horizon the map may miss much of the radiance: the table ends there.
+Nodes have the reflected radiance divided by the cosine to the light. The cosine is computed at each normal,
+because it is less linear. Within 6 degrees of a horizon the map may have a large error, because the table ends
+there.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ from coupole.kernels import kernel
 PHI_NODES = 25
 """Nodes of half a mesh in phi, from 0 to pi."""
 _LEAST_COSINE = 0.03
-"""Nodes that the eye does not see, which its horizon is interpolated from, have the values of this cosine."""
+"""Nodes that the eye does not see have the values of this cosine, for interpolation at the eye's horizon."""
 
 
 @dataclass(frozen=True)
 class SphereMap:
-    """Radiance by normal."""
+    """Radiance as a function of the normal."""
 
     to_eye: Array
     """[3], unit."""
@@ -39,15 +40,16 @@ class SphereMap:
     theta: Array
     """[theta], radians, of all meshes."""
     radiance: Array
-    """[lights, theta, PHI_NODES, bands] at the meshes' nodes, over the cosine to the light."""
+    """[lights, theta, PHI_NODES, bands] radiance at the meshes' nodes, divided by the cosine to the light."""
 
     @property
     def vertices(self) -> int:
-        """Number of vertices that are shaded, of all meshes."""
+        """Number of shaded vertices of all meshes."""
         return int(np.prod(self.radiance.shape[:3]))
 
     def at(self, normals: Array) -> Array:
-        """Radiance [n, bands] of normals [n, 3], linear between nodes; 0 for those that the eye does not see."""
+        """Return radiance [n, bands] of normals [n, 3], linear between nodes; 0 for normals that the eye does not
+        see."""
         total = np.zeros((len(normals), self.radiance.shape[3]))
         faces_eye = normals @ self.to_eye > 0.0
         for to_light, nodes in zip(self.to_lights, self.radiance, strict=True):
@@ -69,7 +71,7 @@ class SphereMap:
         return total
 
     def picture(self, side_px: int) -> Array:
-        """[side, side, bands] of a sphere in orthographic projection, seen by an eye with z above it."""
+        """Return [side, side, bands] of a sphere in orthographic projection, seen by an eye with z above it."""
         right, above = _axes_of(self.to_eye)
         steps = (np.arange(side_px) + 0.5) / side_px * 2.0 - 1.0
         x, y = np.meshgrid(steps, -steps)
@@ -82,8 +84,8 @@ class SphereMap:
 
 
 def sphere_map(table: SpecularTable, to_eye: Array, to_lights: Array, irradiance: Array) -> SphereMap:
-    """The map for an eye in the direction `to_eye` [3] and lights [k, 3] of `irradiance` [k, bands] on what faces
-    them. Raises InputError for other shapes."""
+    """Return the map for an eye in the direction `to_eye` [3] and lights [k, 3], whose `irradiance` [k, bands] is
+    that on a surface facing them. Raises InputError for other shapes."""
     bands = table.log_cosines.shape[3]
     eye, lights = _unit(np.asarray(to_eye, float)), _unit(np.atleast_2d(np.asarray(to_lights, float)))
     power = np.ascontiguousarray(np.atleast_2d(np.asarray(irradiance, float)))
@@ -109,14 +111,15 @@ def _shade(eye, lights, firsts, power, incidence, theta, table, radiance):  # ty
         for row in range(len(theta)):
             c, s = np.cos(theta[row]), np.sin(theta[row])
             for column in range(PHI_NODES):
-                # s' by its components along the eye and in the plane of eye and light; n is halfway to the light.
+                # s' by its components along the eye and in the plane of eye and light; n bisects the angle between
+                # s' and the light.
                 between = c * to_eye + s * cosines_phi[column] * to_first
                 half = np.sqrt(max(0.5 * (1.0 + between), 1e-12))
                 nl, nv = half, (to_eye + c) / (2.0 * half)
                 for band in range(bands):
                     radiance[k, row, column, band] = 0.0
                 for order in range(2):
-                    # Once with light and eye as they are, once exchanged: their mean is reciprocal.
+                    # The value is computed twice, with light and eye exchanged: the mean is reciprocal.
                     here, there = (nl, nv) if order == 0 else (nv, nl)
                     here = min(max(here, _LEAST_COSINE), 1.0)
                     sine = np.sqrt(1.0 - here * here) * s
@@ -141,14 +144,14 @@ def _unit(vectors: Array) -> Array:
 
 
 def _in_plane(to_eye: Array, to_light: Array) -> Array:
-    """Perpendicular to the eye's direction, in the plane of it and the light."""
+    """Return the unit vector perpendicular to the eye's direction, in the plane of eye and light."""
     across = to_light - (to_light @ to_eye) * to_eye
     size = float(np.linalg.norm(across))
     return np.asarray(across / size) if size > 1e-9 else _axes_of(to_eye)[0]
 
 
 def _axes_of(to_eye: Array) -> tuple[Array, Array]:
-    """Right and up of a picture."""
+    """Return right and up of a picture."""
     up = np.array([0.0, 0.0, 1.0]) if abs(to_eye[2]) < 1.0 - 1e-9 else np.array([0.0, 1.0, 0.0])
     right = _unit(np.cross(up, to_eye))
     return right, np.cross(to_eye, right)

@@ -1,8 +1,8 @@
 """Spectra of the tutorial's statue: a library, films of paints on cards, and spots of the statue, with the truth.
 
-Absorption is that of the assumed shapes of `coupole.appearance.matter.typical` (drawn curves, no measured
-pigments), scattering is assumed; gold is Johnson and Christy's. Reflectances are computed here, by Kubelka and
-Munk's formulas and Saunderson's face as their papers have them, without Coupole's own functions for them.
+Absorption has the assumed shapes of `coupole.appearance.matter.typical`, which are invented curves, not measured
+pigments. Scattering is assumed; gold is from Johnson and Christy. Reflectances are computed here by the published
+formulas of Kubelka and Munk, and of Saunderson for the face, without Coupole's own functions.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ SHAPE_OF = {
     "dull green": "dull_green_shape",
 }
 FALL_NM = 250.0
-"""Scattering falls with the wavelength by exp(-nm / this), relative to that of its coarse part."""
+"""Wavelength constant: scattering falls by exp(-nm / this), relative to that of its coarse part."""
 
 
 @dataclass(frozen=True)
@@ -71,25 +71,25 @@ def write_all(out: Path, random: np.random.Generator) -> None:
 
 
 def k_over_s(paint: str) -> Array:
-    """[81] of the paint's assumed shape."""
+    """Return [81] the assumed curve of the paint."""
     inside = typical.reflectance(SHAPE_OF[paint]).values
     return np.asarray((1.0 - inside) ** 2 / (2.0 * inside))
 
 
 def coefficients(paint: str) -> tuple[Array, Array]:
-    """K and S [81] per mm."""
+    """Return K and S [81] per mm."""
     s = SCATTERING_PER_MM[paint] * (0.8 + 0.2 * np.exp((550.0 - NM) / FALL_NM))
     return k_over_s(paint) * s, s
 
 
 def opaque(k: Array, s: Array) -> Array:
-    """Reflectance inside of a layer that hides its ground (Kubelka and Munk 1931)."""
+    """Return the reflectance inside of a layer that hides its ground (Kubelka and Munk 1931)."""
     q = k / s
     return np.asarray(1.0 + q - np.sqrt(q**2 + 2.0 * q))
 
 
 def film(k: Array, s: Array, thickness_mm: float, ground: float) -> Array:
-    """Reflectance inside of a layer over a ground (Kubelka 1948)."""
+    """Return the reflectance inside of a layer over a ground (Kubelka 1948)."""
     a = 1.0 + k / s
     b = np.sqrt(a**2 - 1.0)
     coth = 1.0 / np.tanh(b * s * thickness_mm)
@@ -97,12 +97,12 @@ def film(k: Array, s: Array, thickness_mm: float, ground: float) -> Array:
 
 
 def reflectance_in_air(inside: Array) -> Array:
-    """Reflectance in air, gloss excluded (Saunderson 1942)."""
+    """Return the reflectance in air, gloss excluded (Saunderson 1942)."""
     return np.asarray((1.0 - FACE) * (1.0 - INNER) * inside / (1.0 - INNER * inside))
 
 
 def gold_leaf(thickness_nm: float, bare_share: float) -> Array:
-    """A leaf on the papers' bole, all light that comes back (a burnished leaf has no separate gloss)."""
+    """Return the total reflectance of a leaf on the papers' bole (a burnished leaf has no separate gloss)."""
     gilt = gilding.gilt(indices.gold(), thickness_nm, typical.bole(), bare_share=bare_share)
     specular, diffuse = gilding.reflectances(gilt)
     return np.asarray(specular + diffuse)
@@ -112,7 +112,7 @@ def gold_leaf(thickness_nm: float, bare_share: float) -> Array:
 
 
 def _write_library(folder: Path, random: np.random.Generator) -> None:
-    """Five batches of each paint, with other concentrations, and gold leaf of other thicknesses."""
+    """Write five batches of each paint, with different concentrations, and gold leaf of different thicknesses."""
     rows, classes = {}, {}
     for paint in SHAPE_OF:
         for number, strength in enumerate(np.geomspace(0.45, 2.2, 5), 1):
@@ -131,7 +131,7 @@ def _write_library(folder: Path, random: np.random.Generator) -> None:
 
 
 def _write_films(folder: Path, random: np.random.Generator) -> None:
-    """Films on cards of black and white, one file for `coupole layer` for each paint."""
+    """Write films on black and white cards, one file for `coupole layer` for each paint."""
     for ground, inside in (("black", CARD_BLACK), ("white", CARD_WHITE)):
         _write_spectrum(
             folder / f"card-{ground}.csv", reflectance_in_air(np.full(len(NM), inside)), U_FILM, random
@@ -157,7 +157,7 @@ def _write_spots(out: Path, random: np.random.Generator) -> None:
         values = reflectance_in_air(opaque(np.asarray(k), np.asarray(s)))
         _write_spectrum(out / f"spectra/{spot.name}.csv", values, U_SPOT, random)
     _write_spectrum(out / "spectra/hair.csv", gold_leaf(110.0, 0.12), U_SPOT, random)
-    # a synthetic dye of a later repair, which no class of the library is like
+    # a synthetic dye of a later repair; no class of the library resembles it
     violet = np.interp(NM, [380, 430, 540, 640, 780], [0.35, 0.40, 0.08, 0.30, 0.60])
     _write_spectrum(out / "spectra/repair.csv", violet, U_SPOT, random)
     lines = ["# What the simulation put into the spectra. Shares are of the paints' volumes.", "recipes:"]

@@ -1,6 +1,7 @@
-"""Strangers by name: causes that calibrations have no term for, drawn for a random cell by its seed.
+"""Strangers by name: effects for which calibrations have no parameter, drawn for a random cell by its seed.
 
-Each is as large as in real cells of this kind; the lens's in pixels are for frames of 1024, and scale with them.
+Each is as large as in real cells of this kind. Effects of the lens are given in pixels of frames 1024 px wide, and
+scale with the width.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ Drawn = dict[str, Any]
 Draw = Callable[[np.random.Generator], Drawn]
 OF_WIDTH_PX = 1024
 _LED_LOBE = ((0, 1.0), (15, 0.985), (30, 0.92), (45, 0.78), (60, 0.55), (75, 0.25), (85, 0.06), (90, 0.0))
-"""Wider than the cosine, as of a power LED under a silicone dome (assumed)."""
+"""An emission wider than the cosine, as of a power LED under a silicone dome (assumed)."""
 
 
 def _normals(random: np.random.Generator, *sigmas: float) -> tuple[float, ...]:
@@ -74,7 +75,7 @@ STRANGERS: dict[str, Draw] = {
 
 
 def draw_stranger(name: str | None, seed: int, width_px: int) -> Drawn:
-    """The stranger of a cell; nothing without a name."""
+    """Return the stranger of a cell; nothing without a name."""
     if name is None:
         return {}
     stranger = STRANGERS[name](np.random.default_rng((seed, 5)))

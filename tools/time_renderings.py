@@ -1,10 +1,10 @@
-"""Times of renderings beside those of the papers: a table for docs/gallery.md.
+"""Measures times of renderings beside those of the papers: a table for docs/gallery.md.
 
     uv run python tools/time_renderings.py [NAME[=NOISE] ...] [--size 1200] [--step 5] [--samples 512]
 
-Each scene of `configs/scenes` is rendered, first camera, square, until half of the pixels have the noise (or at
-most `--samples`).
-Seed 000 took 8 hours for a picture of 1200 x 1200 pixels (figure 12).
+Each scene of `configs/scenes` is rendered with its first camera as a square picture, until half of the pixels have
+at most the given noise (or until `--samples` are reached). Seed 000 took 8 hours for a picture of 1200 x 1200
+pixels (figure 12).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _HEAD = ("scene", "pixels", "bands", "noise wanted", "noise reached", "paths a p
 
 
 def square(scene: Scene, size_px: int, step_nm: int, noise: float, most: int) -> Scene:
-    """The scene for its first camera alone, as many pixels high as wide."""
+    """Return the scene with only its first camera, with equal height and width."""
     camera = scene.cameras[0]
     optics = FieldOfView(kind="field", degrees=camera.field_deg())
     square_camera = camera.model_copy(update={"width_px": size_px, "height_px": size_px, "optics": optics})
@@ -34,7 +34,7 @@ def square(scene: Scene, size_px: int, step_nm: int, noise: float, most: int) ->
 
 
 def time_picture(scene: Scene) -> tuple[Spectral, float, float]:
-    """The picture, and the seconds that it took: on the clock, and of all cores together."""
+    """Return the picture, and its seconds: on the clock, and of all cores together."""
     wall, cpu = time.perf_counter(), time.process_time()
     with open_renderer(scene, SCENES) as renderer:
         rendering = renderer.render(scene.cameras[0])

@@ -1,7 +1,8 @@
-"""Names that no product code reads, and that are used all the same: vulture reads this file too (`tools/check`).
+"""Names that no product code reads, but that are used elsewhere; vulture reads this file, too (`tools/check`).
 
-Each line says by whom. A function that only tests call is no entry: it gets a user, or it goes. The last lines are
-the exception: what tests do to stand-ins, and what they see of them.
+Each line states the user of the name. A function that only tests call must not be listed here: it gets a user, or
+it is removed. The last lines are the exception: faults that tests inject into stand-ins, and their state that
+tests read.
 """
 # ruff: noqa: B018, F821
 # mypy: disable-error-code="name-defined"
@@ -15,7 +16,7 @@ _.export_scan, _.Stills, _.measure_jitter  # named in coupole/plan/registry.py
 _._do_limits, _._do_memory, _._do_trigger, _._do_statistics, _._do_disarm  # CameraServer, by the message's verb
 _._write_command, _._write_enumeration, _._write_string, _._write_boolean  # Features, by the node's kind
 _._write_integer, _._write_float  # the same
-_.relight_uncertainty, _.PicturesResult, _.Acquisition, _.__dir__  # users of the Python face
+_.relight_uncertainty, _.PicturesResult, _.Acquisition, _.__dir__  # users of the Python interface
 _.__getattr__  # drivers/kuka/rsi, drivers/ur: Python, for names that are imported on first use
 _.open_run, _.open_result, _.open_cell, _.fit_reflectance  # coupole/__init__.py, by its table
 _.residual_rms_us, _.residual_max_us  # the report, coupole/viewing/report_facts.py
@@ -63,8 +64,8 @@ _.run_folder, _.take_view  # users of coupole/neighbours/bluesky.py
 _.m_max_partitions  # etcpak: parameter of BC7
 
 # ---- by tests alone ----
-_.LEFT_BY_SFNC, _.is_safe, _.light_given_s  # coupole/testing, for the tests of others
-_.switch_panel, _.ledbox_alone, _.RobotAlone  # sim/world, for them and for ours
+_.LEFT_BY_SFNC, _.is_safe, _.light_given_s  # coupole/testing, for the tests of other projects
+_.switch_panel, _.ledbox_alone, _.RobotAlone  # sim/world, for these tests and for ours
 _.safeguard_stop, _.safety_fault, _.stop_program, _.drop_link  # faults of the simulated UR controller
 _.ended_programs  # the simulated RSI controller: how often a client has ended its program
-_.ambiguous  # Match: whether frames were left open, whose reason people are told
+_.ambiguous  # Match: whether frames were left open; people are told the reason

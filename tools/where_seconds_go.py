@@ -1,8 +1,8 @@
 """Account of where the seconds of the tests go, by room (a folder of tests) and by kind.
 
 `python tools/where_seconds_go.py [--workers N] [--show] [PATH ...]` runs the tests (all, or these paths) with
-pytest's `--account`. It prints two tables and the dearest tests. The counts stay in `runs/where_seconds_go`;
-`--show` prints them again. Unknown options go to pytest.
+pytest's `--account`. It prints two tables and the most expensive tests. The counts are stored in
+`runs/where_seconds_go`; `--show` prints them again. Unknown options go to pytest.
 
 CPU seconds, of all processes together:
 
@@ -11,12 +11,12 @@ CPU seconds, of all processes together:
 - *world*: the rest of simulated worlds.
 - *browser*: Chromium, its driver, and the calls to it.
 - *mitsuba*: the tests' process during `render` and `load_dict`.
-- *python*: interpreters of their own, with all that they do. Nobody looks inside: imports are among it.
+- *python*: separate interpreters, with all that they do, including imports. They are not divided further.
 - *others*: other processes.
 - *work*: the rest of the tests' process and of forked commands.
 
-The room "(workers)" is no test's: start of the tests' processes and of their nurseries, collection of the tests,
-and, in *others*, all that the system counted beyond what was accounted for.
+The room "(workers)" belongs to no test. It has the start of the tests' processes and of their nurseries, the
+collection of the tests and, in *others*, all CPU time of the system that is not accounted for elsewhere.
 
 Wall seconds of the tests' process: on a core (*cpu*), waiting for a core (*queue*), blocked while processes of
 the test computed (*processes*: at most their CPU seconds), and blocked otherwise: in the *browser*, *paced* (the
@@ -76,14 +76,14 @@ class Spent:
 
 
 def add_up(into: dict[str, float], more: Mapping[str, float]) -> None:
-    """Seconds by kind to those that are there."""
+    """Add seconds by kind to those in `into`."""
     for kind, seconds in more.items():
         into[kind] += seconds
 
 
 @dataclass
 class Process:
-    """One that a test started, or that one of these asked the nursery for."""
+    """A process that a test started, or that the nursery forked for such a process."""
 
     name: str
     test: str
@@ -103,14 +103,15 @@ class Process:
 
 
 def count(paths: list[str], workers: int) -> int:
-    """Run the tests and keep what they spend; pytest's exit code."""
+    """Run the tests and store the seconds that they spend; return pytest's exit code."""
     shutil.rmtree(KEPT, ignore_errors=True)
     KEPT.mkdir(parents=True)
-    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # who outlives its parent is waited for here
+    # a process that outlives its parent is waited for here
+    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     worker_options = ["-n", str(workers), "--dist", "loadscope", "--no-loadscope-reorder"] if workers > 1 else []
     command = [sys.executable, "-m", "pytest", *worker_options, f"--account={KEPT}", *paths]
-    # As tools/test does: hundreds of processes would each compile every module again, and threads that wait would
-    # take the other workers' cores.
+    # like tools/test: otherwise hundreds of processes would each compile every module again, and waiting threads
+    # would take the other workers' cores
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     environment["OMP_WAIT_POLICY"] = "passive"
     tests = subprocess.Popen(command, cwd=ROOT, env=environment)
@@ -129,7 +130,8 @@ def count(paths: list[str], workers: int) -> int:
 
 
 def bury_children() -> Iterator[tuple[int, str, int, float]]:
-    """Each child, and each that lost its parent, when it ends: pid, name, status, CPU seconds."""
+    """Yield each child, and each process that has lost its parent, when it ends: pid, name, status, CPU
+    seconds."""
     while True:
         try:
             exit_info = os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)
@@ -156,7 +158,7 @@ def processes(lines_read: list[dict[str, Any]]) -> dict[int, Process]:
         for line in lines_read
         if line["what"] == "process" and line["test"] and line["pid"] not in nurseries
     }
-    for line in lines_read:  # a command's world is of the command's test
+    for line in lines_read:  # the world of a command belongs to the command's test
         if line["what"] == "fork" and line["parent"] in process_of_pid:
             process_of_pid[line["pid"]] = Process("world", process_of_pid[line["parent"]].test)
     for line in lines_read:
@@ -170,7 +172,7 @@ def processes(lines_read: list[dict[str, Any]]) -> dict[int, Process]:
 
 
 def columns(kinds: dict[str, float]) -> dict[str, float]:
-    """CPU seconds by column, of what is counted by kind."""
+    """Return CPU seconds by column, from the counts by kind."""
     seconds_of_column: dict[str, float] = defaultdict(float)
     for kind, seconds in kinds.items():
         seconds_of_column[COUNTED[kind]] += seconds
@@ -178,7 +180,8 @@ def columns(kinds: dict[str, float]) -> dict[str, float]:
 
 
 def add_cpu(seconds_used: Spent, total_s: float, inside: dict[str, float], rest: str) -> None:
-    """Add what was counted inside, and under `rest` the remainder of all that a process used."""
+    """Add the seconds that were counted inside a process, and under `rest` the remainder of the seconds that it
+    used."""
     seconds_of_kind = {kind: seconds for kind, seconds in inside.items() if kind != "work"}
     add_up(seconds_used.cpu_s, seconds_of_kind)
     seconds_used.cpu_s[rest] += max(0.0, total_s - sum(seconds_of_kind.values()))
@@ -209,7 +212,7 @@ def of_tests(lines_read: list[dict[str, Any]]) -> tuple[dict[str, Spent], Spent]
 
 
 def wall(line: dict[str, Any], test_processes: list[Process]) -> dict[str, float]:
-    """The wall seconds of a test by kind; `test_processes` are its processes."""
+    """Return the wall seconds of a test by kind; `test_processes` are its processes."""
     blocked_s = max(0.0, line["wall"] - line["main"] - line["queued"])
     kinds = line["kinds"]
     browser = min(blocked_s, max(0.0, kinds["wall_s"].get("browser", 0.0) - kinds["cpu_s"].get("browser", 0.0)))
@@ -231,7 +234,7 @@ def wall(line: dict[str, Any], test_processes: list[Process]) -> dict[str, float
 
 
 def table(title: str, kinds: tuple[str, ...], rows: list[tuple[str, dict[str, float], int]]) -> None:
-    """Seconds of each row by kind, the largest row first, and of all."""
+    """Print the seconds of each row by kind, the largest row first, and of all rows."""
     print(f"\n{title:28} tests    all" + "".join(f"{kind:>10}" for kind in kinds))
     whole: dict[str, float] = defaultdict(float)
     for name, seconds, tests in sorted(rows, key=lambda row: -sum(row[1].values())):
@@ -244,7 +247,7 @@ def table(title: str, kinds: tuple[str, ...], rows: list[tuple[str, dict[str, fl
 
 
 def show() -> None:
-    """Print what was counted last."""
+    """Print the last counts."""
     about = json.loads((KEPT / "about.json").read_text())
     by_test, nobody = of_tests(lines())
     rooms: dict[str, Spent] = defaultdict(Spent)

@@ -1,2 +1,2 @@
-"""The commands of the command line, by subject. Each reads its input, calls the room that does the work, and
-prints the result."""
+"""The commands of the command line, one module for each subject. A command reads its input, calls the package that
+does the work, and prints the result."""

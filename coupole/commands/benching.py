@@ -111,7 +111,7 @@ def _say(words: str) -> None:
 
 
 def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> dict[str, Any]:
-    """Plan, show, ask, drive; the work's figures when the arm has arrived."""
+    """Plan a path, show it, ask, and drive the arm. Return the figures of the motion when the arm has arrived."""
     from coupole.acquisition.cell_bench.bench_client import checked_answer
     from coupole.viewing.terminal import ask
 
@@ -120,7 +120,7 @@ def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> di
     print(f"{path['to']}: {path['duration_s']:.1f} s, {steps} straight motion(s)", file=sys.stderr)
     if not yes and not ask("Drive the arm along this path?"):
         raise Interrupted("the arm was not driven: answer the question, or give `--yes`")
-    control.await_word()  # the answer may have been given while nobody ran
+    control.await_word()  # the answer may have been given while this process did not run
     control.go_on()
     try:
         work = checked_answer(send_request("drive", path=path["path"]))
@@ -135,7 +135,7 @@ def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> di
             _say(str(silent))
         raise
     if work["state"] != "done":
-        control.go_on()  # whose stop ends the work too
+        control.go_on()  # this raises if the session was asked to stop, which also ends the motion
         raise DeviceError(
             "robot", expected=f"the arm to arrive at {work['to']}", happened=work["why"], remedy="See its state."
         )

@@ -1,4 +1,4 @@
-"""`coupole bracket`: photographs with several exposure times, merged into one of linear values."""
+"""`coupole bracket`: photographs with several exposure times, merged into one picture with linear values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from coupole.exchange.bracket.sphere_brdf import Finish
 
 _TOLD_FROM = 1e-3
-"""Share of contradicting pixels of a photograph from which it is named."""
+"""Least share of contradicting pixels for which a message names the photograph."""
 
 
 def bracket(
@@ -120,7 +120,7 @@ def sphere_brdf(
 
 
 def _prediction_lines(finish: Finish, paths: list[str]) -> list[str]:
-    """One line for each photograph that the others predict."""
+    """Return one line for each photograph that the others predict."""
     return [
         "prediction of each photograph by the others: incidence, error at the peak, median error, nearest sample",
         *(

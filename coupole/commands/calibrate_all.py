@@ -78,7 +78,7 @@ def calibrate_all(
 
 
 def _for_a_rig(rig: Path, records: dict[str, str]) -> str:
-    """The lines for the rig that name the cell's records, without those of an object."""
+    """Return the rig's lines that name the records of the cell, without the records of an object."""
     folder = rig.resolve().parent
     paths = [os.path.relpath(path, folder) for kind, path in records.items() if kind != MESH]
     return "\n".join(["calibrations:", *(f"  - {path}" for path in paths)])

@@ -194,7 +194,7 @@ def _by_pictures(paths: list[Path], options: _GivenOptions, *, srgb: bool) -> Wo
 
 
 def _refuse_options_of_runs(options: _GivenOptions) -> None:
-    """Raise InputError for options that say something of the dome."""
+    """Raise InputError for options that describe the dome."""
     usual = TargetCalibrations()
     flags = {field.name: f"--{field.name.removesuffix('_record').replace('_', '-')}" for field in fields(usual)}
     wrong_flags = [
@@ -205,7 +205,7 @@ def _refuse_options_of_runs(options: _GivenOptions) -> None:
 
 
 def corners_of(words: str | None) -> Floats | None:
-    """[4, 2] px of `X,Y X,Y X,Y X,Y`. Raises InputError for anything else."""
+    """Return [4, 2] px of the text `X,Y X,Y X,Y X,Y`. Raises InputError for any other text."""
     import numpy as np
 
     if words is None:

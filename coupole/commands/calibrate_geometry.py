@@ -46,7 +46,7 @@ class RobotRepeatability:
 
 @dataclass(frozen=True)
 class ScannedStickers:
-    """Their size, where they stand, and how exactly the scanner placed them."""
+    """Size of the stickers, their distance from the camera, and the accuracy of the scanner."""
 
     diameter_mm: Annotated[float, typer.Option(min=1.0, max=50.0, help="Diameter of a sticker's bright disk.")] = (
         6.0
@@ -179,7 +179,7 @@ def _base_from_support(cell: Cell) -> Transform:
 
 
 def _cell(rig: Path | None, runs: list[Path]) -> Cell:
-    """The rig that is named, or the first run's."""
+    """Read the named rig, or the rig of the first run if none is named."""
     from coupole.plan.cell import read_cell
 
     return read_cell(rig or rig_of(runs[0]))

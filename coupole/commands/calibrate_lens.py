@@ -70,7 +70,7 @@ class Warmth:
 
     @property
     def pair(self) -> tuple[float | None, float]:
-        """Both, as `sight_board` takes them."""
+        """Temperature and its uncertainty, in the form that `sight_board` takes."""
         return self.celsius, self.u_k
 
 
@@ -120,7 +120,7 @@ def chromatic(
 
 @dataclass(frozen=True)
 class StatedRobot:
-    """Errors of the robot, as stated."""
+    """Repeatability of the robot, as its maker states it."""
 
     repeatability_mm: Annotated[
         float, typer.Option(min=1e-4, help="Repeatability of position, as stated by the robot's maker.")
@@ -193,8 +193,8 @@ def _refuse_unknown_model(model: str) -> None:
 
 
 def _plain_board(text: str | None, square_mm: float | None) -> Board | None:
-    """The plain chessboard COLUMNSxROWS of squares of a stated side; None if `text` names a file, or nothing.
-    Raises InputError if only one of the two is given, or for a board that none can be."""
+    """Return the plain chessboard COLUMNSxROWS with squares of the stated side; None if `text` names a file or is
+    empty. Raises InputError if only one of the two is given, or if there can be no such board."""
     from coupole.scripting.analyses import plain_chessboard
 
     match = re.fullmatch(r"([0-9]{1,3})x([0-9]{1,3})", text or "")

@@ -49,7 +49,7 @@ LedsOption = Annotated[
 
 @dataclass(frozen=True)
 class TargetCalibrations:
-    """Rig, records and emission by which frames of a target of known pose are read."""
+    """Rig, records and emission that are used to read frames of a target of known pose."""
 
     rig: RigOption = None
     leds: LedsOption = None
@@ -193,8 +193,8 @@ def drift(
 def frames_with_poses(
     frames: LightFrames, hand_eye: Path | None, rig: Path | None, runs: list[Path]
 ) -> LightFrames:
-    """Frames with poses by a hand-eye record and its axis zeros. Raises InputError for another record, or one of
-    another focus, and for a rig without a model of the record's arm."""
+    """Return frames with the poses of a hand-eye record, which may include zeros of the axes. Raises InputError if
+    the record is of another kind or focus, or if the rig has no model of the record's arm."""
     from coupole.calibration.posed_camera import read_posed_camera
     from coupole.plan.cell import read_cell
 
@@ -205,7 +205,8 @@ def frames_with_poses(
 
 
 def setting_of(frames: LightFrames, tile: Path, rig: Path, calibrations: TargetCalibrations) -> Setting:
-    """Descriptions and calibrations that frames of a tile are read with. Raises InputError for invalid files."""
+    """Return the descriptions and calibrations that are used to read frames of a tile. Raises InputError for
+    invalid files."""
     from coupole.calibration.light.led_power_tile import Setting, calibrated_positions
     from coupole.calibration.light.spectralon import read_tile
     from coupole.calibration.light.tile_views import Positions
@@ -243,7 +244,8 @@ def light_of(cell: Cell) -> LightSpectrum | None:
 
 
 def lens_of(record_path: Path | None, frames: LightFrames) -> Intrinsics:
-    """The lens by a camera's record, or the rig's without one. Raises InputError for another camera's."""
+    """Return the lens of a camera record; without a record, the nominal lens of the rig. Raises InputError if the
+    record is of another camera."""
     from coupole.calibration.earlier import read_earlier
     from coupole.calibration.optics import Intrinsics
     from coupole.calibration.record import intrinsics_of

@@ -37,7 +37,7 @@ else:
 _SUFFIXES = (".yaml", ".html", ".png", ".csv", ".h5", ".icc")
 """Suffixes of a record and of the files beside it."""
 _MOST_FAULTS = 5
-"""Most faults that a refusal names; the record has all."""
+"""Greatest number of faults that a refusal names; the record contains all of them."""
 Paths = Annotated[
     list[Path],
     typer.Argument(help="Runs, or one folder of pictures.", show_default=False, metavar="RUN_OR_FOLDER..."),
@@ -54,7 +54,7 @@ DaysOption = Annotated[int, typer.Option("--valid-days", min=1, max=3650, help="
 
 
 def emission_of(name: str) -> Emission:
-    """The profile of that name. Raises InputError if there is none."""
+    """Return the emission profile of this name. Raises InputError if there is none."""
     if name == "lambertian":
         return "lambertian"
     if name == "paper":
@@ -63,7 +63,8 @@ def emission_of(name: str) -> Emission:
 
 
 def rig_of(run: Path) -> Path:
-    """A run's rig: its own copy, or in runs without copies the file that it names, if it is unchanged."""
+    """Return a run's rig: the run's own copy or, if the run has no copies, the file that it names, if that file is
+    unchanged."""
     from coupole.storage.durable import sha256
     from coupole.storage.run import Run
 
@@ -76,8 +77,8 @@ def rig_of(run: Path) -> Path:
 
 
 def arm_of(cell: Cell, hand_eye: Path) -> CalibratedArm | None:
-    """The rig's arm with the axis zeros of a hand-eye record; None for a record without. Raises InputError if the
-    rig's driver has no model of the arm."""
+    """Return the rig's arm with the axis zeros of a hand-eye record; None if the record has none. Raises
+    InputError if the rig's driver has no model of the arm."""
     from coupole.calibration.calibrated_arm import has_axis_zeros, read_arm
     from coupole.plan.rig_devices import planning_arm
 
@@ -95,10 +96,10 @@ def arm_of(cell: Cell, hand_eye: Path) -> CalibratedArm | None:
 def calibration(
     kind: str, *, limits: Sequence[Allowed] = (), valid_days: int = 180, lens: bool = True
 ) -> Callable[[Callable[..., Work]], Callable[..., None]]:
-    """Make a command from a function that takes the calibration's options and returns the work to do.
+    """Decorator: make a command from a function that takes the calibration's options and returns the work to do.
 
-    Its options may be in dataclasses (`option_groups`). All commands have `--out`, `--name`, `--valid-days` and
-    `--json` besides; `--limit` where the calibration has `limits`, and `--lens` where records are of one lens.
+    The options may be in dataclasses (`option_groups`). Every command also has `--out`, `--name`, `--valid-days`
+    and `--json`. It has `--limit` if the calibration has `limits`, and `--lens` if its records belong to one lens.
     """
     words = f"Set an acceptance limit; repeat for more. The usual limits are {words_of(limits)}."
     common: list[tuple[str, Any, Any]] = [
@@ -171,7 +172,7 @@ def _calibrate(kind: str, work: Work, options: _CommonOptions, limits: Sequence[
             if path.exists():
                 raise InputError(f"{path}: exists already. Choose another --name or --out.")
         outcome = work(console, request)
-        from coupole.calibration.report import write_outcome  # imports much: not before options are refused
+        from coupole.calibration.report import write_outcome  # its imports take long, so options are refused first
 
         page, picture = write_outcome(record_path, outcome)
     except CoupoleError as error:
@@ -215,7 +216,8 @@ def _refuse_name(name: str | None) -> None:
 
 @contextmanager
 def bar(console: Console, step_name: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar; yields the function that advances it: done, total."""
+    """Show a progress bar; yield the function that advances it, which takes the number of finished parts and of
+    all parts."""
     from rich.progress import Progress
 
     with Progress(console=console, disable=not console.is_terminal) as bars:

@@ -70,7 +70,7 @@ class Campaign:
         return {kind: str(self._record(kind)) for kind in kinds if self._record(kind).is_file()}
 
     def do_all(self, names: Collection[str]) -> None:
-        """The steps with these names, in their order."""
+        """Do the steps with these names, in the order of `STEPS`."""
         for step in STEPS:
             if step.name in names:
                 self.do(step)
@@ -88,8 +88,8 @@ class Campaign:
             self._calibrations()[kind](run)
 
     def _refuse_missed(self, step: Step) -> None:
-        """Raise CalibrationRefused if a record of an earlier call exceeds its limits: later steps must not use
-        it."""
+        """Raise CalibrationRefused if a record of an earlier call exceeds its limits, because later steps must not
+        use it."""
         from coupole.calibration.record import read_record
 
         for kind in step.records:
@@ -108,7 +108,7 @@ class Campaign:
                 )
 
     def _acquire(self, step: Step) -> Path:
-        """The step's run, complete."""
+        """Return the complete run of a step; acquire or resume it first if it is not complete."""
         from coupole.acquisition.session import SessionRequest, acquire_plan
         from coupole.preflight.job import read_job
         from coupole.storage.run_status import is_complete, newest_run
@@ -130,7 +130,7 @@ class Campaign:
         return Path(summary["run"])
 
     def _plan(self, step: Step) -> Path:
-        """The step's plan; an existing one is kept, as it may have been edited."""
+        """Return the step's plan. An existing plan is kept, because the operator may have edited it."""
         from coupole.calibration.leds.led_plan import led_plan
         from coupole.plan.cell import read_cell
         from coupole.plan.templates import LEDS, TEMPLATES
@@ -147,8 +147,8 @@ class Campaign:
         return path
 
     def _rig_of(self, step: Step) -> Path:
-        """The rig; for a simulated cell a copy with the step's things on the support, which is kept if it
-        exists."""
+        """Return the rig. For a simulated cell, return a copy with the step's things on the support; an existing
+        copy is kept."""
         path = self._out / "rigs" / f"{step.name}.yaml"
         if not self._simulated:
             return self._rig
@@ -158,7 +158,8 @@ class Campaign:
         return path
 
     def _scan(self) -> Path:
-        """The object's scan; a simulated cell's scanner makes one, which is imported like any other."""
+        """Return the object's scan. The scanner of a simulated cell makes one, which is imported like any
+        other."""
         from coupole.plan.registry import SCANNER_EXPORT, load_class
         from coupole.viewing.scan_sheet import import_scan
 

@@ -1,4 +1,4 @@
-"""`coupole calibrate check-artefact`: a calibrated cell measures an artefact that took part in no fit."""
+"""`coupole calibrate check-artefact`: a calibrated cell measures an artefact that was used in no fit."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ OF_BOARD: tuple[Kind, ...] = ("hand-eye",)
 
 @dataclass(frozen=True)
 class IndependentArtefact:
-    """The artefact, and what it is measured with."""
+    """Options of the independent artefact, and of the records that are used to measure it."""
 
     board: Annotated[
         Path | None, typer.Option("--board", help="A second board's description (YAML), with its certificate.")
@@ -104,8 +104,10 @@ def check_artefact(
 
 
 def _refuse_wrong(paths: Sequence[Path], independent: IndependentArtefact, emission: str) -> None:
-    """Raise InputError for options that do not go together, and for files that are not there: before anything is
-    read, and before what takes seconds to import."""
+    """Raise InputError for options that do not go together and for missing files.
+
+    This is done first, because reading takes long and some imports take seconds.
+    """
     from coupole.calibration.check.permissible import parse_permissible
 
     tiles = independent.tile or []
@@ -157,7 +159,7 @@ def _check_board(
     )
     from coupole.calibration.lens.board import read_board
 
-    assert independent.board is not None  # as `check_artefact` has refused
+    assert independent.board is not None  # `check_artefact` has refused the other case
     permissible = None if independent.mpe is None else parse_permissible(independent.mpe)
     record_of_kind = records_by_kind(records, OF_BOARD)
     needed_record(record_of_kind, "hand-eye")
@@ -182,7 +184,7 @@ def _check_board(
 def _position(
     path: Path, independent: IndependentArtefact, warmth: Warmth, hand_eye: InForce, console: Console
 ) -> tuple[Position, Sources, Board]:
-    """One run or folder: sightings and poses, by the hand-eye record."""
+    """Return sightings and poses of one run or folder, by the hand-eye record."""
     import numpy as np
 
     from coupole.calibration.calibrated_arm import calibrated_poses
@@ -200,7 +202,7 @@ def _position(
         if None in joints:
             raise InputError(f"{hand_eye.path}: has axis zeros of the arm, but {path} has no joints; give runs")
         arm = arm_of(read_cell(independent.rig or rig_of(path)), hand_eye.path)
-        assert arm is not None  # the record has zeros
+        assert arm is not None  # `arm_of` returns None only for a record without axis zeros
         base_from_flange, camera = calibrated_poses(base_from_flange, np.array(joints), arm, camera)
     return Position(path.resolve().name, sightings.sightings, base_from_flange, camera), sources, target
 
@@ -266,7 +268,7 @@ def _check_tile(
 def _calibrations_of(
     record_of_kind: Mapping[Kind, InForce], rig: Path | None, emission: str
 ) -> TargetCalibrations:
-    """The records by which frames of the tile are read."""
+    """Return the records that are used to read frames of the tile."""
     paths = {kind: item.path for kind, item in record_of_kind.items()}
     return TargetCalibrations(
         rig=rig,
@@ -284,7 +286,7 @@ def _calibrations_of(
 def _place(
     run: Path, tile: Path, rig: Path | None, calibrations: TargetCalibrations, console: Console
 ) -> tuple[Place, LightFrames, list[tuple[str, str]]]:
-    """The tile in one run, the run's frames, and all files that were read."""
+    """Return the tile's reflectance in one run, the run's frames, and all files that were read."""
     from coupole.calibration.check.tile_reflectance import place_of
     from coupole.calibration.light.frames import open_light_frames
 

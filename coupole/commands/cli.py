@@ -40,8 +40,8 @@ AT_A_CELL = {
     "sim",
 }
 AT_A_CELL |= {"serve", "pause", "go-on", "stop"}
-"""Commands that hold a cell, or that speak to a process that holds one. None of them waits until somebody reads
-its output.
+"""Commands that hold a cell, or that speak to a process that holds one. None of them waits until its output is
+read.
 """
 
 GROUPS = {
@@ -104,15 +104,16 @@ GROUPS = {
         "archive": "keeping.archive",
     },
 }
-"""Module of `coupole.commands` and function, or group of steps, by command; under the headings of `--help`, in its
-order."""
+"""Module in `coupole.commands` and function, or group of steps, of each command. The headings and their order are
+those of `--help`."""
 
 COMMANDS = {name: place for group in GROUPS.values() for name, place in group.items()}
 _HEADINGS = {name: heading for heading, group in GROUPS.items() for name in group}
 
 
 class _OnDemand(Mapping[str, Any]):
-    """`COMMANDS` as the command line wants them: a module is imported, and its signatures read, when asked for."""
+    """The mapping `COMMANDS` for typer: a module is imported, and its signatures are read, only when its command
+    is used."""
 
     def __len__(self) -> int:
         return len(COMMANDS)
@@ -134,7 +135,8 @@ def _entry(name: str) -> Any:
 
 
 def _summary(name: str) -> TyperCommand:
-    """Return a command as the list of all needs it: with its text, without its options, which take longest."""
+    """Return a command for the list of all commands: with its help text, but without its options, because reading
+    these takes longest."""
     entry = _entry(name)
     text = entry.info.help if isinstance(entry, typer.Typer) else inspect.getdoc(entry)
     return TyperCommand(name, help=text, rich_help_panel=_HEADINGS[name])
@@ -196,7 +198,7 @@ def _options(
 
 
 def _about_version() -> dict[str, Any]:
-    """Return the facts of an installation for the report of a defect."""
+    """Return the facts about an installation that a bug report needs."""
     return {
         "coupole": coupole.__version__,
         "python": platform.python_version(),
@@ -215,7 +217,7 @@ def main() -> None:
 
 
 def _exit_code_of_command() -> int:
-    """Run the command; its exit code."""
+    """Run the command; return its exit code."""
     try:
         code = app(standalone_mode=False)
     except CoupoleError as error:
@@ -240,13 +242,13 @@ def _exit_code_of_command() -> int:
             code = _code_of_defect(error)
     if why := text_outlet.full_stdout():
         code = _not_taken(why)
-    with contextlib.suppress(SignalReceived):  # a signal more: nothing is waited for
+    with contextlib.suppress(SignalReceived):  # if another signal comes, nothing more is waited for
         text_outlet.finish()
     return int(code or 0)
 
 
 def _code_of_missing(error: ImportError) -> int:
-    """Tell which extra has the library; return the exit code."""
+    """Print which extra provides the missing library; return the exit code."""
     missing = missing_extra(error)
     if missing is None:
         return _code_of_defect(error)
@@ -269,7 +271,7 @@ def _code_of_defect(error: Exception) -> int:
 
 
 def _not_taken(why: str) -> int:
-    """Tell that standard output does not have the whole document; the exit code."""
+    """Print that standard output has not received the whole document; return the exit code."""
     error = StorageError(f"standard output: {why}; the text printed there is not complete")
     _say(error)
     return error.exit_code

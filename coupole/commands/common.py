@@ -44,14 +44,15 @@ RunPath = Annotated[Path, typer.Argument(help="The run's folder.", show_default=
 
 
 LONGEST_NAME = 200
-"""Characters of a person's name; the console takes no longer one either."""
+"""Greatest number of characters of a person's name; the console has the same limit."""
 
 
 class JobOrStep(TyperGroup):
-    """A first word that is a step's name is the step; anything else belongs to the main job."""
+    """A group of commands with a main job: if the first word is the name of a step, that step is called; otherwise
+    the words belong to the main job."""
 
     job: ClassVar[str]
-    """Name of the main job among the steps; nobody types it."""
+    """Name of the main job in the list of steps; it is never typed."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
@@ -60,7 +61,7 @@ class JobOrStep(TyperGroup):
 
 
 def plan_of(resumed_run: Path | None) -> Path:
-    """The plan of a run that is resumed without naming it."""
+    """Return the plan of a run that is resumed without naming the plan."""
     from coupole.storage.run import Run
 
     if resumed_run is None:
@@ -69,7 +70,7 @@ def plan_of(resumed_run: Path | None) -> Path:
 
 
 def served_cell(plan: Path | None, rig: Path | None, resume: Path | None) -> Cell | None:
-    """The cell of a plan, or of a run that is resumed, if a console owns it; None if none does."""
+    """Return the cell of a plan, or of a run that is resumed, if a console owns that cell; otherwise None."""
     from coupole.console.command_line.client import is_served
     from coupole.plan.cell import read_cell
     from coupole.plan.reading import read_plan
@@ -84,15 +85,15 @@ def served_cell(plan: Path | None, rig: Path | None, resume: Path | None) -> Cel
         except InputError:
             if rig is not None:
                 raise
-            return None  # a run needs nothing outside its folder
+            return None  # a run can be resumed from its folder alone
     else:
         return None
     return cell if is_served(cell) else None
 
 
 def person_named(name: str, person_role: str) -> str:
-    """A person's name as `--name` gives it, without blanks around it. Raises InputError if there is no name, or
-    the text is not a name.
+    """Return a person's name from `--name`, without blanks around it. Raises InputError if the name is empty or
+    too long.
     """
     if not (person := name.strip()):
         raise InputError(f"--name: expected the name of {person_role}")

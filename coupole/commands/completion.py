@@ -24,7 +24,7 @@ def fits(incomplete: str) -> list[tuple[str, str]]:
 
 
 def materials(incomplete: str) -> list[tuple[str, str]]:
-    """Fits that `coupole export --fit` takes."""
+    """Fits that `coupole export --fit` accepts."""
     from coupole.reflectance.fits import MATERIALS, TEXELS
 
     return [(name, title) for name, title in fits(incomplete) if name in (*MATERIALS, TEXELS)]
@@ -48,12 +48,12 @@ def mesh_units(incomplete: str) -> list[str]:
 
 
 def schemas(incomplete: str) -> list[str]:
-    """Files of which `coupole schema` has a schema."""
+    """Kinds of files for which `coupole schema` has a schema."""
     return _beginning({"plan", "rig"}, incomplete)
 
 
 def plans(incomplete: str) -> list[str]:
-    """Files that look like plans, and folders in which there may be some."""
+    """Files that look like plans, and folders that may contain plans."""
     return sorted(
         f"{path}/" if path.is_dir() else str(path)
         for path in _paths(incomplete)
@@ -62,7 +62,7 @@ def plans(incomplete: str) -> list[str]:
 
 
 def runs(incomplete: str) -> list[str]:
-    """Folders of runs, and folders in which there may be some."""
+    """Folders of runs, and folders that may contain runs."""
     return sorted(
         str(path) if (path / "run.json").exists() else f"{path}/" for path in _paths(incomplete) if path.is_dir()
     )

@@ -81,7 +81,8 @@ def serve(
 
 
 def _plans_beside(rig: Path) -> Path:
-    """The folder of plans beside a rig's; of a rig in an installed package the working folder."""
+    """Return the folder `plans` beside that of the rig, or the rig's own folder. For a rig in an installed
+    package, return the working folder."""
     from coupole.plan.shipped_files import place_to_write
 
     rig_folder = rig.resolve().parent
@@ -91,7 +92,8 @@ def _plans_beside(rig: Path) -> Path:
 
 
 def _test_notifications(rig: Path, *, as_json: bool) -> None:
-    """Raises InputError: nothing is set up, or something could not be sent."""
+    """Send a test message by each way of notification. Raises InputError if none is set up, or if a message could
+    not be sent."""
     from coupole.console.upkeep.notifications import NAME, console_folder, read_settings
     from coupole.console.upkeep.notifier import send_test
     from coupole.plan.cell import read_cell
@@ -188,7 +190,7 @@ def _show_queue(console: RichConsole, state: dict[str, Any]) -> None:
 
 
 def _outlook(entry: dict[str, Any]) -> str:
-    """Say when it is expected and what it needs; empty if it has ended."""
+    """Return when an entry is expected to run and what it needs; empty if it has ended."""
     from coupole.viewing.terminal import bytes_text, duration_text
 
     begin, end = (

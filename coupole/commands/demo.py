@@ -1,4 +1,4 @@
-"""The command `coupole demo`: from a plan to a page, on the simulated cell, from anywhere."""
+"""The command `coupole demo`: from a plan to a page to relight, on the simulated cell, in any folder."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def demo(
 
 
 def _refuse_foreign(folder: Path, plan_name: str) -> None:
-    """Raise InputError if the folder holds anything that no demo of this plan has made."""
+    """Raise InputError if the folder contains anything that a demo of this plan does not make."""
     if folder.is_file():
         raise InputError(f"{folder}: is a file; name a folder for the demo")
     names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
@@ -73,7 +73,7 @@ def _refuse_foreign(folder: Path, plan_name: str) -> None:
 
 
 def _make(folder: Path, plan_name: str, console: Console) -> Demo:
-    """Take the steps that are missing."""
+    """Take the steps that are still missing."""
     console.print(f"1 of 3: the plan {plan_name} is acquired on the simulated cell")
     run = _acquire(folder / RUNS, plan_name, console)
     console.print("2 of 3: the reflectance of the relief is found from the frames")
@@ -84,13 +84,14 @@ def _make(folder: Path, plan_name: str, console: Console) -> Demo:
 
 
 def _acquire(parent: Path, plan_name: str, console: Console) -> Path:
-    """The plan's run, complete."""
+    """Return the complete run of the plan; acquire or resume it first if it is not complete."""
     from coupole.acquisition.session import SessionRequest, acquire_plan
     from coupole.plan.shipped_files import shipped_folder
     from coupole.preflight.job import read_job
     from coupole.storage.run_status import is_complete, newest_run
 
-    job = read_job(shipped_folder() / "plans" / f"{plan_name}.yaml")  # never a file of that name that lies here
+    # the shipped plan, even if a file of the same name is in the working folder
+    job = read_job(shipped_folder() / "plans" / f"{plan_name}.yaml")
     run = newest_run(parent, plan_name, job.document.path, console.print)
     if run is not None and is_complete(run):
         return run
@@ -100,7 +101,7 @@ def _acquire(parent: Path, plan_name: str, console: Console) -> Path:
 
 
 def _find_reflectance(run: Path, out: Path, console: Console) -> Path:
-    """The result of the run, which goes on where it was; one that is whole stays."""
+    """Make the result of the run, or continue it; a complete result is kept."""
     from coupole.reflectance.run_result import REPORT
     from coupole.scripting.analyses import fit_reflectance
     from coupole.viewing.terminal import step_bars

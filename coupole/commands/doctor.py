@@ -1,4 +1,5 @@
-"""`coupole doctor`: what this machine lacks for a cell, and what it can promise. No device is opened."""
+"""`coupole doctor`: what this machine lacks for a cell, and which cycle of the arm's controller it can answer. No
+device is opened."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from coupole.plan.cell import Cell
 
 SLOWER_MS = 12
-"""RSI's other cycle (#IPO)."""
+"""The slower of RSI's two cycles, ms (#IPO)."""
 NOT_TIMED = "the arm's driver does not answer its controller in cycles, so there is nothing to measure"
 
 
@@ -72,8 +73,8 @@ def doctor(
 
 
 def _measure(cell: Cell, seconds: float, console: Console) -> list[Any]:
-    """Measure the answers in the rig's cycle, and in the longer one if that does not hold; nothing for a driver
-    that does not answer in cycles."""
+    """Measure the answers in the rig's cycle. If they are too late, measure them in the slower cycle, too. Return
+    nothing if the driver does not answer in cycles."""
     from rich.progress import Progress, TimeRemainingColumn
 
     from coupole.plan.registry import ANSWER_JITTER, load_class
@@ -94,14 +95,14 @@ def _measure(cell: Cell, seconds: float, console: Console) -> list[Any]:
 
 
 def line_of(part: str, need: HostNeed) -> str:
-    """Return a need as a line for people, with the remedy if it is not met."""
+    """Return one line about a need, with the remedy if the need is not met."""
     mark = "[green]ok  [/]" if need.is_met else "[red]lack[/]" if need.is_vital else "[yellow]weak[/]"
     remedy = "" if need.is_met else f". {need.remedy}"
     return f"{mark} {part}: {need.name}: {need.state}{remedy}"
 
 
 def words_of(jitter: Any) -> str:
-    """The figures of one cycle, for people."""
+    """Return one line with the figures of one cycle."""
     return (
         f"{jitter.cycle_ms} ms: {jitter.answers} answers, "
         f"{'real-time' if jitter.realtime else 'normal'} priority; p50 {jitter.p50_us / 1e3:.2f} ms, "
@@ -111,7 +112,8 @@ def words_of(jitter: Any) -> str:
 
 
 def advice_of(jitters: list[Any], rig: Path) -> str:
-    """Say what to do; `jitters` are of the rig's cycle, and of the longer one where that was not held."""
+    """Return the advice to the user. `jitters` were measured in the rig's cycle and, if it was not held, in the
+    slower one."""
     first, last = jitters[0], jitters[-1]
     if first.holds:
         return f"{rig}: this machine holds a cycle of {first.cycle_ms} ms, as far as was measured"

@@ -77,8 +77,8 @@ def dose(
 
 
 def _entered_by_console(cell: Cell | None, object_id: str, resource: str, body: dict[str, Any]) -> bool:
-    """Tell whether the cell's console has entered it, and so knows who did; False if none is served. Raises
-    InputError: it refuses."""
+    """Return True if the cell's console has made the entry, which then names the person who is signed in; False if
+    no console is served. Raises InputError if the console refuses the entry."""
     from coupole.console.command_line.client import NotServed, call
 
     try:

@@ -1,4 +1,4 @@
-"""The command `coupole example`: the files of a tutorial's case, copied into a folder of one's own."""
+"""The command `coupole example`: copies the files of a tutorial's case into a new folder."""
 
 from __future__ import annotations
 
@@ -70,9 +70,9 @@ def _case(examples: Path, name: str) -> Path:
 
 
 def _copy(case: Path, out: Path) -> tuple[list[str], list[str], list[str]]:
-    """Copy what is missing: names of new files, of those that were there, and of those that are changed.
+    """Copy the missing files; return the names of new files, of unchanged ones and of changed ones.
 
-    Raises InputError for a folder of something else, StorageError.
+    Raises InputError if the folder holds other files, StorageError if a file cannot be copied.
     """
     paths = sorted(path for path in case.rglob("*") if path.is_file())
     names = [path.relative_to(case).as_posix() for path in paths]

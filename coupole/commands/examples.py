@@ -1,4 +1,4 @@
-"""Two examples of each command, which end its help; a test parses each of them."""
+"""Two examples of each command, printed at the end of its help; a test parses each of them."""
 
 from __future__ import annotations
 
@@ -164,15 +164,17 @@ EXAMPLES: dict[str, tuple[str, str]] = {
     "stop": ("stop", "stop RUN"),
     "report": ("report RUN", "report RUN --out report.html"),
 }
-"""Examples of a command without the word `coupole`, by its name or those of its group and step.
+"""Examples of a command, without the word `coupole`. The key is the command's name, or the names of its group and
+step.
 
-RUN, RESULT, WHITE (a run with a white sheet) and PICTURES stand for folders, SCAN for one of `coupole scan`."""
+RUN, RESULT, WHITE (a run with a white sheet) and PICTURES stand for folders, SCAN for one of `coupole scan`.
+"""
 
 HEADING = "Examples:"
 
 
 def add_examples(command: Any, name: str) -> None:
-    """End the help of a command, and of the steps that it has, with its examples."""
+    """Add the examples to the end of a command's help, and of the help of its steps."""
     if name not in EXAMPLES:
         raise LookupError(f"coupole/commands/examples.py: expected two examples of `coupole {name}` in EXAMPLES")
     command.epilog = "\n\n".join([HEADING, *(f"coupole {example}" for example in EXAMPLES[name])])

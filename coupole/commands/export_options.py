@@ -209,7 +209,7 @@ BaseUrlOption = Annotated[
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """All that only some formats and sources know."""
+    """Options that apply only to some formats and sources."""
 
     views: ViewsOption = None
     shots: ShotsOption = None
@@ -236,7 +236,7 @@ class ExportOptions:
     base_url: BaseUrlOption = None
 
     def given_options(self) -> dict[str, object]:
-        """Options that were given, by their names on the command line without dashes before them."""
+        """Return the given options by their names on the command line, without the leading dashes."""
         return {
             name.replace("_", "-"): value
             for name, value in vars(self).items()

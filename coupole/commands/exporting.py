@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Asked:
-    """Options of an export; those that were not given are empty."""
+    """The request for an export. Options that were not given are empty."""
 
     source: Path
     to: str
@@ -73,7 +73,7 @@ class Found:
     files: int
     bytes: int
     misses_dn: dict[str, float] = field(default_factory=dict)
-    """Difference of each view's file from its own pictures, rms, in steps of 8 bits."""
+    """Difference between each view's file and the view's own pictures, rms, in steps of 8 bits."""
 
 
 @flatten_options
@@ -133,7 +133,7 @@ def _refuse_empty(request: Asked) -> None:
 
 
 def _refuse_unknown_planes(request: Asked) -> None:
-    """Raise InputError for a basis or a number of planes that `relight` does not have."""
+    """Raise InputError for a basis or a number of planes that the format `relight` does not have."""
     from coupole.exchange.rti.relight_web import BASES, PLANES
 
     basis, planes = request.text("basis"), request.options.get("planes")
@@ -244,7 +244,7 @@ def _export_frames(request: Asked, console: Console) -> Found:
 
 
 def _colour_of(request: Asked) -> ColourWanted | None:
-    """Raises InputError for options that do not go together."""
+    """Return the wanted colours. Raises InputError for options that do not go together."""
     from coupole.exchange.run_colour import ColourWanted
 
     eye, sensor = "for-the-eye" in request.options, request.path("sensor-spectra")

@@ -1,4 +1,4 @@
-"""Libraries that not everybody needs: `pip install 'coupole[EXTRA]'` adds them, by purpose."""
+"""Optional libraries: `pip install 'coupole[EXTRA]'` adds those of one purpose."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ EXTRA_OF = {
     "xsdata": "materials",
     "zstandard": "ktx2",
 }
-"""Extra of pyproject.toml by the name under which a library is imported."""
+"""Extra of pyproject.toml that installs a library, by the library's import name."""
 
 
 def missing_extra(error: ImportError) -> ExtraMissing | None:
-    """Return the message about a library that could not be imported; None if no extra holds it."""
+    """Return the message about a library that could not be imported; None if no extra installs it."""
     library = (error.name or "").partition(".")[0]
     if library not in EXTRA_OF:
         return None

@@ -71,7 +71,7 @@ AtOption = Annotated[
 
 @dataclass(frozen=True)
 class SpotOptions:
-    """A spot of a result, and by what the camera's channels become a spectrum's."""
+    """Options of a spot of a result, with the spectra that relate camera channels to a reflectance spectrum."""
 
     result: ResultOption = None
     at: AtOption = None

@@ -19,19 +19,20 @@ _CHANNELS = 3
 
 @dataclass(frozen=True)
 class Spot:
-    """Place on a result, and what its camera saw under which light."""
+    """A place on a result, with the spectra of camera and LEDs."""
 
     result: Path
     at: str
     """X,Y,Z in mm of the exported mesh."""
     sensor: Path
-    """Table of nm, red, green, blue."""
+    """Table with the columns nm, red, green, blue."""
     leds: Path
-    """Table of nm, power."""
+    """Table with the columns nm, power."""
 
 
 def asked_spot(result: Path | None, at: str | None, sensor: Path | None, leds: Path | None) -> Spot | None:
-    """The spot that the options name, if they do. Raises InputError if one of them is missing."""
+    """Return the spot that the options name; None if none of these options is given. Raises InputError if one of
+    them is missing."""
     options = {"--result": result, "--at": at, "--sensor-spectra": sensor, "--led-spectrum": leds}
     if all(value is None for value in options.values()):
         return None
@@ -45,9 +46,10 @@ def asked_spot(result: Path | None, at: str | None, sensor: Path | None, leds: P
 
 
 def identify_spot(spot: Spot, references: References) -> dict[str, Any]:
-    """Return what `--json` tells of a spot: the keys of a spectrum's, and the classes that cannot be told apart.
+    """Return the content of `--json` for a spot: the keys of a spectrum, and the classes that cannot be
+    distinguished.
 
-    Three channels vouch for no class: the verdict is "ambiguous", or "unknown" if no class has the colour.
+    Three channels cannot prove a class. The verdict is "ambiguous", or "unknown" if no class has the colour.
     """
     from coupole.appearance.spectra.measured import read_spectrum
     from coupole.heritage.analysis.channel_classes import classes_of_channels
@@ -81,7 +83,7 @@ def identify_spot(spot: Spot, references: References) -> dict[str, Any]:
 
 
 def _channels_at(spot: Spot) -> tuple[np.ndarray, np.ndarray]:
-    """[3] diffuse reflectance pi kd of the nearest triangle that was fitted, and its relative uncertainty."""
+    """Return [3] the diffuse reflectance pi kd of the nearest fitted triangle, and its relative uncertainty."""
     import h5py
     import numpy as np
 

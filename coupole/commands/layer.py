@@ -1,4 +1,4 @@
-"""`coupole layer`: K, S and their uncertainty from spectra of a paint's films."""
+"""`coupole layer`: K, S and their uncertainty from the spectra of films of one paint."""
 
 from __future__ import annotations
 
@@ -38,12 +38,13 @@ class FilmSpectra:
     u_thickness_um: Annotated[float, typer.Option(min=0.0, help="Standard uncertainty of the thickness.")] = 0.0
 
     def are_named(self) -> bool:
-        """Tell whether any was given."""
+        """True if any of these options was given."""
         options = (self.over_black, self.over_white, self.black, self.white, self.opaque, self.thickness_um)
         return any(option is not None for option in options)
 
     def film_descriptions(self) -> list[dict[str, Any]]:
-        """List them as `LayerGiven` has them. Raises InputError: a film without its ground, or too few."""
+        """List the films in the form of `LayerGiven`. Raises InputError for a film without its ground, and for too
+        few films."""
         films: list[dict[str, Any]] = []
         for film, ground, kind in ((self.over_black, self.black, "black"), (self.over_white, self.white, "white")):
             if (film is None) != (ground is None):
@@ -66,7 +67,7 @@ class FilmSpectra:
 
 @dataclass(frozen=True)
 class Instrument:
-    """Spectrometer, and what it sees of a paint."""
+    """The spectrometer's geometry, and the refractive index of the paint's film."""
 
     binder_index: Annotated[
         float, typer.Option(min=1.0, max=3.0, help="Refractive index of the film; 1 means no glossy face.")
@@ -76,7 +77,7 @@ class Instrument:
     ] = "gloss excluded"
 
     def known_geometry(self) -> Geometry:
-        """Raises InputError if there is none of that name."""
+        """Return the geometry of the instrument. Raises InputError if there is none of that name."""
         from typing import get_args
 
         from coupole.appearance.matter.glossy_face import Geometry
@@ -89,20 +90,20 @@ class Instrument:
 
 @dataclass(frozen=True)
 class Wishes:
-    """Results beyond K and S."""
+    """Requested results beyond K and S."""
 
     at_um: tuple[float, ...]
     """Thicknesses at which the film is predicted."""
     other_paint: Path | None
-    """Another grinding of the pigment."""
+    """File of a paint with another grinding of the pigment."""
     out: Path | None
     """Folder for the files."""
     overwrite: bool = False
-    """True if files that are there may be replaced."""
+    """True if existing files may be replaced."""
 
     def files_of(self, paint_name: str) -> tuple[Path, Path] | None:
-        """Return paint file and report of a paint; None if none are wanted. Raises InputError if they are there
-        already and may not be replaced."""
+        """Return the paths of paint file and report; None if no folder is given. Raises InputError if the files
+        exist and may not be replaced."""
         from coupole.appearance.matter.paint_file import ENDING
         from coupole.exchange.target_folder import refuse_standing
 
@@ -178,7 +179,8 @@ def layer(
 
 
 def read_films(path: Path) -> tuple[LayerGiven, Path]:
-    """A YAML file of films, and the folder of its paths. Raises InputError with line and column."""
+    """Read the YAML file of films; return it with the folder of its relative paths. Raises InputError with line
+    and column."""
     from coupole.heritage.analysis.layer_samples import LayerGiven
     from coupole.plan import yamlfile
 
@@ -274,7 +276,7 @@ def _four_flux_document(four: FourFlux) -> dict[str, list[float]]:
 
 
 def _film_document(film: FilmAtThickness) -> dict[str, Any]:
-    """Facts for `--json`; a band in which the measured films hide their grounds is null."""
+    """Return the values for `--json`. A band in which the measured films hide their grounds is null."""
     from coupole.heritage.analysis.layer_fit import COVERAGE_FACTOR
 
     def values(array: Any) -> list[float | None]:
@@ -290,7 +292,7 @@ def _film_document(film: FilmAtThickness) -> dict[str, Any]:
 
 
 def _misfit(fit: Any) -> float | None:
-    """Root mean square of residuals over what noise explains; None of two spectra, which leave none."""
+    """Return the rms residual as a multiple of the noise; None for two spectra, which leave no residual."""
     freedom = fit.spectra - 2
     return None if freedom == 0 else float((fit.chi2.mean() / freedom) ** 0.5)
 
@@ -369,7 +371,7 @@ def _say(document: dict[str, Any], console: Console) -> None:
 
 
 def _say_films(document: dict[str, Any], console: Console) -> None:
-    """A line for each predicted film, about the middle band that is known."""
+    """Print one line for each predicted film, with the values in the middle one of its known bands."""
     for film in document.get("at", ()):
         name = f"at {film['thickness_um']:g} um over {film['over']}"
         bands = [number for number, value in enumerate(film["reflectance"]) if value is not None]

@@ -1,4 +1,4 @@
-"""`coupole makie`: a photograph of metal powder on lacquer, taken apart into a drawing for scenes."""
+"""`coupole makie`: separates a photograph of metal powder on lacquer into a drawing for scenes."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ if TYPE_CHECKING:
     from coupole.appearance.matter.makie import Makie
 
 _AROUND_PX = 4
-"""A colour is the mean of the pixels up to this far from the place that is named."""
+"""Half width, px, of the square over which a colour is averaged; the named pixel is its centre."""
 _TOLD_FROM = 0.01
-"""Share of clamped pixels above which a message says so."""
+"""Share of clamped pixels above which a message states it."""
 
 
 @dataclass(frozen=True)
 class _Result:
-    """A photograph, decomposed."""
+    """The parts of a separated photograph."""
 
     parts: Makie
     metal_rgb: NDArray[np.float64]
     """[3], linear, in the photograph's unit."""
     lacquer_rgbs: list[NDArray[np.float64]]
-    """[3] each, as `metal_rgb`."""
+    """List of [3], in the unit of `metal_rgb`."""
     unknown_share: float
     """Share of pixels that are saturated or dark in a merged photograph."""
     checks: list[dict[str, Any]]
-    """Shares found at the places of known share."""
+    """Shares found at the places whose share is known."""
 
 
 def makie(
@@ -104,7 +104,7 @@ def makie(
 def _take_apart(
     picture: NDArray[np.float64], metal: str, lacquers: list[str], known_shares: list[str], *, is_inside: bool
 ) -> _Result:
-    """Take a linear picture [h, w, 3] apart, NaN where nothing is known; places are words of the command line."""
+    """Separate a linear picture [h, w, 3], NaN where a pixel is not known. Places are texts of the options."""
     import numpy as np
 
     from coupole.appearance.matter.makie import decompose
@@ -147,7 +147,8 @@ def _say(console: Any, out: Path, result: _Result) -> None:
 
 
 def _linear_values(path: Path, *, linear: bool) -> NDArray[np.float64]:
-    """[h, w, 3] proportional to light: 0 to 1, or of a merged bracket in its unit, NaN where nothing is known."""
+    """Return values [h, w, 3] proportional to light. They range from 0 to 1; a merged bracket has its own unit,
+    and NaN where a pixel is not known."""
     import numpy as np
 
     if path.suffix.lower() == ".exr":
@@ -166,14 +167,15 @@ def _linear_values(path: Path, *, linear: bool) -> NDArray[np.float64]:
 
 
 def _colour_at(picture: NDArray[np.float64], place: str, option: str) -> NDArray[np.float64]:
-    """[3] mean about a place X,Y."""
+    """Return [3] the mean around a place X,Y."""
     import numpy as np
 
     return np.asarray(_about(picture, place.split(","), f"{option} {place}", "X,Y").mean(axis=(0, 1)))
 
 
 def _check_share(alpha: NDArray[np.float64], is_unknown: NDArray[np.bool_], known_share: str) -> dict[str, Any]:
-    """Find the share at a place X,Y,SHARE: the mean about it, and its standard uncertainty by the scatter."""
+    """Return the found share at a place X,Y,SHARE: the mean around it, with its standard uncertainty by the
+    scatter."""
     import numpy as np
 
     *place, word = known_share.split(",")
@@ -196,7 +198,8 @@ def _check_share(alpha: NDArray[np.float64], is_unknown: NDArray[np.bool_], know
 
 
 def _about(picture: NDArray[np.float64], place: list[str], option: str, form: str) -> NDArray[np.float64]:
-    """The pixels about a place. Raises InputError for a place outside the picture, or where nothing is known."""
+    """Return the pixels around a place. Raises InputError for a place outside the picture, or with pixels that are
+    not known."""
     import numpy as np
 
     height, width = picture.shape[:2]
@@ -213,7 +216,7 @@ def _about(picture: NDArray[np.float64], place: list[str], option: str, form: st
 
 
 def _write(path: Path, result: _Result) -> None:
-    """Write the drawing. White is 1, or the brightest of the named colours if that is more."""
+    """Write the drawing. White is 1, or the brightest value of the named colours if that is above 1."""
     import numpy as np
     from PIL import Image
 

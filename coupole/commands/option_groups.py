@@ -1,4 +1,4 @@
-"""Options that travel together, as one value: a command takes a dataclass, the command line has its fields."""
+"""Groups of options as one value: the command takes a dataclass, whose fields are options of the command line."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ R = TypeVar("R")
 
 
 def flatten_options(command: Callable[..., R]) -> Callable[..., R]:
-    """The command with the fields of each parameter that is a dataclass in its place, as typer reads them.
+    """Return the command with each dataclass parameter replaced by its fields, as typer reads them.
 
-    Fields are annotated as typer's parameters are, and have defaults. Their names are unique in the command.
+    The fields have typer's annotations and defaults. Their names are unique in the command.
     """
     signature = inspect.signature(command, eval_str=True)
     groups: dict[str, Any] = {

@@ -214,8 +214,8 @@ def plan_new(
 
 
 def _on_the_support(template: str, rig: Path, name: str) -> Path | None:
-    """A copy of the rig of a simulated cell, with what a calibration needs on its support; None if it needs
-    nothing, or if the cell is real."""
+    """Return a copy of a simulated cell's rig with the things that a calibration needs on its support; None if it
+    needs nothing, or if the cell is real."""
     from coupole.calibration.campaign_steps import BESIDE, STEPS
     from coupole.commands.simulated_support import place_for
     from coupole.plan.cell import read_cell

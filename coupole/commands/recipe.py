@@ -1,4 +1,4 @@
-"""`coupole recipe TARGET`: which paints of a palette, and how much of each, are seen as a colour."""
+"""`coupole recipe TARGET`: which paints of a palette, in which shares, give a colour."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from coupole.heritage.analysis.recipe_search import Found, Recipe
 
 _FEWER = 3
-"""Numbers of paints shown: the chosen one, one less, two less."""
+"""Number of solutions that are shown: with the chosen number of paints, one less, and two less."""
 
 PaletteOption = Annotated[
     list[Path],

@@ -1,4 +1,4 @@
-"""The command `coupole reflectance refine`: poses, lens and mesh from what views disagree about."""
+"""The command `coupole reflectance refine`: improves poses, lens and mesh from the disagreement of views."""
 
 from __future__ import annotations
 

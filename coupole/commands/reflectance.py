@@ -39,11 +39,11 @@ Said = Callable[[str, int, int], None]
 Made = tuple[dict[str, Any], list[str], Path]
 """Content of `result.json`, remarks, path of the report."""
 JOB = "from"
-"""Name of the main job among the steps; nobody types it."""
+"""Name of the main job in the list of steps; it is never typed."""
 
 
 class FromOrStep(JobOrStep):
-    """`coupole reflectance RUN` is its main job."""
+    """`coupole reflectance RUN` calls the main job."""
 
     job = JOB
 
@@ -140,7 +140,7 @@ def _refuse_mixed(runs: list[Path], samples: SamplesOfRuns, without: PicturesWit
 
 
 def _texel_size(text: str | None, runs: list[Path], without: PicturesWithoutRecords) -> TexelSize | None:
-    """Return the size that `--texels` names. Raises InputError."""
+    """Return the size of texels that `--texels` names. Raises InputError."""
     if text is None:
         return None
     from coupole.commands.texels_told import read_size
@@ -170,7 +170,7 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
 
 @dataclass(frozen=True)
 class Texels:
-    """Texels that are asked for, and where is told what they will take."""
+    """Requested texels, and the function that prints how long they will take and what they need."""
 
     size: TexelSize | None
     print_line: Callable[[str], None]
@@ -312,7 +312,7 @@ def cluster(
 
 
 def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool) -> None:
-    """A step by itself, with bars; what it returns is its `--json`."""
+    """Run one step with progress bars, and print its result for `--json`."""
     from coupole.viewing.terminal import make_console, step_bars
 
     try:

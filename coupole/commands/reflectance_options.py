@@ -124,7 +124,7 @@ TexelsOption = Annotated[
 
 @dataclass(frozen=True)
 class SamplesOfRuns:
-    """Options by which samples of reflectance are taken from frames of runs."""
+    """Options that control how samples of reflectance are extracted from frames of runs."""
 
     mesh: MeshOption = None
     calibrations: RecordsOption = None
@@ -135,7 +135,7 @@ class SamplesOfRuns:
     poses: PosesOption = None
 
     def request(self, runs: Sequence[Path], left_out: Sequence[int]) -> RunRequest:
-        """Request to these runs; LEDs that are left out are kept for the check."""
+        """Return the request for these runs. LEDs that are left out are kept for the check."""
         from coupole.calibration.record import records_named
         from coupole.reflectance.run_job import RunRequest
 
@@ -170,7 +170,7 @@ class KnownPictures:
     mask: MaskOption = None
 
     def read(self) -> PictureSet:
-        """The set, without its pictures. Raises InputError."""
+        """Read the set, without its pictures. Raises InputError."""
         from coupole.reflectance.picture_set import read_pictures
 
         if self.pictures is None or self.lights is None:
@@ -182,19 +182,19 @@ class KnownPictures:
 
 @dataclass(frozen=True)
 class Workers:
-    """Share of this machine that fits may use, or the cluster that does them."""
+    """Memory that fits may use on this machine, or the cluster that does them."""
 
     memory: MemoryOption = "2GB"
     scheduler: SchedulerOption = None
 
     @property
     def memory_bytes(self) -> int:
-        """Raises InputError for another text than a size."""
+        """Memory in bytes. Raises InputError if the text is not a size."""
         return bytes_of(self.memory)
 
 
 def bytes_of(text: str) -> int:
-    """A size such as 500MB or 4GB. Raises InputError."""
+    """Return the bytes of a size such as 500MB or 4GB. Raises InputError."""
     units = {"GB": 10**9, "MB": 10**6}
     try:
         size = float(text[:-2]) * units[text[-2:].upper()]

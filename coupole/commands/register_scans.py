@@ -1,4 +1,4 @@
-"""The command `coupole register`: scans with unknown poses, brought together and merged."""
+"""The command `coupole register`: finds the poses of scans, and merges the scans."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from coupole.reflectance.new_light.pictured_surface import FreeCamera
 
 _LOOKED_AT = 8
-"""Pictures of a video that its white is found by."""
+"""Number of pictures of a video from which its white is found."""
 
 
 Several = list[str] | None
@@ -124,7 +124,7 @@ WhiteOption = Annotated[
 
 @dataclass(frozen=True)
 class Lighting:
-    """Lights, which are summed, and rays to those with a size."""
+    """Options of the lights, whose pictures are summed, and number of rays to each light with a size."""
 
     direction: DirectionOption = None
     led: LedOption = None
@@ -135,7 +135,7 @@ class Lighting:
     samples: SamplesOption = 256
 
     def read_lights(self) -> list[AnyLight]:
-        """Raises InputError for a light that is none, and if there is none."""
+        """Return the lights. Raises InputError for an invalid light, and if there is none."""
         from coupole.reflectance.new_light import light_kinds as kinds
 
         lights: list[AnyLight] = [] if self.lights is None else kinds.read_lights(self.lights)
@@ -155,7 +155,7 @@ class Lighting:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Place from which a result is seen, and the fit."""
+    """Place from which a result is seen, and the fit that is used."""
 
     view: ViewOption = None
     from_: FromOption = None
@@ -167,7 +167,7 @@ class Viewpoint:
 
 @dataclass(frozen=True)
 class MoreOutput:
-    """Other files that are written, and the white of pictures."""
+    """Options of other files that are written, and of the white of pictures."""
 
     uncertainty: UncertaintyOption = None
     interval: IntervalOption = None
@@ -247,7 +247,8 @@ def _refuse_target(to: Path, more: MoreOutput, *, for_the_eye: bool) -> None:
 
 
 def _low_and_high(option: str) -> tuple[Path, Path]:
-    """Return the two files of `--interval`. Raises InputError if these are not two files that hold all values."""
+    """Return the two paths of `--interval`. Raises InputError unless they are two files of a format that holds all
+    values."""
     names = option.split(",")
     paths = [Path(name) for name in names]
     if len(names) != 2 or any(path.suffix.lower() not in (".npy", ".exr") for path in paths):
@@ -296,7 +297,7 @@ def _write(
     bars: Callable[[str, int, int], None],
     before_writing: Callable[[], None],
 ) -> dict[str, Any]:
-    """Make and write the picture or the video; what `--json` says."""
+    """Make and write the picture or the video; return the content of `--json`."""
     if turn is None:
         from coupole.exchange.picture_files import write_picture
 
@@ -335,16 +336,18 @@ def _write(
 
 @dataclass(frozen=True)
 class Companions:
-    """Pictures that belong to the one of `--to`, such as its uncertainty. They are written after it, and what an
-    earlier call has left in their places is removed before it: a call that is interrupted leaves no picture beside
-    the uncertainty of another one."""
+    """Pictures that belong to the picture of `--to`, such as its uncertainty.
+
+    Old files of their names are removed before that picture is written, and they are written after it. So an
+    interrupted call never leaves a picture beside the uncertainty of another one.
+    """
 
     pictures: dict[Path, NDArray[np.float32]]
     document: dict[str, Any]
-    """Their part of what `--json` says."""
+    """Entries of these pictures in `--json`."""
 
     def clear(self) -> None:
-        """Remove what is in their places. Raises StorageError."""
+        """Remove old files of their names. Raises StorageError."""
         for path in self.pictures:
             try:
                 path.unlink(missing_ok=True)
@@ -352,7 +355,7 @@ class Companions:
                 raise StorageError(f"{path}: {reason(error)}") from error
 
     def write(self) -> None:
-        """Raises StorageError."""
+        """Write the pictures. Raises StorageError."""
         from coupole.exchange.picture_files import write_picture
 
         for path, picture in self.pictures.items():
@@ -362,7 +365,8 @@ class Companions:
 def _companions(
     relit: Relit, lights: Sequence[AnyLight], more: MoreOutput, bars: Callable[[str, int, int], None]
 ) -> Companions:
-    """Make the picture's uncertainty, and the bounds of its 95 % interval, not below 0, where they are wanted."""
+    """Compute the requested companions: the picture's uncertainty, and the bounds of its 95 % interval, which are
+    not below 0."""
     import numpy as np
 
     companions = Companions({}, {})

@@ -1,5 +1,5 @@
-"""`coupole reflectance relight --for-the-eye`: relit pictures in colours, by a chart or by spectra of sensor and
-LEDs."""
+"""`coupole reflectance relight --for-the-eye`: relit pictures in the colours that the eye sees, by a chart or by
+spectra of sensor and LEDs."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ RecordOption = Annotated[
 
 @dataclass(frozen=True)
 class EyeColours:
-    """Pictures for the eye, and by what the camera's channels become colours."""
+    """Options of pictures for the eye, and of the colours that their channels become."""
 
     for_the_eye: EyeOption = False
     sensor_spectra: SensorOption = None
@@ -53,7 +53,8 @@ class EyeColours:
     colour_record: RecordOption = None
 
     def read_colour(self) -> CameraColour | None:
-        """Read it from a record, or from tables of spectra; None if no picture for the eye is wanted.
+        """Read the colour conversion from a record, or from tables of spectra; None if no picture for the eye is
+        wanted.
 
         Raises InputError for options that do not go together, and as `camera_colour` and `colour_of_record`.
         """
@@ -87,7 +88,7 @@ def write_relit_for_the_eye(
     bars: Callable[[str, int, int], None],
     before_writing: Callable[[], None],
 ) -> dict[str, Any]:
-    """Make and write the picture as sRGB; what `--json` says."""
+    """Compute the picture and write it as sRGB; return the content of `--json`."""
     import numpy as np
 
     from coupole.exchange.picture_for_the_eye import linear_colours, write_for_the_eye
@@ -109,6 +110,6 @@ def write_relit_for_the_eye(
 
 
 def bright(picture: NDArray[Any]) -> NDArray[Any]:
-    """Values of the pixels that are not dark."""
+    """Return the values of the pixels that are not black."""
     lit = picture[picture.max(axis=2) > 0.0]
     return lit if len(lit) else picture.reshape(-1, 3)

@@ -80,7 +80,7 @@ def _noise(camera_summary: dict[str, Any]) -> str:
 
 
 def read_scene(path: Path) -> tuple[Document, Scene]:
-    """The scene file, checked; its files are there. Raises InputError with file:line:column."""
+    """Read and check the scene file, and check that its files exist. Raises InputError with file:line:column."""
     from coupole.appearance.render.scene_file import Scene, files
     from coupole.plan import yamlfile
 

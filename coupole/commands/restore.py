@@ -1,4 +1,5 @@
-"""`coupole restore MESH`: what an object may have looked like, by stated hypotheses; `pick`: parts by hand."""
+"""`coupole restore MESH`: renders hypotheses of an object's earlier look; its step `pick` makes a page to mark
+parts by hand."""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ _JOB = "from"
 
 
 class RenderOrPick(JobOrStep):
-    """`pick` as first word is that step; anything else belongs to the restoration itself."""
+    """The first word `pick` calls that step; all other words belong to the restoration."""
 
     job = _JOB
 
@@ -118,7 +119,7 @@ def checked_restoration(
     unit: str,
     say: Say,
 ) -> Restoration:
-    """All that is asked for, checked. Raises InputError."""
+    """Read and check all that the restoration needs. Raises InputError."""
     from coupole.heritage.restoration import part_labels, parts_file, restoration_file
     from coupole.heritage.restoration.painted_mesh import read_painted
     from coupole.heritage.restoration.restoring import Restoration

@@ -31,7 +31,8 @@ RunningRun = Annotated[
 ]
 _LOOK_EVERY_S = 0.2
 _ENDS_WITHIN_S = 600.0
-"""Longer than a session whose every call hangs (`coupole.bounded`), and than a slow report."""
+"""Longest wait for the end of a process, s: longer than a session in which every call hangs (`coupole.bounded`),
+and than a slow report."""
 _PLAIN_LINE_EVERY_S = 5.0
 
 
@@ -59,7 +60,7 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     Ends when its process has ended; exit code 4 if the journal says that the cell may not be safe. This is no
     emergency stop: that is the button at the cell.
     """
-    reply = _state_after(run, "stop")  # before the imports that only its outcome wants
+    reply = _state_after(run, "stop")  # sent before the imports, which only the outcome needs
 
     from coupole.storage.run import Run
     from coupole.storage.run_status import status
@@ -88,7 +89,7 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
 
 
 def _unsafe(run: Run) -> list[str]:
-    """Say why it is not sure that the cell is safe after the last session, by the run's journal."""
+    """Return reasons to doubt that the cell is safe after the last session, from the run's journal."""
     from coupole.storage import journal
     from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
 
@@ -119,7 +120,8 @@ def follow(run: Path | None, console: Console) -> Path:
 
 
 def _states(folder: Path) -> Iterator[State]:
-    """States of a run until its process has ended; none while that opens the run, or concludes it."""
+    """Yield the states of a run until its process has ended; there is no state while the process opens or
+    concludes the run."""
     from coupole.acquisition.run_control import ask
     from coupole.storage.run import Run
 
@@ -131,7 +133,7 @@ def _states(folder: Path) -> Iterator[State]:
 
 
 def running_run(run: Path | None) -> State:
-    """State of a run that is being acquired, or of the only one. Raises InputError."""
+    """Return the state of the given run, or of the only run that is being acquired. Raises InputError."""
     from coupole.acquisition.run_control import ask, running
 
     if run is not None:
@@ -150,11 +152,12 @@ def running_run(run: Path | None) -> State:
 
 
 def _state_after(run: Path | None, command: Command, *, until: str = "") -> State:
-    """State after a command, or once it is `until`. Raises InputError: the run is not being acquired, or ended."""
+    """Send a command; return the state after it, or the state in which it is `until`. Raises InputError if the run
+    is not being acquired, or has ended."""
     from coupole.acquisition.run_control import ask
 
     def alarm(message: str) -> None:
-        """Alarm: a run does not answer."""
+        """Print a warning: a run does not answer."""
         from coupole.viewing import terminal
 
         terminal.alarm(message)

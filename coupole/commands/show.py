@@ -88,7 +88,7 @@ AlignedOption = Annotated[
 
 @dataclass(frozen=True)
 class ShowOptions:
-    """Options that only some sources take."""
+    """Options that apply only to some sources."""
 
     view: ViewOption = None
     samples: SamplesOption = False
@@ -141,7 +141,8 @@ def show(source: SourceArgument, out: OutOption, options: ShowOptions, as_json: 
 
 
 def _look(source: Path, options: ShowOptions, say: Callable[[str, int, int], None]) -> Look:
-    """Build it by the kind of the source. Raises InputError if it is neither a scene, a run nor a whole result."""
+    """Build the page's content from a source. Raises InputError if the source is neither a scene, a run nor a
+    complete result."""
     from coupole.exchange.look.look_environment import with_environment
     from coupole.exchange.look.look_of_frames import look_of_run
     from coupole.exchange.look.look_of_pictures import look_of_pictures
@@ -188,7 +189,8 @@ def _look(source: Path, options: ShowOptions, say: Callable[[str, int, int], Non
 
 
 def _other_state(first: Path, other_folder: Path, *, is_aligned: bool) -> OtherState:
-    """Bring another result onto the first. Raises InputError if it is none, or of something else; ExtraMissing."""
+    """Align another result with the first. Raises InputError if it is not a result of runs, or if it cannot be
+    aligned; ExtraMissing."""
     import numpy as np
 
     from coupole.exchange.look.look_of_runs import OtherState
@@ -219,8 +221,8 @@ def _other_state(first: Path, other_folder: Path, *, is_aligned: bool) -> OtherS
 
 
 def _look_of_scene(path: Path) -> Look:
-    """Build it from a scene file. Raises InputError for one that a page cannot show, or without the materials'
-    data."""
+    """Build the page's content from a scene file. Raises InputError if a page cannot show the scene, or if the
+    data of its materials are not installed."""
     from coupole.commands.render_scene import read_scene
     from coupole.exchange.look.look_of_scenes import look_of_scene
 

@@ -1,5 +1,5 @@
-"""Things that a simulated cell has on its support for a calibration: a copy of its rig, and descriptions of
-things."""
+"""Things on a simulated cell's support for a calibration: a copy of the rig with these things, and their
+descriptions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command `coupole plan suggest`: a plan for an object, with what it promises."""
+"""The command `coupole plan suggest`: a plan for an object, with the expected uncertainty."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ def seconds_of(text: str) -> float:
 
 
 def to_middle_mm(mesh: Path, mm_per_unit: float) -> tuple[float, float, float]:
-    """Translation, mm, that puts a mesh on the middle of the support. Raises InputError if there is none."""
+    """Return the translation, mm, that puts a mesh on the middle of the support. Raises InputError if the mesh
+    cannot be read."""
     from coupole.scan.mesh_files import read_mesh
 
     points_mm = read_mesh(mesh, mesh.read_bytes()).vertices * mm_per_unit
@@ -85,12 +86,15 @@ class Wishes:
     ] = 30.0
 
     def file_stem(self, mesh: Path) -> str:
-        """Name of the plan: the mesh's without letters that names must not have, if none is given."""
+        """Name of the plan. If none is given, it is the name of the mesh, without characters that a name must not
+        have."""
         return self.name or re.sub(r"[^A-Za-z0-9._-]", "-", mesh.stem).lstrip("._-")[:64] or "object"
 
     def request(self, mesh: Path) -> SuggestionRequest:
-        """The request for a plan. Raises InputError for the first wish that cannot be, before the mesh is read and
-        what takes seconds is imported."""
+        """Return the request for a plan. Raises InputError for the first option that cannot be met.
+
+        This is done before the mesh is read, and before imports that take seconds.
+        """
         from coupole.plan.base_model import NAME_PATTERN
         from coupole.reflectance.suggestion.supposed_materials import SUPPOSED, UNKNOWN
 
@@ -141,7 +145,7 @@ def plan_suggest(
     console = make_console(quiet=as_json)
     try:
         with step_bars(console) as say:
-            say(_READING, 0, 1)  # the first seconds go into it and into what it imports
+            say(_READING, 0, 1)  # reading and imports take the first seconds
             request = wishes.request(mesh)
             from coupole.reflectance.result_pages import suggestion_page
             from coupole.reflectance.suggestion.plan_suggestion import suggest_plan

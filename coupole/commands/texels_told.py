@@ -1,4 +1,4 @@
-"""Size of texels from the command line, and messages about texels before they are made."""
+"""Size of texels from the command line, and messages before texels are made."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def read_size(text: str) -> TexelSize:
-    """Read what `--texels` names. Raises InputError."""
+    """Return the size that `--texels` names. Raises InputError."""
     if text == "auto":
         return TexelSize()
     try:
@@ -24,7 +24,7 @@ def read_size(text: str) -> TexelSize:
 
 
 def lines_of(forecast: TexelForecast, machine_bytes: int) -> Iterator[str]:
-    """Yield messages to the user about texels before they are made, on a machine with so much memory."""
+    """Yield the messages that the user sees before texels are made, on a machine with so much memory."""
     views, size_mm = forecast.views, forecast.size.mm
     sides = sorted({view.side_px for view in views})
     pixels = "single pixels" if sides == [1] else f"{' and '.join(f'{n} x {n}' for n in sides)} pixels each"

@@ -38,7 +38,7 @@ CoverageOption = Annotated[
 
 @dataclass(frozen=True)
 class SpotOfObject:
-    """Measured spot: a triangle of the mesh, and the light on it."""
+    """Options of the measured spot: a triangle of the mesh, and the light on it."""
 
     incidence_deg: Annotated[
         float, typer.Option("--incidence", min=0.0, max=75.0, help="Angle of incidence of the light.")
@@ -134,24 +134,24 @@ def _say(result: _Result, console: Console, *, as_json: bool) -> None:
 class _Result:
     budget: Budget
     dome_spread: Spread
-    """Spread of the first case."""
+    """Spread over the dome by our own records."""
     cases: list[Case]
-    """Our records, then those of `--beside`."""
+    """Our own records, then those of `--beside`."""
     table: tuple[Accuracy, ...]
     doubts: tuple[str, ...]
     traces: tuple[str, ...]
-    """The certificates that our records rest on."""
+    """Certificates to which our own records are traceable."""
     document: dict[str, Any]
-    """Document as `--json` prints it."""
+    """Content of `--json`."""
 
     def with_doubts(self, more: tuple[str, ...]) -> _Result:
-        """The same with more reasons not to rely on the records."""
+        """Return a copy with more reasons not to rely on the records."""
         all_doubts = (*self.doubts, *more)
         return replace(self, doubts=all_doubts, document=self.document | {"doubts": all_doubts})
 
 
 def _doubts_by_drift(our_records: tuple[InForce, ...], earlier: list[Path]) -> tuple[str, ...]:
-    """Records whose drift exceeds their uncertainty."""
+    """Return messages about records whose drift exceeds their uncertainty."""
     from coupole.calibration.in_force import read_in_force
     from coupole.calibration.record import records_named
     from coupole.calibration.validity import expired_by_drift
@@ -167,7 +167,7 @@ def _propagate(
     emission: str,
     coverages: Sequence[float],
 ) -> _Result:
-    """The budget by our records, and the table that compares them with those of `beside`."""
+    """Compute the budget by our own records, and the table that compares them with those of `beside`."""
     from coupole.calibration.budget.accuracy import Case, accuracies
     from coupole.calibration.budget.budget import budget_of
     from coupole.calibration.budget.records import doubts, known_from, read_records, traces
@@ -190,7 +190,7 @@ def _propagate(
 
 
 def _write_report(out: Path, result: _Result) -> None:
-    """The picture, and HTML and JSON beside it."""
+    """Write the picture, with HTML and JSON beside it."""
     from coupole.calibration.budget.page import page
     from coupole.calibration.budget.report import draw_budget
 
@@ -208,7 +208,7 @@ def _write_report(out: Path, result: _Result) -> None:
 
 
 def _with_plan(given_records: tuple[InForce, ...], plan: Path | None) -> tuple[InForce, ...]:
-    """The given records; for kinds that are not given, the records in force for a plan."""
+    """Return the given records, and for all other kinds the records in force for a plan."""
     from coupole.calibration.budget.records import of_use
     from coupole.preflight.job import read_job
 
@@ -221,12 +221,13 @@ def _with_plan(given_records: tuple[InForce, ...], plan: Path | None) -> tuple[I
 
 
 def _folder(records: tuple[InForce, ...]) -> str:
-    """Heading of a column: the folder of its records."""
+    """Heading of a column: the folder of the records."""
     return records[0].path.resolve().parent.name if records else "no records"
 
 
 def _spread_over_dome(figures: Known) -> Spread:
-    """Samples over a dome: LEDs of equal density on the sphere above 20 degrees elevation."""
+    """Compute the budget for directions spread evenly over a dome, from the zenith to 20 degrees above the
+    horizon."""
     from coupole.calibration.budget.budget import Geometry, spread_over
 
     steps = [(number + 0.5) / _SAMPLES for number in range(_SAMPLES)]

@@ -1,1 +1,1 @@
-"""The operator's console: one service that owns a cell while it works, and what talks to it."""
+"""The operator's console: the service that owns a cell, and its clients."""

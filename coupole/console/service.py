@@ -53,11 +53,13 @@ def serve(
     tls: tuple[Path, Path] | None,
     tell: Callable[[dict[str, Any]], object],
 ) -> None:
-    """Serve a cell's console until a signal ends it; runs that are being acquired go on. `names` are other names
-    under which browsers know this machine; `tell` is called with `url`, `token` and `pid` when it listens.
+    """Serve a cell's console until a signal ends it; acquisitions continue.
 
-    Raises InputError: another service owns the cell, an address without TLS that others can reach, no such
-    address; StorageError.
+    `names` are other names under which browsers reach this machine. `tell` is called with `url`, `token` and `pid`
+    when the service listens.
+
+    Raises InputError if another service owns the cell, if the address does not exist, or if others can reach it
+    and there is no TLS; StorageError.
     """
     if not is_here(host) and tls is None:
         raise InputError(
@@ -65,7 +67,7 @@ def serve(
         )
     folder = console_folder(cell)
     make_folder(folder)
-    folder.chmod(0o700)  # hashes of passwords, and who did what
+    folder.chmod(0o700)  # hashes of passwords, and the log of people's requests
     with _console_lock(folder):
         context, listening = tls_context(tls), listen(host, port)
         port = listening.getsockname()[1]
@@ -84,7 +86,8 @@ def serve(
 
 @contextlib.contextmanager
 def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cookie: str) -> Iterator[Service]:
-    """All that serves a cell, begun and ended in its order; `folder` keeps what must outlive it."""
+    """Make all parts of the service, begin them, and end them in order; `folder` stores what must survive the
+    service."""
     with contextlib.ExitStack() as parts:
         audit = parts.enter_context(contextlib.closing(Audit(folder / "audit.jsonl")))
         queue, settings, control = PlanQueue(folder / "queue.json"), read_settings(folder), Control()
@@ -135,7 +138,7 @@ def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cooki
 
 @contextlib.contextmanager
 def _console_lock(folder: Path) -> Iterator[None]:
-    """The cell's console, of this process alone. Raises InputError: another one has it."""
+    """Lock the cell's console for this process. Raises InputError if another process has it."""
     with (folder / "lock").open("w", encoding="utf-8") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

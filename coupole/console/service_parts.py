@@ -1,4 +1,4 @@
-"""Parts of a console behind its interface and its screens."""
+"""Parts of a console that its interface and its screens use."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Service:
     acquisitions: Acquisitions
     plan_files: PlanFiles
     desk: Desk
-    """Checks and draws plans while they are written."""
+    """Checks and draws plans that are being written."""
     runs: RunFiles
     sheets: FrameSheets
     calibrations: CalibrationStatus
@@ -55,15 +55,15 @@ class Service:
     objects: ObjectFiles
     tasks: Tasks
     bench: Bench
-    """Holds the devices while no run is at work."""
+    """Holds the devices while there is no run."""
     state: Callable[[], StateNow]
-    """Function that returns the cell's state as it is."""
+    """Function that returns the present state of the cell."""
     newest: Callable[[], StateNow]
-    """Function that returns the cell's state as it was a moment ago; takes no time."""
+    """Function that returns the state of a moment ago, without delay."""
     entering: Entering
     origins: frozenset[str]
     """Origins of this service's own pages."""
     cookie: str
-    """Name of the sessions' cookie, which no other console of this machine has."""
+    """Name of the cookie of sessions; no other console of this machine uses it."""
     command_line: Session
     """Session of the service's own user, on this machine."""

@@ -1,1 +1,1 @@
-"""Export to other programs' formats (`formats`: the table of them all)."""
+"""Export to the formats of other programs; `formats` has the table of all formats."""

@@ -1,10 +1,11 @@
-"""Colour of frames for the eye, to CIE XYZ: by a chart's record, or by the sensor's sensitivities and the LEDs'
-spectrum.
+"""Colours of frames for the eye, in CIE XYZ: from a chart's record, or from the sensor's sensitivities and the
+LEDs' spectrum.
 
-The transform by spectra is the linear one with the smallest mean error, over smooth reflectances, from the colour
-of the same surface under daylight (D65) for the 1931 observer; the perfect white is exact. Reflectances are taken
-as a random process of wavelength with a Gaussian covariance (Wiener estimation: Pratt and Mancill, Spectral
-estimation techniques for the spectral calibration of a color image scanner, Applied Optics 15, 1976).
+The transform by spectra is the linear one with the smallest mean error over smooth reflectances. The error is the
+difference from the colour of the same surface under daylight (D65) for the 1931 observer; the perfect white is
+exact. Reflectances are modelled as a random process over wavelength with a Gaussian covariance (Wiener estimation:
+Pratt and Mancill, Spectral estimation techniques for the spectral calibration of a color image scanner, Applied
+Optics 15, 1976).
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from coupole.errors import InputError, reason
 
 Floats = NDArray[np.float64]
 Neutral = Callable[[int | None], Floats]
-"""[3] of white under an LED, by its id: what the channels give, the greatest 1."""
+"""[3] of white under an LED, by the LED's id: values of the channels, the greatest of which is 1."""
 
 _NOISE = 0.02
-"""Share of a table's greatest value by which a value may fall below 0."""
+"""Share of a table's greatest value by which a value may be below 0."""
 D65_CODE = 21
-"""EXIF's LightSource."""
+"""Code of D65 in EXIF's LightSource."""
 _LARGEST_CONDITION = 1e5
-"""Largest condition number of the covariance of what the channels give of reflectances; that of real sensors is
-below 1e4."""
+"""Largest condition number of the covariance of the channels' values of reflectances; for real sensors it is below
+1e4."""
 _CORRELATED_NM = 50.0
 """Correlation length of reflectances: the standard deviation of their covariance over wavelength."""
 
@@ -38,25 +39,26 @@ class CameraColour:
     """Colours of a camera under the LEDs, as far as they are known."""
 
     xyz_from_balanced: Floats | None
-    """[3, 3] XYZ under D65, Y = 1 for white, of red, green, blue of which white has 1, 1, 1; None: not known."""
+    """[3, 3] matrix to XYZ under D65 (Y = 1 for white) from red, green, blue that are 1, 1, 1 for white; None if
+    it is not known."""
     neutral: Neutral
     origin: str
     """Origin of this knowledge, in words."""
 
 
 def unknown_colour() -> CameraColour:
-    """Return the colours of a camera of which nothing is known."""
+    """Return the colours of a camera about which nothing is known."""
     origin = "not calibrated: ColorMatrix1 is the identity, AsShotNeutral is 1 1 1"
     return CameraColour(None, lambda led: np.ones(3), origin)
 
 
 def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None) -> CameraColour:
     """Compute the colours from tables of the sensor's sensitivities (nm, red, green, blue; relative to each other)
-    and of the LEDs' spectral power (nm, power). `white_of_leds` is what the channels measured of white, if a
-    record has it.
+    and of the LEDs' spectral power (nm, power). `white_of_leds` are the channels' measured values of white, if a
+    record has them.
 
-    Raises InputError for other tables, channels that do not tell colours apart, or without colour-science, which
-    has the CIE's observer.
+    Raises InputError for other tables, for channels that cannot distinguish colours, and without colour-science,
+    which has the CIE's observer.
     """
     from coupole.appearance.spectra.grid import WAVELENGTHS_NM
     from coupole.appearance.spectra.light import illuminant, observer
@@ -89,7 +91,7 @@ def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None
 
 
 def _least_missing(signals: Floats, towards: Floats, covariance: Floats) -> Floats:
-    """[3, 3] Wiener's matrix of `signals` [3, 81] to `towards` [3, 81], corrected to keep white."""
+    """[3, 3] Wiener's matrix from `signals` [3, 81] to `towards` [3, 81], corrected so that white is exact."""
     within = signals @ covariance @ signals.T
     free = np.linalg.solve(within, signals @ covariance @ towards.T).T
     white = signals.sum(axis=1)
@@ -99,7 +101,7 @@ def _least_missing(signals: Floats, towards: Floats, covariance: Floats) -> Floa
 
 
 def _spectrum(path: Path, column: int) -> Floats:
-    """[81] of a column of a table; what lies beyond its ends is 0."""
+    """[81] values of a column of a table; beyond the ends of the table they are 0."""
     from coupole.appearance.spectra.measured import read_spectrum
     from coupole.appearance.spectra.resampling import on_grid
 
@@ -116,7 +118,7 @@ def _spectrum(path: Path, column: int) -> Floats:
 def colour_of_record(path: Path) -> CameraColour:
     """Take the colours from the matrix of a record of `coupole calibrate colour`, adapted from D50 to D65.
 
-    Raises InputError for another record, or one that missed its limits.
+    Raises InputError for another record, or if the record exceeds its limits.
     """
     from coupole.calibration.colour.colorimetry import d65_from_d50
     from coupole.calibration.colour.colour_workflow import MATRIX

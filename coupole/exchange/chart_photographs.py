@@ -1,4 +1,4 @@
-"""Pictures of a colour chart, as any camera and converter writes them, with linear values."""
+"""Pictures of a colour chart with linear values, from any camera and converter."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from coupole.exchange.bracket.photographs import PLAIN, read_raw
 from coupole.exchange.srgb import linear_from_srgb
 
 RAW = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".3fr", ".iiq"}
-"""Suffixes of raw files that are looked for in a folder; a file that is named may have another."""
+"""Suffixes of raw files that are searched in a folder; a named file may have another suffix."""
 _JPEG = {".jpg", ".jpeg"}
 _MOST_PICTURES = 60
 
 
 def pictures_at(paths: Sequence[Path], without: Path | None = None) -> list[Path]:
-    """Files of pictures, or all pictures of one folder but one. Raises InputError if there are none."""
+    """Return the picture files, or all pictures of one folder except one. Raises InputError if there are none."""
     if len(paths) == 1 and paths[0].is_dir():
         kinds = PLAIN | RAW | {".exr"}
         files = sorted(path for path in paths[0].iterdir() if path.suffix.lower() in kinds)
@@ -44,10 +44,10 @@ def pictures_at(paths: Sequence[Path], without: Path | None = None) -> list[Path
 
 
 def read_chart_photograph(path: Path, *, srgb: bool = False) -> PlainPicture:
-    """One picture. `srgb`: its codes have the transfer curve of IEC 61966-2-1, and are decoded.
+    """Read one picture. With `srgb`, its codes have the transfer curve of IEC 61966-2-1, and are decoded.
 
-    OpenEXR may have the channels `saturated` and `dark` of `coupole bracket`. Raises InputError: no picture, one
-    channel, a JPEG that is said to be linear, a linear file that is said to be encoded.
+    An OpenEXR may have the channels `saturated` and `dark` of `coupole bracket`. Raises InputError if it is not a
+    picture, if it has one channel, if a JPEG is declared linear, or if a linear file is declared encoded.
     """
     suffix = path.suffix.lower()
     if suffix in PLAIN:
@@ -92,11 +92,11 @@ def _plain(path: Path, *, srgb: bool) -> PlainPicture:
 
 
 def _linear(most: int, *, srgb: bool) -> NDArray[np.float32]:
-    """[most + 1] values, 0 to 1, of the codes."""
+    """[most + 1] linear values, 0 to 1, of the codes."""
     codes = np.arange(most + 1) / most
     return np.asarray(linear_from_srgb(codes) if srgb else codes, np.float32)
 
 
 def _unknown(values: NDArray[Any]) -> NDArray[np.bool_]:
-    """[h, w] where a channel has no number."""
+    """[h, w] True if a channel has no number."""
     return np.asarray(~np.isfinite(values).all(axis=2), np.bool_)

@@ -1,7 +1,7 @@
-"""Views of a run as a sparse model of COLMAP's text format, with pictures: for dense stereo, splatting, texturing.
+"""Views of a run as a sparse model in COLMAP's text format, with pictures: for dense stereo, splatting, texturing.
 
-The lens of the record is COLMAP's OPENCV model, or FULL_OPENCV where k3 was estimated: the same equations, so
-nothing is lost; only the first pixel's centre is (0.5, 0.5) there. The world is the support frame, in mm.
+The lens of the record is COLMAP's OPENCV model, or FULL_OPENCV if k3 was estimated. The equations are the same, so
+nothing is lost; only the first pixel's centre is at (0.5, 0.5) there. The world is the support frame, in mm.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from coupole.storage.run import Run
 MODEL, PICTURES = "sparse/0", "images"
 MOST_POINTS = 50_000
 _MOST_FRAMES = 48
-"""Greatest number of frames of a view, spread over its LEDs, whose mean is its picture: light from all sides,
-almost without shadows."""
+"""Greatest number of frames, spread over the LEDs, whose mean is the picture of a view: it has light from all
+sides, and almost no shadows."""
 _WHITE_QUANTILE = 0.999
 _TO_CENTRE_PX = 0.5
-"""Offset from our pixels to COLMAP's, in which the first one ends at 1."""
+"""Offset from our pixels to COLMAP's, whose first pixel goes from 0 to 1."""
 
 
 @dataclass(frozen=True)
 class PosedPicture:
-    """A view and the triangles' centres that it sees."""
+    """A view, and the centres of the triangles that it sees."""
 
     name: str
     """Name of its file."""
     support_from_camera: Transform
     triangles: NDArray[np.int64]
-    """[n] rising numbers."""
+    """[n] numbers of the triangles, increasing."""
     pixels: Floats
-    """[n, 2] where their centres are, ours: the first pixel's centre is (0, 0)."""
+    """[n, 2] pixels of the triangles' centres; the first pixel's centre is (0, 0)."""
     codes: NDArray[np.uint8]
     """[h, w, 3] sRGB, blue first."""
 
@@ -63,12 +63,13 @@ def export_colmap(
     overwrite: bool,
     say: Callable[[str, int, int], None],
 ) -> list[Path]:
-    """Write `images/VIEW.png` (8 bit, sRGB, the mean of some 48 frames of the view) and `sparse/0` with cameras,
-    images and points: centres of at most 50 000 triangles that two views or more see, with these views. Poses and
-    lens are of the run's records, or of those that are named, or of `refined_folder`, a folder of `coupole
-    reflectance refine`.
+    """Write `images/VIEW.png` (8 bit, sRGB, the mean of about 48 frames of the view) and the folder `sparse/0`.
 
-    Raises InputError: records or mesh are missing, frames were discarded, files stand there already (unless
+    The folder has cameras, images and points. The points are centres of at most 50 000 triangles that at least two
+    views see, with these views. Poses and lens are from the run's records, from the named records, or from
+    `refined_folder`, a folder of `coupole reflectance refine`.
+
+    Raises InputError if records or mesh are missing, if frames were discarded, or if files exist already (unless
     `overwrite`); StorageError.
     """
     run = Run(folder)
@@ -121,7 +122,7 @@ def texts_of(posed_pictures: Sequence[PosedPicture], centres_mm: Floats, lens: I
     triangles, times = np.unique(
         np.concatenate([picture.triangles for picture in posed_pictures]), return_counts=True
     )
-    if (times > 1).any():  # COLMAP's bundle adjustment ends at a point of one image
+    if (times > 1).any():  # COLMAP's bundle adjustment fails for a point in one image
         triangles = triangles[times > 1]
     point_triangles = triangles[
         np.unique(np.linspace(0, len(triangles) - 1, min(len(triangles), MOST_POINTS)).astype(np.int64))
@@ -174,7 +175,7 @@ def _posed_picture(measured_run: MeasuredRun, view: MeasuredView, mesh: PacketMe
 
 
 def _picture(measured_run: MeasuredRun, view: MeasuredView) -> NDArray[np.uint8]:
-    """[h, w, 3] sRGB, blue first, of the mean of frames of LEDs all round."""
+    """[h, w, 3] sRGB, blue first, of the mean of frames under LEDs on all sides."""
     frames = [led_frames[0] for led_frames in view.by_led.values()]
     samples = frames[:: -(-len(frames) // _MOST_FRAMES)]
     total = np.zeros(samples[0].read().shape)

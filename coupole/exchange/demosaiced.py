@@ -1,4 +1,4 @@
-"""Pictures of a Bayer filter with all colours in each pixel."""
+"""Demosaicing: pictures of a Bayer sensor with all colours in each pixel."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 PATTERNS = ("RGGB", "GRBG", "BGGR", "GBRG")
-"""Letters of the upper left two rows of two pixels."""
+"""Letters of the first two pixels of the first two rows."""
 
 
 def demosaiced(mosaic: NDArray[np.uint16], pattern: str) -> NDArray[np.uint16]:
-    """[h, w, 3] red, green, blue of a picture [h, w], interpolated between the filter's pixels; three times the
-    same for MONO."""
+    """[h, w, 3] red, green, blue of a picture [h, w], interpolated between the filter's pixels; for MONO, three
+    equal channels."""
     if pattern == "MONO":
         return np.repeat(mosaic[..., None], 3, axis=2)
     import cv2

@@ -1,8 +1,8 @@
 """A frame as DNG (Adobe, Digital Negative Specification 1.4), for LibRaw, darktable, RawTherapee.
 
-The pixels are the camera's, bit for bit: uncompressed, packed if they have 12 bits, else 16 bits each. Exposure,
-lens and time are in the Exif directory. Where the camera's colours are not known the colour matrix is the
-identity, which the file states: colours are those of the sensor.
+The pixels are the camera's, bit for bit: uncompressed, packed if they have 12 bits, otherwise 16 bits each.
+Exposure, lens and time are in the Exif directory. If the camera's colours are not known, the colour matrix is the
+identity, and the file states that the colours are those of the sensor.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5,
 _CFA, _LINEAR_RAW = 32803, 34892
 _HEADER_BYTES, _ENTRY_BYTES = 8, 12
 _STRIP_OFFSETS, _EXIF = 273, 34665
-"""Tags whose values are places in the file."""
+"""Tags whose values are offsets in the file."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class Tag:
 
 
 def encode(picture: Picture, colour: CameraColour | None = None) -> bytes:
-    """The whole file: header, two directories, each with values that do not fit into it, one strip of pixels.
-    Raises InputError for colours of a camera that has none."""
+    """Return the whole file: header, two directories, each with the values that do not fit into it, and one strip
+    of pixels. Raises InputError if colours are given for a camera without colours."""
     if colour is not None and picture.pattern == "MONO":
         raise InputError("--sensor-spectra: the camera's pattern is MONO; it has no colours")
     height, width = picture.pixels.shape
@@ -99,7 +99,7 @@ def _camera_tags(picture: Picture, colour: CameraColour) -> list[Tag]:
 
 
 def _exif_tags(picture: Picture) -> list[Tag]:
-    """Exif 2.31: UTC, and what is known of the lens."""
+    """Exif 2.31: UTC, and the known facts of the lens."""
     tags = [
         _rationals(33434, [Fraction(picture.exposure_us, 1_000_000)]),  # ExposureTime, s
         Tag(36864, _UNDEFINED, 4, b"0231"),  # ExifVersion
@@ -123,8 +123,8 @@ def _times(picture: Picture, number: int) -> list[Tag]:
 
 
 def _colour_tags(picture: Picture, colour: CameraColour) -> list[Tag]:
-    """Return the tags of colour. If colours are known, ColorMatrix1 gives from XYZ under D65 what the channels
-    give under the LED."""
+    """Return the tags of colour. If colours are known, ColorMatrix1 maps XYZ under D65 to the channels' values
+    under the LED."""
     neutral = colour.neutral(picture.about.get("led"))
     matrix = np.eye(3)
     if colour.xyz_from_balanced is not None:
@@ -142,7 +142,7 @@ def _colour_tags(picture: Picture, colour: CameraColour) -> list[Tag]:
 
 
 def _size(tags: list[Tag]) -> int:
-    """Bytes of a directory and its values; even."""
+    """Number of bytes of a directory and its values; even."""
     return (
         2
         + _ENTRY_BYTES * len(tags)
@@ -152,8 +152,8 @@ def _size(tags: list[Tag]) -> int:
 
 
 def _directory(tags: list[Tag], at: int, places: dict[int, int]) -> bytes:
-    """A directory that begins at the byte `at`, without a next one, and its values; `places` are tags whose value
-    is a place in the file."""
+    """Return a directory that begins at the byte `at`, without a next one, and its values. `places` are tags whose
+    value is an offset in the file."""
     values_at = at + 2 + _ENTRY_BYTES * len(tags) + 4
     values = bytearray()
     entries = [struct.pack("<H", len(tags))]

@@ -59,11 +59,11 @@ def export_run(
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Exported:
-    """Write proven frames that match `patterns` into `folder`, as `<view>_led0417_e0.<to>`. With `colour` a TIFF
-    has colours for the eye, and a DNG has its matrix.
+    """Write proven frames whose view and label match `patterns` into `folder`, as `<view>_led0417_e0.<to>`. With
+    `colour`, a TIFF has colours (sRGB for the eye, or linear values), and a DNG contains the colour matrix.
 
     Raises InputError if nothing matches or a file exists already (unless `overwrite`), before anything is written;
-    ChecksumMismatch if a frame is not what was proven, DiskFull or StorageError.
+    ChecksumMismatch if a frame differs from the proven one, DiskFull or StorageError.
     """
     encode = _encoder(to, run, colour)
     frames = [frame for shot, frame in run.proven().items() if patterns.has(shot)]
@@ -102,7 +102,7 @@ def _matches(name: str, patterns: Sequence[str]) -> bool:
 
 
 def _pictures(run: Run, frames: list[FrameProven]) -> Iterator[Picture]:
-    """The frames, in the order of their files and slots."""
+    """Yield the frames, in the order of their files and slots."""
     by_file: dict[str, list[FrameProven]] = {}
     for frame in sorted(frames, key=lambda f: (f.file, f.index)):
         by_file.setdefault(frame.file, []).append(frame)
@@ -139,7 +139,7 @@ def _pictures(run: Run, frames: list[FrameProven]) -> Iterator[Picture]:
 
 
 def _plain(attributes: dict[str, Any]) -> dict[str, Any]:
-    """Attributes of a view's file (object, lens, gain) in JSON types."""
+    """Return attributes of a view's file (object, lens, gain) as JSON types."""
     entries = {key: value for key, value in attributes.items() if key not in ("NX_class", "default")}
     return {key: np.asarray(value).tolist() for key, value in entries.items()}
 

@@ -1,4 +1,4 @@
-"""One frame as every format takes it."""
+"""One frame as input of every format."""
 
 from __future__ import annotations
 
@@ -21,6 +21,6 @@ class Picture:
     white_dn: int
     exposure_us: int
     taken_utc: str
-    """UTC, ISO 8601: when the frame was proven, soon after it was taken; empty if not known."""
+    """Time when the frame was proven, soon after it was taken, UTC, ISO 8601; empty if not known."""
     about: dict[str, Any]
     """Stored in the file as JSON: shot, LED, exposure, pose, lens, `simulated`, run."""

@@ -1,9 +1,9 @@
-"""Every format of `coupole export`, in one table: command line, completion, console and exporters read it.
+"""Every format of `coupole export`, in one table for command line, completion, console and exporters.
 
-A format of frames is a module of this folder with `encode(picture)`, which gives the file's bytes. A format of
-results is a module of `of_results` with `write(surface, folder)`, which gives the files that it has written.
-A format of views is a module of `rti` with `write(view, path, say)`, which writes one file for each view and gives
-the rms error of its pictures; those with other files are in `rti/export_views.py`.
+A format of frames is a module of this folder with `encode(picture)`, which returns the file's bytes. A format of
+results is a module of `of_results` with `write(surface, folder)`, which returns the written files. A format of
+views is a module of `rti` with `write(view, path, say)`, which writes one file for each view and returns the rms
+error of its pictures; formats with other files are in `rti/export_views.py`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from coupole.errors import InputError
 
 
 class Source(Enum):
-    """Kinds of sources that can be exported, as messages name them."""
+    """Kinds of sources that can be exported, with their names in messages."""
 
     RUN = "a run"
     RESULT = "a result"
@@ -25,7 +25,7 @@ class Source(Enum):
 
 
 class Writer(Enum):
-    """Kinds of writers of a format, named by what one file of it holds."""
+    """Kinds of writers, named by the content of one file."""
 
     FRAMES = "a frame in each file"
     VIEWS = "a view with all its lights"
@@ -36,7 +36,7 @@ class Writer(Enum):
 
 @dataclass(frozen=True)
 class Format:
-    """One format; `options` are those of the command line that not every format has."""
+    """One format; `options` are the options of the command line that only some formats have."""
 
     name: str
     gives: str
@@ -47,7 +47,8 @@ class Format:
 
 
 RESTORATION_RESULT = "result.json"
-"""Figures of `coupole restore`. Results of reflectance have a file of this name too, and files of their own."""
+"""Result file of `coupole restore`. Results of reflectance also have a file of this name, but with other files
+beside it."""
 MAPS = ("texel-mm", "map-px", "uv")
 """Options of formats with maps."""
 _RUN, _PICTURES_TOO = (Source.RUN,), (Source.RUN, Source.PICTURES)
@@ -99,7 +100,7 @@ FORMATS = {one.name: one for one in _TABLE}
 
 
 def source_of(folder: Path) -> Source:
-    """Tell which kind of source a folder is, by its files."""
+    """Return the kind of source of a folder, by its files."""
     if (folder / "object.h5").exists():
         return Source.RESULT
     if (folder / "normals.npy").exists():
@@ -108,7 +109,7 @@ def source_of(folder: Path) -> Source:
 
 
 def formats_of(source: Source, writer: Writer | None = None) -> list[str]:
-    """Names of the formats of a kind of source, of one writer or of all."""
+    """Return the names of the formats for a kind of source, of one writer or of all."""
     return [
         entry.name
         for entry in FORMATS.values()
@@ -117,7 +118,7 @@ def formats_of(source: Source, writer: Writer | None = None) -> list[str]:
 
 
 def format_named(name: str, source: Source, writer: Writer | None = None) -> Format:
-    """Raises InputError if there is none of this name for the source (and the writer)."""
+    """Return the format of this name. Raises InputError if there is none for the source (and the writer)."""
     names = formats_of(source, writer)
     if name not in names:
         sources = [kind.value for kind in FORMATS[name].sources] if name in FORMATS else []

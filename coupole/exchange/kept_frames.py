@@ -10,7 +10,7 @@ from coupole.storage.discarding import discarded_views, place_of_result
 from coupole.storage.run import Run
 
 Remedy = Callable[[Sequence[ShotId]], str]
-"""Says what can be exported instead, from the shots whose frames are kept."""
+"""Function of the shots whose frames are kept; returns a sentence about what can be exported instead."""
 
 
 def refuse_discarded(run: Run, shots: Collection[ShotId], remedy: Remedy) -> None:
@@ -30,8 +30,8 @@ def refuse_discarded(run: Run, shots: Collection[ShotId], remedy: Remedy) -> Non
 
 
 def refuse_discarded_lights(run: Run, views: Iterable[str], to: str) -> None:
-    """Raise FrameDiscarded if frames of these views under single LEDs were discarded: a format that shows a view
-    under all its LEDs needs all of them."""
+    """Raise FrameDiscarded if frames of these views under single LEDs were discarded, because formats that show a
+    view under all its LEDs need all of them."""
     names = set(views)
     shots = [shot for shot in run.proven() if shot.view in names and isinstance(shot.light, Led)]
     refuse_discarded(run, shots, lambda _: f"--to {to} needs the frames of all LEDs. ")

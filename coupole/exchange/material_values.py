@@ -1,4 +1,4 @@
-"""Values that pages and exports take of a result's materials."""
+"""Values of a result's materials for pages and exports."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from coupole.reflectance.run_result_files import refuse_without_uncertainty
 
 Floats = NDArray[np.float64]
 UNCERTAIN = ("u_kd", "u_ks", "u_normal", "u_alpha")
-"""Names of standard uncertainties, in the order in which files and pages have them."""
+"""Names of standard uncertainties, in the order of files and pages."""
 _FIRST_TILT, _SECOND_TILT, _ALPHA = 0, 2, 14
-"""Variances in the lower half of the covariance, row by row."""
+"""Indices of variances in the lower half of the covariance, row by row."""
 
 
 def red_green_blue(values: Floats) -> Floats:
-    """[n, 3] of [n, channels]; one channel is grey."""
+    """[n, 3] from [n, channels]; one channel becomes grey."""
     return values if values.shape[1] == 3 else np.repeat(values, 3, axis=1)
 
 
 def standard_uncertainties(path: Path) -> dict[str, Floats]:
-    """[n] of a file of materials, all parts together: `u_kd`, `u_ks` (relative, the channels' mean), `u_normal`
-    (rad) and `u_alpha` (relative). Raises InputError if it has none."""
+    """[n] standard uncertainties from all sources in a file of materials: `u_kd`, `u_ks` (relative, the channels'
+    mean), `u_normal` (rad) and `u_alpha` (relative). Raises InputError if the file has none."""
     with h5py.File(path, "r") as file:
         refuse_without_uncertainty(path, file)
         lower = file["covariance"][()].astype(np.float64)

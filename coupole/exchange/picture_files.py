@@ -15,16 +15,16 @@ _PNG_WHITE = 65535
 
 
 def refuse_unknown(path: Path) -> None:
-    """Raise InputError if there is no writer for such a file."""
+    """Raise InputError if there is no writer for this kind of file."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
 
 
 def write_picture(path: Path, picture: NDArray[np.float32]) -> None:
-    """Write [h, w, 3] red, green, blue, whole or not at all. PNG has 16 bit, linear, and holds 0 to 1 alone; the
-    others hold all of it.
+    """Write [h, w, 3] red, green, blue, completely or not at all. A PNG has 16 bits, is linear, and holds only
+    values from 0 to 1; the other kinds hold all values.
 
-    Raises InputError for another kind of file, StorageError if it cannot be written.
+    Raises InputError for any other kind of file, StorageError if it cannot be written.
     """
     refuse_unknown(path)
     part = path.with_name(f".{path.name}.part")

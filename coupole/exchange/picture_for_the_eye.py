@@ -1,7 +1,7 @@
-"""Relit pictures for the eye: by CIE XYZ to sRGB (IEC 61966-2-1), with its profile.
+"""Relit pictures for the eye: through CIE XYZ to sRGB (IEC 61966-2-1), with its profile.
 
-A relit picture has 1 in all channels where a white diffuser faces a light of strength 1: it is balanced, and the
-matrix of `coupole.exchange.camera_colour` converts it to the colour of the surface under daylight.
+In a relit picture, all channels are 1 where a white diffuser faces a light of strength 1. So it is balanced, and
+the matrix of `coupole.exchange.camera_colour` converts it to the colour of the surface under daylight.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ SUFFIXES = (".png", ".tif", ".tiff")
 
 
 def refuse_unknown(path: Path) -> None:
-    """Raise InputError if there is no writer for such a file."""
+    """Raise InputError if there is no writer for this kind of file."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"--to {path}: for the eye expected a name that ends in {', '.join(SUFFIXES)}")
 
 
 def linear_colours(picture: NDArray[np.float32], colour: CameraColour) -> NDArray[np.float64]:
-    """[h, w, 3] linear sRGB under daylight of a relit picture in the camera's channels; out of gamut below 0."""
+    """[h, w, 3] linear sRGB under daylight of a relit picture in the camera's channels; colours outside the gamut
+    have values below 0."""
     from coupole.appearance.spectra.light import linear_srgb
 
     assert colour.xyz_from_balanced is not None
@@ -38,10 +39,10 @@ def linear_colours(picture: NDArray[np.float32], colour: CameraColour) -> NDArra
 
 
 def write_for_the_eye(path: Path, linear: NDArray[np.float64], white: float, about: dict[str, Any]) -> None:
-    """Write linear sRGB, of which `white` is shown as white, whole or not at all: PNG of 8 bits or TIFF of 16,
-    with the profile of sRGB and `about`. Values that are brighter, or out of gamut, are cut.
+    """Write linear sRGB, completely or not at all: PNG of 8 bits or TIFF of 16 bits, with the profile of sRGB and
+    `about`. The value `white` is shown as white. Brighter values, and colours outside the gamut, are clipped.
 
-    Raises InputError for another kind of file, StorageError if it cannot be written.
+    Raises InputError for any other kind of file, StorageError if it cannot be written.
     """
     refuse_unknown(path)
     encoding, profile = srgb(linear / white), srgb_profile()

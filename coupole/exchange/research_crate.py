@@ -1,5 +1,8 @@
 """A run or a result as a research object crate (RO-Crate 1.1): its files, with `ro-crate-metadata.json` beside
-them, which says in JSON-LD what they are, whose they are, from what and by what they were made."""
+them.
+
+This file states in JSON-LD what the files are, who owns them, and from what and by what they were made.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ from coupole.storage.run import Run
 
 METADATA = "ro-crate-metadata.json"
 DATA = "data"
-"""Folder of the files, where they are not described in place."""
+"""Folder of the files, unless they are described in place."""
 _SPECIFICATION = "https://w3id.org/ro/crate/1.1"
 _ORCID = re.compile(r"https://orcid\.org/\d{4}-\d{4}-\d{4}-\d{3}[\dX]")
 _TOLD = {
@@ -47,17 +50,17 @@ Entity = dict[str, Any]
 
 @dataclass(frozen=True)
 class CrateFacts:
-    """Facts that only the authors of a crate can say."""
+    """Facts that only the authors of a crate can state."""
 
     licence: str | None = None
-    """A URL, or words; None: what the run's plan says."""
+    """A URL, or words; None for the licence in the run's plan."""
     authors: tuple[str, ...] = ()
-    """`NAME <https://orcid.org/...> at INSTITUTION` each, or a name alone."""
+    """Each as `NAME <https://orcid.org/...> at INSTITUTION`, or a name alone."""
     publisher: str | None = None
     name: str | None = None
-    """Title; None: the folder's name."""
+    """Title; None for the folder's name."""
     identifier: str | None = None
-    """Such as a DOI."""
+    """An identifier such as a DOI."""
 
 
 def write_crate(
@@ -69,13 +72,14 @@ def write_crate(
     overwrite: bool,
     say: Callable[[str, int, int], None],
 ) -> list[Path]:
-    """Write the crate into `out`: its files below `data/`, copies, but for frames and samples (HDF5): hard links
-    where the file system allows them. With `in_place` only the metadata is written, into `source`.
+    """Write the crate into `out`, with its files below `data/`.
 
-    With `overwrite` the files of a crate that is in `out` are removed first; what else is there is kept.
+    Files are copied. Frames and samples (HDF5) are hard links where the file system allows them. With `in_place`,
+    only the metadata is written, into `source`. With `overwrite`, the files of a crate in `out` are removed first;
+    all other files are kept.
 
-    Raises InputError: no licence or author is known, or one is named twice, a run that is being acquired, an `out`
-    that holds the source, or has files (unless `overwrite`); DiskFull or StorageError.
+    Raises InputError if no licence or author is known, if one is named twice, if the run is being acquired, if
+    `out` contains the source, or if `out` has files (unless `overwrite`); DiskFull or StorageError.
     """
     origin = _source_facts(source)
     licence = facts.licence or origin.get("licence")
@@ -115,7 +119,7 @@ def write_crate(
 
 
 def _source_facts(source: Path) -> dict[str, Any]:
-    """Kind, time, software and inputs of the source."""
+    """Return kind, time, software and inputs of the source."""
     if source_of(source) is Source.RESTORATION:
         return _restoration_facts(source)
     if (source / ABOUT).exists():
@@ -151,7 +155,7 @@ def _nature(*, is_simulated: bool) -> str:
 
 
 def _restoration_facts(source: Path) -> dict[str, Any]:
-    """Raises InputError if its result.json is none of `coupole restore`."""
+    """Return the facts of a restoration. Raises InputError if its result.json is not from `coupole restore`."""
     result = read_json(source / RESTORATION_RESULT, allow_nan=True)
     if not isinstance(result, dict) or not {"restoration", "hypotheses", "software", "mesh"} <= result.keys():
         raise InputError(f"{source / RESTORATION_RESULT}: expected what `coupole restore` writes; restore again")
@@ -260,7 +264,7 @@ def _people(texts: Sequence[str]) -> list[tuple[Entity, Entity | None]]:
 
 
 def _person(text: str) -> tuple[Entity, Entity | None]:
-    """An author and the house they belong to."""
+    """Return an author and the author's institution."""
     author, _, house = map(str.strip, text.partition(" at "))
     name, _, within = map(str.strip, author.partition("<"))
     url = within.removesuffix(">")
@@ -281,7 +285,7 @@ def _organisation(name: str) -> Entity:
 
 
 def _part_of_id(name: str) -> str:
-    """Encode a name as a part of a URI; other names give other ids."""
+    """Encode a name as a part of a URI; different names give different ids."""
     return quote(name, safe="")
 
 
@@ -301,12 +305,13 @@ def _to(entity: Entity) -> Entity:
 
 
 def _to_all(entities: Sequence[Entity]) -> Entity | list[Entity]:
-    """A list, but of one entity that itself, as the specification wants it."""
+    """Return a list, or the entity itself if there is only one, as the specification demands."""
     return _to(entities[0]) if len(entities) == 1 else [_to(entity) for entity in entities]
 
 
 def _take(path: Path, to: Path) -> None:
-    """Link a file that is large and is not written anew; copy others, which their commands may write in place."""
+    """Hard-link a file that is large and never rewritten; copy others, because commands may rewrite them in
+    place."""
     to.parent.mkdir(parents=True, exist_ok=True)
     to.unlink(missing_ok=True)
     if path.suffix == _LINKED:

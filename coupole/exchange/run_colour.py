@@ -1,4 +1,4 @@
-"""The colour of a run's frames: tables of spectra, and the white that its records have measured."""
+"""Colours of a run's frames: tables of spectra, and the white that the run's records have measured."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ _HOW = "give a table of nm, power with --led-spectrum, or name it in the rig (do
 
 @dataclass(frozen=True)
 class ColourWanted:
-    """Tables and records by which frames are to be coloured."""
+    """Tables and records that determine the colours of frames."""
 
     sensor: Path
-    """Table of nm, red, green, blue."""
+    """Table with the columns nm, red, green, blue."""
     leds: Path | None
-    """Table of nm, power; None: the rig's."""
+    """Table with the columns nm, power; None for that of the rig."""
     records: tuple[Path, ...] = ()
-    """Records in place of those that the run names."""
+    """Records that replace those that the run names."""
     is_linear: bool = False
     """True for a TIFF with linear values, in place of sRGB for the eye."""
 
 
 def colour_of_run(run: Run, colour_request: ColourWanted) -> CameraColour:
-    """Raises InputError: no table of the LEDs' spectrum, tables that are wrong, no colour-science."""
+    """Return the colours of a run. Raises InputError if there is no table of the LEDs' spectrum, or if a table is
+    wrong, or without colour-science."""
     files = read_plan(run.plan_path, run.rig_path)
     leds, rig_spectrum = colour_request.leds, files.cell.rig.dome.spectrum
     if leds is None and rig_spectrum is None:
@@ -47,7 +48,7 @@ def colour_of_run(run: Run, colour_request: ColourWanted) -> CameraColour:
 
 
 def _measured_white(records: Sequence[Path]) -> Neutral | None:
-    """Return white by the record of the LEDs' power, if one is named."""
+    """Return white as the record of the LEDs' power measured it, if one is named."""
     power_records = [path for path in records if read_record(path).kind == "led-power"]
     if not power_records:
         return None

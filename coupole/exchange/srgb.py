@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def srgb(linear: NDArray[Any]) -> NDArray[Any]:
-    """Encoded values, 0 to 1, of linear ones; what is outside is cut off."""
+    """Encoded values, 0 to 1, of linear ones; values outside are clipped."""
     inside = np.clip(linear, 0.0, 1.0)
     codes: NDArray[Any] = np.where(inside <= 0.0031308, 12.92 * inside, 1.055 * inside ** (1 / 2.4) - 0.055)
     result: NDArray[Any] = codes.astype(linear.dtype)

@@ -11,7 +11,7 @@ from coupole.errors import DiskFull, InputError, StorageError
 
 
 def refuse_standing(paths: Sequence[Path]) -> None:
-    """Raise InputError if one of the files that would be written is there already."""
+    """Raise InputError if one of the files that would be written exists already."""
     if standing := [path for path in paths if path.exists()]:
         raise InputError(
             f"{standing[0]}: exists already ({len(standing)} such files). Choose another name or folder, or give "
@@ -21,8 +21,8 @@ def refuse_standing(paths: Sequence[Path]) -> None:
 
 @contextmanager
 def writing_into(folder: Path) -> Iterator[None]:
-    """Make the folder; an operating system's error becomes DiskFull or StorageError, a file in the folder's place
-    InputError. When the export fails, folders that were made for it and are empty are removed."""
+    """Make the folder. An error of the operating system becomes DiskFull or StorageError; a file in the folder's
+    place becomes InputError. If the export fails, folders that were made for it and are empty are removed."""
     made_folders = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         with _removed_if_empty(made_folders):
@@ -38,7 +38,7 @@ def writing_into(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _removed_if_empty(folders: Sequence[Path]) -> Iterator[None]:
-    """Remove these folders, the innermost first, if an error is raised; one that has something in it stays."""
+    """Remove these folders, the innermost first, if an error is raised; a folder that is not empty stays."""
     try:
         yield
     except BaseException:

@@ -1,4 +1,4 @@
-"""A frame as TIFF: 16 bits, grey, the camera's values; metadata is JSON in ImageDescription."""
+"""A frame as TIFF: 16 bits, grey, the camera's values; metadata are JSON in ImageDescription."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from coupole.exchange.exported_frame import Picture
 
 
 def encode(picture: Picture) -> bytes:
-    """The whole file; for a colour sensor it holds the mosaic, with pattern and levels in the metadata."""
+    """Return the whole file. For a colour sensor it has the mosaic, with pattern and levels in the metadata."""
     import tifffile
 
     about = {

@@ -1,5 +1,5 @@
-"""A frame as TIFF for the eye: demosaicked, white-balanced, by CIE XYZ to sRGB (IEC 61966-2-1), 16 bits, with its
-profile."""
+"""A frame as TIFF for the eye: demosaiced, white-balanced, converted through CIE XYZ to sRGB (IEC 61966-2-1), 16
+bits, with its profile."""
 
 from __future__ import annotations
 
@@ -22,10 +22,12 @@ _SRGB_NAME, _LINEAR_NAME = ("sRGB built-in".encode("utf-16-be"), "sRGB, linear "
 
 
 def encode(picture: Picture, colour: CameraColour, *, linear: bool) -> bytes:
-    """The whole file. The value 1 is the camera's range above black, in the frame's own exposure, of the channel
-    that
-    is brightest for white. The other channels are clipped at the same level, so that saturated pixels are white.
-    Raises InputError for a camera without colours."""
+    """Return the whole file.
+
+    The value 1 is the camera's range above black, in the frame's own exposure, of the channel that is brightest
+    for white. The other channels are clipped at the same level, so that saturated pixels are white. Raises
+    InputError for a camera without colours.
+    """
     from coupole.appearance.spectra.light import linear_srgb
 
     if picture.pattern not in PATTERNS:
@@ -43,7 +45,8 @@ def encode(picture: Picture, colour: CameraColour, *, linear: bool) -> bytes:
 
 
 def tiff_of(codes: NDArray[np.uint16], about: dict[str, Any], profile: bytes) -> bytes:
-    """The whole file of [h, w, 3] red, green, blue by an ICC profile; `about` is its description."""
+    """Return the whole file of a picture [h, w, 3], red, green, blue, with an ICC profile; `about` is its
+    description."""
     import tifffile
 
     buffer = io.BytesIO()
@@ -60,14 +63,15 @@ def tiff_of(codes: NDArray[np.uint16], about: dict[str, Any], profile: bytes) ->
 
 
 def srgb_profile() -> bytes:
-    """ICC profile of sRGB, as LittleCMS makes it."""
+    """Return the ICC profile of sRGB that LittleCMS makes."""
     from PIL import ImageCms
 
     return ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 
 
 def linear_profile() -> bytes:
-    """The same primaries with the identity as curve: (a x + b)^g from d on, below it c x (ICC.1, type 3)."""
+    """Return a profile with the same primaries and the identity as curve: (a x + b)^g from d on, below it c x
+    (ICC.1, type 3)."""
     profile = bytearray(srgb_profile().replace(_SRGB_NAME, _LINEAR_NAME))
     ones = np.array([1, 1, 0, 1, 0], ">i4") << 16
     place = profile.find(_PARAMETRIC)

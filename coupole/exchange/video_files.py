@@ -18,22 +18,23 @@ SUFFIX = ".mp4"
 FRAMES_PER_S = 25
 _CODEC = "libx264"
 _QUALITY = "18"
-"""Constant rate factor of x264: no loss that is seen at once."""
+"""Constant rate factor of x264; losses are hardly visible."""
 _BT709, _SRGB, _LIMITED = 1, 13, 1
 """ITU-T H.273: primaries and matrix, transfer characteristics, range."""
 
 
 def refuse_unknown(path: Path) -> None:
-    """Raise InputError if it is not the name of a video."""
+    """Raise InputError if this is not the name of a video."""
     if path.suffix.lower() != SUFFIX:
         raise InputError(f"{path}: expected a name that ends in {SUFFIX}")
 
 
 def write_video(path: Path, pictures: Iterable[NDArray[np.float32]], *, white: float, about: str) -> None:
-    """Write pictures [h, w, 3], linear, `white` as the brightest, as a video whose comment is `about`, whole or
-    not at all. An odd last row or column is left out: the format halves colour.
+    """Write pictures [h, w, 3], linear, with `white` as the brightest value, as a video with the comment `about`,
+    completely or not at all. An odd last row or column is left out, because the format halves the resolution of
+    colour.
 
-    Raises InputError for another kind of file or without x264, StorageError if it cannot be written.
+    Raises InputError for any other kind of file or without x264, StorageError if it cannot be written.
     """
     import av
 

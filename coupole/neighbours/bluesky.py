@@ -5,10 +5,10 @@
     cell = DomeCell("demo-short", name="cell")
     RE(take_view(cell, "top", exposure_us=8000))
 
-The cell's signals say what the next flight takes; nothing lights or moves when they are set. A flight is
-`coupole.acquire`: a process of its own, with preflight, ledger, proof, and a watch over the arm. So a process that
-is killed leaves nothing lit and nothing in motion, and a RunEngine that is paused lets the view be taken to its
-end. Documents name proven frames only. Needs the extra `bluesky`.
+The cell's signals say which frames the next flight takes; setting them lights and moves nothing. A flight calls
+`coupole.acquire`, which starts a separate process with preflight, ledger, proof, and supervision of the arm. So
+nothing stays lit or in motion if the process of the RunEngine is killed. If the RunEngine is paused, the flight
+takes the rest of the view. Documents name proven frames only. This module needs the extra `bluesky`.
 """
 
 from __future__ import annotations
@@ -56,8 +56,11 @@ _UNIT_OF = {name: unit for unit, names in _UNITS.items() for name in names.split
 
 
 def _facts(row: int, frame: Frame) -> dict[str, Any]:
-    """Facts of a frame as single values: Tiled gives lists in a table back as text. `row` is its place in the
-    stream of pixels, A1 to A6 are measured angles; `led` is -1 and its place NaN where no LED is lit."""
+    """Return the facts of a frame as single values, because Tiled turns lists in a table into text.
+
+    `row` is the frame's row in the stream of pixels; A1 to A6 are measured angles. If no LED is lit, `led` is -1
+    and its position is NaN.
+    """
     led_mm = [math.nan] * 3 if frame.led_position_mm is None else frame.led_position_mm
     return {
         "shot": frame.shot,
@@ -90,16 +93,16 @@ class ProvenFrames(Device, EventCollectable):
     def __init__(self) -> None:
         super().__init__()
         self.rows: list[tuple[int, Frame]] = []
-        """Place in the stream of pixels, and frame."""
+        """Row in the stream of pixels, and frame."""
 
     async def describe_collect(self) -> dict[str, DataKey]:
-        """Keys of each event. Raises InputError: no flight has been completed."""
+        """Return the key of each value of an event. Raises InputError if no flight has been completed."""
         if not self.rows:
             raise InputError("no flight has been completed: there are no frames to describe")
         return {name: _key(name, value) for name, value in _facts(*self.rows[0]).items()}
 
     def collect(self) -> Iterator[PartialEvent]:
-        """One partial event for each proven frame."""
+        """Yield one partial event for each proven frame."""
         now_s = time.time()
         for row, frame in self.rows:
             facts = _facts(row, frame)
@@ -109,8 +112,8 @@ class ProvenFrames(Device, EventCollectable):
 class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
     """The cell of a plan's rig. A flight takes the view that `view` names, under the lights of `leds`.
 
-    `plan` is a `coupole.Plan`, a file, or the name of a shipped plan; `rig` another rig than the plan's; `output`
-    the parent folder of runs. A real cell moves only with `yes`.
+    `plan` is a `coupole.Plan`, a file, or the name of a shipped plan. `rig` replaces the plan's rig. `output` is
+    the parent folder of runs. A real cell moves only if `yes` is True.
     """
 
     def __init__(
@@ -123,7 +126,7 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
         name: str = "",
     ) -> None:
         self.plan = plan if isinstance(plan, Plan) else Plan.read(plan)
-        """Plan that views, lights and exposures come from where the signals do not say."""
+        """Plan whose views, lights and exposures are used if a signal is not set."""
         self._options: dict[str, Any] = {"rig": rig, "output": output, "yes": yes}
         self._acquisition: Acquisition | None = None
         self._stream_assets: list[StreamAsset] = []
@@ -146,7 +149,7 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
         super().__init__(name)
 
     async def next_plan(self) -> Plan:
-        """The plan of the next flight, by the signals. Raises InputError: the plan has no such view."""
+        """Return the plan of the next flight, by the signals. Raises InputError if the plan has no such view."""
         name, leds = await self.view.get_value(), await self.leds.get_value()
         views = {view.name: view for view in self.views()}
         if name not in views:
@@ -159,7 +162,7 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
         return Plan.model_validate(self.plan.model_dump() | changes)
 
     def views(self) -> list[LookAt | Joints]:
-        """Views of the plan; those of its grids one by one."""
+        """Names of the plan's views, including each view of its grids."""
         return [
             view
             for entry in self.plan.views
@@ -173,7 +176,7 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
             raise InputError("the cell is in a flight; complete it first")
         plan = await self.next_plan()
         self._forget()
-        # In the thread of the event loop, which lives as long as its process: the run is bound to it.
+        # A run is bound to the thread that begins it. The thread of the event loop lives as long as its process.
         self._acquisition = acquire(plan, **self._options)
 
     @AsyncStatus.wrap
@@ -199,19 +202,19 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
-        """End a flight, if one goes on."""
+        """End a flight that is still going on."""
         await self._land()
         await super().unstage()
 
     async def describe_collect(self) -> dict[str, DataKey]:
-        """Key of the stream of pixels: all rows of the files of the flight's views, of which `frames` names the
+        """Return the key of the stream of pixels. The stream has all rows of the flight's file; `frames` names the
         proven ones."""
         if self._pixels_key is None:
             raise InputError("no flight has been completed: there are no pixels to describe")
         return {"pixels": self._pixels_key}
 
     async def collect_asset_docs(self, index: int | None = None) -> AsyncIterator[StreamAsset]:
-        """Documents of the files of the last flight; once."""
+        """Yield the documents of the last flight's files; a second call yields none."""
         assets, self._stream_assets = self._stream_assets, []
         for asset in assets:
             yield asset
@@ -230,7 +233,7 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
         self._set_proven(0)
 
     def _remember(self, folder: Path) -> None:
-        """Take in the run of a flight, which has one view."""
+        """Store the facts of a flight's run, which has one view."""
         run = Run(folder)
         (view,) = run.values()
         self._set_run_folder(str(folder))
@@ -262,10 +265,10 @@ def _uri(path: Path) -> str:
 def take_view(
     cell: DomeCell, view: str | None = None, *, leds: Sequence[int] | None = None, exposure_us: int | None = None
 ) -> MsgGenerator[None]:
-    """A part of a plan that takes one view: set what is given, fly, and collect into two streams.
+    """Take one view, as a part of a plan: set the given signals, fly, and collect into two streams.
 
     The stream with the view's name has one event for each proven frame; the stream `<view>_pixels` has the pixels
-    [row, height, width], DN. However it ends, the cell is safe.
+    [row, height, width], DN. The cell is safe at the end, also after an error.
     """
     settings: dict[Any, Any] = {cell.view: view, cell.leds: leds, cell.exposure_us: exposure_us}
     given_settings = [word for item in settings.items() if item[1] is not None for word in item]

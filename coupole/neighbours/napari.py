@@ -1,7 +1,7 @@
 """napari's reader of runs and results: folders that are dropped into its window become layers.
 
-Nothing of napari is imported: npe2 finds `get_reader` by `napari.yaml`, and layers are plain tuples of data,
-attributes and kind. Needs the extra `napari`, beside napari itself.
+This module imports nothing of napari: npe2 finds `get_reader` through `napari.yaml`, and layers are plain tuples
+of data, attributes and kind. It needs napari and the extra `napari`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ _RUN, _RESULT = "run.json", "result.json"
 
 
 def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[LayerData]] | None:
-    """The reader of a run's or a result's folder, or of its run.json or result.json; None for all else."""
+    """Return the reader for the folder of a run or a result, or for its run.json or result.json; None for any
+    other path."""
     if not isinstance(path, str):
         return get_reader(path[0]) if len(path) == 1 else None
     folder = _folder(path)
@@ -32,10 +33,10 @@ def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], lis
 
 
 def layers_of_view(view: RunView) -> LayerData:
-    """An image [light, exposure, y, x] of a view's proven frames, DN, read as it is looked at.
+    """Return an image [light, exposure, y, x] of a view's proven frames, DN; each frame is read when it is shown.
 
-    If not every light has every exposure, or a light comes twice, it is [shot, y, x]. `scale` is the nominal size
-    of a pixel on the plane in focus, mm. `metadata` tells what each step of the sliders is.
+    If a light lacks an exposure or occurs twice, the image is [shot, y, x]. `scale` is the nominal size of a pixel
+    on the plane in focus, mm. `metadata` describes each step of the sliders.
     """
     frames = [view[label] for label in view.shots]
     pixels = stack_frames(frames)
@@ -68,13 +69,17 @@ def layers_of_view(view: RunView) -> LayerData:
 
 
 def layers_of_result(result: Result | PicturesResult) -> list[LayerData]:
-    """Surfaces of a run's mesh, mm, in the support frame, with diffuse albedo, normals, roughness and the
-    uncertainty of the normals; of pictures an image of each quantity that was fitted."""
+    """Return the layers of a result.
+
+    For runs these are surfaces of the mesh, mm, in the support frame, with diffuse albedo, normals, roughness and
+    the uncertainty of the normals. For pictures they are one image of each fitted quantity.
+    """
     return _surfaces(result) if isinstance(result, Result) else _maps(result)
 
 
 def _surfaces(result: Result) -> list[LayerData]:
-    """napari has values at corners, so that each face has three of its own. Its axes are z, y, x."""
+    """Return the surfaces. napari has values at corners, therefore each face has three corners of its own. Its
+    axes are z, y, x."""
     materials = result.materials()
     is_known = np.isfinite(materials.kd).all(axis=1)
     support_from_base = np.linalg.inv(result.base_from_support)

@@ -1,13 +1,16 @@
-"""Folders for facts about the controller of a cell's arm. They do not depend on the rig's name and the place of
+"""Folders for facts that belong to the controller of a cell's arm, and not to the rig's name or to the folder of
 the runs.
 
-A standing fault and a commissioning belong to the arm. So they are kept in three places. The first is named after
-the serial number of the arm's controller, which is known after a device is opened. The second is named after the
-controller's address, which is known before. The third is the rig's own state folder, for all who share that rig.
-All places are read, and all are written. The place of an address remembers the serial numbers that have answered
-there, so their places are found before the next opening.
+Examples are a fault that is not confirmed yet, and a commissioning. Such facts are stored in three folders:
 
-A simulated cell has only its state folder, because each of its worlds is another controller.
+- One is named after the serial number of the arm's controller, which is known after a device is opened.
+- One is named after the controller's address, which is known before.
+- One is the rig's own state folder, for all who share that rig.
+
+Every fact is written to all three folders and read from all three. The folder of an address also stores the serial
+numbers that have answered there. So the folders of these serial numbers are found before the next opening.
+
+A simulated cell has only its state folder, because each of its worlds is a different controller.
 """
 
 from __future__ import annotations
@@ -27,13 +30,14 @@ from coupole.plan.rig_devices import device_for, in_world
 _SERIALS = "answered-here.txt"
 _OWN_SOCKET = "listen"
 _ADDRESSES = ("controller", "host", "address", _OWN_SOCKET)
-"""Settings of drivers that say where the arm's controller is. The most specific one is first. `listen` is this
-machine's own socket. All controllers that may use it count as one, which can only be too careful."""
+"""Settings of drivers that give the controller's address, the most specific one first. `listen` is only this
+machine's own socket. Then all controllers that may use this socket count as one; so a fault of one stops them all,
+which is safe."""
 
 
 def places_of_arm(cell: Cell, identity: Identity | None = None) -> tuple[Path, ...]:
-    """Return the folders, which may not exist yet. The controller's own is first, the rig's state folder last.
-    `identity` is that of the opened arm."""
+    """Return the folders, which may not exist yet: the controller's own first, the rig's state folder last.
+    `identity` is the identity of the opened arm."""
     if in_world(cell.rig, dry_run=False):
         return (cell.state_folder,)
     by_address = _by_address(cell)
@@ -42,8 +46,8 @@ def places_of_arm(cell: Cell, identity: Identity | None = None) -> tuple[Path, .
 
 
 def remember_controller(cell: Cell, identity: Identity) -> None:
-    """Note that an arm with this identity has answered, so that its records are found by its address from now on.
-    An error of the disk is ignored, because the serial number is read again at each opening."""
+    """Store the serial number of an arm that has answered, so that its facts are found by its address from now on.
+    Errors of the disk are ignored, because the serial number is read again at each opening."""
     if in_world(cell.rig, dry_run=False):
         return
     by_address = _by_address(cell)
@@ -66,7 +70,8 @@ def _by_address(cell: Cell) -> Path:
 
 
 def _address(model: type[BaseModel], settings: dict[str, object]) -> tuple[str, str]:
-    """Return where a driver with these settings finds its controller, and the setting that says so, if any."""
+    """Return the address at which a driver with these settings finds its controller, and the name of that setting.
+    Without an address, return an empty text and `unknown`."""
     for name in _ADDRESSES:
         field = model.model_fields.get(name)
         address = settings.get(name, field.default if field is not None else "")
@@ -77,8 +82,8 @@ def _address(model: type[BaseModel], settings: dict[str, object]) -> tuple[str, 
 
 
 def _by_serial(identity: Identity | None) -> list[str]:
-    """Return the serial number's file name. It is empty for a stand-in, and if the driver cannot know the
-    number."""
+    """Return the name of the folder for a serial number. The list is empty for a stand-in, and if the driver
+    cannot read the number."""
     if identity is None or identity.simulated or not identity.serial.strip(" 0"):
         return []
     return [_file_name("serial", identity.vendor, identity.serial)]

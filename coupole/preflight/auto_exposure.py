@@ -1,17 +1,18 @@
 """Chooses exposures in the run for each LED of a view, from the view's frames (`exposure: {kind: auto}`).
 
-1. *First pass.* Some LEDs, spread over the dome, are taken at the middle one of the times. Each fourth LED is
-   taken twice, which gives the noise (`exposure_advice.noise_of_pairs`). LEDs that clip are taken again four stops
-   shorter; if all is dark, some are taken four stops longer.
-2. *All LEDs.* The rates of the pixels (DN per us) under the first LEDs give two times for each of these LEDs.
-   Above the longest time, more than the allowed share of pixels is clipped. Below the shortest time, too few of
-   the object's pixels reach the signal-to-noise ratio. Both times are scaled to other LEDs by the illuminance of
-   the LED table, and interpolated by direction (logarithms, weighted by inverse squares of the distance).
-   `exposure_times` chooses.
-3. *Corrections.* Each LED's own frames are judged; for clipping, all pixels count. An LED that does not meet the
-   plan's limits gets one more exposure, at most twice.
+1. *First pass.* Some LEDs, spread over the dome, are taken with the middle one of the plan's exposure times. Some
+   of them are taken twice, which gives the noise (`exposure_advice.noise_of_pairs`). LEDs that clip are taken
+   again with a time four stops shorter. If all frames are dark, some LEDs are taken again with a time four stops
+   longer.
+2. *All LEDs.* The rates of the pixels (DN per us) give two limits for each LED of the first pass. Above the
+   longest time, more than the allowed share of pixels is clipped. Below the shortest time, too few of the object's
+   pixels reach the signal-to-noise ratio. For all other LEDs, both limits are scaled by the illuminance of the LED
+   table, and interpolated by direction (logarithms, weighted by inverse squares of the distance). Within the
+   limits, `exposure_times` chooses the times.
+3. *Corrections.* Each LED's own frames are compared with the plan's limits; for clipping, all pixels count. An LED
+   that does not meet the limits gets one more exposure, at most twice.
 
-A pixel that gets light only from other surfaces need not reach the ratio (`exposure_evidence`).
+Pixels that get light only from other surfaces need not reach the signal-to-noise ratio (`exposure_evidence`).
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ from coupole.preflight.exposure_times import LightLimits, Wish, chosen_times
 Floats = NDArray[np.float64]
 
 _UNSEEN_LIGHTS = 0.85
-"""Factor by which LEDs that were not in the first pass may be brighter."""
+"""Factor on the longest time of LEDs that were not in the first pass, because they may be brighter than
+interpolated."""
 _NOISE_MARGIN = 1.05
 _LEAST_RATE = 1e-9
 _PROBE_STEPS = 4 * STEPS_PER_STOP
@@ -45,7 +47,7 @@ _DARK_SHARE = 0.02
 _BRIGHT_QUANTILE = 0.999
 _NEIGHBOURS = 4
 _BURST_S = 0.14
-"""Time of a burst in addition to its steps, as preflight computes it."""
+"""Duration of a burst, s, in addition to its steps, as in preflight."""
 _CORRECTIONS, _BURSTS_OF_A_CORRECTION = 2, 2
 _PROBE = "probe"
 
@@ -88,7 +90,7 @@ class AutoExposureChooser:
         return Choice(bursts=tuple(bursts), reason=_in_words("first pass over the dome", bursts))
 
     def _probes(self, view: OpenView, evidence: Evidence) -> list[ChosenBurst]:
-        """Choose more exposures of the first LEDs whose rates one exposure does not show."""
+        """Return more exposures of those first LEDs whose rates one exposure does not show."""
         leds, exposure = evidence.first_leds, self._exposure
         place = evidence.taken[leds[0]][0]
         first_samples = {led: evidence.sample(led, place) for led in leds}
@@ -134,8 +136,8 @@ class AutoExposureChooser:
 
     @staticmethod
     def _still_needed(places: Sequence[int], taken_places: Sequence[int]) -> list[int]:
-        """Return the places that exposures at `taken_places` do not replace. These are the ends of `places` that
-        lie beyond `taken_places`."""
+        """Return the places among the exposure times that are still needed after exposures at `taken_places`: the
+        ends of `places` that lie beyond `taken_places`."""
         if not taken_places:
             return list(places)
         ends = [places[0]] if places[0] < taken_places[0] else []
@@ -145,8 +147,12 @@ class AutoExposureChooser:
     def _limits(
         self, view: OpenView, evidence: Evidence, lux_of_led: Mapping[int, float]
     ) -> tuple[LightLimits, NDArray[np.int64]]:
-        """Return the limits of all LEDs, from those of the first pass, and the group [leds] of each LED. The LEDs
-        of a group clip at the same times, and their dim pixels reach the ratio at the same times."""
+        """Return the limits for groups of LEDs, from the limits of the first pass, and the group [leds] of each
+        LED.
+
+        All LEDs of a group have the same limits: they clip from the same time on, and their dim pixels reach the
+        ratio from the same time on.
+        """
         judgements = [evidence.judge(led) for led in evidence.first_leds]
         lux = np.array([lux_of_led[led] for led in view.leds.tolist()])
         first_lux = np.array([lux_of_led[led] for led in evidence.first_leds])
@@ -171,7 +177,8 @@ class AutoExposureChooser:
         return LightLimits(pairs[:, 0], np.exp(log_rates).astype(np.float32), counts), group_of
 
     def _weights(self, view: OpenView, first_leds: Sequence[int]) -> Floats:
-        """Return the weights [leds, first] of the first LEDs for each LED, by direction from the view's target."""
+        """Return the weights [leds, first] of the first LEDs for each LED, by the directions from the view's
+        target. Only the nearest first LEDs have a weight."""
         target_mm = apply(self._base_from_support, np.array([view.target_mm or (0.0, 0.0, 0.0)]))
         ways, first_ways = (
             way / np.linalg.norm(way, axis=1, keepdims=True)
@@ -223,7 +230,7 @@ class AutoExposureChooser:
     # -- small things -------------------------------------------------------------------------------------
 
     def _lux(self, view: OpenView) -> Floats:
-        """Return [leds] illuminance at the view's target by the LED table, over its median."""
+        """Return [leds] illuminance at the view's target by the LED table, relative to its median."""
         target_mm = np.array([view.target_mm or (0.0, 0.0, 0.0)])
         lux = self._leds.illuminance_lux(apply(self._base_from_support, target_mm), emission=self._emission)
         of_view = lux[0, self._leds.rows(view.leds)]
@@ -236,7 +243,8 @@ class AutoExposureChooser:
 
 
 def _lit_rates(judgement: Judgement) -> Floats:
-    """Return [quantiles], DN per us. An LED that lights nothing counts as one that lights all well."""
+    """Return [quantiles] rates of lit pixels, DN per us. An LED that lights no pixel counts as one that lights all
+    pixels well."""
     rates = judgement.lit_rates if len(judgement.lit_rates) else np.full(QUANTILES, judgement.full_rate)
     return np.maximum(rates.astype(np.float64), _LEAST_RATE)
 
@@ -250,8 +258,8 @@ def _period_s(burst: Any) -> float:
 
 
 def _in_groups(place_of_led: Mapping[int, int], representative: Any) -> dict[int, list[int]]:
-    """Group LEDs into at most two places. More places are divided at the widest gap, and each part gets the place
-    that its outermost LED needs."""
+    """Group LEDs by place, into at most two groups. If there are more places, they are divided at the widest gap,
+    and each group gets the place that its outermost LED needs."""
     places = sorted(set(place_of_led.values()))
     if not places:
         return {}
@@ -267,8 +275,8 @@ def _in_groups(place_of_led: Mapping[int, int], representative: Any) -> dict[int
 
 
 def _one_for_each_exposure(bursts: Iterable[ChosenBurst]) -> list[ChosenBurst]:
-    """Return the same bursts, joined to one for each exposure. The smallest is first, because its table is in the
-    box soonest."""
+    """Return the bursts, joined to one burst for each exposure. The smallest burst is first, because its table
+    reaches the box soonest."""
     leds_at: dict[int, ChosenBurst] = {}
     for burst in bursts:
         before = leds_at.get(burst.exposure)

@@ -1,1 +1,2 @@
-"""The Python face, `import coupole`: runs, results, plans, acquisitions and cells for scripts and notebooks."""
+"""The Python interface, `import coupole`: runs, results, plans, acquisitions and cells for scripts and
+notebooks."""

@@ -1,9 +1,9 @@
-"""A plan acquired from a script or a notebook, as an iterator of events.
+"""Acquisition of a plan from a script or a notebook, as an iterator of events.
 
-The run is a process of its own, `coupole acquire`. So the caller's pauses, its garbage collection and its debugger
-never hold the thread that watches the arm; nor do its signal handlers. This module reads the run's journal.
-However the loop ends, the process is interrupted as by Ctrl-C and makes the cell safe; it is interrupted by the
-kernel if the thread that began it dies (docs/decisions/0058-python-face.md).
+The run is a separate process, `coupole acquire`. Therefore the caller's pauses, garbage collection, debugger and
+signal handlers never delay the thread that watches the arm. This module reads the run's journal. When the loop
+ends, for whatever reason, the process is interrupted as by Ctrl-C and makes the cell safe. If the thread that
+began the process dies, the kernel interrupts it (docs/decisions/0058-python-face.md).
 """
 
 from __future__ import annotations
@@ -35,19 +35,20 @@ AnyPath = str | os.PathLike[str]
 _LOG = logging.getLogger("coupole")
 _LOOK_EVERY_S = 0.1
 _SIGNALLED = 128
-"""Exit codes above this are of a signal."""
+"""An exit code above this means that a signal ended the process."""
 _ENDS_WITHIN_S = 600.0
-"""Longer than a session whose every call hangs, and than a slow report."""
+"""Longest wait for the end of the process, s: longer than a session in which every call hangs, and than a slow
+report."""
 
 
 class Acquisition(Iterator[Event]):
-    """A run that is being acquired: its journal's events, as they come. Use it in a `with` statement: when this
+    """A run that is being acquired: an iterator of its journal's events. Use it in a `with` statement: when this
     ends, the run is over and the cell is safe."""
 
     run: Path | None
-    """The run's folder, absolute; None until it is made."""
+    """The run's folder, absolute; None until it exists."""
     figures: Mapping[str, Any]
-    """Figures of the run as of `coupole acquire --json`, when it is over; empty before."""
+    """Figures of the run when it is over, as in `coupole acquire --json`; empty before."""
 
     def __init__(self, arguments: list[str], plan: Plan | None, run: Path | None) -> None:
         self.run, self.figures = None, {}
@@ -69,7 +70,7 @@ class Acquisition(Iterator[Event]):
                 stdin=subprocess.DEVNULL,
                 stdout=figures,
                 stderr=errors,
-                start_new_session=True,  # the terminal's Ctrl-C is passed on once, by `close`
+                start_new_session=True,  # a Ctrl-C of the terminal reaches it once, through `close`
             )
 
     def __enter__(self) -> Acquisition:
@@ -85,8 +86,8 @@ class Acquisition(Iterator[Event]):
             self.close()
 
     def __next__(self) -> Event:
-        """The next event; waits for it. Raises what the command would end with (InputError, PreflightRefused,
-        DeviceError, UnprovenError, StorageError, Interrupted), after the last event."""
+        """Wait for the next event and return it. After the last event, raises the command's error if it failed
+        (InputError, PreflightRefused, DeviceError, UnprovenError, StorageError, Interrupted)."""
         while not self._events:
             is_over = self._process.poll() is not None
             self._look()
@@ -99,18 +100,18 @@ class Acquisition(Iterator[Event]):
         return self._events.popleft()
 
     def close(self) -> None:
-        """Stop the run, if it is not over: lights off, arm still, camera disarmed. Returns when its process has
-        ended; the run can be resumed. Raises DeviceError if it is not sure that the cell is safe."""
+        """Stop the run if it is not over: lights off, arm still, camera disarmed. Returns when its process has
+        ended; the run can be resumed. Raises DeviceError if it is not certain that the cell is safe."""
         was_over = self._process.poll() is not None
         if not was_over:
             self._process.send_signal(signal.SIGINT)
-            self._process.send_signal(signal.SIGCONT)  # it may have been stopped, and is to end now
+            self._process.send_signal(signal.SIGCONT)  # a stopped process must run to end
         self._take_in_the_end()
         if not was_over and (trouble := self.figures.get("unsafe")):
             raise unsafe_end("; ".join(trouble))
 
     def _tell_if_it_stands_still(self) -> None:
-        """Log once that the run's process is stopped (SIGSTOP): no event comes until it runs again."""
+        """Log once that the run's process is stopped (SIGSTOP); no events come until it runs again."""
         stands_still = is_stopped(self._process.pid)
         if stands_still and not self._stands_still:
             _LOG.warning(
@@ -123,7 +124,7 @@ class Acquisition(Iterator[Event]):
         self._stands_still = stands_still
 
     def _look(self) -> None:
-        """Take in what the journal has gained."""
+        """Add the journal's new events."""
         if self._follower is None:
             self._find_run()
         if self._follower is not None:
@@ -145,7 +146,7 @@ class Acquisition(Iterator[Event]):
             self._follower.news()
 
     def _conclude(self) -> None:
-        """Raise what the process ended with, if it did not end well."""
+        """Raise the error of the process, if it failed."""
         self._take_in_the_end()
         code = self._process.returncode
         if code == 0:
@@ -159,7 +160,7 @@ class Acquisition(Iterator[Event]):
         raise unsafe_end(f"its process was killed (signal {-code}); lights and arm stop by their own watchdogs")
 
     def _take_in_the_end(self) -> None:
-        """Wait for the end of the process, and take what it has printed."""
+        """Wait for the end of the process, and read its output."""
         try:
             self._process.wait(_ENDS_WITHIN_S)
         except subprocess.TimeoutExpired as error:
@@ -184,11 +185,13 @@ def acquire(
     resume: AnyPath | None = None,
     yes: bool = False,
 ) -> Acquisition:
-    """Acquire a plan (a `Plan`, a file, or the name of a shipped one), or resume a run; an iterator of events.
+    """Acquire a plan (a `Plan`, a file, or the name of a shipped one), or resume a run; return an iterator of
+    events.
 
-    `rig` is another rig than the plan's, `output` the parent folder of the run. A real cell moves only with `yes`.
-    Events are those of the journal (`coupole.events`), such as `FrameProven` with `shot`, `file` and `index`.
-    Raises InputError for arguments that do not go together; later as `Acquisition.__next__` says.
+    `rig` replaces the plan's rig; `output` is the parent folder of the run. A real cell moves only if `yes` is
+    True. Events are those of the journal (`coupole.events`), such as `FrameProven` with `shot`, `file` and
+    `index`. Raises InputError for arguments that do not go together. The iterator raises the errors of
+    `Acquisition.__next__`.
 
     ::
 

@@ -1,4 +1,4 @@
-"""Work on what was acquired, called from Python: as the commands of these names do it, with values in return."""
+"""Analyses called from Python: the work of the commands of the same names, which returns values."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 CalibrationRecord = Record
 AnyPath = str | os.PathLike[str]
 Progress = Callable[[str, int, int], None]
-"""Called with the name of a step, the number of its parts that are done, and the number of all its parts."""
+"""Function called with the name of a step, the number of its finished parts, and the number of all its parts."""
 PRINTED_U_PPM = 5000.0
 """Standard uncertainty of a board's scale if only the nominal side of its squares is known."""
 
@@ -46,13 +46,14 @@ def fit_reflectance(
     memory_bytes: int = 2_000_000_000,
     progress: Progress | None = None,
 ) -> Result:
-    """Materials of an object from proven frames of its runs, as `coupole reflectance RUN --out OUT` finds them.
+    """Fit the materials of an object to proven frames of its runs, like `coupole reflectance RUN --out OUT`.
 
     `mesh` and `calibrations` (records, or folders of them) replace those of the runs' plans. `left_out` are LEDs
     that are kept for the check (by default every twelfth). `texels` adds materials of single pixels, or of texels
-    of a width in mm on the surface. A job that was stopped goes on where it was when it is called again.
+    of a width in mm on the surface. A job that was stopped continues when it is called again.
 
-    Raises InputError: no runs, or records that do not belong to them; StorageError, ChecksumMismatch.
+    Raises InputError if there are no runs, or if the records do not belong to them; StorageError,
+    ChecksumMismatch.
     """
     from coupole.calibration.record import records_named
     from coupole.reflectance.result_pages import run_reflectance_page
@@ -83,14 +84,14 @@ def calibrate_camera(
     model: Literal["pinhole", "radial", "brown4", "brown5"] = "brown5",
     progress: Progress | None = None,
 ) -> CalibrationRecord:
-    """Lens and distortion from 8 to 60 pictures of a board, as `coupole calibrate camera` finds them.
+    """Find lens and distortion from 8 to 60 pictures of a board, like `coupole calibrate camera`.
 
     `images` is a folder of pictures, or runs. `board` is a description (YAML; by default `board.yaml` of the
     folder), or the numbers of inner corners of a plain chessboard, columns and rows, with the side of its squares
-    `square_mm`. The record has parameters with standard uncertainties, their covariance and remarks; look at
+    `square_mm`. The record has parameters with standard uncertainties, their covariance and remarks. Check
     `is_accepted` before you use it.
 
-    Raises InputError: no board, too few pictures of it; CalibrationRefused.
+    Raises InputError if there is no board or too few pictures of it; CalibrationRefused.
     """
     from coupole.calibration.lens.workflow import camera_from
     from coupole.calibration.request import Request
@@ -118,7 +119,7 @@ def identify(
     unit: Literal["auto", "percent", "fraction"] = "auto",
     progress: Progress | None = None,
 ) -> tuple[PigmentFinding, ...]:
-    """Class of pigments that each reflectance spectrum shows, as `coupole identify` finds it.
+    """Find the class of pigments of each reflectance spectrum, like `coupole identify`.
 
     `spectra` are files of an instrument or tables, or folders of them; `library` has the spectra of known
     pigments, `classes` the class of each (by default the table that comes with Coupole). Raises InputError.
@@ -147,14 +148,14 @@ def register(
     trust_poses: bool = False,
     progress: Progress | None = None,
 ) -> Registration:
-    """Poses of two or more scans from what they overlap, as `coupole register` finds them.
+    """Find the poses of two or more scans from their overlaps, like `coupole register`.
 
-    `scans` are PLY, STL, OBJ, PTX, PTS, E57, or text with x y z, in `unit` (mm, cm, m, um or in; E57 is always in
-    m). `targets` is a table of targets in the scans, `control` one of targets whose places are known;
-    `seen_from` is the scanner's place in each scan's frame: origin, +x, -x, +y, -y, +z, -z or none (by default it
-    is found); `trust_poses` starts from the poses that PTX and E57 state.
+    `scans` are files: PLY, STL, OBJ, PTX, PTS, E57, or text with x y z. Their `unit` is mm, cm, m, um or in; E57
+    is always in m. `targets` is a table of the targets in the scans, and `control` one of targets whose positions
+    are known. `seen_from` tells where the scanner was in each scan's frame: origin, +x, -x, +y, -y, +z, -z or
+    none; by default it is found. With `trust_poses` the search starts from the poses that PTX and E57 state.
 
-    Raises InputError: no two scans overlap; ExtraMissing.
+    Raises InputError if no two scans overlap; ExtraMissing.
     """
     from coupole.scan.registration import registering
     from coupole.scan.registration.control import TargetTables
@@ -184,11 +185,11 @@ def compare(
     is_aligned: bool = False,
     progress: Progress | None = None,
 ) -> Comparison:
-    """Significant changes of shape and colour between two states of an object, as `coupole compare` finds them.
+    """Find significant changes of shape and colour between two states of an object, like `coupole compare`.
 
     Both are meshes or clouds (PLY, STL, OBJ) in `unit`, or folders of a result of reflectance. `noise_mm` is the
-    standard deviation of a point (by default estimated from the scatter); with `is_aligned` they are in one frame
-    already. Raises InputError, ExtraMissing.
+    standard deviation of a point (by default estimated from the scatter); with `is_aligned` both states are
+    already in one frame. Raises InputError, ExtraMissing.
     """
     from coupole.heritage.comparison import state_comparison
     from coupole.scan.scan import UNITS
@@ -214,8 +215,11 @@ def fit_runs(
     texels: TexelSize | None,
     tell: Callable[[TexelForecast], None] | None = None,
 ) -> dict[str, Any]:
-    """Make a result, or what of it is missing; return what `result.json` says. What texels will take is given to
-    `tell` before the work begins. Raises as `fit_reflectance`."""
+    """Make a result, or its missing parts; return the content of `result.json`.
+
+    The forecast of the texels' time and size is given to `tell` before the work begins. Raises the errors of
+    `fit_reflectance`.
+    """
     from coupole.reflectance.run_job import reflectance_of
 
     forecast = None
@@ -241,7 +245,7 @@ def fit_runs(
 
 
 def references_of(library: Path, classes: Path | None) -> References:
-    """Return the library's spectra with their classes. Raises InputError, also if no table of classes is known."""
+    """Return the library's spectra with their classes. Raises InputError, also if there is no table of classes."""
     from coupole.appearance.spectra.spectra_library import read_library
     from coupole.heritage.analysis.pigment_classes import read_classes, shipped_classes
     from coupole.heritage.analysis.references import make_references
@@ -272,7 +276,8 @@ def identify_spectra(
 
 
 def plain_chessboard(corners: tuple[int, int], square_mm: float | None) -> Board:
-    """Return a chessboard of so many inner corners, columns and rows. Raises InputError if there can be none."""
+    """Return a chessboard with this number of inner corners, columns and rows. Raises InputError if there can be
+    no such board."""
     from coupole.calibration.lens.board import Board
 
     columns, rows = corners
@@ -291,10 +296,11 @@ def sight_board(
     progress: Callable[[int, int], None],
     warmth: tuple[float | None, float] = (None, 0.5),
 ) -> tuple[Sources, Board, Found]:
-    """Open the images, and find the board in them: a plain one, that of a file, or of `board.yaml` beside them.
+    """Open the images, and find the board in them: a plain one, that of a file, or that of `board.yaml` beside the
+    images.
 
-    `warmth` is the board's temperature when it was photographed (C, None if nobody measured it) and its standard
-    uncertainty (K); a board with a certificate has the lengths of that temperature.
+    `warmth` is the board's temperature when it was photographed (C, None if not measured) and its standard
+    uncertainty (K). It gives the lengths of a board with a certificate.
     """
     from coupole.calibration.artefact import temperature_of
     from coupole.calibration.lens.board import read_board
@@ -307,7 +313,7 @@ def sight_board(
         raise InputError(f"expected the board's description: give --board, or put it at {usual_file}")
     description = None if plain_board is not None else named_file
     target = plain_board if description is None else read_board(description)
-    assert target is not None  # as was refused above
+    assert target is not None  # the case without a board was refused above
     sources = open_sources(paths, poses).with_file(description)
     if description is None:
         across, down = target.corners
@@ -317,11 +323,11 @@ def sight_board(
 
 
 def _silent(step: str, count: int, total: int) -> None:
-    """Tell nobody."""
+    """Report no progress."""
 
 
 def _paths(paths: AnyPath | Sequence[AnyPath], what: str = "") -> list[Path]:
-    """Raises InputError if there is none and `what` is expected."""
+    """Return the paths as a list. Raises InputError if there is none, although `what` is expected."""
     if isinstance(paths, str | os.PathLike):
         return [Path(paths)]
     if what and not len(paths):

@@ -1,4 +1,4 @@
-"""The devices of a cell for a script of one's own: opened by their contracts, safe on exit."""
+"""The devices of a cell for scripts: opened by their contracts, safe on exit."""
 
 from __future__ import annotations
 
@@ -21,16 +21,15 @@ from coupole.storage.arm_faults import faults_of
 def open_cell(rig: str | os.PathLike[str] = "sim", *, support_is_empty: bool = False) -> Iterator[OpenedCell]:
     """Open the devices of a rig (a file, or the name of a shipped one), with its simulated world if it has one.
 
-    `cell.ledbox`, `cell.camera` and `cell.robot` are as described in `coupole.devices`; `cell.clock` is the
-    rig's clock, and `cell.identities` has the identity of each device. At the end, also by an exception or Ctrl-C,
-    the lights are
-    switched off, the arm is stopped, the camera is disarmed, and the devices are closed. No path is checked for
-    you, and no ledger counts the light: only a plan does both. So a real cell opens only with your word that its
-    `support_is_empty`.
+    `cell.ledbox`, `cell.camera` and `cell.robot` are as described in `coupole.devices`; `cell.clock` is the rig's
+    clock, and `cell.identities` has the identity of each device. At the end, also after an exception or Ctrl-C,
+    the lights are switched off, the arm is stopped, the camera is disarmed, and the devices are closed. No path is
+    checked, and no ledger counts the light: this is done only for plans. Therefore a real cell opens only if you
+    state that its `support_is_empty`.
 
-    Raises InputError: the rig is wrong, a real cell without that word, or another process has its devices;
-    DeviceError: one cannot be opened, the arm is in a fault, or (at the end) it is not sure that all is off and at
-    rest; PreflightRefused: a real cell that was not commissioned.
+    Raises InputError if the rig is wrong, if `support_is_empty` is missing for a real cell, or if another process
+    holds the devices; DeviceError if a device cannot be opened, if the arm is in a fault, or (at the end) if it is
+    not certain that the cell is safe; PreflightRefused if a real cell was not commissioned.
     """
     cell = read_cell(Path(rig))
     if not (support_is_empty or in_world(cell.rig, dry_run=False)):

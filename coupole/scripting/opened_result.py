@@ -27,12 +27,13 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 SAMPLES = 256
-"""Rays to each area light and environment."""
+"""Number of rays to each area light and environment."""
 
 
 @dataclass(frozen=True)
 class Materials:
-    """GGX materials of the faces of a mesh (or of the fitted pixels of a picture); NaN where there is none."""
+    """GGX materials of the faces of a mesh, or of the fitted pixels of a picture; NaN where no material was
+    fitted."""
 
     normals: NDArray[np.float64]
     """[n, 3] unit normals: base frame for a mesh; x right, y up, z to the camera for a picture."""
@@ -81,7 +82,7 @@ class Result:
 
     @property
     def vertices_mm(self) -> NDArray[np.float32]:
-        """[vertices, 3] of the mesh, base frame, mm; equal corners are one vertex."""
+        """[vertices, 3] of the mesh, base frame, mm; corners with the same coordinates are one vertex."""
         return self._mesh[0]
 
     @property
@@ -91,7 +92,7 @@ class Result:
 
     @cached_property
     def is_seen(self) -> NDArray[np.bool_]:
-        """[faces] True for those that a view sees."""
+        """[faces] True for faces that at least one view sees."""
         mask = np.zeros(len(self._result.corners_mm), bool)
         mask[self._result.triangles] = True
         return mask
@@ -99,20 +100,20 @@ class Result:
     def materials(self, fit: str | None = None) -> Materials:
         """Materials of all faces by a fit (one of `fits`; by default that with the smallest error in the check).
 
-        Raises InputError: the result has no such fit.
+        Raises InputError if the result has no such fit.
         """
         of_seen: TriangleMaterials = self._result.materials(self._fit(fit))
         names = [field.name for field in fields(Materials)]
         return Materials(*(self._on_faces(getattr(of_seen, name)) for name in names))
 
     def normals(self, fit: str | None = None) -> NDArray[np.float64]:
-        """[faces, 3] fitted unit normals, base frame; NaN where there is none."""
+        """[faces, 3] fitted unit normals, base frame; NaN where no normal was fitted."""
         return self.materials(fit).normals
 
     def covariances(self, fit: str | None = None) -> NDArray[np.float64]:
         """[faces, 5, 5] covariance of tilts (rad) along two tangents of the normal and of the logarithms of kd, ks
-        (the channels' mean) and alpha; NaN where there is none. Uncertainties that triangles share are not in
-        it."""
+        (the channels' mean) and alpha; NaN where no material was fitted. Uncertainties that triangles share are
+        not included."""
         return self._on_faces(self._result.material_covariances(self._fit(fit)))
 
     def relight(
@@ -126,12 +127,13 @@ class Result:
         fit: str | None = None,
         samples: int = SAMPLES,
     ) -> NDArray[np.float32]:
-        """[height, width, 3] linear picture under lights that are summed, as `coupole reflectance relight` makes
-        it: 1 is a white diffuser in full light, of an LED the camera's range.
+        """[height, width, 3] linear picture under the sum of the lights, like that of `coupole reflectance
+        relight`. 1 is a white diffuser in full light; for LEDs, 1 is the full range of the camera.
 
-        `direction` (to a distant light, support frame, z up) and `led` (number of an LED of the run) are short for
-        lights of `coupole.lights`. `view` is a measured view, by default the first; a `camera` stands anywhere.
-        `samples` are rays to each area light and environment. Raises InputError: no light, an unknown view or fit.
+        `direction` (to a distant light, support frame, z up) and `led` (number of an LED of the run) are short
+        forms of lights of `coupole.lights`. `view` is a measured view, by default the first; a `camera` replaces
+        the view and may be anywhere. `samples` are rays to each area light and environment. Raises InputError if
+        there is no light, or if view or fit are unknown.
         """
         scene = relit_result.open_result(self.folder, view, fit, camera, samples, uncertain=False)
         return scene.picture(_lights(lights, direction, led), _say_nothing)
@@ -147,8 +149,8 @@ class Result:
         fit: str | None = None,
         samples: int = SAMPLES,
     ) -> NDArray[np.float32]:
-        """[height, width, 3] standard uncertainty (68 %) of the picture that `relight` makes of the same
-        arguments, by a fit of materials. Raises InputError, also for a fit that states no uncertainty."""
+        """[height, width, 3] standard uncertainty (68 %) of the picture that `relight` makes with the same
+        arguments and a fit of materials. Raises InputError, also for a fit that states no uncertainty."""
         scene = relit_result.open_result(self.folder, view, fit, camera, samples, uncertain=True)
         assert scene.uncertainty is not None
         return scene.uncertainty(_lights(lights, direction, led), _say_nothing)
@@ -157,8 +159,8 @@ class Result:
         self, name: str, out: str | os.PathLike[str], *, fit: str | None = None, overwrite: bool = False
     ) -> list[Path]:
         """Write the result in a format of `coupole export` (ply, gltf, obj, usd, ktx2, materialx, exr, bsdf,
-        merl, bird, alta) into the folder `out`; return its files. Raises InputError for another
-        format, and for a folder with files in it (unless `overwrite`); StorageError."""
+        merl, bird, alta) into the folder `out`; return its files. Raises InputError for any other format, and if
+        the folder contains files (unless `overwrite`); StorageError."""
         from coupole.exchange.of_results.export_result import export_result
 
         return export_result(self.folder, name, Path(out), fit=fit, overwrite=overwrite)
@@ -170,20 +172,21 @@ class Result:
         return vertices, places.reshape(-1, 3).astype(np.int64)
 
     def _fit(self, name: str | None) -> str:
-        """Raises InputError: there is none of this name."""
+        """Return the fit of this name. Raises InputError if there is none."""
         if name is not None and name not in self.fits:
             raise InputError(f"{self.folder}: expected a fit of {', '.join(self.fits)}; found {name}")
         return name or run_relighting.best_fit(self._result, self.fits)
 
     def _on_faces(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[faces, ...] of values of the faces that a view sees."""
+        """Return [faces, ...]: the values, which are given for the faces that a view sees, and NaN for the
+        others."""
         all_values = np.full((len(self._result.corners_mm), *values.shape[1:]), np.nan)
         all_values[self._result.triangles] = values
         return all_values
 
 
 class PicturesResult:
-    """A result folder of pictures under known lights (`coupole reflectance --pictures`): values for its pixels."""
+    """A result folder of pictures under known lights (`coupole reflectance --pictures`): values of pixels."""
 
     folder: Path
     """The result's folder, absolute."""
@@ -199,7 +202,7 @@ class PicturesResult:
 
     @property
     def mask(self) -> NDArray[np.bool_]:
-        """[height, width] True where a material was fitted."""
+        """[height, width] True for pixels with a fitted material."""
         return self._result.mask
 
     @property
@@ -208,8 +211,8 @@ class PicturesResult:
         return self._result.directions
 
     def materials(self) -> dict[str, NDArray[np.float32]]:
-        """Pictures [height, width, ...] of what was fitted, by the names of docs/reference/result-folder.md; NaN
-        outside the mask."""
+        """Pictures [height, width, ...] of the fitted quantities, by the names of docs/reference/result-folder.md;
+        NaN outside the mask."""
         with picture_result.open_result_file(self.folder / picture_result.MATERIALS) as file:
             arrays = {name: np.asarray(data, np.float32) for name, data in file.items()}
         pixels = int(self.mask.sum())
@@ -224,14 +227,15 @@ class PicturesResult:
     def relight(
         self, lights: Sequence[AnyLight] = (), *, direction: Vector | None = None, samples: int = SAMPLES
     ) -> NDArray[np.float32]:
-        """[height, width, 3] linear picture under lights that are summed; `direction` is short for a distant light
-        (x right, y up, z to the camera). Raises InputError: no light, or one that pictures cannot have."""
+        """[height, width, 3] linear picture under the sum of the lights. `direction` is a short form of a distant
+        light (x right, y up, z to the camera). Raises InputError if there is no light, or if pictures cannot have
+        it."""
         scene = relit_result.open_result(self.folder, None, None, None, samples, uncertain=False)
         return scene.picture(_lights(lights, direction, None), _say_nothing)
 
     def to(self, name: str, out: str | os.PathLike[str], *, overwrite: bool = False) -> list[Path]:
-        """Write the result in a format of `coupole export` (relight, ptm, rti, iiif) into the folder `out`; the
-        files. Raises InputError for another format, and for files that are there already (unless `overwrite`)."""
+        """Write the result in a format of `coupole export` (relight, ptm, rti, iiif) into the folder `out`; return
+        the files. Raises InputError for any other format, and if the files exist (unless `overwrite`)."""
         from coupole.exchange.rti.export_views import export_views
 
         format_named(name, Source.PICTURES, Writer.VIEWS)
@@ -242,7 +246,7 @@ def open_result(path: str | os.PathLike[str]) -> Result | PicturesResult:
     """Open the folder of a result of `coupole reflectance RUN` (a `Result`) or of `--pictures` (a
     `PicturesResult`).
 
-    Raises InputError if it holds neither.
+    Raises InputError if the folder contains neither.
     """
     folder = so_far.as_it_is_now(Path(path).resolve())
     if (folder / run_result.OBJECT).exists():
@@ -253,7 +257,7 @@ def open_result(path: str | os.PathLike[str]) -> Result | PicturesResult:
 
 
 def _lights(lights: Sequence[AnyLight], direction: Vector | None, led: int | None) -> list[AnyLight]:
-    """Raises InputError: there is none."""
+    """Return the list of all lights. Raises InputError if there is none."""
     whole = list(lights)
     whole += [] if direction is None else [DistantLight(towards=direction)]
     whole += [] if led is None else [LedLight(number=led)]
@@ -263,4 +267,4 @@ def _lights(lights: Sequence[AnyLight], direction: Vector | None, led: int | Non
 
 
 def _say_nothing(count: int, of: int) -> None:
-    """Progress that nobody reads."""
+    """Ignore the progress."""

@@ -1,4 +1,5 @@
-"""A run read from Python: its views, and proven frames as numpy arrays, each read when it is asked for."""
+"""A run read from Python: its views, and proven frames as numpy arrays. A frame is read when its pixels are
+used."""
 
 from __future__ import annotations
 
@@ -36,7 +37,7 @@ class RunView(Mapping[str, Frame]):
         self.name, self._events, self._run = name, frames, run
 
     def __getitem__(self, label: str) -> Frame:
-        """Raises KeyError with near names: there is no proven frame of this label."""
+        """Return the frame of this label. Raises KeyError with similar labels if there is no such proven frame."""
         self._run._refuse_closed()
         if label not in self._events:
             raise _unknown(label, self._events, f"proven frame of the view {self.name}")
@@ -53,12 +54,12 @@ class RunView(Mapping[str, Frame]):
 
     @property
     def shots(self) -> tuple[str, ...]:
-        """Labels of the proven frames under a light, without dark frames and marks."""
+        """Labels of the proven frames under a light; dark frames and marks are left out."""
         return tuple(label for label, event in self._events.items() if event.shot.is_shot)
 
     @property
     def darks(self) -> tuple[str, ...]:
-        """Labels of the proven dark frames; dark marks at the ends of bursts are among them."""
+        """Labels of the proven dark frames, including the dark marks at the ends of bursts."""
         return tuple(label for label, event in self._events.items() if event.shot.is_dark)
 
     @property
@@ -78,7 +79,7 @@ class RunView(Mapping[str, Frame]):
 
     @property
     def pixel_mm(self) -> float | None:
-        """Nominal size of a pixel on the plane in focus, mm, by the rig's lens; None if the file has no lens."""
+        """Nominal size of a pixel on the plane in focus, mm, by the rig's lens; None if the file names no lens."""
         names = ("pixel_pitch_um", "focal_length_mm", "focus_distance_mm")
         pitch_um, focal_mm, focus_mm = (self._file.number(name) for name in names)
         if not pitch_um or not focal_mm or not focus_mm or focus_mm <= focal_mm:
@@ -116,7 +117,7 @@ class RunView(Mapping[str, Frame]):
 
 
 class Run(Mapping[str, RunView]):
-    """A run folder: its views by their names. Only proven frames are in it, as the journal had them when it was
+    """A run folder: its views by their names. It contains only frames that the journal had proven when it was
     opened."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -134,11 +135,11 @@ class Run(Mapping[str, RunView]):
         self.close()
 
     def close(self) -> None:
-        """Forget the run; frames that were taken from it can still be read."""
+        """Forget the run; frames that were obtained from it can still be read."""
         self._closed = True
 
     def __getitem__(self, view: str) -> RunView:
-        """Raises KeyError with near names: the run has no such view."""
+        """Return the view of this name. Raises KeyError with similar names if the run has no such view."""
         self._refuse_closed()
         if view not in self._views:
             raise _unknown(view, self._views, "view")
@@ -180,21 +181,22 @@ class Run(Mapping[str, RunView]):
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Ids of the plan's shots and dark frames that are not proven; where frames are chosen in the run, of
-        those chosen so far (see `open_views`)."""
+        """Ids of the plan's shots and dark frames that are not proven. If frames are chosen in the run, only those
+        chosen so far count (see `open_views`)."""
         proven = self._run.proven()
         return tuple(str(shot) for shot in self._run.expected_shots() if shot not in proven)
 
     @property
     def open_views(self) -> tuple[str, ...]:
-        """Views for which more frames may yet be chosen; none where the plan names all frames."""
+        """Views for which more frames may still be chosen; none if the plan names all frames."""
         return tuple(self._run.open_views())
 
     def dataset(self, view: str) -> xr.Dataset:
-        """All proven frames of a view as an xarray Dataset on dask: `pixels` [shot, y, x] uint16 DN, a chunk for
-        each frame, read when it is computed; coordinates as of `Frame`, units in `attrs`.
+        """All proven frames of a view as an xarray Dataset on dask. `pixels` is [shot, y, x] uint16 DN, with a
+        chunk for each frame, which is read when it is computed. Coordinates are the attributes of `Frame`; units
+        are in `attrs`.
 
-        Raises KeyError: no such view; ModuleNotFoundError: the extra `xarray` is not installed.
+        Raises KeyError if there is no such view, ModuleNotFoundError if the extra `xarray` is not installed.
         """
         from coupole.scripting.view_dataset import dataset_of
 
@@ -216,16 +218,17 @@ class Run(Mapping[str, RunView]):
 
 
 def open_run(path: str | os.PathLike[str]) -> Run:
-    """Open a run folder to be read, also while it is being acquired; nothing is written.
+    """Open a run folder for reading, also while it is being acquired.
 
-    `path` is the folder that `coupole acquire` made. Raises InputError if it is no run, StorageError if its
+    `path` is the folder that `coupole acquire` made. Raises InputError if it is not a run, StorageError if its
     journal or a view's file is damaged.
     """
     return Run(path)
 
 
 def _calibrated_positions(record_paths: Iterable[Path]) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-    """Ids and positions [n, 3] of the LEDs, mm, by the record of the kind `leds`; None if none is named."""
+    """Return ids and positions [n, 3] of the LEDs, mm, from the record of the kind `leds`; None if no such record
+    is named."""
     from coupole.calibration.in_force import read_in_force
     from coupole.calibration.light.led_power_tile import calibrated_positions
 

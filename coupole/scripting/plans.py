@@ -1,8 +1,8 @@
 """Plans and rigs in Python: read, built, checked, written.
 
-They are the models of the YAML files, with every key of them as an argument. Paths are absolute: a relative one
-belongs to the file that it is read from, or to the working folder where the model is built in Python. The name of
-a shipped rig, such as `sim`, stays a name.
+They are the models of the YAML files; every key is an argument. Paths are absolute: a relative path is relative to
+its file, or to the working folder if the model is built in Python. The name of a shipped rig, such as `sim`, stays
+a name.
 """
 
 from __future__ import annotations
@@ -40,16 +40,18 @@ class Plan(plan_models.Plan):
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Plan:
         """The plan of a YAML file, or the shipped one of this name. Raises InputError with all mistakes, each with
-        file:line:column; its `problems` holds them one by one."""
+        file:line:column; the error's `problems` lists them."""
         document, plan = _read_model(Path(path), "plans", plan_models.Plan)
         return cls(**_fields(plan, lambda path_: path_ if _is_shipped_rig(path_) else document.resolve(path_)))
 
     def check(self, *, paths: bool = True, disk_speed: bool = True) -> Report:
-        """Everything that preflight knows, without a device: `refusals` and `warnings` (sentences), `views`,
-        `shots`, `frames`, `bytes`, `duration_s`, `dose_lux_h`. The plan can be run if there are no refusals.
+        """Check the plan without a device, like preflight.
 
-        Without `paths` no collisions are looked for; without `disk_speed` the disk's is not measured. Raises
-        InputError: the rig or another file that the plan names is wrong.
+        Returns `refusals` and `warnings` (sentences), `views`, `shots`, `frames`, `bytes`, `duration_s` and
+        `dose_lux_h`. The plan can be run if there are no refusals. Without `paths`, collisions are not checked;
+        without `disk_speed`, the disk's speed is not measured.
+
+        Raises InputError if the rig or another file that the plan names is wrong.
         """
         from coupole.preflight.checking import preflight_of
         from coupole.preflight.job import read_job, without_hidden
@@ -60,12 +62,12 @@ class Plan(plan_models.Plan):
 
     @property
     def text(self) -> str:
-        """The plan as YAML, without keys that have their default."""
+        """Return the plan as YAML, without keys that have their default values."""
         return _text(self)
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
-        """Write the plan as YAML; `Plan.read` gives an equal plan; returns `path`. Raises InputError: the file is
-        there already (unless `overwrite`); OSError."""
+        """Write the plan as YAML and return `path`; `Plan.read` of this file gives an equal plan. Raises
+        InputError if the file exists (unless `overwrite`); OSError."""
         return _write(self, Path(path), overwrite=overwrite)
 
 
@@ -86,12 +88,12 @@ class Rig(rig_models.Rig):
 
     @property
     def text(self) -> str:
-        """The rig as YAML, without keys that have their default."""
+        """Return the rig as YAML, without keys that have their default values."""
         return _text(self)
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
-        """Write the rig as YAML; `Rig.read` gives an equal rig; returns `path`. Raises InputError: the file is
-        there already (unless `overwrite`); OSError."""
+        """Write the rig as YAML and return `path`; `Rig.read` of this file gives an equal rig. Raises InputError
+        if the file exists (unless `overwrite`); OSError."""
         return _write(self, Path(path), overwrite=overwrite)
 
 
@@ -105,7 +107,7 @@ def _fields(model: BaseModel, resolve: Callable[[Path], Path]) -> dict[str, Any]
 
 
 def _with_paths(value: Any, resolve: Callable[[Path], Path]) -> Any:
-    """The value, with each path in it resolved."""
+    """Return the value with each of its paths resolved."""
     if isinstance(value, Path):
         return resolve(value)
     if isinstance(value, BaseModel):
@@ -122,7 +124,7 @@ def _is_shipped_rig(path: Path) -> bool:
 
 
 def _text(model: BaseModel) -> str:
-    """YAML of a model; the version of its format comes first."""
+    """Return the YAML of a model; the version of its format comes first."""
     yaml: Any = YAML(typ="safe", pure=True)
     stream = io.StringIO()
     yaml.default_flow_style, yaml.width, yaml.sort_base_mapping_type_on_output = None, 4096, False

@@ -1,4 +1,4 @@
-"""One proven frame, read when its pixels are asked for."""
+"""One proven frame; its pixels are read when they are used."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class Frame:
     joints_deg: NDArray[np.float64]
     """[6] measured joint angles, degrees."""
     board_temperature_c: float | None
-    """Temperature of the LED's board, C; None if the box could not tell."""
+    """Temperature of the LED's board, C; None if the box did not measure it."""
     taken_utc: str
     """Time when it was proven, UTC, ISO 8601."""
     proof: str
-    """Basis of its identity, in the words of run.json: what ties box and camera."""
+    """Evidence of the frame's identity, in the words of run.json: what relates box and camera."""
     xxh3: str
     """Checksum of its pixels, xxh3-64, 16 hexadecimal digits."""
     _file: ViewFile = field(repr=False)
@@ -48,13 +48,13 @@ class Frame:
 
     @property
     def pixels(self) -> NDArray[np.uint16]:
-        """[height, width] DN as the camera gave them. Raises ChecksumMismatch if they are not what was proven,
+        """[height, width] DN as the camera gave them. Raises ChecksumMismatch if they differ from the proven ones,
         StorageError if they cannot be read."""
         return self._file.proven_pixels(self._event)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Height and width, px; reads no pixels."""
+        """Height and width, px; the pixels are not read."""
         return self._file.layout.height_px, self._file.layout.width_px
 
     @property
@@ -64,11 +64,11 @@ class Frame:
 
     @property
     def slot(self) -> int:
-        """Row of that file's data where its pixels are, from 0."""
+        """Row of the frame's pixels in that file's data, from 0."""
         return self._event.index
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """The pixels as numpy wants them; always a new array."""
+        """The pixels for numpy; always a new array."""
         if copy is False:
             raise ValueError("a frame is read from the disk, so an array without a copy is not possible")
         return np.asarray(self.pixels, dtype)

@@ -1,4 +1,4 @@
-"""Results of runs and of pictures, opened so that lights can be put on them."""
+"""Results of runs and of pictures, opened to be relit."""
 
 from __future__ import annotations
 
@@ -21,25 +21,28 @@ Say = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Relit:
-    """A result that lights can be put on."""
+    """A result that can be relit."""
 
     picture: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]]
-    """[h, w, 3] of lights."""
+    """Function of lights; returns a picture [h, w, 3]."""
     about: dict[str, Any]
     """Description for `--json` and for a video's comment."""
     uncertainty: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]] | None = None
-    """[h, w, 3] standard uncertainty of the picture of lights, if it can be stated."""
+    """Function of lights; returns the standard uncertainty [h, w, 3] of their picture. None if it cannot be
+    stated."""
     half_width_95: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]] | None = None
-    """[h, w, 3] half width of the 95 % interval of the picture of lights, if it can be stated."""
+    """Function of lights; returns the half width [h, w, 3] of the 95 % interval of their picture. None if it
+    cannot be stated."""
     has_colours: bool = True
-    """False of a camera with one channel."""
+    """False for a camera with one channel."""
 
 
 def open_result(
     result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int, *, uncertain: bool
 ) -> Relit:
-    """The result in a folder, of runs or of pictures. `samples` are rays to an area or an environment. Raises
-    InputError: no result, or a result without this view, fit, camera or uncertainty.
+    """Open the result in a folder, of runs or of pictures. `samples` is the number of rays to an area or an
+    environment. Raises InputError if there is no result, or if it does not have this view, fit, camera or
+    uncertainty.
     """
     from coupole.reflectance import fits, relit_uncertainty, run_relighting, run_result
     from coupole.storage import so_far

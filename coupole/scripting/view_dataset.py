@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     import xarray as xr
 
 NO_LED = -1
-"""`led` of a frame without a single LED."""
+"""Value of `led` for a frame without a single LED."""
 _NOWHERE_MM = np.full(3, np.nan)
 
 
 def dataset_of(frames: Sequence[Frame], facts: Mapping[str, Any]) -> xr.Dataset:
-    """Frames of one view, as `Run.dataset` describes them; `facts` become its attributes. Raises
-    ModuleNotFoundError without the extra."""
+    """Return the frames of one view, as `Run.dataset` describes them; `facts` become the dataset's attributes.
+    Raises ModuleNotFoundError without the extra."""
     try:
         import xarray as xr
 
@@ -36,15 +36,15 @@ def dataset_of(frames: Sequence[Frame], facts: Mapping[str, Any]) -> xr.Dataset:
 
 
 def stack_frames(frames: Sequence[Frame]) -> Any:
-    """Dask array [frames, height, width]; a frame is read when a part of it is computed."""
+    """Return a dask array [frames, height, width]; a frame is read when a part of it is computed."""
     import dask.array
 
-    library: Any = dask.array  # which has no types
+    library: Any = dask.array  # dask has no types
     return library.stack([library.from_array(_Lazy(frame), chunks=frame.shape) for frame in frames])
 
 
 class _Lazy:
-    """A frame as dask wants an array."""
+    """A frame in the form of an array that dask can read."""
 
     dtype, ndim = np.dtype(np.uint16), 2
 

@@ -1,14 +1,16 @@
-"""Parts for the tests of others: a simulated cell over its real wires, and the contracts of devices as classes.
+"""Parts for tests of other projects: a simulated cell with its real protocols, and the contracts of devices as
+classes.
 
-A pytest plugin. It is loaded by name, in the `conftest.py` at the top of your tests:
+This is a pytest plugin. Load it by name in the `conftest.py` of your tests' top folder:
 
 ::
 
     pytest_plugins = ["coupole.testing"]
 
-Its fixtures are `simulated_cell`, a running cell (`SimulatedCell`), `simulated_rig` and `simulated_speed`, which
-say of which rig and how fast; override these in your own tests. The classes `...Conformance` hold what a driver of
-a kind must do: subclass one, and give it the fixtures that it names. docs/how-to/test-your-driver.md shows both.
+The fixture `simulated_cell` is a running cell (`SimulatedCell`). The fixtures `simulated_rig` and
+`simulated_speed` set its rig and its speed; override them in your own tests. Each class `...Conformance` tests the
+contract of one kind of device: subclass it, and give it the fixtures that it names.
+docs/how-to/test-your-driver.md shows both.
 """
 
 from __future__ import annotations
@@ -54,12 +56,12 @@ def simulated_rig() -> str | Path:
 
 @pytest.fixture
 def simulated_speed() -> float:
-    """Pace of `simulated_cell`: 1 is real time."""
+    """Speed of `simulated_cell`, as a multiple of real time."""
     return 1.0
 
 
 @pytest.fixture
 def simulated_cell(tmp_path: Path, simulated_rig: str | Path, simulated_speed: float) -> Iterator[SimulatedCell]:
-    """A running simulated cell over its real wires; its process is ended with the test."""
+    """A running simulated cell with its real protocols; its process ends with the test."""
     with started_cell(tmp_path, simulated_rig, speed=simulated_speed) as cell:
         yield cell

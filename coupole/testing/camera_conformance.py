@@ -1,4 +1,5 @@
-"""The contract of cameras: one class, run on each driver against the other end of its wire."""
+"""The contract of cameras as one class, which tests each driver against a simulated camera at the other end of its
+wire."""
 
 from __future__ import annotations
 
@@ -19,22 +20,23 @@ EXPOSURE = Exposure(exposure_us=2_000)
 BY_SOFTWARE = Exposure(exposure_us=2_000, hardware_trigger=False)
 PATIENCE_S = 10.0
 A_MOMENT_S = 0.2
-"""Time for which a test looks for a frame that must not come."""
+"""Time for which a test waits to see that no frame comes, s."""
 
 
 class CameraWorld(Protocol):
-    """A camera, its trigger cable and its clock; every frame is filled with the number of its exposure."""
+    """A camera, its trigger cable and its clock; every pixel of a frame shows the number of its exposure."""
 
     def open(self) -> Camera:
-        """A driver on the camera, closed with the world."""
+        """Open a driver of the camera; it is closed with the world."""
         ...
 
     def open_nothing(self) -> Camera:
-        """Open a camera that is not there."""
+        """Open a camera that does not exist."""
         ...
 
     def fire(self, *periods_us: int) -> list[int]:
-        """Send an edge, and one more after each of `periods_us`; their times, ns of the world."""
+        """Send one trigger edge, and one more after each of `periods_us`; return the times of all edges, ns of the
+        world."""
         ...
 
     def unplug(self) -> None:
@@ -43,24 +45,25 @@ class CameraWorld(Protocol):
 
     @property
     def is_armed(self) -> bool:
-        """True if edges make the camera expose frames."""
+        """True if trigger edges make the camera expose frames."""
         ...
 
 
 def expected_ramp(number: int) -> NDArray[np.uint16]:
-    """Frame number `number` of a ramp [HEIGHT_PX, WIDTH_PX]: 1000 a frame, 40 a row, 1 a column."""
+    """Return frame number `number` of a ramp [HEIGHT_PX, WIDTH_PX]: it grows by 1000 for each frame, 40 for each
+    row and 1 for each column."""
     return (1000 * number + np.arange(HEIGHT_PX * WIDTH_PX).reshape(HEIGHT_PX, WIDTH_PX)).astype(np.uint16)
 
 
 def take(camera: Camera, count: int) -> list[Frame]:
-    """`count` frames, kept."""
+    """Return `count` frames, which are not released."""
     frames = [camera.next_frame(PATIENCE_S) for _ in range(count)]
     assert None not in frames
     return [frame for frame in frames if frame is not None]
 
 
 def take_numbers(camera: Camera, count: int) -> list[int]:
-    """Numbers that `count` frames show, each given back at once."""
+    """Return the numbers that `count` frames show; each frame is released at once."""
     numbers = []
     for _ in range(count):
         (frame,) = take(camera, 1)
@@ -71,7 +74,8 @@ def take_numbers(camera: Camera, count: int) -> list[int]:
 
 
 def _while_taking(camera: Camera, count: int, act: Callable[[], object]) -> list[int]:
-    """Numbers shown by `count` frames. They are taken and given back in a thread while `act` causes them."""
+    """Return the numbers that `count` frames show. A thread takes and releases the frames while `act` causes
+    them."""
     numbers: list[int] = []
     taker = threading.Thread(target=lambda: numbers.extend(take_numbers(camera, count)))
     taker.start()
@@ -89,7 +93,7 @@ class CameraConformance:
     """
 
     frame_format: ClassVar[FrameFormat] = FrameFormat(HEIGHT_PX, WIDTH_PX, 12, "GBRG", 64, WHITE_DN)
-    """Format of frames that `configure` must tell."""
+    """Format of frames that `configure` must return."""
     readout_us: ClassVar[int] = 10_000
     """Least time between frames by the sensor's readout; longer than 4 ms."""
     exposure_gap_us: ClassVar[int] = 100
@@ -97,12 +101,12 @@ class CameraConformance:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Height and width of its frames, px."""
+        """Height and width of the frames, px."""
         return self.frame_format.height_px, self.frame_format.width_px
 
     @pytest.fixture
     def camera(self, world: CameraWorld) -> Camera:
-        """Opened, configured for edges, not armed."""
+        """A camera that is opened and configured for trigger edges, but not armed."""
         camera = world.open()
         camera.configure(EXPOSURE)
         return camera
@@ -159,7 +163,7 @@ class CameraConformance:
         assert camera.next_frame(0.01) is None
 
     def test_released_buffers_are_used_again(self, camera: Camera, world: CameraWorld) -> None:
-        """Many more frames than buffers, taken as they come."""
+        """There are many more frames than buffers; each frame is released before the next is taken."""
         camera.arm(8)
         numbers = _while_taking(camera, 150, lambda: world.fire(*[self.readout_us] * 149))
         assert numbers == list(range(150))
@@ -167,7 +171,7 @@ class CameraConformance:
         assert (statistics.overflows, statistics.lost_transfers) == (0, 0)
 
     def test_a_frame_keeps_its_pixels_until_it_is_released(self, camera: Camera, world: CameraWorld) -> None:
-        """Many more frames come meanwhile than there are buffers."""
+        """While one frame is kept, many more frames come than there are buffers."""
         camera.arm(8)
         world.fire()
         (kept,) = take(camera, 1)
@@ -286,7 +290,7 @@ class CameraConformance:
 
 
 def _when_free(open_camera: Callable[[], Camera]) -> Camera:
-    """Open it as soon as the world has noticed that the last client went."""
+    """Open the camera as soon as the world has noticed that the last client left."""
     for _ in range(100):
         try:
             return open_camera()

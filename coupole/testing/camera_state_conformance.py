@@ -1,7 +1,7 @@
-"""Frames of a camera that another program left in a state of its own: one class for all cameras with features.
+"""Frames of a camera whose features another program has changed: one class for all cameras with features.
 
-`expected_ramp` of `camera_conformance` has the expected frames. This module describes what each state does to
-frames, and the simulated cameras do the same.
+`expected_ramp` of `camera_conformance` returns the expected frames. This module describes the effect of each
+feature on frames, and the simulated cameras behave accordingly.
 """
 
 from __future__ import annotations
@@ -51,18 +51,18 @@ LEFT_BY_SFNC: Mapping[str, Left] = {
     "blue is amplified": (("BalanceRatioSelector", "Blue"), ("BalanceRatio", 2.0)),
     "another pixel format": (("PixelFormat", "Mono8"),),
 }
-"""Features and values, in the order in which a program sets them, by what they do to frames."""
+"""Features and values, in the order in which a program sets them. The key names their effect on frames."""
 
 
 class ForeignStateWorld(CameraWorld, Protocol):
     """A camera whose frames show the ramp of `camera_conformance.expected_ramp`."""
 
     def leave(self, features: Left) -> None:
-        """Have another program set these features, and go."""
+        """Let another program set these features and disconnect."""
         ...
 
     def begun_ns(self, frame: Frame) -> int:
-        """World time at which the frame's exposure began, from the camera's clock."""
+        """Return the world time, ns, at which the frame's exposure began, from the camera's clock."""
         ...
 
 
@@ -82,10 +82,10 @@ def assert_right_frames(world: ForeignStateWorld, camera: Camera) -> None:
 
 
 class ForeignStateConformance:
-    """Any driver passes that decides the camera's state itself.
+    """The contract of a driver that sets the camera's whole state itself.
 
-    A subclass gives the fixtures `world`, a `ForeignStateWorld`; `left`, features that another program has set;
-    and `all_left`, all of these.
+    A subclass gives three fixtures: `world`, a `ForeignStateWorld`; `left`, features that another program has set;
+    and `all_left`, all such features.
     """
 
     def test_frames_are_right_whatever_the_camera_was_left_in(self, world: ForeignStateWorld, left: Left) -> None:

@@ -1,4 +1,5 @@
-"""The contract of LED boxes: one class, run on each driver against the other end of its wire."""
+"""The contract of LED boxes as one class, which tests each driver against a simulated box at the other end of its
+wire."""
 
 from __future__ import annotations
 
@@ -15,71 +16,74 @@ from coupole.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 from coupole.testing.waiting import Call, wait_until
 
 FLASH_US = 200_000
-"""Long enough to be looked at from outside, in a world of eight times real speed on a busy machine."""
+"""Duration of a flash, long enough that it can be observed from outside while the world runs at eight times real
+speed on a busy machine."""
 
 
 class LedBoxWorld(Protocol):
     """An LED box as it is seen from outside: the other end of the driver's wire, and its light.
 
-    `sim.world.ledbox_alone.LedBoxAlone` is all of this for a stand-in on the event loop of the simulated cell.
+    `sim.world.ledbox_alone.LedBoxAlone` implements this for a stand-in on the event loop of the simulated cell.
     """
 
     @property
     def clock(self) -> Clock:
-        """The clock that the driver was given, and that the box runs by."""
+        """The clock of both driver and box."""
 
     @property
     def opener(self) -> Callable[..., AbstractContextManager[Any]]:
-        """Opens the driver on the box; the driver is closed when the context ends."""
+        """Function that opens the driver on the box; the driver is closed when the context ends."""
 
     @property
     def lights(self) -> list[tuple[int, int, int]]:
-        """Each light that was begun, the oldest first: LED, when it began, when it would end by itself (ns)."""
+        """All lights that have begun, the oldest first: LED, begin, and the end if nothing ends it before (ns)."""
 
     @property
     def panels(self) -> list[tuple[int, bool]]:
-        """Each switching of a panel, the oldest first: panel, and whether it was switched on."""
+        """Every switching of a panel, the oldest first: number of the panel, and True if it was switched on."""
 
     def shining(self) -> list[int]:
         """LEDs that shine now."""
 
     def wait_until_dark(self) -> None:
-        """Wait until nothing shines; fails if something shines on and on."""
+        """Wait until nothing shines; fail if something does not go out."""
 
     def lit_us(self, number: int) -> float:
-        """Time for which light number `number` (from 0, in `lights`) has shone until now, us."""
+        """Return how long light number `number` (from 0, in `lights`) has shone until now, us."""
 
     def kill_led(self, led: int) -> None:
-        """Let an LED give no light from its next flash on; the box does not know."""
+        """Make an LED dead from its next flash on; the box cannot notice it."""
 
     def mute(self, seconds: float | None = None) -> None:
-        """The box neither receives nor answers, for ever or for `seconds` of `clock`; a lit LED stays lit until it
-        is due."""
+        """Make the box neither receive nor answer, for `seconds` of `clock` or for ever. A lit LED stays lit until
+        its time ends."""
 
     def unplug(self) -> None:
-        """Pull the cable between host and box; a lit LED stays lit until it is due."""
+        """Pull the cable between host and box. A lit LED stays lit until its time ends."""
 
     def lose_answers(self, count: int) -> list[bytes]:
-        """The box's next `count` answers get lost on their way; the list that they are collected in."""
+        """Lose the box's next `count` answers; return the list in which they are collected."""
 
     def slow_down(self) -> None:
-        """Let a time-out of the driver take longer than anything the machine is busy with, from now on; no effect
-        if `clock` is the machine's."""
+        """From now on, make the driver's time-outs longer than any delay of the machine. This has no effect if
+        `clock` is the machine's clock."""
 
 
 class LedBoxConformance:
     """The contract `coupole.devices.LedBox`.
 
     A subclass gives two fixtures: `world`, a `LedBoxWorld`, and `box`, the driver that its `opener` has opened.
-    The box has eight LEDs at least.
+    The box has at least eight LEDs.
     """
 
     long_us: ClassVar[int] = 2_000_000
-    """Longest light that the box allows: no test may outlast it."""
+    """Longest light that the box allows, us; a flash of this duration does not end during a test."""
     most_on_us: ClassVar[float] = 1.7 * FLASH_US
-    """Most that a record may say of a light of `FLASH_US` that the box ended by itself, one such time ago."""
+    """Upper limit, us, of the on-time in the record of a flash of `FLASH_US` that ended by itself and is read one
+    `FLASH_US` later."""
     is_simulated: ClassVar[bool] = True
-    """The value that `Identity.simulated` must have: stand-ins are kept out of the ledger of real objects."""
+    """Expected value of `Identity.simulated`. The light of stand-ins is not entered in the ledger of real
+    objects."""
     words_of_silence: ClassVar[str] = "expected"
     """Pattern of the message about a box that does not answer."""
     words_of_a_lost_link: ClassVar[str] = "expected"
@@ -114,7 +118,7 @@ class LedBoxConformance:
         assert world.shining() == []
         assert not box.lit()
         assert (record.step, record.led, record.edge_sent) == (0, 5, False)
-        assert record.on_us >= world.lit_us(0) * 0.999  # the box's quartz and the world's clock differ a little
+        assert record.on_us >= world.lit_us(0) * 0.999  # the clocks of box and world differ slightly
         assert not record.invalid_exposure
 
     def test_a_flash_that_nobody_ends_goes_out_by_itself(self, box: LedBox, world: LedBoxWorld) -> None:
@@ -132,7 +136,7 @@ class LedBoxConformance:
         world.clock.sleep(FLASH_US * 1e-6)
         on_us = box.end_flash().on_us
         assert on_us >= world.lit_us(0) * 0.999
-        late_us = (dark_ns - begun_ns) / 1e3 - FLASH_US  # of a busy machine
+        late_us = (dark_ns - begun_ns) / 1e3 - FLASH_US  # delay of a busy machine
         assert on_us <= self.most_on_us + max(0.0, late_us), "a light that the box has ended does not go on"
 
     def test_a_flash_without_light_is_dark_all_through(self, box: LedBox, world: LedBoxWorld) -> None:
@@ -194,13 +198,14 @@ class LedBoxConformance:
         assert world.shining() == []
         error = call.wait()
         assert isinstance(error, DeviceError), error
-        assert not isinstance(error, DeviceTimeout)  # its own time-out is what it would have waited for
+        assert not isinstance(error, DeviceTimeout)  # it must not have waited for its own time-out
         assert world.shining() == []
         box.flash(7, self.long_us)
         wait_until(lambda: world.shining() == [7], "the next flash")
 
     def test_a_call_that_lights_off_overtakes_lights_nothing(self, box: LedBox, world: LedBoxWorld) -> None:
-        """It waits for its turn while another call is answered; then it is too late for it."""
+        """The call waits for its turn while another call is answered. If `lights_off` comes before its turn, it
+        must not light any more."""
         world.slow_down()
         lost_answers = world.lose_answers(1)
         first = Call(lambda: box.flash(5, self.long_us))

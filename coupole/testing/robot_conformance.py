@@ -1,4 +1,5 @@
-"""The contract of robots: one class, run on each driver against the other end of its wire."""
+"""The contract of robots as one class, which tests each driver against a simulated controller at the other end of
+its wire."""
 
 from __future__ import annotations
 
@@ -22,18 +23,19 @@ from coupole.plan.arm_description import shipped_arm
 HOME_DEG = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
 AWAY_DEG = np.array([50.0, -50.0, 40.0, 30.0, 60.0, -70.0])
 UNHURRIED_S = 0.5
-"""A motion ends after this time without a look; it is long because a test's thread may wait on a busy machine."""
+"""A motion ends if nobody looks at the arm for this time, s. It is long because a test's thread may have to wait
+on a busy machine."""
 
 
 class RobotCell(Protocol):
-    """An arm as it is seen from outside: the other end of the driver's wire, and where the axes truly are.
+    """An arm as it is seen from outside: the other end of the driver's wire, and the true angles of the axes.
 
-    `sim.world.robot_alone.RobotAlone` is all of this for a stand-in on the event loop of the simulated cell.
+    `sim.world.robot_alone.RobotAlone` implements this for a stand-in on the event loop of the simulated cell.
     """
 
     @property
     def clock(self) -> Clock:
-        """The clock that the driver was given, and that the controller runs by."""
+        """The clock of both driver and controller."""
 
     @property
     def cycle_ms(self) -> float:
@@ -41,11 +43,11 @@ class RobotCell(Protocol):
 
     @property
     def trace_deg(self) -> list[tuple[float, ...]]:
-        """Places of the axes, sampled since the cell began or since the list was cleared."""
+        """Angles of the axes, sampled since the cell began or since the list was cleared."""
 
     @property
     def velocity_deg_s(self) -> NDArray[np.float64]:
-        """[6] greatest speeds of the driver's motions."""
+        """[6] greatest speeds of motions by the driver."""
 
     @property
     def is_moving(self) -> bool:
@@ -53,19 +55,19 @@ class RobotCell(Protocol):
 
     @property
     def repeatability_mm(self) -> float:
-        """Standard deviation of where the arm comes to rest, mm."""
+        """Standard deviation of the arm's position at rest, mm."""
 
     def open(self) -> Robot:
-        """A driver, closed with the cell."""
+        """Open a driver; it is closed with the cell."""
 
     def in_world(self, action: Callable[[], object]) -> None:
-        """Do something while the controller waits; returns when it is done."""
+        """Perform an action while the controller waits; return when it is done."""
 
     def joints_deg(self) -> NDArray[np.float64]:
-        """[6] where the axes truly are."""
+        """[6] true angles of the axes."""
 
     def true_base_from_flange(self) -> NDArray[np.float64]:
-        """[4, 4] where the flange truly is, mm."""
+        """[4, 4] true pose of the flange, mm."""
 
     def emergency_stop(self) -> None:
         """Press the emergency stop."""
@@ -74,71 +76,72 @@ class RobotCell(Protocol):
         """Release the emergency stop, and switch the drives on."""
 
     def lose_link(self, seconds: float) -> None:
-        """No packet comes through for so long."""
+        """Lose all packets for this time."""
 
     def push_aside(self, turns_deg: tuple[float, ...]) -> None:
-        """Turn the axes by so much, though nobody has commanded it."""
+        """Turn the axes by these angles without a command."""
 
     def wait_until(self, condition: Callable[[], bool]) -> None:
-        """Wait for something of the world, and look at the arm meanwhile, as whoever moves it must."""
+        """Wait for a condition of the world, and look at the arm meanwhile, as every caller that moves the arm
+        must."""
 
     def wait_until_under_way(self) -> None:
-        """Wait until a motion from home has begun in earnest."""
+        """Wait until a motion from home is well under way."""
 
     def stop_under_way(self, robot: Robot) -> None:
-        """Stop a motion from home in its midst."""
+        """Stop a motion from home while it is under way."""
 
     def assert_smooth(self) -> None:
-        """Speed, acceleration and jerk of all that was sampled are within the driver's limits."""
+        """Assert that speed, acceleration and jerk of all samples are within the driver's limits."""
 
     def assert_stands(self) -> None:
-        """The arm does not move for half a second."""
+        """Assert that the arm does not move for half a second."""
 
 
 class RobotConformance:
     """The contract `coupole.devices.Robot`.
 
     A subclass gives the fixture `cell`, a `RobotCell`: the controller that the driver talks to. All angles below
-    are for a KR 10 R1100 sixx; for another arm a subclass gives its own.
+    are for a KR 10 R1100 sixx; for another arm, a subclass overrides them.
     """
 
     home_deg: ClassVar[NDArray[np.float64]] = HOME_DEG
-    """[6] where the arm stands at first."""
+    """[6] angles at the beginning of each test."""
     away_deg: ClassVar[NDArray[np.float64]] = AWAY_DEG
-    """[6] a pose far from there: each axis turns by 20 degrees at least."""
+    """[6] angles far from `home_deg`: each axis differs by at least 20 degrees."""
     beyond_deg: ClassVar[NDArray[np.float64]] = np.array([0.0, -90.0, 90.0, 0.0, 121.0, 0.0])
-    """[6] a pose with one axis out of its range."""
+    """[6] angles with one axis out of its range."""
     attention_s: ClassVar[float] = UNHURRIED_S
-    """A motion of this cell's driver ends after so long without a look."""
+    """A motion of this cell's driver ends if nobody looks at the arm for this time, s."""
     is_simulated: ClassVar[bool] = True
-    """The value that `Identity.simulated` must have."""
+    """Expected value of `Identity.simulated`."""
     poses: ClassVar[int] = 8
     """Number of poses that the arm is sent to."""
     stops: ClassVar[int] = 4
-    """Number of motions that are stopped somewhere."""
+    """Number of motions that are stopped at random times."""
     words_of_a_fault: ClassVar[str] = "."
-    """Pattern of the message of an arm that does not follow."""
+    """Pattern of the message when the arm does not follow its command."""
     words_of_another_command: ClassVar[str] = "expected"
-    """Pattern of the refusal of a call that another thread's has overtaken."""
+    """Pattern of the refusal of a call after another thread's call has ended its motion."""
     words_of_an_axis: ClassVar[str] = "121"
     """Pattern of the refusal of `beyond_deg`; it names the angle."""
 
     def arm(self) -> Arm:
-        """The arm that moves, with its limits."""
+        """Return the arm that moves, with its limits."""
         return shipped_arm("kr10_r1100_sixx").arm
 
     def range_deg(self, cell: RobotCell) -> NDArray[np.float64]:
-        """Lowest and highest angles [6, 2] that tests draw targets from."""
+        """Return the lowest and highest angles [6, 2] from which tests draw targets."""
         return 0.6 * np.array(self.arm().limits_deg)
 
     def targets_deg(self, cell: RobotCell, count: int, seed: int) -> NDArray[np.float64]:
-        """Random joint angles [count, 6]."""
+        """Return random joint angles [count, 6]."""
         low, high = self.range_deg(cell).T
         return np.random.default_rng(seed).uniform(low, high, (count, 6))
 
     @pytest.fixture
     def robot(self, cell: RobotCell) -> Robot:
-        """An opened driver."""
+        """An opened driver of the cell's arm."""
         return cell.open()
 
     def test_opening_moves_nothing(self, cell: RobotCell, robot: Robot) -> None:
@@ -164,7 +167,7 @@ class RobotConformance:
             assert np.allclose(state.base_from_flange, wanted_base_from_flange, atol=0.2)
             settled_mm = np.abs(state.base_from_flange[:3, 3] - wanted_base_from_flange[:3, 3])
             off_mm = np.abs(cell.true_base_from_flange()[:3, 3] - wanted_base_from_flange[:3, 3])
-            # what is measured is rounded to 1e-4 deg, some 2 um at the flange
+            # measured angles are rounded to 1e-4 deg, about 2 um at the flange
             assert np.all(off_mm <= 5.0 * cell.repeatability_mm + settled_mm + 0.01)
 
     def test_motion_is_jerk_limited(self, cell: RobotCell, robot: Robot) -> None:
@@ -208,11 +211,11 @@ class RobotConformance:
             assert np.all(np.abs(cell.joints_deg() - called_deg) <= allowed_deg + 1e-3)
 
     def test_a_stop_forgets_the_next_target_too(self, cell: RobotCell, robot: Robot) -> None:
-        """A target given in motion waits until the arm is at rest; a stop must not bring it to rest for that."""
+        """A target given in motion is begun when the arm is at rest. The rest after a stop must not begin it."""
         robot.move_to(self.away_deg)
         cell.wait_until_under_way()
         robot.move_to(self.home_deg - 20.0)
-        cell.clock.sleep(0.05)  # so that this target is waiting when the stop comes
+        cell.clock.sleep(0.05)  # now the target is waiting when the stop comes
         robot.stop()
         stood_deg = cell.joints_deg()
         cell.assert_stands()
@@ -245,7 +248,7 @@ class RobotConformance:
     def test_a_motion_that_nobody_watches_brakes_on_its_path_and_another_may_follow(
         self, cell: RobotCell, robot: Robot
     ) -> None:
-        """Another thread that looks at the arm is not the one that watches it."""
+        """Looks at the arm from another thread do not count as watching the motion."""
         robot.move_to(self.away_deg, 0.05)
         cell.wait_until_under_way()
         with ThreadPoolExecutor(1) as thread:
@@ -260,7 +263,8 @@ class RobotConformance:
         assert np.ptp(way) < 0.01, "it left its line"
         with pytest.raises(ArmUnattended):
             robot.wait_settled()
-        # A look just after a beat passes none on, so the arm may have waited longer than the looks were apart.
+        # A look directly after a beat passes no beat on, so the time without attention may exceed the time between
+        # looks.
         assert robot.measured().unattended_s > 0.8 * self.attention_s
         assert not robot.measured().fault
         cell.assert_smooth()
@@ -335,7 +339,7 @@ class RobotConformance:
 
 
 def _stop_while_the_world_waits(cell: RobotCell, robot: Robot) -> NDArray[np.float64]:
-    """Axes [6] at the moment when `stop` is called: the world stands still until the command has left."""
+    """Call `stop`; return the axes [6] at that moment. The world stands still until the command has been sent."""
     called_deg: list[NDArray[np.float64]] = []
     stopper = threading.Thread(target=robot.stop)
 

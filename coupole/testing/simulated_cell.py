@@ -1,4 +1,5 @@
-"""The simulated cell of a test: stand-ins at the other ends of real wires, and what an onlooker sees of them."""
+"""The simulated cell of a test: stand-ins at the other ends of real wires, and their state as an onlooker sees
+it."""
 
 from __future__ import annotations
 
@@ -18,13 +19,13 @@ from coupole.preflight.simulated_world import frozen, world_config
 from coupole.scripting.plans import Rig
 
 _UNHURRIED_S = 0.5
-"""A motion of a simulated arm ends after this time without a look; it is long because tests run on busy
-machines."""
+"""A motion of a simulated arm ends if nobody looks at the arm for this time, s. It is long because tests run on
+busy machines."""
 
 
 @dataclass(frozen=True)
 class SeenFromOutside:
-    """A cell at a moment, as an onlooker sees it."""
+    """The state of a cell at one moment, as an onlooker sees it."""
 
     shining: tuple[int, ...]
     """Numbers of the LEDs that shine."""
@@ -33,9 +34,9 @@ class SeenFromOutside:
     arm_moves: bool
     """True while an axis turns."""
     joints_deg: tuple[float, ...]
-    """[6] where the axes truly are."""
+    """[6] true angles of the axes."""
     camera_is_armed: bool
-    """True if edges make frames."""
+    """True if trigger edges make the camera expose frames."""
 
     @property
     def is_safe(self) -> bool:
@@ -45,21 +46,21 @@ class SeenFromOutside:
 
 @dataclass(frozen=True)
 class SimulatedCell:
-    """A running simulated cell. It outlives whoever uses it, and ends with the test."""
+    """A running simulated cell. Its clients may disconnect; it ends with the test."""
 
     rig: Path
     """A rig file that names the cell's devices, for `coupole.open_cell`, `coupole.acquire(plan, rig=...)` and the
-    commands. Runs, ledgers and faults of the arm go to a folder of the test."""
+    commands. Runs, ledgers and the arm's faults are stored in a folder of the test."""
     endpoints: Mapping[str, Any]
-    """Place of each stand-in: `ledbox` has a serial `port`, `robot` and `camera` their addresses; as `coupole sim`
-    prints them."""
+    """Address of each stand-in, as `coupole sim` prints it: `ledbox` has a serial `port`, `robot` and `camera`
+    have network addresses."""
     clock: Clock
     """The cell's clock, for drivers."""
     world: Any
-    """Its control connection (`sim.world.client:World`)."""
+    """Control connection of the simulated world (`sim.world.client:World`)."""
 
     def look(self) -> SeenFromOutside:
-        """The cell as an onlooker sees it now."""
+        """Return the present state of the cell, as an onlooker sees it."""
         state = self.world.ask("state")
         return SeenFromOutside(
             tuple(state["shining"]),
@@ -70,12 +71,12 @@ class SimulatedCell:
         )
 
     def light_given_s(self) -> dict[int, float]:
-        """Seconds for which each LED has shone since the cell began."""
+        """Return how long each LED has shone since the cell began, s."""
         return {int(led): seconds for led, seconds in self.world.ask("light")["leds_s"].items()}
 
     def fault(self, kind: str, **how: Any) -> None:
-        """Let a fault of docs/reference/rig.md happen, such as `fault("mute_box", at_s=0.0)`. Raises ValueError:
-        there is no such fault, or these stand-ins cannot have it."""
+        """Inject a fault of docs/reference/rig.md, such as `fault("mute_box", at_s=0.0)`. Raises ValueError if
+        there is no such fault, or if these stand-ins cannot have it."""
         if error := self.world.ask("fault", fault={"kind": kind, **how}).get("error"):
             raise ValueError(error)
 
@@ -84,10 +85,10 @@ class SimulatedCell:
 def simulated_cell(
     folder: Path, rig: str | Path = "sim", *, plan: str | Path | None = None, speed: float = 1.0
 ) -> Iterator[SimulatedCell]:
-    """Start the stand-ins of a rig, at `speed` times real time; their process is ended with the context.
+    """Start the stand-ins of a rig at `speed` times real time; their process ends with the context.
 
-    `plan` is one whose object lies on the support. `folder` takes the rig file and all that runs leave. Raises
-    InputError: rig or plan are wrong; DeviceError: the cell does not start.
+    The object of `plan` lies on the support. `folder` takes the rig file and all files of runs. Raises InputError
+    if rig or plan are wrong, DeviceError if the cell does not start.
     """
     job = read_job(Path(plan), Path(rig)) if plan is not None else None
     cell = job.cell if job is not None else read_cell(Path(rig))
@@ -105,7 +106,7 @@ def simulated_cell(
 
 
 def _joining(rig: Rig, folder: Path, endpoints: Path) -> Rig:
-    """The rig with its devices in the running cell, and with places of its own."""
+    """Return the rig with its devices in the running cell, and with its own folders."""
     section = rig.world or rig_models.WorldSection()
     robot = rig.robot
     if "attention_s" in settings_class(robot.driver).model_fields:

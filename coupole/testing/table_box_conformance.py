@@ -1,4 +1,4 @@
-"""The contract of LED boxes that run tables, beside that of all boxes."""
+"""The contract of LED boxes that run tables, in addition to the contract of all boxes."""
 
 from __future__ import annotations
 
@@ -15,32 +15,30 @@ from coupole.testing.ledbox_conformance import LedBoxWorld
 
 
 class TableLedBoxWorld(LedBoxWorld, Protocol):
-    """A box whose trigger cable is looked at too."""
+    """A box whose trigger cable is observed, too."""
 
     @property
     def edges_ns(self) -> list[int]:
-        """Times of all edges on the cable to the camera, ns of `clock`."""
+        """Times of all trigger edges on the cable to the camera, ns of `clock`."""
 
 
 class TableLedBoxConformance:
-    """The contract `coupole.devices.TableLedBox`, beside that of `LedBoxConformance`.
+    """The contract `coupole.devices.TableLedBox`, in addition to `LedBoxConformance`.
 
-    `world` is a `TableLedBoxWorld`. Tables have steps of 1 to 100 ms and the box's LEDs, of which it has 30 at
-    least.
+    `world` is a `TableLedBoxWorld`. Tables have steps of 1 to 100 ms; the box has at least 30 LEDs.
     """
 
     limits: ClassVar[Sequence[tuple[str, int, str]]] = (("led", 65_534, ""), ("trigger_delay_us", 8001, ""))
-    """For each field of a step: its name, a value outside the box's limits in a step of `table()`, and a pattern
-    of
+    """Name of a field of a step, a value of it outside the box's limits (in a step of `table()`), and a pattern of
     the refusal. Each refusal also names the step's number."""
     words_of_rest: ClassVar[str] = "7"
-    """Pattern of the refusal of step 7, which lights the LED of step 6 again; empty if the box allows that."""
+    """Pattern of the refusal of step 7, which lights the LED of step 6 again; empty if the box allows this."""
     words_of_no_table: ClassVar[str] = "expected"
     """Pattern of the refusal to start a table that was not loaded."""
     words_of_lost_state: ClassVar[str] = "expected"
-    """Pattern of the message about a box that does not tell whether it runs."""
+    """Pattern of the message when the box does not tell whether it runs."""
     words_of_a_lost_link: ClassVar[str] = "expected"
-    """Pattern of the message about a cable that was pulled."""
+    """Pattern of the message when the cable was pulled."""
 
     def test_it_runs_tables(self, box: LedBox) -> None:
         assert table_box(box) is box
@@ -109,7 +107,7 @@ class TableLedBoxConformance:
         steps = table(box.led_count)
         box.load(steps)
         world.unplug()
-        box.load(steps)  # would raise DeviceLost if it had to be sent
+        box.load(steps)  # this would raise DeviceLost if the table had to be sent
 
     def test_a_table_out_of_limits_is_refused_by_record(self, box: TableLedBox) -> None:
         for field, value, words in self.limits:
@@ -174,7 +172,7 @@ class TableLedBoxConformance:
 def table(
     count: int = 12, *, led: int = 0, on_us: int = 8000, delay_us: int = 100, period_us: int = 10_000
 ) -> NDArray[np.void]:
-    """`count` lit steps of different LEDs, from `led` on."""
+    """Return `count` lit steps of different LEDs, beginning with `led`."""
     steps = np.zeros(count, STEP_DTYPE)
     steps["led"] = led + np.arange(count)
     steps["on_us"], steps["trigger_delay_us"], steps["period_us"] = on_us, delay_us, period_us
@@ -183,19 +181,19 @@ def table(
 
 
 def dark_table(count: int = 4) -> NDArray[np.void]:
-    """`count` steps without light, with edges."""
+    """Return `count` steps without light, with trigger edges."""
     steps = table(count)
     steps["led"], steps["on_us"] = NO_LED, 0
     return steps
 
 
 def _at_most(count: int, box: LedBox) -> int:
-    """So many steps as the box has LEDs for, `count` if it has more."""
+    """Return `count`, or the number of the box's LEDs if that is smaller."""
     return min(count, box.led_count)
 
 
 def run_to_end(driver: TableLedBox, world: TableLedBoxWorld, wait_s: float = 30.0) -> NDArray[np.void]:
-    """Poll until the burst has ended; all records of the log."""
+    """Poll until the burst has ended; return all records of the log."""
     end_ns = world.clock.now_ns() + int(wait_s * 1e9)
     parts = [driver.poll_log()]
     while driver.running():

@@ -1,4 +1,4 @@
-"""Calls in threads of their own, and waiting for what must come, for the conformance classes."""
+"""Calls in separate threads, and waiting for expected events, for the conformance classes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import Any
 
 _PATIENCE_S = 20.0
 _REACHES_ITS_PLACE_S = 5.0
-"""Machine time after which a call that was begun stands where it waits, though nothing tells so."""
+"""Time of the machine, s, after which a call is assumed to wait for its turn, although nothing shows it."""
 
 
 class Call:
-    """A call of the driver in a thread of its own."""
+    """A call of the driver in a separate thread."""
 
     def __init__(self, action: Callable[[], Any]) -> None:
         self.error: BaseException | None = None
@@ -26,17 +26,17 @@ class Call:
         self._thread.start()
 
     def wait(self) -> BaseException | None:
-        """Wait for its end; what it raised."""
+        """Wait for the end of the call; return its error, or None."""
         self._thread.join(20.0)
         assert not self._thread.is_alive()
         return self.error
 
     def waits_its_turn(self) -> bool:
-        """True if its thread is about to take a lock: the line of code that it stands in says so. A driver that
-        keeps order by other means is given time to."""
+        """True if the thread of the call is about to take a lock, by the line of code at which it is. If a driver
+        keeps the order by other means, the result is True after a fixed time."""
         if time.monotonic() > self._reached_s:
             return True
-        gc.disable()  # a collection in there may wait for ever (CPython's gh-106883)
+        gc.disable()  # a garbage collection in there may wait for ever (CPython issue gh-106883)
         try:
             frame = sys._current_frames().get(self._thread.ident or 0)
         finally:
@@ -54,7 +54,7 @@ class Call:
 
 
 def wait_until(condition: Callable[[], bool], event_name: str) -> None:
-    """Fails if it does not come; only a broken box or driver lets the time run out."""
+    """Wait for a condition; fail if it does not become true. Only a broken box or driver lets the time run out."""
     end_s = time.monotonic() + 20.0
     while not condition():
         assert time.monotonic() < end_s, f"waited in vain for {event_name}"

@@ -143,7 +143,7 @@ class State:
                 self.held[name] = str(self._features.read_value(name))
 
     def note_all(self) -> None:
-        """Keep other values that are worth knowing."""
+        """Keep other informative values, if the camera has them."""
         self.note(*_ALSO_READ)
 
     def use_one_region_and_component(self) -> None:
@@ -184,7 +184,7 @@ class State:
                 self.set(offset, 0)
             if size not in self._rigs:
                 largest = self._features.largest(size)
-                if largest < 2**31:  # else the camera does not say
+                if largest < 2**31:  # otherwise the camera does not report it
                     self.set(size, largest)
 
     def _apply(self, line: Line) -> None:
@@ -194,7 +194,7 @@ class State:
         if name is None:
             return
         for entry in self._entries_of(line.selector):
-            if self._features.has(name):  # which may depend on what is selected
+            if self._features.has(name):  # these may depend on the selected entry
                 self._set_first(line, name, entry)
 
     def _has(self, name: str, selector: str) -> bool:

@@ -164,7 +164,7 @@ class LedBox:
         """
         self._running_bank = None
         if self._clears:
-            with contextlib.suppress(DeviceError):  # a link that is lost is told below
+            with contextlib.suppress(DeviceError):  # a lost link is reported below
                 self._scpi.device_clear()
         else:
             self._scpi.end_calls()
@@ -203,8 +203,8 @@ class LedBox:
 
     def _abort(self) -> None:
         for _ in range(_CLEARS_AT_ONCE):
-            with contextlib.suppress(CallEnded):  # by another thread's lights_off: ask again
-                with contextlib.suppress(DeviceFault, DeviceRefused):  # older errors: ABORt was executed
+            with contextlib.suppress(CallEnded):  # another thread's lights_off has ended this call: ask again
+                with contextlib.suppress(DeviceFault, DeviceRefused):  # the errors are older: ABORt was executed
                     self._scpi.ask("ABOR", 0)
                 return
 

@@ -110,7 +110,8 @@ class SerialLink:
                 self._port.reset_output_buffer()
             except self._lost as error:
                 raise ConnectionError(str(error)) from error
-            with contextlib.suppress(*self._lost):  # an adapter without BREAK: what follows is heard all the same
+            # an adapter without BREAK: the following commands reach the box all the same
+            with contextlib.suppress(*self._lost):
                 self._port.break_condition = True
                 self._clock.sleep(max(_SHORTEST_BREAK_S, _BREAK_BITS / self._baud))
                 self._port.break_condition = False
@@ -130,7 +131,7 @@ class SerialLink:
         if not self._port.is_open:
             return
         with contextlib.suppress(*self._lost):
-            self._port.reset_output_buffer()  # else close() may wait for a dead line to drain
+            self._port.reset_output_buffer()  # otherwise close() may wait for a dead line to drain
         connection = getattr(self._port, "_socket", None)
         with contextlib.suppress(*self._lost):
             self._port.close()
@@ -156,13 +157,13 @@ class SerialLink:
         """Reset the connection: bytes that are still on their way are discarded, here and at the box. The port
         stays open, because another thread may be reading from it; its socket is closed."""
         connection: socket.socket = self._port._socket
-        with contextlib.suppress(OSError):  # it is closed already
+        with contextlib.suppress(OSError):  # the socket is already closed
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         connection.close()
         self._hung_up = True
 
     def _connect_again(self) -> None:
-        self._port._socket, self._port.is_open = None, False  # else pyserial would wait 0.3 s for it to close
+        self._port._socket, self._port.is_open = None, False  # otherwise pyserial would wait 0.3 s for it to close
         deadline = Deadline(self._clock, _RECONNECT_S)
         while True:
             if not self._url:

@@ -185,7 +185,7 @@ class TextLineBox:
             )
         ends = self._ends
         longest_s = on_us * 1e-6 + _CONFIRMS_S
-        on_ms = _box_bound_ms(on_us)  # by then the driver has ended it, or the host is gone
+        on_ms = _box_bound_ms(on_us)  # by then the driver has ended the light, or the host is dead
         with self._lock:
             try:
                 self._end(ends)
@@ -240,7 +240,8 @@ class TextLineBox:
             if self._flash is not None:
                 self._flash.end_event.set()
             for _ in range(_ENDED_AT_ONCE):
-                with contextlib.suppress(CallEnded):  # by another thread's lights_off: say it again
+                # another thread's lights_off has ended this call: send it again
+                with contextlib.suppress(CallEnded):
                     self._all_off()
                     break
             if self._flash is not None and self._flash.off_ns is None:

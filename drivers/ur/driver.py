@@ -265,7 +265,7 @@ class UrRobot:
         with self._asking:
             if verb == "stop":
                 self._stops += 1
-            elif self._stops != stops:  # by another thread, since that call began
+            elif self._stops != stops:  # another thread has stopped the arm since that call began
                 raise overtaken()
             self._number += 1
             if verb == "move":

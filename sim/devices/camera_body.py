@@ -98,7 +98,7 @@ class Shot:
 
 
 class Wire(Protocol):
-    """Transport of frames to the host. Both calls run on the reactor's thread, and may pause the world."""
+    """Transport of frames to the host. All calls run on the reactor's thread, and may pause the world."""
 
     def claim(self) -> int | None:
         """A free slot of frame memory, or None if the host has released none."""

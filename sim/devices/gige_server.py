@@ -101,7 +101,7 @@ class GigeServer:
         self._registers.set_text(reg.DESCRIPTION_URL, url, 512)
         self._ports = [_bound(start.address)]
         for address in BROADCASTS:
-            with contextlib.suppress(OSError):  # then a client must know the camera's address
+            with contextlib.suppress(OSError):  # in this case a client must know the camera's address
                 self._ports.append(_bound(address))
         self._stream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._stream.bind((start.address, 0))

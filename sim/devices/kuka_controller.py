@@ -82,7 +82,8 @@ class KukaController:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._host_port = HostPort(settings.sends_to)
         host, port = self.sends_to.rsplit(":", 1)
-        self._socket.connect((host, int(port)))  # connected, so that a closed port is reported at once
+        # the socket is connected, so that a closed port is reported at once
+        self._socket.connect((host, int(port)))
         self._socket.setblocking(False)
         self._timer = reactor.after(0.0, self._cycle)
 

@@ -12,7 +12,7 @@ _LONGEST_MESSAGE_BYTES = 4096
 
 
 class Messages:
-    """Splits a stream of documents, which become children of a document that never ends."""
+    """Splits a stream of documents: the parser reads them as children of one document that never ends."""
 
     def __init__(self) -> None:
         self._parser = _new_parser()
@@ -27,7 +27,7 @@ class Messages:
         elements = [
             element for event, element in self._parser.read_events() if event == "end" and element.tag == "Coupole"
         ]
-        self._stream.clear()  # of messages that were taken, and of what is none
+        self._stream.clear()  # removes messages that were taken, and elements that are not messages
         self._open_bytes = 0 if elements else self._open_bytes + len(data)
         if self._open_bytes > _LONGEST_MESSAGE_BYTES:
             raise ValueError(f"{self._open_bytes} bytes without a message")

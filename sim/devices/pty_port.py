@@ -120,7 +120,7 @@ class PtyPort:
         """Act on the status that a packet without bytes reports: if the client has discarded input, a BREAK
         follows."""
         if status & termios.TIOCPKT_FLUSHWRITE and self._on_break is not None:
-            termios.tcflush(self._master, termios.TCIFLUSH)  # what the kernel had already passed on
+            termios.tcflush(self._master, termios.TCIFLUSH)  # bytes that the kernel had already passed on
             self._on_break()
         self._wait_for_bytes()
 

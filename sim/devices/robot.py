@@ -75,7 +75,7 @@ def build(
             kuka = kuka_controller.KukaController(reactor, settings, tell, stranger)
             paced_by_clock = settings.lock_step or reactor.clock.speed != 1.0
             declared_cycle = {"declared_cycle_ms": settings.cycle_ms} if paced_by_clock else {}
-            # Whom a rehearsed rig names as its controller is not here.
+            # The host that a rehearsed rig names as its controller does not exist here.
             here = {"controller": "127.0.0.1", "any_controller_by": ""}
             endpoint = {"listen": kuka.sends_to, "sends_to": kuka.sends_to, **alike, **declared_cycle, **here}
             return kuka, endpoint

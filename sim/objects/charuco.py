@@ -54,8 +54,7 @@ def charuco_board(board: Charuco) -> Surface:
 def opencv_board(board: Charuco) -> Any:
     """The same board for OpenCV's detector.
 
-    Raises:
-        InputError: OpenCV has no such dictionary, or the markers do not fit.
+    Raises InputError if OpenCV has no such dictionary, or if the markers do not fit.
     """
     import cv2
 

@@ -89,7 +89,7 @@ Disturbing = (
 
 
 class Disturber:
-    """The disturbances of a world, as they happen. Times are world times, ns."""
+    """The disturbances of a world. Times are world times, ns."""
 
     def __init__(self) -> None:
         self._lasting = CALM

@@ -190,7 +190,8 @@ def _collect_all(mean_e, site, radiance, falloff, electrons):  # type: ignore[no
     height, width, _ = mean_e.shape
     k = len(site) // height
     share = np.float32(electrons / (k * k))
-    # In blocks, as sites are numbered, so that each is read while it is near.
+    # The loop goes over blocks, in the order of the sites' numbers, so that each site is read while it is in the
+    # cache.
     for band in numba.prange(-(-height // _BLOCK)):
         for block in range(0, width, _BLOCK):
             for row in range(band * _BLOCK, min(height, (band + 1) * _BLOCK)):

@@ -185,7 +185,7 @@ def _neighbours(centres_mm: NDArray[np.float32], material: NDArray[np.int32]) ->
     for number in np.unique(material):
         members = np.flatnonzero(material == number)
         near = cKDTree(centres_mm[members]).query(centres_mm[members], k=np.arange(1, _NEIGHBOURS + 1))[1]
-        # cKDTree numbers what is missing by the number of points.
+        # cKDTree uses the number of points for missing neighbours.
         neighbours[members] = np.where(
             near < len(members), members[np.minimum(near, len(members) - 1)], members[:, None]
         )

@@ -67,7 +67,8 @@ def visible_triangles(
     counts = np.zeros((-(-len(corners_mm) // _CHUNK), bands), np.int64)
     _find_bands(corners_mm, camera_from_base, lens_terms, width, height, boxes, counts)
     before = np.concatenate([[0], np.cumsum(counts.T.ravel())])
-    bounds = before[:: len(counts)].copy() if len(counts) else np.zeros(bands + 1, np.int64)  # always in order
+    # contiguous in both cases
+    bounds = before[:: len(counts)].copy() if len(counts) else np.zeros(bands + 1, np.int64)
     members = np.empty(int(before[-1]), np.int32)
     _list_bands(boxes, before[:-1].reshape(bands, -1).T.copy(), members)
     pixels, firsts = np.empty((height, width), np.int32), np.empty(len(members), np.int32)
@@ -212,7 +213,7 @@ def _merge(firsts, bounds, firsts_in_band, number_of_triangle):  # type: ignore[
     for band in range(len(firsts_in_band)):
         for place in range(bounds[band], bounds[band] + firsts_in_band[band]):
             triangle = firsts[place]
-            if number_of_triangle[triangle] == 0:  # numbers start at 1 here, as zeroed memory is cheap
+            if number_of_triangle[triangle] == 0:  # numbers start at 1 here, because zeroed memory is cheap
                 triangles[count] = triangle
                 count += 1
                 number_of_triangle[triangle] = count

@@ -117,7 +117,7 @@ class SharedClock:
             self._process = os.pidfd_open(self._read_block()[3])
         except ProcessLookupError:
             self._gone_since_ns = self._looked_ns
-        except (AttributeError, OSError):  # neither Linux nor a new one: a killed world is not noticed
+        except (AttributeError, OSError):  # an old kernel, or not Linux: the end of a killed world is not noticed
             pass
 
     def __del__(self) -> None:

@@ -53,7 +53,7 @@ class Reactor:
         self._order = itertools.count()
         self._selector = selectors.DefaultSelector()
         self._calls: deque[Callable[[], None]] = deque()
-        self._waking = threading.RLock()  # a signal's handler may come within
+        self._waking = threading.RLock()  # reentrant, because a signal handler may run meanwhile
         self._wake_read, self._wake_write = os.pipe()
         self._has_ended = False
         os.set_blocking(self._wake_read, False)
@@ -112,7 +112,7 @@ class Reactor:
             wait_s = self.clock.machine_s_until(next_ns)
             for key, _ in self._selector.select(max(0.0, wait_s)):
                 if self._selector.get_map().get(key.fd) is not key:
-                    continue  # one called before it has removed it
+                    continue  # an earlier callback may have removed it
                 self._now_ns = max(self._now_ns, min(self.clock.paced_ns(), next_ns))
                 key.data()
             self._run_due_timers()

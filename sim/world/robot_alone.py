@@ -105,7 +105,7 @@ class RobotAlone(ABC):
         must."""
         give_up = time.monotonic() + 30.0
         while not condition():
-            with suppress(DeviceError):  # a motion that nobody looks at is ended
+            with suppress(DeviceError):  # a motion ends if nobody looks at the arm
                 if self.robot is not None:
                     self.robot.measured()
             assert time.monotonic() < give_up

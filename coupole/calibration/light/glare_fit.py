@@ -1,10 +1,14 @@
-"""Shares of the veil's parts from pictures of black traps beside white.
+"""Shares of the parts of the veil (veiling glare), from pictures of black traps beside white.
 
-A trap shows t W + sum over k of a_k B_k. The first term is its own light, as the share t of the white W beside it.
-The others are the light that each part of the veil (`veil.py`) brings from the picture's own light. The shares a_k
-are found by least squares, none below 0. Own light is the light without the veil, so both are found in turn.
-Noise, and errors of the veil's form, appear when a fit without a view predicts that view's traps. So covariance
-and remaining error come from leaving out each view in turn (Bell and McCaffrey's CR3 of clusters).
+A trap shows t W + sum over k of a_k B_k. The first term is the trap's own light: the share t of the white W beside
+it. Each other term is the light that one part of the veil (`veil.py`) brings to the trap from the own light of the
+whole picture. The shares a_k are found by least squares; none is below 0.
+
+Own light means light without the veil. Therefore own light and veil are computed in turn, for some rounds.
+
+Noise, and errors of the veil's form, become visible when the traps of a view are predicted by a fit without that
+view. Therefore each view is left out in turn: this gives the covariance and the remaining error (Bell and
+McCaffrey's CR3 of clusters).
 """
 
 from __future__ import annotations
@@ -32,14 +36,15 @@ Floats = NDArray[np.float64]
 LEAST_VIEWS, LEAST_TRAPS = 3, 12
 """Fewest views, and fewest traps of all views together."""
 U_NEAR = 0.15
-"""Relative standard uncertainty of the nearest part of the veil. It allows for light nearer than the traps' rims,
-where blur hides it: for a lobe with half its core there, the result was 13 % too faint."""
+"""Relative standard uncertainty of the nearest part of the veil. It covers light that stays nearer to its source
+than the rims of the traps, where blur hides it. For a lobe with half of its core there, the result was 13 % too
+small."""
 _LEAST_SPREAD = 0.35
-"""Least distance of traps from each other, over the picture's width. Traps in one place say nothing about other
-places."""
+"""Least extent of the traps' positions, over the picture's width. Traps in one place do not show the glare in
+other places."""
 _LEAST_VEIL = 1e-6
-"""Least veil over white for a relative error. A fit without a view may predict no veil, and then no relative error
-exists."""
+"""Least veil, as a share of white, for a relative error. A fit without a view may predict no veil, and a relative
+error of nothing does not exist."""
 _ROUNDS = 4
 
 
@@ -52,16 +57,16 @@ class TrapView:
     """[block rows, block columns] DN/s, with the veil."""
     traps: tuple[Trap, ...]
     dark: Floats
-    """[2 traps] DN/s of the traps: outer and inner part of each trap in turn."""
+    """[2 traps] DN/s in the traps: the outer and the inner part of each trap."""
     beside: Floats
-    """[2 traps] DN/s of the white beside, with its veil."""
+    """[2 traps] DN/s of the white beside each trap, with its veil."""
     size_px: tuple[int, int]
     """Width and height."""
 
 
 @dataclass(frozen=True)
 class TrapLight:
-    """Own light of a trap, divided by that of the white beside it."""
+    """Own light of a trap, divided by the own light of the white beside it."""
 
     share: float
     u: float
@@ -78,12 +83,12 @@ class GlareFit:
     """[parts, parts]"""
     degrees_of_freedom: float
     u_form: float
-    """Relative standard uncertainty of a veil from errors of its form: the distance of the traps of a left-out
-    view from their prediction (root mean square), in the worst view."""
+    """Relative standard uncertainty of the veil, caused by errors of its form. It is the rms relative difference
+    between the traps of a left-out view and their prediction, in the worst view."""
     predicted_veil: Floats
-    """[n] veil at each trap over the white beside, predicted by a fit without its view."""
+    """[n] veil at each trap, over the white beside it, predicted by a fit without its view."""
     found_veil: Floats
-    """[n] the same veil, measured."""
+    """[n] measured veil at each trap, over the white beside it."""
     pixels: Floats
     """[n, 2] x, y of the traps."""
     size_px: tuple[int, int]
@@ -94,8 +99,8 @@ class GlareFit:
         return float(np.sqrt(np.mean((self.found_veil - self.predicted_veil) ** 2)))
 
     def index(self, pixels: Floats) -> tuple[Floats, Floats]:
-        """Return [n], the light at a black point at pixels [n, 2] as a share of a completely white picture, and
-        its standard uncertainty."""
+        """Return [n] the light at a black point at pixels [n, 2] in a completely white picture, as a share of
+        white, and its standard uncertainty."""
         weights = of_white(self.size_px, pixels)
         value = weights @ self.shares
         u = np.sqrt(np.einsum("ni,ij,nj->n", weights, self.covariance, weights) + (self.u_form * value) ** 2)
@@ -123,8 +128,8 @@ def trap_view(name: str, signal: NDArray[np.float32], mask: NDArray[np.bool_], t
 
 
 def fit_glare(views: Sequence[TrapView], trap_light: TrapLight, channel: str) -> GlareFit:
-    """Find the shares of the veil's parts. Raises InputError for too few views or traps, for traps that are all in
-    one place, and for views in which no veil can be distinguished from noise."""
+    """Find the shares of the veil's parts. Raises InputError if there are too few views or traps, if all traps are
+    in one place, or if the traps show no veil."""
     _refuse_few(views)
     shares, equations = np.zeros(len(PARTS)), []
     for _ in range(_ROUNDS):
@@ -134,7 +139,7 @@ def fit_glare(views: Sequence[TrapView], trap_light: TrapLight, channel: str) ->
     count = len(views)
     off = without - without.mean(axis=0)
     covariance = (count - 1) / count * off.T @ off
-    # A trap that shines by more makes all shares smaller.
+    # If the traps' own light is brighter, all shares are smaller.
     by_trap = shares - _solve([_equations(view, shares, trap_light.share + trap_light.u) for view in views])
     covariance += np.outer(by_trap, by_trap)
     predicted_veil = np.concatenate([design @ a for (design, _), a in zip(equations, without, strict=True)])
@@ -167,8 +172,8 @@ def _worst_view(views: Sequence[TrapView], off: Floats) -> float:
 
 
 def _equations(view: TrapView, shares: Floats, trap_share: float) -> tuple[Floats, Floats]:
-    """Return [2 traps, parts], the veil of each part at a trap, and [2 traps], the measured veil there. Both are
-    over the white beside."""
+    """Return [2 traps, parts] the veil of each part at the traps, and [2 traps] the measured veil there. Both are
+    divided by the own light of the white beside."""
     width = view.size_px[0]
     block_px = block_px_of(width)
     veil = veil_of(view.light, shares, width / block_px)

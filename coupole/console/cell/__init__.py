@@ -1,1 +1,1 @@
-"""Work at the cell: runs that the queue begins, the cell's loan, the bench, calibrations, the present state."""
+"""Work at the cell: runs that the queue begins, loans of the cell, the bench, calibrations, the present state."""

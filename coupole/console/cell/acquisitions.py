@@ -1,8 +1,8 @@
-"""Runs the queue: each plan in a process of its own, `coupole acquire`, which no fault of the service touches.
+"""Runs the queue: each plan in a separate process, `coupole acquire`, which no fault of the service affects.
 
-The process is asked and told by its run's socket (`acquisition.run_control`), as by any other client; before it
-has one it can be interrupted, as by Ctrl-C. It goes on if the service dies, and a new service finds it by the
-number of its process in the queue.
+The service asks and commands the process by its run's socket (`acquisition.run_control`), like any other client.
+Before that socket exists, the process can be interrupted as by Ctrl-C. The process continues if the service dies;
+a new service finds it by its process id in the queue.
 """
 
 from __future__ import annotations
@@ -30,24 +30,25 @@ from coupole.storage.line_file import utc_now
 
 _LOOK_EVERY_S = 0.2
 _STOPPED = (129, 130, 143)
-"""Exit codes of a session that somebody stopped."""
+"""Exit codes of a session that was stopped by a person or a signal."""
 _MOST_SAID_BYTES = 65536
 
 
 class Acquisitions:
-    """The thread that begins what waits in a queue, and watches what runs."""
+    """The thread that begins waiting entries of a queue and watches the running one."""
 
     def __init__(self, queue: PlanQueue, cell: Cell, folder: Path) -> None:
-        """`folder`: for what processes print."""
+        """`folder`: for the output of the processes."""
         self._queue, self._cell, self._folder = queue, cell, folder
         self._rig = str(cell.document.path.resolve())
         self._ended = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
         self.state: State | None = None
-        """State of the run at work, as its process tells it; None if no run is at work."""
+        """State of the present run, as its process reports it; None if there is no run."""
         self.lending = Lending()
         self.give_way: Callable[[str], object] = lambda _: None
-        """Called, again and again, when something is to begin and something else has the cell, with its name."""
+        """Function that is called repeatedly while an entry should begin but something else has the cell; its
+        argument is the entry's name."""
         self._beginning = threading.Lock()
         self._thread = threading.Thread(target=self._watch, name="acquisitions", daemon=True)
 
@@ -58,13 +59,14 @@ class Acquisitions:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the thread; a run at work goes on without it."""
+        """End the thread; a present run continues."""
         self._ended.set()
         self._thread.join()
 
     def tell(self, run: str, command: Command) -> State:
-        """Send `pause`, `go-on` or `stop` to the run with this name. A run that the queue has begun and that does
-        not answer is stopped as by Ctrl-C. Raises InputError: the run is not being acquired, or does not answer.
+        """Send `pause`, `go-on` or `stop` to the run with this name. If a run that the queue has begun does not
+        answer a `stop`, it is stopped as by Ctrl-C. Raises InputError if the run is not being acquired, or does
+        not answer.
         """
         for state in [self.state] if self.state and Path(self.state["run"]).name == run else running():
             if Path(state["run"]).name == run and self._is_ours(state):
@@ -82,21 +84,22 @@ class Acquisitions:
             return {**state, "trouble": ["not sure: the run does not answer; its process was told to end"]}
 
     def stop(self, entry: Entry) -> None:
-        """Stop what an entry has begun, also before its run has a name: as Ctrl-C does. Raises InputError."""
+        """Interrupt the process of an entry as by Ctrl-C, also before its run has a name. Raises InputError."""
         if entry.state != "running" or not entry.pid or not self._is_alive(entry):
             raise InputError(f"queue: {entry.id} is not running")
         os.kill(entry.pid, signal.SIGINT)
 
     def begin_at_once(self, by: str, **fields: Any) -> Entry:
-        """A new entry that begins now. Raises InputError: something has the cell or waits for it; StorageError."""
+        """Return a new entry that begins now. Raises InputError if something has the cell or waits for it;
+        StorageError."""
         with self._beginning:
             if why := self._had_by():
                 raise InputError(why)
             return self._queue.add(by, at_once=True, **fields)
 
     def lend(self, pid: int, borrower: str, purpose: str) -> None:
-        """Give the cell to a process for its work, until it gives it back or ends; nothing begins meanwhile. One
-        that has it keeps it. Raises InputError: something else has the cell."""
+        """Lend the cell to a process until it gives the cell back or ends; nothing begins meanwhile. A process
+        that already has the cell keeps it. Raises InputError if something else has the cell."""
         with self._beginning:
             if self.lending.has(pid):
                 return
@@ -105,13 +108,13 @@ class Acquisitions:
             self.lending.lend(pid, borrower, purpose)
 
     def output(self, entry: Entry) -> tuple[str, dict[str, Any]]:
-        """Return what an entry's process has printed (the last 64 KiB), and its figures as of `acquire --json`,
-        once they are there."""
+        """Return the output of an entry's process (the last 64 KiB) and, once they exist, its figures as in
+        `acquire --json`."""
         output_path, figures = self._files(entry)
         return end_of_file(output_path, _MOST_SAID_BYTES), _last_document(figures)
 
     def _had_by(self) -> str:
-        """Return who has the cell; empty if nobody has it."""
+        """Return what has the cell; empty if nothing has it."""
         if self._queue.running is not None:
             return f"{self._queue.running.words} is being acquired"
         if self.state is not None:
@@ -121,8 +124,8 @@ class Acquisitions:
         return "another process of this user has its devices open" if is_in_use(self._cell) else ""
 
     def _is_ours(self, state: State) -> bool:
-        """Tell whether a run is one of this cell: it names its rig, or the queue has begun it (a resumed run names
-        its own copy of the rig)."""
+        """Tell whether a run belongs to this cell: it names its rig, or the queue has begun it. (A resumed run
+        names its own copy of the rig.)"""
         entry = self._queue.running
         return state["rig"] == self._rig or (entry is not None and bool(entry.pid) and state["pid"] == entry.pid)
 
@@ -155,10 +158,11 @@ class Acquisitions:
                 self._begin(following)
 
     def _at_work(self) -> State | None:
-        """The state of this cell's run; `silent`, and else as last known, while its process does not answer."""
+        """Return the state of this cell's run. While its process does not answer, this is the last known state
+        with `silent` as its name."""
         states, entry = running(), self._queue.running
         last = self.state
-        if last is None and entry is not None and entry.run:  # begun by a service before this one
+        if last is None and entry is not None and entry.run:  # begun by an earlier service
             last = {"run": entry.run, "rig": self._rig, "pid": entry.pid, "light_after_lux_h": {}}
         if last is not None:
             socket = named_after(Path(last["run"]), "sock").name
@@ -167,7 +171,8 @@ class Acquisitions:
         return next((state for state in states if self._is_ours(state)), None)
 
     def _begin(self, entry: Entry) -> None:
-        self._queue.change(entry.id, state="running", begun=utc_now())  # first: it must never be begun twice
+        # recorded first, because an entry must never begin twice
+        self._queue.change(entry.id, state="running", begun=utc_now())
         output_path, figures = self._files(entry)
         command = [sys.executable, "-m", "coupole.commands.cli", "acquire", *self._arguments(entry)]
         try:
@@ -203,7 +208,7 @@ class Acquisitions:
     def _is_alive(self, entry: Entry) -> bool:
         if self._process is not None and self._process.pid == entry.pid:
             return self._process.poll() is None
-        try:  # of a service before this one
+        try:  # of an earlier service
             words = Path(f"/proc/{entry.pid}/cmdline").read_bytes().split(b"\0")
         except OSError:
             return False
@@ -215,7 +220,8 @@ class Acquisitions:
         code = last_figures.get("exit_code", 0 if "proven" in last_figures else None)
         if self._process is not None and self._process.pid == entry.pid:
             code = self._process.returncode
-            if code < 0:  # by a signal: those that end a session may come before the process obeys them
+            # ended by a signal: a signal that ends a session may arrive before the process can handle it
+            if code < 0:
                 code = 128 - code if 128 - code in _STOPPED else None
         self._process = None
         state = "done" if code == 0 else "stopped" if code in _STOPPED else "failed"
@@ -227,7 +233,7 @@ class Acquisitions:
         self._forget_old()
 
     def _forget_old(self) -> None:
-        """Take away what processes printed whose entries the queue has no longer."""
+        """Remove the output of processes whose entries are no longer in the queue."""
         entry_ids = {entry.id for entry in self._queue.entries}
         for path in self._folder.iterdir():
             if path.suffix in (".log", ".json") and path.stem not in entry_ids:
@@ -239,7 +245,7 @@ class Acquisitions:
 
 
 def _last_document(path: Path) -> dict[str, Any]:
-    """The last line of JSON; empty if there is none."""
+    """Return the last line as JSON; empty if there is none."""
     try:
         document = json_of(path.read_bytes().strip().splitlines()[-1], str(path), allow_nan=True)
     except (OSError, InputError, IndexError):

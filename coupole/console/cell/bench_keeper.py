@@ -1,7 +1,7 @@
-"""The bench that people at a console have begun: a process that holds the cell's devices while no run is at work.
+"""The bench that people at a console begin: a process that holds the cell's devices while there is no run.
 
-The console only asks it (docs/reference/bench.md). It is closed by a person, when nobody has used it for a while,
-before the queue begins something, and with the console.
+The console only sends requests to it (docs/reference/bench.md). The bench is closed by a person, after some time
+without use, before the queue begins an entry, and when the console ends.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from coupole.plan.reading import read_plan
 from coupole.plan.schedule import expand_view
 
 IDLE_S = 600.0
-"""Time without use after which the bench is closed."""
+"""Time without use, s, after which the bench is closed."""
 _LOOK_EVERY_S, _FOREIGN_EVERY_S, _LOOKED_AT_S = 0.1, 1.0, 2.0
 _CLOSES_WITHIN_S = 20.0
 Phase = Literal["closed", "opening", "open", "closing"]
 
 
 class Bench:
-    """The bench of one cell, as its console sees it."""
+    """The bench of one cell, for its console."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class Bench:
         folder: Path,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`folder`: for what its process prints."""
+        """`folder`: for the output of its process."""
         self._cell, self._acquisitions, self._plans, self._now_s = cell, acquisitions, plans, now_s
         self._tasks = Tasks(folder)
         self._task: Task | None = None
@@ -48,11 +48,12 @@ class Bench:
         self._closing = ""
         self._acted_s = self._looked_s = self._asked_s = -_FOREIGN_EVERY_S
         self.plan = ""
-        """The plan whose object lies on the support; empty: nothing does, or this console has not begun it."""
+        """The plan whose object lies on the support; empty if nothing lies there, or if this console has not begun
+        the bench."""
         self.state: dict[str, Any] | None = None
-        """State that the bench told last; None if there is no bench."""
+        """Last state that the bench reported; None if there is no bench."""
         self.closed_because = ""
-        """Reason why the last bench has ended; empty if somebody closed it."""
+        """Reason why the last bench has ended; empty if a person closed it."""
         self._thread = threading.Thread(target=self._watch, name="bench", daemon=True)
         acquisitions.give_way = self.give_way
 
@@ -61,7 +62,7 @@ class Bench:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close this console's bench: without the console nobody can see what is open."""
+        """Close this console's bench, because without the console nobody can see that devices are open."""
         self._ended.set()
         self._thread.join()
         if self._running is not None:
@@ -77,12 +78,12 @@ class Bench:
 
     @property
     def is_own(self) -> bool:
-        """Tell whether this console has begun the bench."""
+        """True if this console has begun the bench."""
         return self._running is not None
 
     @property
     def work(self) -> dict[str, Any]:
-        """The last work; empty if there was none."""
+        """The last work of the bench; empty if there was none."""
         return (self.state or {}).get("work") or {}
 
     @property
@@ -93,16 +94,16 @@ class Bench:
 
     @property
     def pictures(self) -> Path:
-        """Folder of its last pictures."""
+        """Folder of the bench's last pictures."""
         return named_after(self._cell.state_folder, "frames")
 
     def looked_at(self) -> None:
-        """Somebody looks at it: its state is kept fresh for a while."""
+        """Note that a person looks at the bench: its state is updated for a while."""
         self._looked_s = self._now_s()
 
     def open(self, person: str, plan: str) -> None:
-        """Begin it; the object of a plan lies on the support, or nothing. Raises InputError: something has the
-        cell, or there is no such plan."""
+        """Begin the bench; the object of `plan` lies on the support, or nothing if it is empty. Raises InputError
+        if something has the cell, or if there is no such plan."""
         with self._lock:
             if self.phase != "closed":
                 raise InputError(f"the devices are {self.phase}")
@@ -118,23 +119,24 @@ class Bench:
             self._task, self.plan, self.closed_because = task, plan, ""
 
     def close(self, why: str = "") -> list[str]:
-        """End the bench, with the cell safe; return the devices that are not surely safe then. Raises InputError:
-        there is none.
+        """End the bench and make the cell safe; return the devices that may not be safe. Raises InputError if
+        there is no bench.
         """
         if self.phase not in ("open", "opening"):
             raise InputError(f"the devices are {self.phase}")
         return self._close(why)
 
     def give_way(self, action: str) -> None:
-        """Something is about to begin: close it, as soon as the arm has ended what it does."""
+        """Close the bench for another action, unless the arm is moving. The caller calls again until the bench is
+        closed."""
         if self.is_own and self.phase in ("open", "opening") and self.work.get("state") != "running":
             self._closing = f"closed, because {action} begins"
             threading.Thread(target=self._close, args=(self._closing,), daemon=True).start()
 
     def stop(self) -> list[str]:
-        """Stop the bench's work; return the devices that are not surely safe then. A bench that does not obey (it
-        is being opened or closed) is ended, as by Ctrl-C. Raises InputError: it is not this console's, and does
-        not obey.
+        """Stop the bench's work; return the devices that may not be safe. If the bench does not obey, because it
+        is being opened or closed, it is interrupted as by Ctrl-C. Raises InputError if another console began the
+        bench and it does not obey.
         """
         try:
             return list(self.ask("stop")["trouble"])
@@ -145,20 +147,20 @@ class Bench:
             return ["not sure: the devices do not answer; their process was told to make the cell safe and end"]
 
     def ask(self, command: str, **fields: Any) -> dict[str, Any]:
-        """Send a command to the bench and return its answer. Raises InputError with its words where it did not
-        obey."""
+        """Send a command to the bench and return its answer. Raises InputError with the bench's words if it did
+        not obey."""
         self._acted_s = self._now_s()
         return checked_answer(ask_bench(self._cell, command, **fields))
 
     def views(self) -> list[str]:
-        """Names of the plan's views. Raises InputError."""
+        """Return the names of the plan's views. Raises InputError."""
         if not self.plan:
             return []
         plan = read_plan(self._plans.path(self.plan), self._cell.document.path).plan
         return [pose.name for view in plan.views for pose in expand_view(view)]
 
     def plan_path(self) -> str:
-        """The plan's file. Raises InputError: the bench was begun without a plan."""
+        """Return the plan's file. Raises InputError if the bench was begun without a plan."""
         if not self.plan:
             raise InputError("no plan: close the devices, and open them with the plan whose object lies there")
         return str(self._plans.path(self.plan))

@@ -1,5 +1,5 @@
-"""The records in force for a cell: how old they are, how long and how well they hold, which plans they refuse; and
-the campaigns in which new ones are made."""
+"""The records in force for a cell: their age, validity and margins, and the plans that they refuse; and the
+campaigns that make new records."""
 
 from __future__ import annotations
 
@@ -34,42 +34,43 @@ class RecordRow:
 
     kind: str
     path: Path | None = None
-    """None: no record of this kind is in force."""
+    """None if no record of this kind is in force."""
     is_needed: bool = False
-    """Plans that want calibrations want this kind."""
+    """True if plans that require calibrations need a record of this kind."""
     created_at: str = ""
     """UTC, ISO 8601."""
     age_days: float = 0.0
     left_days: float = 0.0
     """Days until the record expires; below 0 when it has expired."""
     tightest: str = ""
-    """The limit that is nearest to be missed."""
+    """The limit with the smallest margin."""
     margin: float | None = None
-    """Distance below the tightest limit, as a share of it; below 0 when it is missed; None without limits."""
+    """Distance of the figure from its tightest limit, as a share of the limit; below 0 if the limit is exceeded;
+    None without limits."""
     against: tuple[str, ...] = ()
-    """Reasons why plans must not use the record here."""
+    """Reasons why plans must not use the record with this cell."""
 
 
 @dataclass(frozen=True)
 class PlanRow:
-    """A plan of the folder of plans, and the verdict of its records."""
+    """A plan in the folder of plans, and whether its records refuse it."""
 
     plan: str
     wants: bool
-    """It wants calibrations at all."""
+    """True if the plan requires calibrations."""
     against: tuple[str, ...]
-    """Reasons why its records refuse the plan; empty if they do not."""
+    """Reasons why the records refuse the plan; empty if they do not."""
 
 
 @dataclass(frozen=True)
 class StepNow:
-    """A step of a campaign."""
+    """The progress of one step of a campaign."""
 
     step: Step
     accepted_kinds: tuple[str, ...]
-    """Kinds of its records that are there and accepted."""
+    """Kinds of the step's records that exist and are accepted."""
     missed_limits: tuple[str, ...]
-    """Limits that its records miss."""
+    """Limits that the step's records exceed."""
 
     @property
     def is_done(self) -> bool:
@@ -77,7 +78,7 @@ class StepNow:
 
 
 class CalibrationStatus:
-    """Read anew when a file has changed."""
+    """Records and campaigns of a cell; a file is read again when it has changed."""
 
     def __init__(self, cell: Cell, plans: Path) -> None:
         self.rig_path, self._plans = cell.document.path, plans
@@ -86,7 +87,8 @@ class CalibrationStatus:
         self._known: dict[str, tuple[object, object]] = {}
 
     def records(self) -> list[RecordRow]:
-        """All kinds that a cell usually has, and others in force. Raises InputError: the rig is wrong."""
+        """Return all kinds that a cell usually has, and other kinds in force. Raises InputError if the rig is
+        wrong."""
         cell = read_cell(self.rig_path)
         record_names = cell.rig.calibrations
         rows = [
@@ -102,7 +104,7 @@ class CalibrationStatus:
         return sorted([*rows_in_force, *missing], key=lambda row: kinds.index(row.kind))
 
     def plans(self) -> list[PlanRow]:
-        """Plans for this rig, by name."""
+        """Return the plans for this rig, by name."""
         with self._lock:
             return [row for path in sorted(self._plans.rglob("*.yaml")) if (row := self._plan(path)) is not None]
 
@@ -124,7 +126,7 @@ class CalibrationStatus:
         return PlanRow(name, wants=True, against=tuple(refusals(records_in_force, situation_of(files.cell.rig))))
 
     def _record(self, path: Path) -> Record:
-        """Read once for all plans, as long as it is the same file."""
+        """Read a record; while its file stays the same, it is read once for all plans."""
         mtime_ns = path.stat().st_mtime_ns
         known_mtime_ns, record = self._known.get(str(path), (None, None))
         if known_mtime_ns != mtime_ns or not isinstance(record, Record):
@@ -135,18 +137,18 @@ class CalibrationStatus:
     # -- campaigns --------------------------------------------------------------------------------------------
 
     def campaign(self) -> Path | None:
-        """The folder of the newest; None without one."""
+        """Folder of the newest campaign; None if there is none."""
         folders = sorted(self._campaigns.iterdir()) if self._campaigns.is_dir() else []
         return folders[-1] if folders else None
 
     def new_campaign(self) -> Path:
-        """A folder for new records. Raises StorageError."""
+        """Return a folder for new records. Raises StorageError."""
         folder = self._campaigns / datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         make_folder(folder)
         return folder
 
     def steps(self, folder: Path) -> list[StepNow]:
-        """Return how far each step of a campaign is."""
+        """Return the progress of each step of a campaign."""
         return [_step(step, folder) for step in OF_A_CELL]
 
     def lines_for_the_rig(self, folder: Path) -> str:

@@ -1,4 +1,4 @@
-"""Loan of the cell to one process of the service's user at a time, for what needs no run."""
+"""Loan of the cell to one process of the service's user at a time, for work that needs no run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coupole.errors import InputError
 
 
 def begun_here(pid: int) -> bool:
-    """Tell whether this process has begun the process `pid`."""
+    """Tell whether this process has begun process `pid`."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -25,13 +25,13 @@ def begun_here(pid: int) -> bool:
 class _Loan:
     pid: int
     process: int
-    """A file descriptor of the process, which can be read when it has ended: numbers of processes are used
-    again."""
+    """A file descriptor of the process, which becomes readable when the process ends. A process id would not
+    suffice, because ids are used again."""
     words: str
 
 
 class Lending:
-    """The loan there is, if there is one. It ends when the process gives the cell back, or ends."""
+    """The present loan, if there is one. It ends when the process gives the cell back, or ends."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
@@ -51,7 +51,8 @@ class Lending:
             return bool(self.lent_to) and self._loan is not None and self._loan.pid == pid
 
     def lend(self, pid: int, borrower: str, purpose: str) -> None:
-        """Raises InputError: it is lent, or there is no such process."""
+        """Lend the cell to process `pid`. Raises InputError if it is lent already, or if there is no such
+        process."""
         with self._lock:
             if self.lent_to:
                 raise InputError(f"the cell is lent to {self.lent_to}")
@@ -62,14 +63,14 @@ class Lending:
             self._loan = _Loan(pid, process, f"{borrower}: {purpose}")
 
     def interrupt(self) -> None:
-        """End the command that the cell is lent to, as Ctrl-C does. Raises InputError: it is not lent."""
+        """Interrupt the borrower as by Ctrl-C. Raises InputError if the cell is not lent."""
         with self._lock:
             if not self.lent_to or self._loan is None:
                 raise InputError("the cell is not lent")
             signal.pidfd_send_signal(self._loan.process, signal.SIGINT)
 
     def give_back(self, pid: int) -> None:
-        """Raises InputError: this process has not borrowed it."""
+        """End the loan. Raises InputError if this process has not borrowed the cell."""
         with self._lock:
             if self._loan is None or self._loan.pid != pid:
                 raise InputError("the cell is not lent to this process")

@@ -1,4 +1,4 @@
-"""The cell at this moment, as the console tells it."""
+"""The present state of the cell, as the console reports it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _ENDED_TOLD = 20
 
 
 class Newest:
-    """A state that is made anew by a thread of its own, however many ask for it."""
+    """A state that a separate thread renews; the number of readers does not matter."""
 
     def __init__(self, make: Callable[[], StateNow]) -> None:
         self._make, self._state = make, make()
@@ -59,7 +59,7 @@ def state_of(
     checking: str,
     trouble: str,
 ) -> StateNow:
-    """The cell at this moment; `checking` is what preflight is being made of."""
+    """Return the present state of the cell; `checking` describes the preflight that is being made."""
     at_work, entry = acquisitions.state or {}, queue.running
     if not at_work:
         _forget_runs()
@@ -106,12 +106,12 @@ def _entries_now(queue: PlanQueue, left_s: float | None) -> list[EntryNow]:
 
 
 def _rounded_to_10_s(time: datetime) -> datetime:
-    """Round a time to 10 s, so that an expected time does not change with every look."""
+    """Round a time to 10 s, so that an expected time does not change at every update."""
     return datetime.fromtimestamp(round(time.timestamp(), -1), UTC)
 
 
 def _devices(run: str) -> dict[str, Any]:
-    """Identities of a run's devices; none if they cannot be read."""
+    """Return the identities of a run's devices; none if they cannot be read."""
     try:
         return _devices_when(run)
     except (CoupoleError, KeyError):
@@ -120,7 +120,8 @@ def _devices(run: str) -> dict[str, Any]:
 
 @functools.lru_cache(4)
 def _devices_when(run: str) -> dict[str, Any]:
-    """Identities of a run's devices, which do not change while it runs. Raises InputError, KeyError."""
+    """Return the identities of a run's devices, which do not change during a session. Raises InputError,
+    KeyError."""
     return dict(Run(Path(run)).about["devices"])
 
 
@@ -128,8 +129,8 @@ _NO_OBJECT = {"object": "", "dose_before": 0.0, "dose_budget": None}
 
 
 def _object_of(cell: Cell, run: str) -> dict[str, Any]:
-    """Return the object of a run that is being acquired, the light on it that is not this run's, and its budget,
-    both as the ledger has them now; no object if this cannot be read."""
+    """Return the object of a run that is being acquired, the light on it from other runs, and its budget. Light
+    and budget are those of the ledger now. Without an object, or if it cannot be read, return empty values."""
     try:
         ledger, object_id, plans_budget = _ledger_when(cell.ledger_folder, cell.former_ledger_folder, run)
         history = ledger.newest() if ledger else History()
@@ -142,8 +143,8 @@ def _object_of(cell: Cell, run: str) -> dict[str, Any]:
 
 @functools.lru_cache(4)
 def _ledger_when(ledgers: Path, former: Path, run: str) -> tuple[Ledger | None, str, float | None]:
-    """The ledger of a run's object, its id, and its budget by the plan; they do not change while it runs. Raises
-    InputError."""
+    """Return the ledger of a run's object, its id, and its budget by the plan; they do not change during a
+    session. Raises InputError."""
     opened_run = Run(Path(run))
     object_id = opened_run.about.get("object") or ""
     budget = (yamlfile.read_document(opened_run.plan_path).data.get("object") or {}).get("dose_budget_lux_h")
@@ -151,6 +152,6 @@ def _ledger_when(ledgers: Path, former: Path, run: str) -> tuple[Ledger | None, 
 
 
 def _forget_runs() -> None:
-    """A run that goes on later is read anew: its object may have received other light meanwhile."""
+    """Read a run again if it is resumed later, because its object may have received other light meanwhile."""
     _devices_when.cache_clear()
     _ledger_when.cache_clear()

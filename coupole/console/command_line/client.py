@@ -25,7 +25,7 @@ from coupole.viewing.terminal import alarm
 _PATIENCE_S = 30.0
 _SAID_AFTER_S, _PROBED_EVERY_S, _LOOK_EVERY_S = 1.5, 5.0, 0.1
 PREFLIGHT_S = 1800.0
-"""Patience with the preflight of a plan that is entered."""
+"""Longest wait, s, for the preflight of a plan that is entered."""
 
 
 class NotServed(InputError):
@@ -33,15 +33,15 @@ class NotServed(InputError):
 
 
 class NoAnswer(InputError):
-    """The console does not answer, or ended before it did."""
+    """The console does not answer, or has ended without an answer."""
 
 
 class GivenUp(InputError):
-    """The caller does not wait for an answer any more."""
+    """The caller no longer waits for an answer."""
 
 
 def service_socket(cell: Cell) -> Path:
-    """The Unix socket at which the service of a cell hears the command line."""
+    """Return the Unix socket at which the service of a cell accepts commands."""
     return named_after(cell.document.path, "console")
 
 
@@ -70,10 +70,10 @@ def call(
     given_up: Callable[[], bool] = _never,
     meanwhile: str = "",
 ) -> Any:
-    """Send a request and return the service's answer; a person is told on standard error if none comes within 2 s,
-    and what happens `meanwhile`.
+    """Send a request and return the service's answer. If there is no answer within 2 s, a message on standard
+    error says so, and what happens `meanwhile`.
 
-    Raises NotServed; GivenUp; NoAnswer; InputError: the service refuses, with its words.
+    Raises NotServed; GivenUp; NoAnswer; InputError with the service's words if it refuses.
     """
     rig, end_s = cell.document.path, time.monotonic() + patience_s
     place = _place(cell)
@@ -98,7 +98,7 @@ def call(
 
 
 def _refusal(answer: dict[str, Any]) -> InputError:
-    """Return an error with the service's words, and the exit code that the refusal has without a console."""
+    """Return an error with the service's words, and with the exit code that the refusal has without a console."""
     error = InputError(str(answer.get("detail", answer)))
     error.exit_code = answer.get("exit_code", InputError.exit_code)
     return error
@@ -112,7 +112,8 @@ def _place(cell: Cell) -> str:
 
 
 def _connect(cell: Cell, connection: _Local, end_s: float, given_up: Callable[[], bool]) -> None:
-    """Connect, waiting for a console that has the cell and does not listen yet. Raises NotServed: none has it."""
+    """Connect; wait for a console that has the cell but does not listen yet. Raises NotServed if no console has
+    it."""
     rig, begun_s, has_spoken = cell.document.path, time.monotonic(), False
     while True:
         try:
@@ -165,7 +166,7 @@ def _await(
 
 
 def _answers(place: str) -> bool:
-    """Tell whether a console answers at all: one that makes a preflight answers others meanwhile."""
+    """Tell whether a console answers at all: while it makes a preflight, it still answers other requests."""
     probe = _Local(place, _LOOK_EVERY_S * 4)
     try:
         probe.request("GET", "/api/v1/token")
@@ -184,7 +185,7 @@ def _state_of(pid: int) -> str:
 
 @contextlib.contextmanager
 def _told_if_given_up(rig: Path, counts_anyway: bool) -> Iterator[None]:
-    """Say what becomes of a request whose answer nobody awaits any more."""
+    """Print what happens to a request if the caller stops waiting for its answer."""
     try:
         yield
     except BaseException:
@@ -197,7 +198,8 @@ def _told_if_given_up(rig: Path, counts_anyway: bool) -> Iterator[None]:
 
 
 def is_served(cell: Cell) -> bool:
-    """Tell whether a console of this user on this machine owns the cell. Raises InputError: it does not answer."""
+    """Tell whether a console of this user on this machine owns the cell. Raises InputError if it does not
+    answer."""
     try:
         call(cell, "GET", "/api/v1/state")
     except NotServed:
@@ -207,8 +209,8 @@ def is_served(cell: Cell) -> bool:
 
 @contextlib.contextmanager
 def borrowed_cell(cell: Cell, purpose: str) -> Iterator[None]:
-    """The cell for the `purpose` of this process, lent by its console; where none is served nobody is asked.
-    Raises InputError: a run is at work, somebody else is in control, or has it."""
+    """Borrow the cell from its console for the `purpose` of this process; without a console, the cell needs no
+    loan. Raises InputError if a run is being acquired, or if another person is in control or has the cell."""
     try:
         call(cell, "POST", "/api/v1/cell/lease", {"what": purpose})
     except NotServed:
@@ -217,5 +219,5 @@ def borrowed_cell(cell: Cell, purpose: str) -> Iterator[None]:
     try:
         yield
     finally:
-        with contextlib.suppress(InputError):  # it ends with this process anyhow
+        with contextlib.suppress(InputError):  # the loan ends with this process in any case
             call(cell, "DELETE", "/api/v1/cell/lease")

@@ -1,7 +1,8 @@
-"""`coupole acquire` where a console owns the cell: the plan is entered in its queue, and followed in the terminal.
+"""`coupole acquire` with a console that owns the cell: the plan is entered in the queue, and followed in the
+terminal.
 
-The process that acquires is the console's. Signals and keys here are passed on to it, its words and progress are
-shown here, and how it ended is how this ends.
+The acquiring process belongs to the console. Signals and keys of the terminal are passed on to it; its messages
+and its progress are shown here. The command ends with the same error or exit code as that process.
 """
 
 from __future__ import annotations
@@ -44,10 +45,11 @@ def acquire_by_console(
     confirm: bool,
     summary: dict[str, Any],
 ) -> None:
-    """Enter a plan or a run to be resumed (`request`: as of `POST /api/v1/queue`), which begins at once, and
-    follow it to its end; `summary` is filled with the figures of `--json`.
+    """Enter a plan or a run to be resumed (`request`: as in `POST /api/v1/queue`), which begins at once, and
+    follow it to its end. `summary` receives the figures of `--json`.
 
-    Raises InputError: the queue is at work, or somebody else is in control; and what the acquisition raised.
+    Raises InputError if the queue is busy or if another person is in control; otherwise the errors of the
+    acquisition.
     """
     if confirm and not in_world(cell.rig, dry_run=False):
         _confirm(cell, console, request)
@@ -59,7 +61,7 @@ def acquire_by_console(
 
 
 def _confirm(cell: Cell, console: Console, request: dict[str, Any]) -> None:
-    """Show what a real cell is about to do, and ask. Raises PreflightRefused, Interrupted."""
+    """Show what a real cell will do, and ask for confirmation. Raises PreflightRefused, Interrupted."""
     run = Run(Path(request["resume"])) if request.get("resume") else None
     plan = Path(request["plan"]) if request.get("plan") else run.plan_path if run else Path()
     job = without_hidden(read_job(plan, cell.document.path), run.hidden_leds if run else None)
@@ -99,10 +101,12 @@ class _Followed:
             self.stop()
 
     def stop(self) -> list[str]:
-        """Stop the entry, whether or not it has begun; from any thread. Return what is not sure then.
+        """Stop the entry, whether or not it has begun; may be called from any thread. Return the devices that may
+        not be safe.
 
-        A run is asked itself, which obeys whatever its console does, and answers when lights are off and the arm
-        was stopped."""
+        A run is stopped directly, because it obeys even if its console does not. It answers when the lights are
+        off and the arm was stopped.
+        """
         if not self._entry:
             return ["as far as this terminal knows, nothing has begun"]
         for _ in range(_TRIALS):
@@ -111,7 +115,7 @@ class _Followed:
             try:
                 if self._take_out():
                     return []
-            except (NotServed, NoAnswer):  # only then: else it might be somebody else's
+            except (NotServed, NoAnswer):  # only in these cases: otherwise the run may be another person's
                 if (trouble := self._stop_run(self._run_at_work())) is not None:
                     return trouble
             if self._has_ended:
@@ -120,8 +124,8 @@ class _Followed:
         return ["not sure: the run gives no answer"]
 
     def _take_out(self) -> bool:
-        """Have the console stop the entry's process; True if it had not begun, and never will. Raises NotServed,
-        NoAnswer."""
+        """Let the console stop the entry's process. Return True if the entry had not begun and never will. Raises
+        NotServed, NoAnswer."""
         place = f"/api/v1/queue/{self._entry['id']}"
         for method, path in (("POST", f"{place}/stop"), ("DELETE", place)):
             try:
@@ -135,19 +139,20 @@ class _Followed:
         return False
 
     def _stop_run(self, run: Path | None) -> list[str] | None:
-        """Return what is not sure when a run has stopped; None if it gives no answer, or there is none."""
+        """Stop a run; return the devices that may not be safe. None if there is no run, or if it does not
+        answer."""
         with contextlib.suppress(InputError):
             return None if run is None else list(ask(run, "stop").get("trouble", ()))
         return None
 
     def _run_at_work(self) -> Path | None:
-        """The run of this cell that is at work, while the console has not told of it."""
+        """Return this cell's present run, for the time before the console has reported it."""
         rig = str(self._cell.document.path.resolve())
         return next((Path(state["run"]) for state in running() if state["run"] and state.get("rig") == rig), None)
 
     @property
     def _run(self) -> Path | None:
-        """Folder of the entry's run, once it has one."""
+        """Folder of the entry's run, once there is one."""
         return Path(self._entry["run"]) if self._entry.get("run") else None
 
     @property
@@ -155,7 +160,7 @@ class _Followed:
         return bool(self._entry.get("ended"))
 
     def to_its_end(self, summary: dict[str, Any]) -> None:
-        """Show what the process says and does; raises what it raised."""
+        """Show the output and progress of the process until it ends; raise its error."""
         keys = {"p": self._pause_or_go_on, "q": self.stop}
         with key_actions(keys) as has_keys, self._bars:
             if has_keys:
@@ -168,8 +173,8 @@ class _Followed:
         self._conclude(figures, summary)
 
     def _outputs(self) -> Iterator[dict[str, Any]]:
-        """Yield the output until the entry has ended. Raises Interrupted: the entry was taken out before it began;
-        DeviceLost: the console has ended, and after it what it had begun."""
+        """Yield the output until the entry has ended. Raises Interrupted if the entry was taken out before it
+        began; DeviceLost if the console has ended, after the process that it had begun."""
         is_announced = False
         while not self._has_ended:
             try:
@@ -202,7 +207,7 @@ class _Followed:
             time.sleep(_LOOK_EVERY_S)
 
     def _was_stopped(self) -> bool:
-        """Tell whether this terminal has stopped the run, and it has ended."""
+        """Tell whether this terminal has stopped the run, and the run has ended."""
         return self._control.stop.is_set() and self._state() is None
 
     def _meanwhile(self) -> str:
@@ -223,7 +228,7 @@ class _Followed:
                 ask(self._run, "go-on" if is_paused else "pause")
 
     def _say(self, output_text: str) -> None:
-        """Print what is new in the process's output, in whole lines."""
+        """Print the new whole lines of the process's output."""
         whole = output_text[: output_text.rfind("\n") + 1]
         new = whole[len(self._printed) :] if whole.startswith(self._printed) else whole
         self._printed = whole
@@ -232,7 +237,7 @@ class _Followed:
                 self._console.print(line, markup=False)
 
     def _show_progress(self) -> None:
-        """Bars on a terminal; elsewhere the process's own lines say it."""
+        """Show progress bars on a terminal. Elsewhere the lines of the process report the progress."""
         state = self._state() if self._console.is_terminal else None
         if state is None or "view" not in state or self._has_ended:
             return

@@ -1,6 +1,6 @@
-"""Search for the process that has a cell's console, whether or not it listens.
+"""Search for the process that has a cell's console, also if it does not listen.
 
-The query takes no lock itself, so it never hinders a console that begins.
+The search takes no lock, so it never hinders a console that is starting.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from coupole.storage.stopped_process import holder_of
 
 
 def console_lock(cell: Cell) -> Path:
-    """The file that a cell's console has locked, with its process in it."""
+    """Return the file that a cell's console locks; it contains the process id."""
     return cell.state_folder / "console" / "lock"
 
 
 def owner_of(cell: Cell) -> int | None:
-    """The process of a cell's console; None if none has it, or that cannot be told."""
+    """Return the process id of a cell's console; None if there is no console, or if this cannot be determined."""
     lock = console_lock(cell)
     holder = holder_of(lock)
     try:

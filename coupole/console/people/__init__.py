@@ -1,1 +1,1 @@
-"""Rights of people at a console: accounts, sessions, control, the guard before all requests, the log."""
+"""Rights of people at a console: accounts, sessions, control, the check of every request, the log."""

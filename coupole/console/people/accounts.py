@@ -30,11 +30,11 @@ class Role(IntEnum):
     """Rights of a person; each role may also do all that the lower ones may."""
 
     OBSERVER = 1
-    """Looks."""
+    """May look."""
     OPERATOR = 2
-    """Runs plans."""
+    """May run plans."""
     ENGINEER = 3
-    """Calibrates, and keeps the accounts."""
+    """May calibrate, and manages the accounts."""
 
     @property
     def word(self) -> str:
@@ -42,7 +42,7 @@ class Role(IntEnum):
 
     @classmethod
     def of(cls, word: str) -> Role:
-        """Raises InputError."""
+        """Return the role of this name. Raises InputError."""
         try:
             return cls[word.upper()]
         except KeyError:
@@ -56,7 +56,7 @@ class Account:
     name: str
     role: Role
     key: str = field(default="", compare=False, repr=False)
-    """Key that tells this account from a later one of the same name."""
+    """Key that distinguishes this account from a later one of the same name."""
 
 
 FIRST_ENGINEER = Account("first engineer", Role.ENGINEER)
@@ -64,11 +64,11 @@ FIRST_ENGINEER = Account("first engineer", Role.ENGINEER)
 
 
 class Accounts:
-    """The accounts in a file that only its owner reads. Passwords are hashed by argon2id with its library's
+    """The accounts, in a file that only its owner may read. Passwords are hashed by argon2id with the library's
     parameters (RFC 9106)."""
 
     def __init__(self, path: Path) -> None:
-        """Raises StorageError: the file cannot be read."""
+        """Raises StorageError if the file cannot be read."""
         self._path, self._lock = path, threading.Lock()
         self._hasher = argon2.PasswordHasher()
         self._nobodys_hash = self._hasher.hash(secrets.token_hex())
@@ -79,22 +79,23 @@ class Accounts:
         except (OSError, InputError) as error:
             raise StorageError(f"{path}: the console's accounts cannot be read: {error}") from error
         self.first_token = "" if _has_engineer(self._stored) else secrets.token_urlsafe(24)
-        """Token with which an engineer signs in while no engineer has an account; empty if it does not hold."""
+        """Token with which an engineer signs in while no engineer has an account; empty if the token is not
+        valid."""
 
     def all_accounts(self) -> list[Account]:
         """Return all accounts, by name."""
         return [Account(name, Role.of(entry["role"])) for name, entry in sorted(self._stored.items())]
 
     def holds(self, account: Account) -> bool:
-        """Tell whether an account that has signed in still holds: it is there, with this role. The first
-        engineer's holds while no engineer has an account."""
+        """Tell whether a signed-in account is still valid: it exists and has this role. The account of the first
+        engineer is valid while no engineer has an account."""
         if account == FIRST_ENGINEER:
             return not _has_engineer(self._stored)
         entry = self._stored.get(account.name)
         return entry is not None and entry["role"] == account.role.word and _key(entry) == account.key
 
     def add(self, name: str, password: str, role: Role) -> Account:
-        """A new account, on the disk when this returns. Raises InputError, StorageError."""
+        """Add an account; it is on the disk when this returns. Raises InputError, StorageError."""
         if not _NAME.fullmatch(name):
             raise InputError(
                 "name: expected at most 64 letters, digits, spaces, dots, hyphens; a letter first, no space last"
@@ -115,7 +116,8 @@ class Accounts:
         return Account(name, role)
 
     def change_role(self, name: str, role: Role) -> None:
-        """Raises InputError: no such account, or the last engineer's; StorageError."""
+        """Change the role of an account. Raises InputError if there is no such account, or if it is the last
+        engineer's; StorageError."""
         with self._lock:
             if name not in self._stored:
                 raise InputError(f"name: {name} has no account")
@@ -125,7 +127,8 @@ class Accounts:
             self._keep(accounts)
 
     def remove(self, name: str) -> None:
-        """Raises InputError: no such account, or the last engineer's; StorageError."""
+        """Remove an account. Raises InputError if there is no such account, or if it is the last engineer's;
+        StorageError."""
         with self._lock:
             if name not in self._stored:
                 raise InputError(f"name: {name} has no account")
@@ -137,10 +140,12 @@ class Accounts:
             self._keep(remaining_accounts)
 
     def sign_in(self, name: str, password: str, *, here: bool) -> Account | None:
-        """The account with this name and password; None if there is none, and for a minute after five failures.
+        """Return the account with this name and password; None if there is none, and for a minute after five
+        failures.
 
-        It takes as long whether or not the name is known, and one is checked at a time: hashing is made to cost.
-        Failures from other machines keep out nobody who is `here`, and after thirty all who are not.
+        The check takes equally long for unknown names. Only one password is checked at a time, because hashing is
+        expensive by design. Failures from other machines do not block a person who is `here`; thirty of them block
+        all other machines.
         """
         with self._checking:
             now_s = time.monotonic()
@@ -166,7 +171,8 @@ class Accounts:
         return Account(name, Role.of(entry["role"]), _key(entry)) if entry else None
 
     def sign_in_first(self, token: str) -> Account | None:
-        """An engineer with the token of a start without an engineer's account; once."""
+        """Return the first engineer's account for the token of a start without an engineer's account; the token is
+        valid once."""
         with self._lock:
             if not self.first_token or not hmac.compare_digest(token.encode(), self.first_token.encode()):
                 return None
@@ -186,13 +192,13 @@ class Accounts:
 
 
 def _key(entry: dict[str, Any]) -> str:
-    """Differs for each account, as its password is hashed with a salt of its own."""
+    """Return a key that differs for each account, because each password is hashed with its own salt."""
     return hashlib.sha256(entry["password"].encode()).hexdigest()
 
 
 def _visible_form(name: str) -> str:
-    """Return a name as a reader sees it: two that differ only by capitals, width or spaces are one person in a
-    log."""
+    """Return a name as it looks in a log: names that differ only by capitals, width or spaces are the same
+    person."""
     return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 

@@ -1,4 +1,4 @@
-"""Account of whoever sends a request, as routes ask for it."""
+"""Account of the sender of a request, for routes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Log of requests at the console and their authors: `audit.jsonl`, a line for each request that would change
-something, with its answer; also if it was refused.
+"""Log of the requests at the console and their senders: `audit.jsonl` has a line for each request that would
+change something, with its answer, also if it was refused.
 """
 
 from __future__ import annotations
@@ -14,8 +14,11 @@ from coupole.storage.line_file import LineFile, utc_now
 
 
 class Audit:
-    """The log of one cell's console. Raises StorageError when it is opened; later `trouble` says that it could not
-    be written, as a stop must not wait for a disk."""
+    """The log of one cell's console.
+
+    Raises StorageError if it cannot be opened. Later, `trouble` reports that the log could not be written, because
+    a stop must not wait for a disk.
+    """
 
     def __init__(self, path: Path) -> None:
         make_folder(path.parent)
@@ -23,8 +26,8 @@ class Audit:
         self.trouble = ""
 
     def note(self, name: str, action: str, status: int, address: str, about: str = "") -> None:
-        """`name` (empty: nobody who is signed in) at `address` asked for something, and got this HTTP status;
-        `about`: what of it the path does not say."""
+        """Log a request of `name` (empty if nobody is signed in) at `address`, with the HTTP status of its answer.
+        `about` adds what the path does not say."""
         line = {"t": utc_now(), "name": name, "asked": action, "status": status, "from": address}
         if about:
             line["about"] = about

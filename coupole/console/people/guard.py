@@ -1,5 +1,6 @@
-"""Guard before all requests. Nothing but the sign-in page is served to somebody who is not signed in. Nothing is
-changed for another site's page, or twice. Requests that would change something are logged, with their answers.
+"""Check of every request before it is handled. A visitor who is not signed in gets only the sign-in page. A
+request changes nothing if it comes from another site's page, or for the second time. Requests that would change
+something are logged, with their answers.
 """
 
 from __future__ import annotations
@@ -29,22 +30,23 @@ _MOST_BYTES_OF_A_PICTURE = 20_000_000
 _LOOPBACK = ("127.0.0.1", "::1")
 _SIGN_IN = Path(__file__).parent / "sign_in.html"
 _STATIC = "/_nicegui/"
-"""Files of the screens' library: the same for everybody, with their version in the name."""
+"""Files of the screens' library. They are the same for everybody, and their names contain their version."""
 _SIGN_IN_POLICY = "default-src 'self'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
 _SCREEN_POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src 'self' data:; worker-src 'self' blob:; frame-src 'self'; "
     "object-src 'none'; base-uri 'self'; form-action 'self'"
 )
-"""The screens' library compiles its templates in the browser; nothing comes from, or goes, elsewhere."""
+"""The screens' library compiles its templates in the browser. Nothing is loaded from, or sent to, another
+place."""
 
 
 def guard(app: FastAPI, service: Service) -> None:
-    """Put the guard in front of an app."""
+    """Put this check in front of an app."""
 
     @app.middleware("http")
     async def log_request(request: Request, call_next: Callable[[Request], Any]) -> Response:
-        status = 500  # if it raises
+        status = 500  # the status if the app raises
         try:
             response: Response = await check(request, call_next)
             status = response.status_code
@@ -90,7 +92,7 @@ def guard(app: FastAPI, service: Service) -> None:
 
 
 def _answer_errors(app: FastAPI) -> None:
-    """Answer errors in words, with their status."""
+    """Answer errors with their words and their status."""
 
     @app.exception_handler(InputError)
     async def wrong(_: Request, error: InputError) -> Response:
@@ -117,7 +119,7 @@ def _answer_errors(app: FastAPI) -> None:
 
 
 def _finite(content: Any) -> Any:
-    """Return a value that JSON can express: numbers that are not finite (NaN) become text."""
+    """Return a value that JSON can express: numbers that are not finite (such as NaN) become text."""
     if isinstance(content, dict):
         return {key: _finite(value) for key, value in content.items()}
     if isinstance(content, list):
@@ -126,7 +128,7 @@ def _finite(content: Any) -> Any:
 
 
 class _WebSocketGuard:
-    """The same for the connections by which screens work."""
+    """The same check for the WebSocket connections of the screens."""
 
     def __init__(self, app: ASGIApp, service: Service) -> None:
         self._app, self._service = app, service
@@ -153,7 +155,7 @@ def _wants_page(request: Request) -> bool:
 
 
 def _foreign(request: Request, service: Service) -> Response | None:
-    """A refusal, if another site's page asks, or another host's name was used."""
+    """Return a refusal if the request comes from another site's page, or if it names another host."""
     hosts = {origin.partition("://")[2] for origin in service.origins}
     if not is_command_line(request) and request.headers.get("host", "") not in hosts:
         return _no(400, "expected this console's own address as host")
@@ -168,7 +170,7 @@ def _no(code: int, why: str) -> Response:
 
 
 def why_unwanted(request: Request, service: Service) -> str:
-    """Return why nothing is begun for a request: its sender has gone, or it may have lain here long; else
+    """Return why nothing is begun for a request: its sender has disconnected, or the request may be old. Otherwise
     empty."""
     if hung_up(request.state.connection):
         return "the caller has disconnected: not begun"
@@ -176,7 +178,7 @@ def why_unwanted(request: Request, service: Service) -> str:
 
 
 def is_command_line(request: Request | WebSocket) -> bool:
-    """Tell whether a request came by the service's Unix socket, which hears only processes of its own user."""
+    """Tell whether a request came by the service's Unix socket, which accepts only processes of its own user."""
     server = request.scope.get("server")
     return server is not None and server[1] is None
 
@@ -187,12 +189,12 @@ def bearer_of(request: Request | WebSocket) -> str:
 
 
 def address_of(request: Request | WebSocket) -> str:
-    """Return the address of whoever asks."""
+    """Return the address of the sender."""
     return request.client.host if request.client else "command line"
 
 
 def session_of(request: Request | WebSocket, service: Service, *, counts_as_use: bool = True) -> Session | None:
-    """Return the session of whoever asks; None without one. Looking on does not count as using it."""
+    """Return the session of the sender; None if there is none. Requests that only observe do not prolong it."""
     if is_command_line(request):
         return service.command_line
     if bearer := bearer_of(request):
@@ -201,12 +203,12 @@ def session_of(request: Request | WebSocket, service: Service, *, counts_as_use:
 
 
 def is_of_this_machine(request: Request | WebSocket) -> bool:
-    """A connection from an address of this machine itself: nobody else can have one."""
+    """Tell whether a connection comes from an address of this machine, which no other machine can have."""
     if is_command_line(request) or request.client is None:
         return is_command_line(request)
     return request.client.host in _LOOPBACK or request.client.host == request.scope["server"][0]
 
 
 def account_here(account: Account, *, of_this_machine: bool) -> Account:
-    """Return an account with its role at this place: from another machine everybody is an observer."""
+    """Return an account with its role at this place: a person at another machine is an observer."""
     return account if of_this_machine else replace(account, role=min(account.role, Role.OBSERVER))

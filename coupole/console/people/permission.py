@@ -1,4 +1,4 @@
-"""Permission for a request: by the person's role, and by the person in control."""
+"""Permission for a request, by the person's role and by the person in control."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from coupole.console.service_parts import Service
 
 
 class NotAllowed(Exception):
-    """Refusal of an action, with the HTTP status and the words for whoever asked."""
+    """Refusal of an action, with the HTTP status and the words for the sender."""
 
     def __init__(self, status: int, words: str) -> None:
         super().__init__(words)
@@ -15,7 +15,7 @@ class NotAllowed(Exception):
 
 
 def allow(service: Service, account: Account, role: Role, action: str, *, acts: bool = False) -> None:
-    """Raise NotAllowed if somebody's role, or who is in control, forbids an action."""
+    """Raise NotAllowed if the person's role, or another person's control, forbids an action."""
     if account.role < role:
         raise NotAllowed(403, f"{action}: only for {role.word}s; {account.name} is {account.role.word}")
     of_command_line = account is service.command_line.account

@@ -1,4 +1,4 @@
-"""Sessions of the people who are signed in, and which of them is in control."""
+"""Sessions of the people who are signed in, and the one who is in control."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from coupole.console.people.accounts import Account, Role
 from coupole.errors import InputError
 
 IDLE_S = 12 * 3600.0
-"""Time after which a session that was not used is over."""
+"""Time without use, s, after which a session is over."""
 ABSENT_S = 300.0
-"""Time after which any operator may relieve somebody in control who did nothing."""
+"""Time without action, s, after which any operator may replace the person in control."""
 _MOST_TOKENS = 64
 
 
 @dataclass
 class Session:
-    """One browser or script of a person."""
+    """One browser, or one script, of a person."""
 
     account: Account
     seen_s: float
     script: bool
-    """Its secret comes as a bearer, which no browser adds by itself."""
+    """True for a script: its secret is sent as a bearer token, which no browser adds by itself."""
     tokens: set[str] = field(default_factory=set)
-    """Tokens, each for one request that changes something."""
+    """Unused tokens; each is valid for one request that changes something."""
 
 
 class Sessions:
-    """All sessions, in memory: after a restart everybody signs in anew."""
+    """All sessions, in memory only: after a restart, everybody signs in again."""
 
     def __init__(
         self,
         now_s: Callable[[], float] = time.monotonic,
         holds: Callable[[Account], bool] = lambda _: True,
     ) -> None:
-        """`holds` tells whether somebody still is who signed in; a session is over as soon as that is not so."""
+        """`holds` tells whether an account is still valid; the session ends when it is not."""
         self._now_s, self._holds, self._lock = now_s, holds, threading.Lock()
         self._by_hash: dict[str, Session] = {}
 
     def begin(self, account: Account, *, script: bool) -> str:
-        """A new session's secret, which only its browser or script keeps."""
+        """Begin a session; return its secret, which only the browser or script keeps."""
         secret = secrets.token_urlsafe(32)
         now_s = self._now_s()
         with self._lock:
@@ -55,8 +55,8 @@ class Sessions:
         return secret
 
     def of(self, secret: str, *, script: bool, counts_as_use: bool = True) -> Session | None:
-        """The session of this kind with this secret, if it is not over; `counts_as_use`: from now on it
-        counts as just used."""
+        """Return the session of this kind with this secret, if it is not over. `counts_as_use`: this request
+        prolongs it."""
         with self._lock:
             session = self._by_hash.get(_hash(secret))
             if session is None or session.script is not script:
@@ -82,7 +82,7 @@ class Sessions:
         return token
 
     def spend(self, session: Session, token: str) -> bool:
-        """True once for each of the session's tokens."""
+        """Use up a token. Return True for a token of the session that was not used before."""
         with self._lock:
             is_valid = token in session.tokens
             session.tokens.discard(token)
@@ -95,14 +95,15 @@ def _hash(secret: str) -> str:
 
 @dataclass(frozen=True)
 class InControl:
-    """Name of the person in control, and of the one who asks for control."""
+    """Name of the person in control, and of the person who asks for control."""
 
     name: str = ""
     asked_by: str = ""
 
 
 class Control:
-    """One person at a time is in control: others look, until it is handed over, given up or left alone."""
+    """Control of the cell. One person at a time is in control, until control is handed over or given up, or the
+    person does nothing for some time."""
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s, self._lock = now_s, threading.Lock()
@@ -113,7 +114,8 @@ class Control:
         return self._now
 
     def take(self, account: Account) -> InControl:
-        """Take it if nobody has it, who has it does nothing, or one is an engineer; else ask for it."""
+        """Take control if nobody has it, if its holder has done nothing for some time, or if this account is an
+        engineer's; otherwise ask for it."""
         with self._lock:
             holder = self._now.name
             absent = self._now_s() - self._acted_s > ABSENT_S
@@ -124,7 +126,7 @@ class Control:
             return self._now
 
     def give(self, account: Account, to: str) -> InControl:
-        """Hand it over to who asked for it, or give it up (`to` is empty). Raises InputError."""
+        """Hand control over to the person who asked for it, or give it up (`to` is empty). Raises InputError."""
         with self._lock:
             if self._now.name != account.name:
                 raise InputError(f"{account.name} is not in control")
@@ -134,8 +136,8 @@ class Control:
             return self._now
 
     def act(self, account: Account, *, keep: bool = True) -> bool:
-        """Tell whether somebody may act now: the person in control, or any operator if nobody is. That operator
-        then takes control, unless `keep` is false."""
+        """Tell whether a person may act now: the person in control, or any operator if nobody is in control. That
+        operator then takes control, unless `keep` is false."""
         with self._lock:
             if self._now.name not in ("", account.name):
                 return False

@@ -1,9 +1,9 @@
-"""Check whether what was asked of a console is still wanted when the console gets to it.
+"""Check whether a request to the console is still wanted when the console reads it.
 
-A console stands still if it is stopped (Ctrl-Z, SIGSTOP), or if its machine sleeps. When it runs again it finds
-requests whose senders have long given up. So nothing begins for a caller whose connection is gone. Where that
-cannot be seen (a page that is still open), nothing begins of what may have come while the console stood still.
-Requests that end or pause something are always obeyed.
+A console is frozen while it is stopped (Ctrl-Z, SIGSTOP), and while its machine sleeps. When it runs again, it
+finds requests whose senders may have given up long ago. So nothing begins for a caller who has disconnected. If
+that cannot be seen (a page is still open), nothing begins that may have been requested while the console was
+frozen. Requests that end or pause something are always obeyed.
 """
 
 from __future__ import annotations
@@ -14,20 +14,21 @@ import time
 from collections.abc import Callable
 
 STOOD_STILL_S = 5.0
-"""A console that stood still for this time begins nothing that it was asked meanwhile."""
+"""A console that was frozen for this time, s, begins nothing that was requested in this time."""
 HELD_STOOD_STILL_S = 1.0
-"""The same time for a motion by hand, whose button is held."""
+"""The same time, s, for a motion by hand, which lasts while its button is held."""
 _NOTED_S, _BACKLOG_S = 0.5, 2.0
 _ENDINGS = ("/stop", "/pause", "/sign-out", "/control/give")
 
 
 def begins_nothing(method: str, path: str) -> bool:
-    """Tell whether a request of the HTTP interface only reads, ends or pauses: it counts, whoever is gone."""
+    """Tell whether a request of the HTTP interface only reads, ends or pauses something. These are obeyed even if
+    the sender is gone."""
     return method in ("GET", "HEAD", "DELETE") or path.endswith(_ENDINGS)
 
 
 def hung_up(connection: socket.socket) -> bool:
-    """Tell whether the other end of a connection is closed, whatever it has sent before."""
+    """Tell whether the other end of a connection is closed, also if it sent data before."""
     if connection.fileno() < 0:
         return True
     poll = select.poll()
@@ -36,18 +37,19 @@ def hung_up(connection: socket.socket) -> bool:
 
 
 def _now_s() -> float:
-    return time.clock_gettime(time.CLOCK_BOOTTIME)  # goes on while the machine sleeps
+    return time.clock_gettime(time.CLOCK_BOOTTIME)  # this clock goes on while the machine sleeps
 
 
 class LoopWatch:
-    """Knows for how long the console's loop did not run: the loop beats, anybody asks, from any thread."""
+    """Measures for how long the console's event loop did not run. The loop calls `beat`; `refusal` may be called
+    by any thread."""
 
     def __init__(self, now_s: Callable[[], float] = _now_s) -> None:
         self._now_s, self._beat_s = now_s, now_s()
         self._stood_s = self._awake_s = 0.0
 
     def beat(self) -> None:
-        """The loop runs."""
+        """Note that the loop runs."""
         now_s = self._now_s()
         stood_s = now_s - self._beat_s
         if stood_s > _NOTED_S and (stood_s > self._stood_s or now_s - self._awake_s > _BACKLOG_S):
@@ -55,7 +57,8 @@ class LoopWatch:
         self._beat_s = now_s
 
     def refusal(self, longest_s: float = STOOD_STILL_S) -> str:
-        """Return why nothing may begin now: what came while the console stood still reaches it now; else empty."""
+        """Return why nothing may begin now: the request may have been sent while the console was frozen. Otherwise
+        empty."""
         now_s = self._now_s()
         stood_s = now_s - self._beat_s
         if now_s - self._awake_s < _BACKLOG_S:

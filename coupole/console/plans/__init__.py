@@ -1,1 +1,1 @@
-"""Plans and objects: their files and forms, their preflight, the queue and what it will need."""
+"""Plans and objects: their files and forms, their preflight, the queue and its outlook."""

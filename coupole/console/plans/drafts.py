@@ -1,4 +1,4 @@
-"""Plans while they are written: checked and drawn in a process of its own, so that nothing waits for it."""
+"""Plans that are being written: checked and drawn in a separate process, so that the console does not wait."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _PATIENCE_S = 300.0
 
 @dataclass(frozen=True)
 class Draft:
-    """A plan's text, to be read as if it were this file's."""
+    """A plan's text, which is read as if it were the content of this file."""
 
     path: Path
     text: str
@@ -27,16 +27,16 @@ class Checked:
     """Result of the check of a draft."""
 
     problems: tuple[Problem, ...] = ()
-    """Mistakes in the files; with any there is nothing else."""
+    """Mistakes in the files; if there are any, the other fields are empty."""
     report: dict[str, Any] = field(default_factory=dict)
-    """Report, as of `coupole check --json`."""
+    """Report, as in `coupole check --json`."""
     views: tuple[dict[str, Any], ...] = ()
-    """Name, duration in s and dose in lux h of each, in the order of the visits."""
+    """Name, duration in s and dose in lux h of each view, in the order of the visits."""
     budget_lux_h: float | None = None
 
 
 def check_draft(draft: Draft) -> Checked:
-    """Everything but paths and collisions: those take longer."""
+    """Check everything except paths and collisions, which take longer."""
     from coupole.preflight.checking import preflight_of
     from coupole.preflight.job import read_job
     from coupole.viewing.preflight_table import document_of
@@ -56,7 +56,8 @@ def check_draft(draft: Draft) -> Checked:
 
 
 def draw_draft(draft: Draft, folder: Path) -> tuple[Path, Path]:
-    """Picture and page of the cell with the plan's views and paths, as `coupole view`. Raises InputError."""
+    """Draw picture and page of the cell with the plan's views and paths, like `coupole view`. Raises
+    InputError."""
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
     from coupole.viewing.view import look_at_plan
@@ -65,7 +66,7 @@ def draw_draft(draft: Draft, folder: Path) -> tuple[Path, Path]:
 
 
 def draw_object(draft: Draft, path: Path) -> Path:
-    """Picture of the object as it lies on the support. Raises InputError: the plan names no mesh."""
+    """Draw the object as it lies on the support. Raises InputError if the plan names no mesh."""
     from coupole.preflight.job import read_job
     from coupole.viewing.object_picture import write_object_picture
 
@@ -76,7 +77,8 @@ def draw_object(draft: Draft, path: Path) -> Path:
 
 
 def bounds_of_mesh(draft: Draft) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Corners of the box round the draft's object in the support frame, mm. Raises InputError: there is none."""
+    """Return the corners of the bounding box of the draft's object, support frame, mm. Raises InputError if there
+    is none."""
     from coupole.preflight.job import read_job
 
     corners = read_job(draft.path, text=draft.text).shape.corners_mm
@@ -93,25 +95,25 @@ class Desk:
         self._turn = asyncio.Lock()
 
     async def check(self, draft: Draft, is_wanted: Callable[[], bool] = lambda: True) -> Checked | None:
-        """None if the draft is no longer needed when its turn comes. Raises InputError: it takes too long, or the
-        process died of it.
+        """Check a draft; return None if it is no longer wanted when its turn comes. Raises InputError if the check
+        takes too long, or if the process dies.
         """
         async with self._turn:
             checked_draft: Checked | None = await self._do_now(check_draft, draft) if is_wanted() else None
         return checked_draft
 
     async def draw(self, draft: Draft, folder: Path) -> tuple[Path, Path]:
-        """Raises InputError."""
+        """Call `draw_draft` in the process. Raises InputError."""
         paths: tuple[Path, Path] = await self._do(draw_draft, draft, folder)
         return paths
 
     async def draw_object(self, draft: Draft, path: Path) -> Path:
-        """Raises InputError."""
+        """Call `draw_object` in the process. Raises InputError."""
         picture_path: Path = await self._do(draw_object, draft, path)
         return picture_path
 
     async def bounds(self, draft: Draft) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Raises InputError."""
+        """Call `bounds_of_mesh` in the process. Raises InputError."""
         bounds_mm: tuple[tuple[float, ...], tuple[float, ...]] = await self._do(bounds_of_mesh, draft)
         return bounds_mm
 

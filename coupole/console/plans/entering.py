@@ -1,7 +1,7 @@
-"""Reads and checks plans and runs to be acquired, and enters them in the queue.
+"""Reads and checks plans and runs, and enters them in the queue.
 
-Preflight is made by a process of its own (`entry_preflight`). While something is acquired it does not measure the
-disk's speed, as that takes all of it.
+A separate process makes the preflight (`entry_preflight`). During an acquisition it does not measure the disk's
+speed, because the measurement takes the whole speed of the disk.
 """
 
 from __future__ import annotations
@@ -38,25 +38,28 @@ class EntryRefused(InputError):
 
 
 class Entering:
-    """Entrance to one cell's queue, which decides what may enter."""
+    """Decides what may enter one cell's queue."""
 
     def __init__(self, cell: Cell, plans: Path, queue: PlanQueue, acquisitions: Acquisitions) -> None:
         self._cell, self._plans, self._queue, self._acquisitions = cell, plans, queue, acquisitions
         self._rig = cell.document.path.resolve()
         self.preflight = EntryPreflight()
         self.one_at_a_time = CapacityLimiter(1)
-        """Limit for threads that call `enter` and `move`: each counts what the ones before have entered."""
+        """Lets one thread at a time call `enter` and `move`, because each must count the entries made before."""
 
     def close(self) -> None:
-        """End the present check."""
+        """End the present preflight."""
         self.preflight.close()
 
     def enter(
         self, request: NewEntry, by: str, *, by_command_line: bool, may_still: Callable[[], None] = lambda: None
     ) -> Entry:
-        """A new entry. The command line may name files anywhere, other people only plans and runs of this cell's
-        folders. `may_still` raises if whoever asked may not any more, after preflight. Raises InputError: it
-        cannot be run, with all problems; StorageError."""
+        """Enter a plan, a run or a hold; return the new entry.
+
+        The command line may name files anywhere; other clients only plans and runs in this cell's folders.
+        `may_still` is called after the preflight; it raises if the person is no longer allowed. Raises InputError
+        with all problems if the entry cannot be run; StorageError.
+        """
         if bool(request.plan or request.resume) == bool(request.hold):
             raise InputError("expected either `plan` or `hold`, or `resume`")
         if request.hold:
@@ -88,7 +91,8 @@ class Entering:
         return self._queue.add(by, before=request.before, **fields)
 
     def move(self, number: str, before: str) -> None:
-        """Raises InputError: it does not wait, or another order exceeds an object's budget; StorageError."""
+        """Move a waiting entry. Raises InputError if it does not wait, or if the new order exceeds an object's
+        budget; StorageError."""
         reordered_entries = self._queue.order_after(number, before)
         if more := self._more_light(reordered_entries):
             raise EntryRefused(
@@ -116,7 +120,7 @@ class Entering:
     # -- preflight --------------------------------------------------------------------------------------------
 
     def _needs(self, files: PlanFiles, fields: dict[str, Any], by: str) -> Needs:
-        """Raises EntryRefused: preflight refuses it, with all refusals."""
+        """Make the preflight, and return the needs of the entry. Raises EntryRefused with all refusals."""
         run = Path(fields["resume"]) if fields["resume"] else None
         plan, rig = (Path(fields["plan"]), self._rig) if fields["plan"] else (files.document.path, None)
         entry_files = Files(plan, rig, run, Path(fields["output"]) if fields["output"] else None)
@@ -160,7 +164,8 @@ class Entering:
             raise EntryRefused(problems)
 
     def _more_light(self, entries: tuple[Entry, ...] | list[Entry]) -> dict[str, str]:
-        """Refusals of light that these entries have in this order, and have not as they are."""
+        """Return the refusals for too much light that these entries have in this order, but not in the present
+        queue."""
         at_work = at_work_of(self._acquisitions.state, self._cell.rig.frame_bytes)
 
         def received_lux_h(name: str) -> float:
@@ -175,7 +180,7 @@ class Entering:
 
 
 def _place(key: str, folder: Path, name: str, *, anywhere: bool) -> Path:
-    """Raises InputError: no path, or not below the folder."""
+    """Return the path of a file. Raises InputError if it is not a possible path, or not below the folder."""
     try:
         path = (folder / possible_path(Path(name))).resolve()
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Preflight of entries of the queue, in a separate process, with text for the people who wait for it."""
+"""Preflight of entries of the queue, in a separate process, which reports its progress for the people who wait."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from coupole.preflight.files import Files, check_files
 from coupole.storage.line_file import utc_now
 
 AT_MOST_S = 1500.0
-"""Less than the command line waits (`client.PREFLIGHT_S`)."""
+"""Longest duration, s; less than the command line waits (`client.PREFLIGHT_S`)."""
 BESIDE_A_RUN = 5
-"""Niceness while a run is at work: a third of the time of a core that both want. More would starve it on a machine
-that is busy; a burst does not wait for it, as the box fires by itself."""
+"""Niceness during a run: about a third of the time of a core that run and preflight both need. A higher value
+would starve the preflight on a busy machine. Bursts do not wait for the preflight, because the box fires by
+itself."""
 
 
 @dataclass(frozen=True)
@@ -24,15 +25,15 @@ class Found:
     """Result of a preflight."""
 
     problems: tuple[Problem, ...] = ()
-    """Mistakes in the files, or refusals; with any nothing can be run."""
+    """Mistakes in the files, or refusals; if there are any, nothing can be run."""
     document: dict[str, Any] = field(default_factory=dict)
-    """Figures, as of `coupole check --json`."""
+    """Figures, as in `coupole check --json`."""
     exit_code: int = InputError.exit_code
     """Exit code of `coupole check`, if there are problems."""
 
 
 def check_entry(files: Files, *, measure: bool) -> Found:
-    """Preflight of files; their mistakes are in `problems`."""
+    """Make the preflight of files; mistakes in them are in `problems`."""
     from coupole.viewing.preflight_table import document_of
 
     name = str(files.resume or files.plan)
@@ -47,7 +48,7 @@ def check_entry(files: Files, *, measure: bool) -> Found:
 
 
 class EntryPreflight:
-    """The process that makes it, and what it is at work on."""
+    """The process that makes a preflight, and its present work."""
 
     def __init__(self) -> None:
         self._process = WarmProcess("makes preflight")
@@ -55,14 +56,15 @@ class EntryPreflight:
 
     @property
     def words(self) -> str:
-        """Words on what is being checked, for whom, since when, and how far it is; empty if nothing is."""
+        """Text about the present check: of what, for whom, since when, and how far it is; empty if there is
+        none."""
         if not (subject := self._for):
             return ""
         return f"{subject}: {self._process.step or 'it begins'}"
 
     def of(self, files: Files, by: str, *, beside_a_run: bool) -> Found:
-        """Return what preflight says of files. Raises InputError: it takes too long, is given up, or its process
-        died."""
+        """Return the result of the preflight of files. Raises InputError if it takes too long or is given up, or
+        if its process dies."""
         with self._with_words(f"{(files.resume or files.plan).name}, entered by {by} at {utc_now()[11:19]} UTC"):
             niceness = BESIDE_A_RUN if beside_a_run else 0
             return self._process.run(check_entry, AT_MOST_S, niceness, files, measure=not beside_a_run)
@@ -76,7 +78,7 @@ class EntryPreflight:
             self._for = ""
 
     def give_up(self) -> None:
-        """End the present check: its plan or run is not entered. Raises InputError: nothing is being checked."""
+        """End the present check; its plan or run is not entered. Raises InputError if nothing is being checked."""
         if not self._for:
             raise InputError("no preflight is being made")
         self._process.end()

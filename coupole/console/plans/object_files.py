@@ -48,25 +48,25 @@ class ObjectFiles:
         return self._plans_by_object().get(object_id, [])
 
     def runs_of(self, object_id: str) -> list[RunRow]:
-        """The newest first."""
+        """Return the runs of an object, the newest first."""
         return [row for row in self._runs.rows() if row.object == object_id]
 
     def history(self, object_id: str) -> History:
-        """All light on it. Raises InputError, StorageError."""
+        """Return all light on an object. Raises InputError, StorageError."""
         return ledger_of(self._cell, object_id).read_history()
 
     def similar(self, object_id: str) -> list[str]:
-        """Others whose ids are nearly the same."""
+        """Return other ids that are nearly the same."""
         return similar_ids(self._cell.ledger_folder, object_id)
 
     def enter_light(self, object_id: str, dose_lux_h: float, note: str) -> None:
-        """Light that was given elsewhere. Raises InputError, StorageError."""
+        """Enter light that was given elsewhere. Raises InputError, StorageError."""
         if not note.strip() or not 0 < dose_lux_h < 1e9:
             raise InputError("expected lux hours, above 0, and a note about the light")
         ledger_of(self._cell, object_id).enter(dose_lux_h, note.strip())
 
     def set_budget(self, object_id: str, dose_lux_h: float, name: str, reason: str) -> None:
-        """All light that it may receive. Raises InputError, StorageError."""
+        """Set the total light that an object may receive. Raises InputError, StorageError."""
         ledger_of(self._cell, object_id).set_budget(dose_lux_h, name, reason)
 
     def photograph(self, object_id: str) -> Path | None:
@@ -74,7 +74,7 @@ class ObjectFiles:
         return path if path.is_file() else None
 
     def keep_photograph(self, object_id: str, data: bytes) -> None:
-        """Keep a picture in place of the one before. Raises InputError: not a picture."""
+        """Store a photograph and replace the former one. Raises InputError if it is not a picture."""
         from PIL import Image, ImageOps, UnidentifiedImageError
 
         try:

@@ -1,4 +1,4 @@
-"""Outlook of a queue: when each entry begins and ends, and whether light and disk suffice for all of them."""
+"""Outlook of a queue: the begin and end of each entry, and whether light and disk suffice for all of them."""
 
 from __future__ import annotations
 
@@ -13,19 +13,22 @@ from coupole.console.plans.plan_queue import Entry
 
 @dataclass(frozen=True)
 class AtWork:
-    """Disk space and light that the run at work still takes."""
+    """Disk space and light that the present run still needs."""
 
     folder: str = ""
     bytes_left: int = 0
     light_after_lux_h: Mapping[str, float] = field(default_factory=dict)
-    """All light on its object, by id, when the run is complete."""
+    """Total light on each object, by id, when the run is complete."""
 
 
 def expected_times(
     entries: Sequence[Entry], now: datetime, *, left_s: float | None, is_halted: bool
 ) -> dict[str, tuple[datetime | None, datetime | None]]:
-    """Begin and end of each entry that runs or waits, by its id; None where a person decides on it (a hold, a
-    queue that is halted), or where it is not known. `left_s` of the run at work."""
+    """Return the expected begin and end of each running or waiting entry, by its id.
+
+    A time is None if a person decides on it (a hold, a halted queue), or if it is not known. `left_s` is the time
+    that the present run still needs.
+    """
     times: dict[str, tuple[datetime | None, datetime | None]] = {}
     free_at: datetime | None = None if is_halted else now
     for entry in entries:
@@ -59,10 +62,11 @@ def too_much_light(
     at_work: AtWork,
     budget_lux_h: Callable[[str], float | None] = lambda _: None,
 ) -> dict[str, str]:
-    """Refusals of the entries that wait whose object's budget is exceeded when all before them are done, by id.
+    """Return the refusals of waiting entries, by id: those that exceed their object's budget after all entries
+    before them.
 
-    `received_lux_h` is the light that an object has received by its ledger, `budget_lux_h` the light that it may
-    receive; a plan's own budget can only be stricter.
+    `received_lux_h` returns the light that an object has received by its ledger, `budget_lux_h` the light that it
+    may receive. A plan's own budget can only be stricter.
     """
     light: dict[str, float] = {}
     refusals: dict[str, str] = {}
@@ -90,7 +94,8 @@ def too_little_disk(
     free_bytes: Callable[[Path], int],
     reserve_bytes: int,
 ) -> list[str]:
-    """Refusals of the disks that cannot take all that runs and waits; `reserve_bytes` must stay free."""
+    """Return the refusals for disks without space for all running and waiting entries; `reserve_bytes` must stay
+    free."""
     needs_of_disk: dict[int, tuple[Path, int]] = {}
     folders: list[tuple[str, int]] = [(at_work.folder, at_work.bytes_left)] if at_work.folder else []
     folders += [(e.needs.folder, e.needs.bytes) for e in entries if e.state == "waiting" and e.needs]
@@ -107,7 +112,7 @@ def too_little_disk(
 
 
 def at_work_of(state: Mapping[str, Any] | None, frame_bytes: int) -> AtWork:
-    """Return what a run still takes, by its state as its process tells it; nothing if there is no state."""
+    """Return what a run still needs, from the state that its process reports; nothing if there is no state."""
     if state is None:
         return AtWork()
     frames_left = max(0, state.get("frames", 0) - state.get("proven", 0))

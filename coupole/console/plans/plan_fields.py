@@ -1,6 +1,6 @@
-"""The commonest parts of a plan as fields of a form, and a plan's text with other values in them.
+"""The most common parts of a plan as fields of a form, and a plan's text with changed values.
 
-Comments and everything that no field stands for stay as they are written.
+Comments, and all parts without a field, stay as they are written.
 """
 
 from __future__ import annotations
@@ -17,17 +17,18 @@ from coupole.errors import InputError
 from coupole.plan import yamlfile
 
 LONGEST = 100_000
-"""Characters of a plan that is written with a form."""
+"""Greatest number of characters of a plan that a form can write."""
 MOST_AZIMUTHS = 360
 _LARGEST = 1e12
-"""Numbers beyond it are shown by the text alone."""
+"""The form does not show numbers above this; only the text shows them."""
 ALL_ROUND = "round"
 """Name of the views that the form makes."""
 
 
 @dataclass(frozen=True)
 class PlanFields:
-    """Empty text, or None: the plan does not say, or says it in a way that only its text shows."""
+    """Values of the form's fields. A value is empty or None if the plan does not state it, or states it in a form
+    that only the text can show."""
 
     object_id: str = ""
     mesh: str = ""
@@ -36,21 +37,21 @@ class PlanFields:
     distance_mm: float | None = None
     elevations_deg: tuple[float, ...] = ()
     azimuths: int | None = None
-    """Views at each elevation, evenly round the object."""
+    """Number of views at each elevation, evenly around the object."""
     exposures_us: tuple[int, ...] = ()
     every_led: int | None = None
-    """1: all LEDs; 4: each fourth."""
+    """1 for all LEDs, 4 for every fourth LED."""
     darks_per_view: int | None = None
     own_views: bool = False
-    """The views are not those of the form."""
+    """True if the views are not those of the form."""
     own_lights: bool = False
-    """The lights are not those of the form."""
+    """True if the lights are not those of the form."""
     own_exposure: bool = False
-    """The exposure is chosen in the run; times in the form would replace it."""
+    """True if the exposure is chosen in the run; times in the form would replace it."""
 
 
 def fields_of(path: Path, text: str) -> PlanFields:
-    """Raises InputError: not YAML, or too long for a form."""
+    """Read the fields from a plan's text. Raises InputError if it is not YAML, or too long for a form."""
     if len(text) > LONGEST:
         raise InputError(f"a text of more than {LONGEST:,} characters: write it in an editor of texts")
     data = yamlfile.parse(path, text).data
@@ -70,8 +71,8 @@ def fields_of(path: Path, text: str) -> PlanFields:
 
 
 def text_with(path: Path, text: str, fields: PlanFields, target_mm: tuple[float, ...] | None = None) -> str:
-    """A plan's text with these fields; `target_mm` is where its views look, if they are the form's. Raises
-    InputError: not YAML."""
+    """Return a plan's text with these fields. If the views are the form's, they look at `target_mm`. Raises
+    InputError if it is not YAML."""
     before = fields_of(path, text)
     try:
         return _rewritten(text, before, fields, target_mm)
@@ -112,7 +113,7 @@ def _same_views(first: PlanFields, second: PlanFields) -> bool:
 
 
 def _set(mapping: Any, key: str, value: Any, before: Any) -> None:
-    """Set a key only if its value has changed; None takes the key out."""
+    """Set a key only if its value has changed; None removes the key."""
     if value == before:
         return
     if value is None:
@@ -195,7 +196,8 @@ def _views(fields: PlanFields, target_mm: tuple[float, ...]) -> CommentedSeq:
 
 
 def _azimuths(count: int) -> tuple[float, ...]:
-    """Evenly round the object, beginning at -90: towards who stands before the cell."""
+    """Return azimuths evenly around the object, beginning at -90 degrees, the side of a person in front of the
+    cell."""
     angles_deg = [round((-90.0 + 360.0 * number / count + 180.0) % 360.0 - 180.0, 3) for number in range(count)]
     return tuple(int(angle) if angle == int(angle) else angle for angle in angles_deg)
 

@@ -1,4 +1,4 @@
-"""The folder of plans: which there are, their texts, new ones."""
+"""The folder of plans: names, texts, new plans."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ class PlanFiles:
     """Plans below a folder, by their paths relative to it."""
 
     def __init__(self, folder: Path, rig: Path, drawings: Path) -> None:
-        """`rig`: which new plans name; `drawings`: folder for pictures of plans, of which the newest are kept."""
+        """`rig` is written into new plans. `drawings` is the folder for pictures of plans, of which the newest are
+        kept."""
         self.folder, self._rig, self.drawings = folder.resolve(), rig.resolve(), drawings
         self._lock = threading.Lock()
         keep_newest(drawings, _DRAWINGS_KEPT)
 
     def new_drawing(self) -> Path:
-        """A folder for pictures of a plan, to be made."""
+        """Return a new folder for pictures of a plan; it does not exist yet."""
         keep_newest(self.drawings, _DRAWINGS_KEPT - 1)
         return self.drawings / secrets.token_hex(8)
 
@@ -50,18 +51,19 @@ class PlanFiles:
         return sorted(names)
 
     def path(self, name: str) -> Path:
-        """Raises InputError: not below the folder."""
+        """Return the file of a plan. Raises InputError if it is not below the folder."""
         path = (self.folder / name).resolve()
         if not name or not path.is_relative_to(self.folder) or path.suffix != ".yaml":
             raise InputError(f"plan: expected a .yaml file below {self.folder}; found {name!r}")
         return path
 
     def read_text(self, name: str) -> str:
-        """Raises InputError."""
+        """Return the text of a plan. Raises InputError."""
         return yamlfile.text_of(self.path(name))
 
     def create(self, name: str, template: str) -> str:
-        """A new plan's name, with its file. Raises InputError: a bad name, or there is such a plan."""
+        """Make a new plan with its file; return its name. Raises InputError for an invalid name, and if the plan
+        exists."""
         if not re.fullmatch(NAME_PATTERN, name):
             raise InputError(
                 f"{name!r}: expected letters, digits, dots, hyphens and underscores, a letter or digit first"
@@ -78,7 +80,7 @@ class PlanFiles:
         return path.name
 
     def retake(self, run: Run, view: str) -> str:
-        """A new plan that takes one view of a run again; its name. Raises InputError, StorageError."""
+        """Make a plan that takes one view of a run again; return its name. Raises InputError, StorageError."""
         with self._lock:
             names_in_use = {Path(name).stem for name in self.names()}
             path = self.path(f"{name_of_retake(run, view, names_in_use)}.yaml")
@@ -86,8 +88,8 @@ class PlanFiles:
         return path.name
 
     def write(self, name: str, text: str, before: str) -> str:
-        """Another text for a plan whose text was `before`; its name. Raises InputError: somebody else has changed
-        it."""
+        """Replace the text of a plan, which was `before`; return its name. Raises InputError if another person has
+        changed it."""
         if len(text) > _LONGEST:
             raise InputError(f"{name}: expected at most {_LONGEST} characters")
         path = self.path(name)
@@ -105,7 +107,7 @@ class PlanFiles:
 
 
 def _from(folder: Path, path: Path) -> str:
-    """A path as a file in a folder would name it."""
+    """Return a path in the form in which a file of this folder names it."""
     return os.path.relpath(path, folder)
 
 

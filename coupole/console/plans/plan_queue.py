@@ -1,4 +1,4 @@
-"""Plans that wait for the cell, in order; kept in a file, so that a restarted service finds what ran."""
+"""Plans that wait for the cell, in order; stored in a file, so that a restarted service finds the running one."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ MOST_WAITING, MOST_ENDED = 200, 100
 
 
 class Needs(BaseModel):
-    """Needs of an entry, as preflight found them when it was entered; of a run that is resumed, of what is left of
-    it."""
+    """Needs of an entry, as preflight found them when it was entered. For a resumed run, these are the needs of
+    its rest."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     duration_s: float
     """Duration of the acquisition."""
     preparation_s: float
-    """Time that preflight took; it is made again when the entry begins."""
+    """Duration of the preflight, which is made again when the entry begins."""
     dose_lux_h: float
     """Light on the object, in lux hours."""
     bytes: int
@@ -35,50 +35,50 @@ class Needs(BaseModel):
     frames: int
     """Number of frames, dark frames included."""
     object: str | None = None
-    """Its id; None if the plan names none."""
+    """Id of the object; None if the plan names none."""
     dose_budget_lux_h: float | None = None
-    """All light that the object may receive, in lux hours, with what it has received; None: no limit."""
+    """Total light that the object may receive, in lux hours, including what it has received; None: no limit."""
     folder: str = ""
-    """Folder in which the run will be."""
+    """Folder that will contain the run."""
     warnings: tuple[str, ...] = ()
-    """Warnings that the operator should know."""
+    """Warnings for the operator."""
 
 
 class Entry(BaseModel):
-    """A plan to be run, a run to be resumed, or a hold: the queue stops there until somebody goes on with it."""
+    """A plan to be run, a run to be resumed, or a hold. At a hold the queue stops until a person continues it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     id: str
     """Id of this entry."""
     plan: str = ""
-    """File of the plan; empty for a hold, and for a run that goes on with its own copy."""
+    """File of the plan; empty for a hold, and for a run that is resumed with its own copy."""
     hold: str = ""
     """Task to be done before the queue goes on; empty for a plan."""
     resume: str = ""
     """Folder of the run to be resumed; empty for a new one."""
     output: str = ""
-    """Folder for the run, if not the rig's."""
+    """Folder for the run, if it is not the rig's."""
     with_mesh: bool = False
     """Copy the mesh into the run even if it is large."""
     reflectance: bool = False
-    """Process the views beside the acquisition, and end with the result."""
+    """Process the views during the acquisition, and make the result at its end."""
     result: str = ""
-    """Folder of that result, if not the run's with `-reflectance` behind."""
+    """Folder of that result; by default the run's name followed by `-reflectance`."""
     needs: Needs | None = None
-    """None for a hold, and for an entry that began at once."""
+    """Needs of the entry; None for a hold, and for an entry that began at once."""
     by: str
-    """Name of whoever entered it."""
+    """Name of the person who entered it."""
     entered: str
     """UTC, ISO 8601."""
     state: EntryState = "waiting"
-    """State of the entry: how far it is."""
+    """State of the entry in the queue."""
     begun: str = ""
     """UTC; empty while it waits."""
     ended: str = ""
     """UTC; empty until it has ended."""
     pid: int = 0
-    """Id of the process that acquires; 0 while the entry waits."""
+    """Id of the acquiring process; 0 while the entry waits."""
     run: str = ""
     """Folder of the run, once there is one."""
     exit_code: int | None = None
@@ -100,11 +100,11 @@ class _Kept(BaseModel):
 
 
 class PlanQueue:
-    """Entries in their order, with the `MOST_ENDED` that ended last. Every change is on the disk when the call
-    returns."""
+    """Entries in their order, with the `MOST_ENDED` entries that ended last. Every change is on the disk when the
+    call returns."""
 
     def __init__(self, path: Path) -> None:
-        """Raises StorageError: the file cannot be read."""
+        """Raises StorageError if the file cannot be read."""
         self._path, self._lock = path, threading.RLock()
         try:
             self._kept = _Kept.model_validate_json(path.read_bytes()) if path.exists() else _Kept()
@@ -117,7 +117,7 @@ class PlanQueue:
 
     @property
     def halt_reason(self) -> str:
-        """Reason why nothing more begins; empty if something may."""
+        """Reason why nothing more begins; empty if entries may begin."""
         return self._kept.halted
 
     @property
@@ -126,7 +126,7 @@ class PlanQueue:
 
     @property
     def following(self) -> Entry | None:
-        """The first that waits, if it may begin now."""
+        """The first waiting entry, if it may begin now."""
         if self.halt_reason or self.running is not None:
             return None
         return next((entry for entry in self.entries if entry.state == "waiting"), None)
@@ -136,10 +136,10 @@ class PlanQueue:
         return tuple(entry for entry in self.entries if entry.state == "waiting")
 
     def add(self, by: str, *, before: str = "", at_once: bool = False, **fields: Any) -> Entry:
-        """A new entry with these fields, before another that waits or at the end.
+        """Add an entry with these fields, before another waiting entry or at the end; return it.
 
-        `at_once`: to begin now, whatever the last plan ended with. Raises InputError: too many wait, or (if
-        `at_once`) something runs, waits or holds; StorageError.
+        `at_once`: the entry begins now, whatever the end of the last plan was. Raises InputError if too many wait,
+        or (with `at_once`) if something runs, waits or holds; StorageError.
         """
         with self._lock:
             if len(self.waiting) >= MOST_WAITING:
@@ -151,12 +151,12 @@ class PlanQueue:
         return entry
 
     def move(self, number: str, before: str) -> None:
-        """Put an entry that waits before another one, or at the end. Raises InputError, StorageError."""
+        """Move a waiting entry before another one, or to the end. Raises InputError, StorageError."""
         with self._lock:
             self._keep(self.order_after(number, before), self.halt_reason)
 
     def order_after(self, number: str, before: str) -> tuple[Entry, ...]:
-        """All entries as they would be after `move`. Raises InputError."""
+        """Return all entries in their order after `move`. Raises InputError."""
         entry = self.waiting_entry(number)
         if before == number:
             raise InputError(f"queue: {number} cannot be put before itself")
@@ -165,13 +165,13 @@ class PlanQueue:
         )
 
     def remove(self, number: str) -> None:
-        """Take out an entry that waits. Raises InputError, StorageError."""
+        """Remove a waiting entry. Raises InputError, StorageError."""
         with self._lock:
             self.waiting_entry(number)
             self._keep(tuple(entry for entry in self.entries if entry.id != number), self.halt_reason)
 
     def waiting_entry(self, number: str) -> Entry:
-        """Raises InputError: none with this id waits."""
+        """Return a waiting entry. Raises InputError if no entry with this id waits."""
         entry = self.entry(number)
         if entry.state != "waiting":
             raise InputError(f"queue: {number} is {entry.state}; only waiting entries can be removed or moved")
@@ -184,8 +184,7 @@ class PlanQueue:
         return (*entries[:place], entry, *entries[place:])
 
     def _in_the_way(self) -> str:
-        """Return why nothing can begin at once; empty if it can. A plan that failed is not in the way of another
-        one."""
+        """Return why nothing can begin at once; empty if it can. A failed plan does not prevent another one."""
         if self.running is not None:
             return f"{self.running.words} is being acquired"
         if self.waiting:
@@ -194,14 +193,14 @@ class PlanQueue:
         return self.halt_reason if self.halt_reason and ended_entries and ended_entries[-1].hold else ""
 
     def entry(self, number: str) -> Entry:
-        """Raises InputError: there is none with this id."""
+        """Return an entry. Raises InputError if there is none with this id."""
         matching_entry = next((entry for entry in self.entries if entry.id == number), None)
         if matching_entry is None:
             raise InputError(f"queue: no entry {number!r}")
         return matching_entry
 
     def change(self, number: str, **fields: object) -> Entry:
-        """An entry with other fields. Raises InputError, StorageError."""
+        """Change fields of an entry; return it. Raises InputError, StorageError."""
         with self._lock:
             changed_entry = self.entry(number).model_copy(update=fields)
             self._keep(
@@ -210,23 +209,26 @@ class PlanQueue:
             return changed_entry
 
     def conclude(self, number: str, *, halt: str = "", **fields: object) -> None:
-        """Change fields of an entry, and set the reason why nothing more begins, in one change. Raises InputError
-        and StorageError; even then nothing more begins."""
+        """Change fields of an entry and, in the same step, set the reason why nothing more begins. Raises
+        InputError and StorageError; even then, nothing more begins."""
         with self._lock:
             changed_entry = self.entry(number).model_copy(update=fields)
             entries = tuple(changed_entry if entry.id == number else entry for entry in self.entries)
             self._keep(entries, halt or self.halt_reason)
 
     def halt(self, why: str) -> None:
-        """Begin nothing more until somebody goes on with it, also if that cannot be written. Raises
+        """Begin nothing more until a person continues the queue. This holds even if it cannot be written. Raises
         StorageError."""
         with self._lock:
             self._kept = self._kept.model_copy(update={"halted": why})
             self._keep(self.entries, why)
 
     def go_on(self, seen_reason: str | None = None) -> None:
-        """Begin what waits, from now on. Raises InputError: `seen_reason`, why it was halted when somebody
-        decided, is not why it is now."""
+        """Begin waiting entries from now on.
+
+        `seen_reason` is the reason of the halt that the person saw. Raises InputError if the reason is a different
+        one by now.
+        """
         with self._lock:
             if seen_reason is not None and self.halt_reason not in (seen_reason, ""):
                 raise InputError(f"queue: it now waits for another reason: {self.halt_reason}")

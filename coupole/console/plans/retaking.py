@@ -1,4 +1,4 @@
-"""A plan that takes one view of a run again, as it was taken."""
+"""A plan that takes one view of a run again, with the settings of the run."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from coupole.storage.run import Run
 
 
 def retaking_plan(run: Run, view: str, name: str, rig: Path) -> str:
-    """Text of a plan called `name` with one view of a run, on this rig; the other files are those that the run
-    keeps. Raises InputError: there is no such view, or the run's plan cannot be read."""
+    """Return the text of a plan called `name` with one view of a run, on this rig. Its other files are the copies
+    in the run. Raises InputError if there is no such view, or if the run's plan cannot be read."""
     files = read_plan(run.plan_path)
     plan = files.plan
     view_keys = next(
@@ -41,7 +41,7 @@ def retaking_plan(run: Run, view: str, name: str, rig: Path) -> str:
 
 
 def name_of_retake(run: Run, view: str, taken_names: set[str]) -> str:
-    """A name for the plan that no other one has."""
+    """Return a name for the plan that is not used yet."""
     run_name = run.folder.name.partition("-")[2]
     stem = re.sub(r"[^\w.-]", "-", f"{run_name}-{view}")[:48]
     return next(name for k in range(1, len(taken_names) + 2) if (name := f"{stem}-again{k}") not in taken_names)

@@ -1,1 +1,1 @@
-"""Processes that compute for a console, and what they print."""
+"""Processes that compute for a console, and their output."""

@@ -1,4 +1,4 @@
-"""File into which a process prints, read as it grows: only what is new is read."""
+"""File to which a process prints. It is read while it grows; each time, only the new part is read."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 class GrowingFile:
-    """The end of a file that something appends to; for any thread."""
+    """The end of a file to which another process appends; usable by any thread."""
 
     def __init__(self, path: Path, most_bytes: int) -> None:
         self._path, self._most, self._lock = path, most_bytes, threading.Lock()
@@ -16,7 +16,7 @@ class GrowingFile:
 
     @property
     def text(self) -> str:
-        """Its last `most_bytes`; empty while there is no file."""
+        """Return the last `most_bytes` of the file; empty while there is no file."""
         with self._lock:
             try:
                 with self._path.open("rb") as file:

@@ -1,5 +1,5 @@
-"""Tasks that people begin at the console beside the queue: commands of the command line (`verify`, `archive`,
-...), each in a process of its own, whose output is kept while the service lives."""
+"""Tasks that people begin at the console, independent of the queue: commands such as `verify` and `archive`, each
+in a separate process. Their output is kept while the service lives."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from coupole.storage.line_file import utc_now
 
 MOST_AT_ONCE, _MOST_KEPT, _MOST_SAID = 4, 100, 20_000
 _PATIENCE_S = 20.0
-"""A cell is made safe before its process ends."""
+"""Longest wait for the end of a process, s; it includes making a cell safe."""
 _COUPOLE = (sys.executable, "-m", "coupole.commands.cli")
 _BOUND = Path(__file__).with_name("bound_process.py")
 _FORMER_KEPT = 50
@@ -34,13 +34,13 @@ _FORMER_KEPT = 50
 
 @dataclass
 class Task:
-    """One command, under way or ended."""
+    """One command, running or ended."""
 
     id: str
     words: str
     """Description of what the task does, for people."""
     command: tuple[str, ...]
-    """Arguments of `coupole`."""
+    """Arguments of the command `coupole`."""
     by: str
     begun_at: str
     process: subprocess.Popen[bytes] = field(repr=False)
@@ -60,7 +60,7 @@ class Task:
 
     @property
     def exit_code(self) -> int | None:
-        """None while it runs; below 0 if a signal ended it."""
+        """Exit code; None while the task runs; below 0 if a signal ended it."""
         return self.process.poll()
 
     @property
@@ -69,12 +69,12 @@ class Task:
 
     @property
     def output_text(self) -> str:
-        """The end of what it printed for people."""
+        """The end of the output for people."""
         return self._log.text
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Its `--json`; empty until it has ended, and if there is none."""
+        """Content of `--json`; empty until the task has ended, and if there is none."""
         if self.running:
             return {}
         if self._figures is None:
@@ -88,7 +88,7 @@ class Task:
 
     @property
     def why(self) -> str:
-        """Reason why the task failed, in a line; empty if it did not."""
+        """Reason why the task failed, in one line; empty if it did not fail."""
         if self.running or self.exit_code == 0:
             return ""
         lines = [line.strip() for line in self.output_text.splitlines() if line.strip()]
@@ -105,18 +105,20 @@ class Task:
 
 
 class Tasks:
-    """All tasks of a service's life, the newest last. They end with the service, also if it is killed."""
+    """All tasks during a service's life, the newest last. They end with the service, also if it is killed."""
 
     def __init__(self, folder: Path) -> None:
-        """`folder`: for what processes print; of former lives the newest stay, for whoever looks for a fault."""
+        """`folder`: for the output of processes. The newest outputs of earlier services are kept, to help in
+        finding faults."""
         self._folder, self._lock = folder, threading.Lock()
         self._tasks: OrderedDict[str, Task] = OrderedDict()
         self._beginner = ThreadPoolExecutor(1, "tasks")
-        """The kernel interrupts a bound process when the thread ends that has begun it: this one lives as long."""
+        """The kernel interrupts a bound process when the thread that began it ends; this thread lives as long as
+        the service."""
         keep_newest(folder, _FORMER_KEPT)
 
     def begin(self, words: str, command: Sequence[str], by: str) -> Task:
-        """Begin `coupole COMMAND... --json`. Raises InputError: too many are under way."""
+        """Begin `coupole COMMAND... --json`. Raises InputError if too many tasks are running."""
         make_folder(self._folder)
         with self._lock:
             if sum(task.running for task in self._tasks.values()) >= MOST_AT_ONCE:
@@ -134,7 +136,7 @@ class Tasks:
 
     @property
     def newest_first(self) -> list[Task]:
-        """The newest first."""
+        """Return all tasks, the newest first."""
         return list(reversed(self._tasks.values()))
 
     def close(self) -> None:
@@ -161,7 +163,7 @@ class Tasks:
 
 
 def _begin_process(command: Sequence[str], figures: BinaryIO, errors: BinaryIO) -> subprocess.Popen[bytes]:
-    """A process that ends with the thread that calls this."""
+    """Begin a process that ends with the calling thread."""
     return subprocess.Popen(
         [sys.executable, "-I", "-S", _BOUND, str(os.getpid()), *command],
         stdin=subprocess.DEVNULL,

@@ -1,7 +1,7 @@
 """A separate process for computations, forked from a process that has already imported the modules that plans
 need.
 
-It stays for the next job, with the kernels that it has loaded, and ends with the console, also if that is killed.
+The process and its loaded kernels stay for the next job. It ends with the console, also if the console is killed.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ _IMPORTED = [
 ]
 _LONGEST_STEP = 200
 _steps: list[Any] = []
-"""Places in which a worker says what it does; empty outside a worker."""
+"""Memory in which a worker reports its step; empty outside a worker."""
 
 
 def say(step: str) -> None:
-    """Tell whoever waits what is being done; nothing outside a worker."""
+    """Report the present step to the waiting process; no effect outside a worker."""
     for place in _steps:
         place.value = step.encode()[: _LONGEST_STEP - 1]
 
 
 def _begin(step: Any, niceness: int) -> None:
-    """Prepare a worker: it ends with the console, to which Ctrl-C is left."""
+    """Prepare a worker: it ends with the console, and it ignores Ctrl-C, which is for the console."""
     threading.Thread(target=_end_with_console, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(niceness)
@@ -55,10 +55,10 @@ def _end_with_console() -> None:
 
 
 class WarmProcess:
-    """One process, that does one thing after the other; a new one after it died or was ended."""
+    """One process, which does one job after the other. If it dies or is ended, a new one is begun."""
 
     def __init__(self, activity: str) -> None:
-        """`activity`: what it does, for people: `reads plans`."""
+        """`activity` describes the process in messages, such as `reads plans`."""
         self._what, self._lock = activity, threading.Lock()
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(_IMPORTED)
@@ -68,14 +68,14 @@ class WarmProcess:
 
     @property
     def step(self) -> str:
-        """Step at which the process is now, as it said last."""
+        """The last step that the process has reported."""
         return bytes(self._step.value).decode(errors="replace")
 
     def run(
         self, work: Callable[P, T], within_s: float, niceness: int = 0, *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """Run work in the process and return its result. Raises InputError: it takes too long, or the process died
-        of it or was ended; and what the work raises."""
+        """Run work in the process and return its result. Raises InputError if it takes too long, or if the process
+        dies or is ended; otherwise the errors of the work."""
         self._step.value = b""
         pool, future = self._submit(niceness, work, *args, **kwargs)
         try:
@@ -94,18 +94,18 @@ class WarmProcess:
     def _submit(
         self, niceness: int, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> tuple[ProcessPoolExecutor, Future[T]]:
-        if self._niceness != niceness:  # nobody but root can take it back
+        if self._niceness != niceness:  # only root can lower the niceness again
             self.end()
         with self._lock:
             if self._pool is not None:
-                with contextlib.suppress(BrokenProcessPool):  # it died while it had nothing to do
+                with contextlib.suppress(BrokenProcessPool):  # it died while it was idle
                     return self._pool, self._pool.submit(work, *args, **kwargs)
             self._niceness = niceness
             self._pool = ProcessPoolExecutor(1, self._context, initializer=_begin, initargs=(self._step, niceness))
             return self._pool, self._pool.submit(work, *args, **kwargs)
 
     def end(self) -> None:
-        """End the process, and what it does."""
+        """End the process and its present work."""
         with self._lock:
             pool, self._pool = self._pool, None
         if pool is not None:

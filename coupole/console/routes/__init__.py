@@ -1,1 +1,1 @@
-"""The HTTP interface, and where it listens."""
+"""The HTTP interface, and its sockets."""

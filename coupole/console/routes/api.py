@@ -1,4 +1,4 @@
-"""The console's HTTP interface, version 1: what it tells, what may be asked of it, and by whom."""
+"""The console's HTTP interface, version 1: its answers, its requests, and the rights that they need."""
 
 from __future__ import annotations
 
@@ -65,8 +65,7 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
 
     @app.post("/api/v1/sign-in", responses={401: {"description": "Wrong, or tried too often."}})
     def sign_in(credentials: SignIn, request: Request, response: Response) -> dict[str, str]:
-        """Begin a session: a cookie for browsers, or for a script `session`, to be sent as `Authorization:
-        Bearer`."""
+        """Begin a session. Browsers get a cookie; scripts get `session`, to be sent as `Authorization: Bearer`."""
         here = is_of_this_machine(request)
         if credentials.name:
             account = service.accounts.sign_in(credentials.name, credentials.password, here=here)
@@ -101,19 +100,19 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
 def _add_cell(app: FastAPI, service: Service) -> None:
     @app.get("/api/v1/state")
     def state() -> StateNow:
-        """The cell at this moment."""
+        """Return the present state of the cell."""
         return service.state()
 
     @app.get("/api/v1/events", response_class=StreamingResponse)
     async def events(request: Request) -> StreamingResponse:
-        """The state whenever it has changed, and every second, as an event stream (`event: state`), until the
+        """Send the state after every change, and every second, as an event stream (`event: state`), until the
         session is over."""
         return StreamingResponse(_events(service, request), media_type="text/event-stream")
 
     @app.post("/api/v1/queue", responses=REFUSALS)
     async def add(new_entry: NewEntry, person: Who, request: Request) -> Entry:
-        """Enter a plan, a run to be resumed, or a hold. Preflight is made first, for which this waits; what cannot
-        be run with what runs and waits before it is refused with all its problems."""
+        """Enter a plan, a run to be resumed, or a hold. The answer comes after the preflight. An entry that cannot
+        be run, or not with all running and waiting entries before it, is refused with all its problems."""
         allow(service, person, Role.OPERATOR, "queue", acts=True)
         request.state.about = new_entry.plan or new_entry.resume or new_entry.hold
         here = is_command_line(request)
@@ -132,14 +131,14 @@ def _add_cell(app: FastAPI, service: Service) -> None:
 
     @app.delete("/api/v1/queue/{entry}", responses=REFUSALS)
     def remove(entry: Text, person: Who) -> dict[str, str]:
-        """Take out an entry that waits."""
+        """Remove a waiting entry."""
         allow(service, person, Role.OPERATOR, "take out", acts=True)
         service.queue.remove(entry)
         return {"removed": entry}
 
     @app.post("/api/v1/queue/{entry}/stop", responses=REFUSALS)
     def stop(entry: Text, person: Who) -> dict[str, str]:
-        """Stop what an entry has begun, at any time, also before its run has a name."""
+        """Stop the process of an entry, at any time, also before its run has a name."""
         allow(service, person, Role.OPERATOR, "stop")
         service.acquisitions.stop(service.queue.entry(entry))
         return {"stopped": entry}
@@ -153,9 +152,9 @@ def _add_cell(app: FastAPI, service: Service) -> None:
 
     @app.post("/api/v1/runs/{run}/{command}", responses=REFUSALS)
     def tell(run: Text, command: Literal["pause", "go-on", "stop"], person: Who) -> dict[str, Any]:
-        """Send a command to the run that is being acquired. Any operator may pause and stop, whoever is in
-        control: this never harms. `stop` is answered when the lights are off and the arm was told to stop, or with
-        the `trouble`."""
+        """Send a command to the run that is being acquired. Any operator may pause and stop, even if another
+        person is in control, because this never harms. The answer to `stop` comes when the lights are off and the
+        arm was told to stop, or it contains the `trouble`."""
         allow(service, person, Role.OPERATOR, command, acts=command == "go-on")
         return service.acquisitions.tell(run, command)
 
@@ -177,33 +176,34 @@ async def _events(service: Service, request: Request) -> AsyncIterator[str]:
 def _add_people(app: FastAPI, service: Service) -> None:
     @app.post("/api/v1/control/take", responses=REFUSALS)
     def take(person: Who) -> dict[str, str]:
-        """Take control, or ask for it; an engineer, and anybody after five minutes without a sign, takes it."""
+        """Take control, or ask for it. An engineer takes it; so does any operator if the person in control has
+        done nothing for five minutes."""
         allow(service, person, Role.OPERATOR, "take control")
         return asdict(service.control.take(person))
 
     @app.post("/api/v1/control/give", responses=REFUSALS)
     def give(handover: Hand, person: Who) -> dict[str, str]:
-        """Hand control over to who asked for it, or give it up."""
+        """Hand control over to the person who asked for it, or give it up."""
         allow(service, person, Role.OPERATOR, "give control")
         return asdict(service.control.give(person, handover.to))
 
     @app.get("/api/v1/accounts", responses=REFUSALS)
     def accounts(person: Who) -> list[dict[str, str]]:
-        """All accounts, for engineers."""
+        """Return all accounts; for engineers."""
         if person.role < Role.ENGINEER:
             raise NotAllowed(403, "accounts: only for engineers")
         return [{"name": account.name, "role": account.role.word} for account in service.accounts.all_accounts()]
 
     @app.post("/api/v1/accounts", responses=REFUSALS)
     def new_account(request: NewAccount, person: Who) -> dict[str, str]:
-        """A new account."""
+        """Add an account."""
         allow(service, person, Role.ENGINEER, "new account")
         account = service.accounts.add(request.name, request.password, Role.of(request.role))
         return {"name": account.name, "role": account.role.word}
 
     @app.delete("/api/v1/accounts/{name}", responses=REFUSALS)
     def no_account(name: Text, person: Who) -> dict[str, str]:
-        """Take an account away; its sessions are over."""
+        """Remove an account; its sessions end."""
         allow(service, person, Role.ENGINEER, "remove account")
         service.accounts.remove(name)
         return {"removed": name}

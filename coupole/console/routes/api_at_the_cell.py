@@ -1,4 +1,4 @@
-"""Routes of the HTTP interface for what is done with the cell besides runs: its loan, light by hand, the queue's
+"""Routes of the HTTP interface for work at the cell other than runs: its loan, light entered by hand, the queue's
 order, its preflight."""
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def add_routes_at_the_cell(app: FastAPI, service: Service) -> None:
 
     @app.post("/api/v1/queue/{entry}/move", responses=REFUSALS)
     async def move(entry: Text, place: Move, person: Who) -> StateNow:
-        """Put an entry that waits before another one, or at the end."""
+        """Move a waiting entry before another one, or to the end."""
         allow(service, person, Role.OPERATOR, "move", acts=True)
         limiter = service.entering.one_at_a_time
         await to_thread.run_sync(service.entering.move, entry, place.before, limiter=limiter)
@@ -35,7 +35,7 @@ def add_routes_at_the_cell(app: FastAPI, service: Service) -> None:
 
     @app.delete("/api/v1/preflight", responses=REFUSALS)
     def give_up(person: Who) -> dict[str, str]:
-        """Give up the preflight that is being made: what it is of is not entered."""
+        """Give up the present preflight; its plan or run is not entered."""
         allow(service, person, Role.OPERATOR, "give up a preflight")
         words = service.entering.preflight.words
         service.entering.preflight.give_up()
@@ -43,7 +43,7 @@ def add_routes_at_the_cell(app: FastAPI, service: Service) -> None:
 
     @app.get("/api/v1/queue/{entry}/output", responses=REFUSALS)
     def output(entry: Text) -> Output:
-        """Return what the process of an entry has told."""
+        """Return the output of an entry's process."""
         queue_entry = service.queue.entry(entry)
         output_text, figures = service.acquisitions.output(queue_entry)
         return Output(entry=queue_entry, said=output_text, figures=figures)
@@ -57,8 +57,9 @@ def _add_loan(app: FastAPI, service: Service) -> None:
 
     @app.post("/api/v1/cell/lease", responses=REFUSALS)
     def lend(lease: Lease, person: Who, request: Request) -> dict[str, str]:
-        """Lend the cell to the process that asks, by the Unix socket, until it gives it back or ends. The queue
-        waits meanwhile. A process that the console itself has begun acts for whoever asked for it there."""
+        """Lend the cell to the process that asks, through the Unix socket, until it gives the cell back or ends.
+        The queue waits meanwhile. A process that the console itself has begun acts for the person who began it
+        there."""
         allow(service, person, Role.OPERATOR, lease.what)
         pid = borrower(request)
         if not begun_here(pid):
@@ -84,12 +85,12 @@ def _add_light(app: FastAPI, service: Service, cell: Cell) -> None:
 
     @app.get("/api/v1/objects/{thing}/light", responses=REFUSALS)
     def light(thing: Text) -> dict[str, Any]:
-        """All light that an object has received by its ledger, as of `coupole dose --json`."""
+        """Return all light that an object has received by its ledger, as in `coupole dose --json`."""
         return document(ledger_of(cell, thing))
 
     @app.post("/api/v1/objects/{thing}/light", responses=REFUSALS)
     def enter(thing: Text, new_light: Light, person: Who, request: Request) -> dict[str, Any]:
-        """Enter light that was given elsewhere in an object's ledger."""
+        """Enter light that was given elsewhere into an object's ledger."""
         allow(service, person, Role.OPERATOR, "enter light")
         request.state.about = f"{new_light.dose_lux_h:g} lux.h: {new_light.note}"
         ledger = ledger_of(cell, thing)
@@ -98,7 +99,7 @@ def _add_light(app: FastAPI, service: Service, cell: Cell) -> None:
 
     @app.post("/api/v1/objects/{thing}/budget", responses=REFUSALS)
     def set_budget(thing: Text, budget: Budget, person: Who, request: Request) -> dict[str, Any]:
-        """Say what an object may receive in its life, by a named person's word."""
+        """Set the light that an object may receive in its life; a named person is responsible for it."""
         allow(service, person, Role.OPERATOR, "set a light budget")
         request.state.about = f"{budget.dose_lux_h:g} lux.h: {budget.reason}"
         ledger = ledger_of(cell, thing)
@@ -110,7 +111,7 @@ def _add_light(app: FastAPI, service: Service, cell: Cell) -> None:
 
     @app.post("/api/v1/objects/{thing}/warning", responses=REFUSALS)
     def warn(thing: Text, warning: Warn, person: Who, request: Request) -> dict[str, Any]:
-        """Have an object's ledger warn of more light than this."""
+        """Set the light above which an object's ledger warns."""
         allow(service, person, Role.OPERATOR, "warn")
         request.state.about = f"above {warning.above_lux_h} lux.h"
         ledger = ledger_of(cell, thing)

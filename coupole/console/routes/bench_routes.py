@@ -1,4 +1,4 @@
-"""The bench's pictures, and the connection by which a button at the console holds the arm in motion."""
+"""The bench's pictures, and the connection by which a button at the console keeps the arm in motion."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _PRESSED = {"axis", "direction", "share"}
 
 
 def add_bench_routes(app: FastAPI, service: Service) -> None:
-    """Add them to a console's app."""
+    """Add the routes to a console's app."""
 
     @app.get("/api/v1/bench")
     def bench() -> dict[str, Any]:
-        """`phase` (closed, opening, open, closing), `plan`, `closed_because`; `state` as the bench tells it."""
+        """Return `phase` (closed, opening, open, closing), `plan`, `closed_because`, and the bench's `state`."""
         keeper = service.bench
         keeper.looked_at()
         return {
@@ -41,7 +41,7 @@ def add_bench_routes(app: FastAPI, service: Service) -> None:
 
     @app.get("/api/v1/bench/pictures/{name}", response_class=Response)
     def picture(name: Text) -> FileResponse:
-        """One of the last pictures as JPEG (`7.jpg`), or `loupe.png`."""
+        """Return one of the last pictures as JPEG (`7.jpg`), or `loupe.png`."""
         if not re.fullmatch(r"[0-9]{1,9}\.jpg|loupe\.png", name):
             raise InputError("expected a number and .jpg, or loupe.png")
         path = service.bench.pictures / name
@@ -94,7 +94,7 @@ class _Hold:
             await self._socket.close()
 
     def _press_or_renew(self, request: Any) -> dict[str, Any]:
-        """Press or renew. Raises NotAllowed, InputError."""
+        """Begin or prolong the motion. Raises NotAllowed, InputError."""
         is_press = self._number is None
         keys = _PRESSED if is_press else _PRESSED | {"renew"}
         if not isinstance(request, dict) or set(request) != keys:
@@ -118,7 +118,7 @@ class _Hold:
             raise InputError("a renewal is for the axis and the direction of the press")
 
     def _let_go(self) -> str:
-        """End the motion at once: a renewal the other way ends a hold."""
+        """End the motion at once: a command in the opposite direction ends it."""
         if self._number is None:
             return "the button was released"
         reversed_jog = {**self._asked, "direction": -self._asked["direction"], "hold": self._number}

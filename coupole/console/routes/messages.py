@@ -1,4 +1,4 @@
-"""Messages that are sent to the console, and its answers, version 1."""
+"""Messages to the console, and its answers, version 1."""
 
 from __future__ import annotations
 
@@ -28,11 +28,12 @@ Line = Annotated[Text, AfterValidator(_one_line)]
 
 
 MOST_LUX_H = 1e9
-"""A hundred thousand years in a museum at 50 lux are half of it; more is a slip of the finger."""
+"""Greatest dose of an entry, in lux hours. Half of it is a hundred thousand years in a museum at 50 lux; more is a
+typing error."""
 
 
 class Asked(BaseModel):
-    """Unknown keys are errors."""
+    """Base class of messages to the console: unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
 
@@ -45,9 +46,11 @@ class SignIn(Asked):
     password: Text = ""
     """Password of the account."""
     token: Text = ""
-    """Printed at a start without an engineer's account; an engineer's, once, on the same machine."""
+    """Token that is printed at a start without an engineer's account. It signs in an engineer, once, on the same
+    machine."""
     script: bool = False
-    """The session is returned in `session`, to be sent as a bearer, in place of a cookie."""
+    """True for a script: the session is returned in `session`, to be sent as a bearer token, instead of a
+    cookie."""
 
 
 class NewEntry(Asked):
@@ -60,25 +63,25 @@ class NewEntry(Asked):
     hold: Line = ""
     """Task to be done before the queue goes on."""
     before: Text = ""
-    """Id of the waiting entry before which it comes; empty: at the end."""
+    """Id of the waiting entry before which the new one is put; empty for the end."""
     now: bool = False
-    """Begin at once, with preflight only then; refused if something runs, waits or has the cell."""
+    """Begin at once, with the preflight at the beginning; refused if something runs, waits or has the cell."""
     output: Text = ""
-    """Folder for the run, if not the rig's; for the command line."""
+    """Folder for the run, if it is not the rig's; for the command line."""
     with_mesh: bool = False
     """Copy the mesh into the run even if it is large; for the command line."""
     reflectance: bool = False
-    """Process the views beside the acquisition, and end with the result; a resumed run that was begun so does it
-    anyway."""
+    """Process the views during the acquisition, and make the result at its end. A resumed run that began with this
+    option keeps it in any case."""
     result: Text = ""
-    """Folder of that result, if not the run's with `-reflectance` behind; for the command line."""
+    """Folder of that result; by default the run's name followed by `-reflectance`; for the command line."""
 
 
 class Move(Asked):
     """A place in the queue."""
 
     before: Text = ""
-    """Id of the waiting entry before which it comes; empty: at the end."""
+    """Id of the waiting entry before which the entry is put; empty for the end."""
 
 
 class Lease(Asked):
@@ -103,7 +106,7 @@ class Budget(Asked):
     dose_lux_h: Annotated[float, Field(ge=0, le=MOST_LUX_H, allow_inf_nan=False, strict=True)]
     """Light dose in lux hours."""
     name: Annotated[str, Field(max_length=200)] = ""
-    """Name of the person whose word it is; empty: whoever asks."""
+    """Name of the person who is responsible; empty for the sender."""
     reason: Annotated[str, Field(max_length=2000)] = ""
     """Reason for this budget."""
 
@@ -119,10 +122,10 @@ class EntryNow(Entry):
     """An entry of the queue at this moment."""
 
     expected_begin: str | None = None
-    """UTC; null if it has ended, if a person decides (a hold before it, a queue that is halted), or if it is not
-    known."""
+    """UTC; null if the entry has ended, if a person decides (a hold before it, a halted queue), or if the time is
+    not known."""
     expected_end: str | None = None
-    """Likewise."""
+    """UTC; null in the same cases as `expected_begin`."""
 
 
 class Output(BaseModel):
@@ -131,11 +134,11 @@ class Output(BaseModel):
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     entry: Entry
-    """Entry of the queue, as it is."""
+    """The entry."""
     said: str
-    """The last 64 KiB of what it printed."""
+    """The last 64 KiB of its process's output."""
     figures: dict[str, Any]
-    """Figures, as of `coupole acquire --json`; empty until the process has ended."""
+    """Figures, as in `coupole acquire --json`; empty until the process has ended."""
 
 
 class NewAccount(Asked):
@@ -150,29 +153,29 @@ class NewAccount(Asked):
 
 
 class Hand(Asked):
-    """Control, given to who asked for it."""
+    """Hand-over of control to the person who asked for it."""
 
     to: Text = ""
-    """Who; empty: nobody."""
+    """Name of that person; empty to give control up."""
 
 
 class StateNow(BaseModel):
-    """The cell at this moment."""
+    """The present state of the cell."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     state: Literal[
         "idle", "starting", "running", "pausing", "paused", "stopping", "concluding", "halted", "silent"
     ]
-    """`halted`: the queue waits for a person; `starting`: a plan is checked, and devices are opened; `concluding`:
-    devices are closed, the report is made; `silent`: the run's process does not answer, all else is what it told
-    last."""
+    """State in one word. `halted`: the queue waits for a person. `starting`: a plan is checked, and devices are
+    opened. `concluding`: devices are closed, and the report is made. `silent`: the run's process does not answer,
+    and all other values are its last ones."""
     t: str
-    """Time when this was so, UTC."""
+    """Time of this state, UTC."""
     rig: str
     """Name of the rig."""
     simulated: bool
-    """No real light, no real arm."""
+    """True if the cell has no real light and no real arm."""
     run: str | None
     """Name of the run that is being acquired."""
     view: str | None
@@ -190,24 +193,25 @@ class StateNow(BaseModel):
     dose_budget: float | None
     """Light that the object may receive in its life, by its ledger and the run's plan."""
     left_s: float | None
-    """Expected time until the run is complete."""
+    """Expected time until the run is complete, s."""
     halted: str
-    """Reason why the queue waits for a person; empty if it does not."""
+    """Reason why the queue waits for a person; empty if it does not wait."""
     arm_fault: str
-    """The fault of the arm that stands until a person confirms; empty if there is none."""
+    """The arm's fault that a person has not confirmed yet; empty if there is none."""
     devices: dict[str, Any]
-    """Identities of the devices that a run, or the bench, has open."""
+    """Identities of the devices that a run or the bench has open."""
     lent_to: str
-    """Name of the borrower of the cell, and the purpose; empty if it is not lent. Nothing begins meanwhile."""
+    """Name of the borrower of the cell, and the purpose; empty if the cell is not lent. Nothing begins
+    meanwhile."""
     queue: list[EntryNow]
-    """All entries that run or wait, after the 20 that ended last, in their order."""
+    """All running or waiting entries, in their order, after the 20 entries that ended last."""
     checking: str
-    """Preflight that is being made: of what, for whom, since when and how far it is; empty if none is. Other
-    entries wait for it.
+    """Present preflight: of what, for whom, since when, and how far it is; empty if there is none. Other entries
+    wait for it.
     """
     in_control: str
-    """Name of the person who may act; empty: any operator."""
+    """Name of the person in control; if it is empty, any operator may act."""
     asked_by: str
     """Name of the person who asks for control."""
     trouble: str
-    """Trouble of the service itself, such as that it cannot write its log; empty if there is none."""
+    """Trouble of the service itself, such as a log that cannot be written; empty if there is none."""

@@ -16,11 +16,11 @@ from coupole.errors import InputError
 
 
 def add_object_routes(app: FastAPI, service: Service) -> None:
-    """Add the routes for what the object screen shows and takes."""
+    """Add the routes of the object screen."""
 
     @app.get("/api/v1/objects")
     def objects() -> list[str]:
-        """Ids of all objects that a plan, a run or a ledger names."""
+        """Return the ids of all objects that a plan, a run or a ledger names."""
         return service.objects.ids()
 
     @app.get("/api/v1/objects/{object_id}/photograph", response_class=Response)
@@ -34,7 +34,7 @@ def add_object_routes(app: FastAPI, service: Service) -> None:
     def keep(
         object_id: Text, picture: Annotated[bytes, Body(media_type="application/octet-stream")], person: Who
     ) -> dict[str, str]:
-        """Keep a picture (JPEG, PNG or TIFF, at most 20 MB) in place of the one before."""
+        """Store a picture (JPEG, PNG or TIFF, at most 20 MB) and replace the former one."""
         allow(service, person, Role.OPERATOR, "photograph")
         service.objects.keep_photograph(object_id, picture)
         return {"object": object_id}

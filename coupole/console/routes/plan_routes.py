@@ -15,11 +15,11 @@ _PAGE_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; "
     "img-src data: blob:; worker-src blob:; sandbox allow-scripts; frame-ancestors 'self'"
 )
-"""A page that Coupole made, shown inside a screen: it can ask for nothing."""
+"""Policy of a page that Coupole made and that is shown inside a screen: it may load nothing."""
 
 
 def add_plan_routes(app: FastAPI, service: Service) -> None:
-    """The drawings that the plan screen has made."""
+    """Add the route of the drawings that the plan screen has made."""
 
     @app.get("/drawings/{folder}/{name}", include_in_schema=False)
     def drawing(folder: Text, name: Text) -> Response:

@@ -24,34 +24,34 @@ _STILL = (
     "sandbox allow-popups; default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'self'"
 )
-"""Policy of a page that only shows: no script, nothing from elsewhere, nothing of this console's origin."""
+"""Policy of a page without scripts: it may load nothing from another place, and has no rights of this console."""
 _LIVELY = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval'; "
     "style-src 'unsafe-inline'; img-src data: blob:; connect-src data: blob:; worker-src blob:; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'self'"
 )
-"""Policy of a page with scripts of its own, which reach nothing but the page itself."""
+"""Policy of a page with its own scripts, which reach nothing outside the page."""
 
 
 def add_run_routes(app: FastAPI, service: Service) -> None:
-    """Add them to a console's app."""
+    """Add the routes to a console's app."""
 
     @app.get("/api/v1/runs")
     def runs() -> list[RunRow]:
-        """The cell's runs, the newest first."""
+        """Return the cell's runs, the newest first."""
         return service.runs.rows()
 
     @app.get("/api/v1/runs/{run}/picture", response_class=Response)
     def picture(
         run: Text, shot: Text, width: Annotated[int, Query(ge=1, le=2048)] = 640, saturation: bool = False
     ) -> Response:
-        """A proven shot as JPEG, developed for the eye; with `saturation` clipped pixels are red."""
+        """Return a proven shot as JPEG, developed for the eye; with `saturation`, saturated pixels are red."""
         jpeg = service.runs.picture(run, shot, width, saturation=saturation)
         return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})
 
     @app.get("/api/v1/runs/{run}/first-look", response_class=FileResponse)
     def first_look(run: Text) -> FileResponse:
-        """Normals and diffuse colour of the view that was processed last, as PNG, while the run goes on."""
+        """Return normals and diffuse colour of the view that was processed last, as PNG, during the run."""
         result = service.runs.run(run).asked_result
         if result is None:
             raise InputError(f"{run}: is not processed during its acquisition")
@@ -59,7 +59,7 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
 
     @app.get("/api/v1/runs/{run}/so-far", response_class=FileResponse)
     def result_so_far(run: Text) -> FileResponse:
-        """Report of the result of the views so far, while the run goes on: normals, materials, uncertainty."""
+        """Return the report of the result of the views so far, during the run: normals, materials, uncertainty."""
         result = service.runs.run(run).asked_result
         if result is None:
             raise InputError(f"{run}: is not processed during its acquisition")
@@ -67,17 +67,17 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
 
     @app.get("/api/v1/runs/{run}/report", response_class=FileResponse)
     def report_page(run: Text) -> FileResponse:
-        """The run's report, without the right to run scripts."""
+        """Return the run's report, which may not run scripts."""
         return _file(service.runs.run(run).report_path, "text/html", _STILL)
 
     @app.get("/api/v1/runs/{run}/readme", response_class=FileResponse)
     def readme(run: Text) -> FileResponse:
-        """Return the README.txt of the run's folder: what the folder says of itself."""
+        """Return the README.txt of the run's folder, which describes the folder."""
         return _file(service.runs.run(run).folder / "README.txt", "text/plain; charset=utf-8", _STILL)
 
     @app.get("/api/v1/support-bundles/{name}", response_class=FileResponse)
     def support_bundle(name: Text, request: Request) -> FileResponse:
-        """One that was made at the console; for engineers."""
+        """Return a support bundle that was made at the console; for engineers."""
         session: Session = request.state.session
         if account_here(session.account, of_this_machine=is_of_this_machine(request)).role < Role.ENGINEER:
             raise NotAllowed(403, "support bundles: only for engineers")
@@ -85,12 +85,12 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
 
     @app.get("/api/v1/runs/{run}/look", response_class=FileResponse)
     def look(run: Text) -> FileResponse:
-        """The page that `coupole show` made of the run, if it stands alone."""
+        """Return the page that `coupole show` made of the run, if all its data are in it."""
         return _file(look_page(service.cell, service.runs.run(run)), "text/html", _LIVELY)
 
 
 def _file(path: Path, kind: str, policy: str) -> FileResponse:
-    """A file of ours with a policy of its own. Raises InputError."""
+    """Return one of Coupole's files with a given policy. Raises InputError."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such file yet")
     return FileResponse(path, media_type=kind, headers={"Content-Security-Policy": policy})

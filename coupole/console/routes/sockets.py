@@ -1,4 +1,5 @@
-"""Sockets of a console: a port for browsers, by TLS if others can reach it, and a Unix socket for commands."""
+"""Sockets of a console: a port for browsers, with TLS if other machines can reach it, and a Unix socket for
+commands."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ _BEAT_S = 0.1
 
 
 class _Known(H11Protocol):
-    """HTTP whose requests know their `connection`, a socket, in their state."""
+    """HTTP whose requests have their `connection`, a socket, in their state."""
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
@@ -31,7 +32,8 @@ class _Known(H11Protocol):
 
 
 class _OfThisUser(_Known):
-    """HTTP on a Unix socket, with processes of this user alone. Their number stands for the client's port."""
+    """HTTP on a Unix socket, with processes of this user only. The process id takes the place of the client's
+    port."""
 
     def connection_made(self, transport: Any) -> None:
         peer = transport.get_extra_info("socket").getsockopt(
@@ -53,7 +55,7 @@ async def run_servers(
     tell: Callable[[], object],
     beat: Callable[[], object],
 ) -> None:
-    """Serve until a signal ends it: `tell` is called once both places listen, `beat` again and again."""
+    """Serve until a signal ends it. `tell` is called once when both sockets listen, `beat` repeatedly."""
     page, line = uvicorn.Server(_config(app, lifespan="on")), uvicorn.Server(_config(app, lifespan="off"))
     page.config.ssl_context_factory = (lambda *_: tls) if tls else None
     page.config.http, line.config.http = _Known, _OfThisUser
@@ -108,7 +110,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def tls_context(tls: tuple[Path, Path] | None) -> ssl.SSLContext | None:
-    """Raises InputError: the files are no certificate with its key."""
+    """Return the TLS context of a certificate and its key. Raises InputError if the files are not such a pair."""
     if tls is None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -131,7 +133,7 @@ def in_url(host: str) -> str:
 
 
 def origins_of(url: str, hosts: Sequence[str]) -> frozenset[str]:
-    """Return the origins of pages at these hosts; browsers leave out the port that is their scheme's own."""
+    """Return the origins of pages at these hosts; browsers leave out the default port of a scheme."""
     scheme, port = url.partition("://")[0], url.rpartition(":")[2]
     places = {f"{scheme}://{in_url(host)}" for host in hosts}
     is_default_port = port == {"http": "80", "https": "443"}[scheme]

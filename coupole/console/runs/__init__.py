@@ -1,1 +1,1 @@
-"""Runs as people look at them: rows, frames, sheets, the one at work, what is made of them."""
+"""Runs for people: rows of tables, frames, contact sheets, the present run, and results."""

@@ -1,4 +1,4 @@
-"""A run's journal in plain words, for people who did not write it."""
+"""A run's journal in plain words for operators."""
 
 from __future__ import annotations
 
@@ -32,8 +32,7 @@ from coupole.storage.journal_events import (
 
 
 def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
-    """Describe what happened; empty for what a person does not need to read (each proven frame, and the file's
-    head)."""
+    """Describe an event; empty for events that people need not read (each proven frame, and the file's head)."""
     match event:
         case JournalBegun() | FrameProven() | ArmSettled():
             return ""

@@ -1,5 +1,5 @@
-"""Contents of a run's contact sheets and pictures of the dome: its frames by view, light and exposure, how bright
-each is, and where each LED stands."""
+"""Contents of a run's contact sheets and dome pictures: its frames by view, light and exposure, the brightness of
+each, and the position of each LED."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from coupole.storage.durable import make_folder
 from coupole.storage.view_reader import View
 
 _MOST_PAIRS = 256
-"""Greatest number of pairs of rows by which the mean of a frame is found."""
+"""Greatest number of pairs of rows that are read for the mean of a frame."""
 _KEPT_EVERY = 100
 
 
@@ -33,7 +33,7 @@ class SheetFrame:
     light: str
     """Name of the light for people: `LED 417`, `dark 3`."""
     led: int | None
-    """Its id in the dome's table; None for a panel, and without light."""
+    """Id of the LED in the dome's table; None for a panel, and without light."""
     exposure: int
     """Index into the plan's exposures."""
     exposure_us: int
@@ -41,7 +41,7 @@ class SheetFrame:
 
 @dataclass(frozen=True)
 class LedPlace:
-    """Place of an LED, seen from the support's centre."""
+    """Direction of an LED, seen from the support's centre."""
 
     azimuth_deg: float
     """Azimuth about the support's z axis, from its x axis."""
@@ -50,16 +50,16 @@ class LedPlace:
 
 
 class FrameSheets:
-    """Frames and their means for all runs of a cell; means are read once and kept."""
+    """Frames of all runs of a cell, and their means; a mean is computed once and stored."""
 
     def __init__(self, runs: RunFiles, folder: Path) -> None:
-        """`folder`: for the means."""
+        """`folder`: for the stored means."""
         self._runs, self._folder = runs, folder
         self._reading = threading.Lock()
         self._places: dict[str, dict[int, LedPlace]] = {}
 
     def frames(self, name: str, view: str) -> list[SheetFrame]:
-        """The proven frames of a view: by LED, then panels, then without light. Raises InputError,
+        """Return the proven frames of a view: by LED, then panels, then frames without light. Raises InputError,
         StorageError."""
         proven = {shot: event for shot, event in self._runs.proven(name).items() if shot.view == view}
         if not proven:
@@ -77,13 +77,13 @@ class FrameSheets:
         ]
 
     def places(self, name: str) -> dict[int, LedPlace]:
-        """Return the places of all LEDs of the run's own table, by id. Raises InputError."""
+        """Return the directions of all LEDs of the run's own table, by id. Raises InputError."""
         if name not in self._places:
             self._places[name] = places_in(read_cell(self._runs.run(name).rig_path))
         return self._places[name]
 
     def known_means(self, name: str, shots: Sequence[str]) -> dict[str, float]:
-        """Return those of `means` that were read before. Raises InputError, StorageError."""
+        """Return the results of `means` that are stored already. Raises InputError, StorageError."""
         known_means, proven = self._stored_means(name), self._runs.proven(name)
         mean_of_shot = {
             shot: known_means.get(proven[shot_id].xxh3)
@@ -93,8 +93,9 @@ class FrameSheets:
         return {shot: mean for shot, mean in mean_of_shot.items() if mean is not None}
 
     def means(self, name: str, shots: Sequence[str], tell: Callable[[int, int], object]) -> dict[str, float]:
-        """The mean above black of each of these proven frames of one view, as a share of full scale, by at most
-        256 pairs of rows; `tell` is told how many of how many are read. Raises InputError, StorageError."""
+        """Return the mean above black of each of these proven frames of one view, as a share of full scale. At
+        most 256 pairs of rows are read. `tell` is called with the number of read frames and of all frames. Raises
+        InputError, StorageError."""
         with self._reading:
             known_means, proven = self._stored_means(name), self._runs.proven(name)
             events = [proven[ShotId.parse(shot)] for shot in shots]
@@ -109,7 +110,7 @@ class FrameSheets:
         return {shot: known_means[event.xxh3] for shot, event in zip(shots, events, strict=True)}
 
     def _stored_means(self, name: str) -> dict[str, float]:
-        """Means by the frames' checksums."""
+        """Return the stored means, by the frames' checksums."""
         self._runs.run(name)
         try:
             means: dict[str, float] = read_json(self._folder / f"{name}.json", allow_nan=True)
@@ -125,7 +126,7 @@ class FrameSheets:
 
 
 def places_in(cell: Cell) -> dict[int, LedPlace]:
-    """Return the places of all LEDs of a cell, by id."""
+    """Return the directions of all LEDs of a cell, by id."""
     support_from_base = np.linalg.inv(cell.rig.support.base_from_support.matrix())
     x, y, z = support_from_base[:3, :3] @ cell.leds.positions_mm.T + support_from_base[:3, 3:]
     azimuths, elevations = np.degrees(np.arctan2(y, x)), np.degrees(np.arctan2(z, np.hypot(x, y)))
@@ -136,7 +137,7 @@ def places_in(cell: Cell) -> dict[int, LedPlace]:
 
 
 def led_places(sheets: FrameSheets, name: str) -> dict[int, LedPlace]:
-    """Return places as `FrameSheets.places` does; empty for a run whose rig cannot be read any more."""
+    """Return directions like `FrameSheets.places`; empty for a run whose rig can no longer be read."""
     try:
         return sheets.places(name)
     except (InputError, CoupoleError):

@@ -1,4 +1,4 @@
-"""The runs of a cell as its console shows them, read from their folders alone."""
+"""The runs of a cell for its console, read from their folders alone."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class RunRow:
 
     name: str
     state: str
-    """State of the run, as `run_status.Status.state`, or `damaged`."""
+    """State of the run, as in `run_status.Status.state`, or `damaged`."""
     object: str
     created: str
     operator: str
@@ -41,16 +41,16 @@ class RunRow:
     frames: int
     bytes: int
     archived: bool
-    """All views are compressed."""
+    """True if all views are compressed."""
     verified: str
-    """Time when it was last read back without a fault and has not changed since, UTC; empty if never."""
+    """Time, UTC, when the run was last verified without a fault; empty if never, or if it has changed since."""
     thumbnail: str
-    """A shot to be shown; empty without one."""
+    """A shot for the thumbnail; empty without one."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame to be looked at."""
+    """One frame and its figures."""
 
     shot: str
     exposure_us: int
@@ -65,7 +65,7 @@ class Frame:
 
 
 class _Followed:
-    """The proven frames of one run; only what its journal has gained is read."""
+    """The proven frames of one run; only new lines of its journal are read."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._lock = path, threading.Lock()
@@ -76,13 +76,13 @@ class _Followed:
         self._inode = self._size = 0
 
     def event(self, shot: ShotId) -> FrameProven | None:
-        """Raises StorageError."""
+        """Return the event of a proven shot. Raises StorageError."""
         with self._lock:
             self._read_news()
             return self._proven.get(shot)
 
     def proven_frames(self) -> dict[ShotId, FrameProven]:
-        """Raises StorageError."""
+        """Return the events of all proven frames. Raises StorageError."""
         with self._lock:
             self._read_news()
             return dict(self._proven)
@@ -108,39 +108,39 @@ class RunFiles:
     """Runs in a cell's storage folder, by the names of their folders."""
 
     def __init__(self, folder: Path, notes: Path) -> None:
-        """`notes`: folder for what is noted of runs, such as when they were verified."""
+        """`notes`: folder for notes about runs, such as when they were verified."""
         self.folder, self._notes, self._lock = folder, notes, threading.Lock()
         self._rows: dict[str, tuple[str, RunRow]] = {}
         self._followed: OrderedDict[str, _Followed] = OrderedDict()
         self._pictures = functools.lru_cache(_PICTURES_KEPT)(self._picture)
 
     def names(self) -> list[str]:
-        """The newest first."""
+        """Return the names of all runs, the newest first."""
         if not self.folder.is_dir():
             return []
         names = [path.parent.name for path in self.folder.glob(f"*/{RUN_JSON}")]
         return sorted(names, reverse=True)
 
     def run(self, name: str) -> Run:
-        """Raises InputError: no run of this cell has this name."""
+        """Return a run. Raises InputError if no run of this cell has this name."""
         if not name or "/" in name or name.startswith(".") or not (self.folder / name / RUN_JSON).is_file():
             raise InputError(f"{name!r}: no run of this cell")
         return Run(self.folder / name)
 
     def rows(self) -> list[RunRow]:
-        """All runs; read anew only where something has changed."""
+        """Return the rows of all runs; a run is read again only if it has changed."""
         return [self.row(name) for name in self.names()]
 
     def status(self, name: str) -> Status:
-        """Raises InputError, StorageError."""
+        """Return the progress of a run. Raises InputError, StorageError."""
         return status(self.run(name))
 
     def proven(self, name: str) -> dict[ShotId, FrameProven]:
-        """Raises InputError, StorageError."""
+        """Return the events of a run's proven frames. Raises InputError, StorageError."""
         return self._follow(name).proven_frames()
 
     def _follow(self, name: str) -> _Followed:
-        """The frames of the runs that were asked for last are kept."""
+        """Return the followed run; those that were asked for last are kept."""
         path = self.run(name).journal_path
         with self._lock:
             follower = self._followed.setdefault(name, _Followed(path))
@@ -150,21 +150,21 @@ class RunFiles:
         return follower
 
     def view(self, name: str, events: Sequence[FrameProven]) -> View:
-        """The file that has these frames, of one view. Raises InputError, StorageError."""
+        """Return the file with these frames of one view. Raises InputError, StorageError."""
         path = self.run(name).folder / events[0].file
         if not path.is_file():
             raise StorageError(f"{path}: no such file")
         return read_view(path, events)
 
     def picture(self, name: str, shot: str, width_px: int, *, saturation: bool = False) -> bytes:
-        """JPEG of a proven shot, at most `width_px` wide (rounded up to one of PICTURE_WIDTHS). Raises InputError,
-        StorageError."""
+        """Return a JPEG of a proven shot, at most `width_px` wide (rounded up to one of PICTURE_WIDTHS). Raises
+        InputError, StorageError."""
         width_px = next((width for width in PICTURE_WIDTHS if width >= width_px), PICTURE_WIDTHS[-1])
         event = self._event(name, shot)
         return self._pictures(name, shot, event.xxh3, width_px, saturation)
 
     def frame(self, name: str, shot: str) -> Frame:
-        """Figures of one frame. Raises InputError, StorageError."""
+        """Return the figures of one frame. Raises InputError, StorageError."""
         event = self._event(name, shot)
         view = self.view(name, [event])
         record = view.records[event.index]
@@ -184,22 +184,22 @@ class RunFiles:
         )
 
     def fingerprint(self, name: str) -> str:
-        """Return a checksum of names, sizes and times of all files in a run's folder: it changes once any file was
-        written, put in or taken out."""
+        """Return a checksum of names, sizes and times of all files in a run's folder. It changes if a file is
+        written, added or removed."""
         folder = self.folder / name
         checksum = hashlib.sha256()
         for path in sorted(folder.rglob("*")):
             try:
                 about = path.stat()
-            except OSError:  # it was taken away while we looked
+            except OSError:  # the file was removed meanwhile
                 continue
             if not path.is_dir():
                 checksum.update(f"{path.relative_to(folder)}\0{about.st_size}\0{about.st_mtime_ns}\0".encode())
         return checksum.hexdigest()
 
     def note_verified(self, name: str, t: str, before: str) -> None:
-        """It was read back at `t` without a fault. Nothing is noted unless its `fingerprint` is still the one from
-        `before` it was read."""
+        """Note that a run was verified at `t` without a fault. Nothing is noted if its `fingerprint` differs from
+        `before`, the one before the verification."""
         if self.fingerprint(name) == before:
             self._notes.mkdir(parents=True, exist_ok=True)
             (self._notes / name).write_text(f"{t} {before}", encoding="utf-8")
@@ -212,7 +212,7 @@ class RunFiles:
         return t if noted_fingerprint == fingerprint else ""
 
     def row(self, name: str) -> RunRow:
-        """One of them."""
+        """Return the row of one run."""
         fingerprint = self.fingerprint(name)
         known_fingerprint, row = self._rows.get(name, ("", None))
         if row is None or known_fingerprint != fingerprint or row.state in ("running", "paused", "created"):
@@ -266,7 +266,7 @@ class RunFiles:
 
 
 def _typical(run: Run) -> str:
-    """A proven shot with light from the middle of a run's first view; empty without one."""
+    """Return a proven shot with light from the middle of a run's first view; empty without one."""
     lit: list[ShotId] = []
     for event in journal.read_events(run.journal_path):
         if isinstance(event, FrameProven) and event.shot.is_shot and isinstance(event.shot.light, Led):

@@ -1,4 +1,5 @@
-"""Folders for what the console makes of a run: outside of the run's folder, below the cell's storage folder."""
+"""Folders for the results that the console makes from a run: outside the run's folder, in the cell's storage
+folder."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ RESULTS = "results"
 
 
 def results_folder(cell: Cell, run: Run) -> Path:
-    """`STORAGE/results/RUN`."""
+    """Return `STORAGE/results/RUN`."""
     return cell.storage_folder / RESULTS / run.folder.name
 
 
@@ -24,10 +25,10 @@ def reflectance_folder(cell: Cell, run: Run) -> Path:
 
 
 def look_page(cell: Cell, run: Run) -> Path:
-    """Return the path of the page that `coupole show` makes."""
+    """Return the path of the page that `coupole show` makes from the run."""
     return results_folder(cell, run) / "look.html"
 
 
 def stands_alone(page: Path) -> bool:
-    """Tell whether a page to look at has all its data in itself."""
+    """Tell whether a page contains all its data."""
     return page.is_file() and not page.with_suffix(".data").exists()

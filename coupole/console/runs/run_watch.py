@@ -1,4 +1,4 @@
-"""The run at work, followed by its journal: what is proven of each view, what happened, its newest frame."""
+"""The present run, followed by its journal: the proven frames of each view, the events, the newest frame."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _EVENTS_KEPT = 200
 
 @dataclass(frozen=True)
 class Watched:
-    """A run as far as it has come."""
+    """The progress of a run."""
 
     run: str
     views: tuple[tuple[str, int, int], ...]
-    """Name, proven and expected frames of each, in the plan's order."""
+    """Name, number of proven frames and number of expected frames of each view, in the plan's order."""
     newest: FrameProven | None
     """Newest proven frame under an LED."""
     reshot: int
@@ -34,7 +34,7 @@ class Watched:
     events: tuple[tuple[str, str], ...]
     """Time (UTC) and words, the newest first."""
     processing: Processing | None
-    """Processing beside the run; None if it was not asked for."""
+    """State of the processing during the run; None if it was not asked for."""
 
 
 @dataclass
@@ -47,7 +47,7 @@ class _Followed:
     reshot: int = 0
     hottest_board_c: float | None = None
     result: str = ""
-    """Folder of the result that is made beside it."""
+    """Folder of the result that is made during the run."""
     events: deque[tuple[str, str]] = field(default_factory=lambda: deque(maxlen=_EVENTS_KEPT))
 
     def read_news(self) -> None:
@@ -72,7 +72,7 @@ class _Followed:
 
 
 class RunWatch:
-    """One reader for however many screens: only the first that asks after a moment waits for it."""
+    """One reader for all screens: its answer is kept for a moment, and only the first request after that waits."""
 
     def __init__(self, runs: RunFiles) -> None:
         self._runs, self._lock = runs, threading.Lock()
@@ -81,13 +81,13 @@ class RunWatch:
         self._read_s = 0.0
 
     def of(self, name: str) -> Watched:
-        """A run of this cell. Raises InputError, StorageError."""
+        """Return the progress of a run of this cell. Raises InputError, StorageError."""
         with self._lock:
             followed_run = self._followed
             if followed_run is None or followed_run.run.folder.name != name:
                 run = self._runs.run(name)
                 shots_of_view = Counter(dict.fromkeys(run.about["views"], 0) if run.is_open else {})
-                if not run.is_open:  # else the journal has them
+                if not run.is_open:  # otherwise frames are chosen in the run, and only its journal names them
                     shots_of_view.update(shot.view for shot in run.expected_shots())
                 followed_run = self._followed = _Followed(run, Follower(run.journal_path), shots_of_view)
                 self._read_s = 0.0

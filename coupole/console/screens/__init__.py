@@ -1,1 +1,1 @@
-"""The console's screens, in NiceGUI: each module builds one; `all_screens` lists them."""
+"""The console's screens, made with NiceGUI: each module builds one; `all_screens` lists them."""

@@ -1,4 +1,4 @@
-"""Puts the screens before a console's interface."""
+"""Adds the screens to a console's interface."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ from coupole.console.screens.visit import Visit
 from coupole.console.service_parts import Service
 
 Build = Callable[..., None]
-"""Called with the visit, and the parts of the path by their names. Quick: what takes time is begun by a timer."""
+"""Function that builds a screen. It is called with the visit, and with the parts of the path by their names. It
+must be quick: long work is begun by a timer."""
 RUNS = Place("/runs", "Runs", "photo_library")
 SCREENS: dict[Place, Build] = {
     Place("/run", "Run", "play_circle"): run_screen.build,
@@ -43,11 +44,11 @@ SCREENS: dict[Place, Build] = {
 PAGES_BELOW: dict[str, tuple[Place, Build]] = {
     "/runs/{name}": (RUNS, run_page.build),
 }
-"""Pages that the navigation does not have, and what they belong to."""
+"""Pages that are not in the navigation, and the entry to which they belong."""
 
 
 def add_screens(app: FastAPI, service: Service) -> None:
-    """Serve all screens of a cell's console. Everything they need comes from this machine."""
+    """Serve all screens of a cell's console. All their files come from this machine."""
     nicegui_app.colors(primary="var(--accent)", negative="#b00020", positive="#1b6e3c")
     ui.add_css(Path(__file__).parent / "screens.css", shared=True)
     nicegui_app.on_exception(_say)
@@ -67,8 +68,8 @@ def add_screens(app: FastAPI, service: Service) -> None:
 
 
 def _say(error: Exception) -> None:
-    """An error that nobody expected, to whoever met it."""
-    with suppress(RuntimeError, AttributeError):  # nobody did
+    """Show an unexpected error to the person who caused it."""
+    with suppress(RuntimeError, AttributeError):  # there may be no page that can show it
         ui.notify(
             f"{type(error).__name__}: {error}", type="negative", multi_line=True, close_button="close", timeout=0
         )

@@ -1,4 +1,4 @@
-"""The arm at the console: its posture, paths that are shown before they are driven, motion by hand."""
+"""The arm at the console: its posture, paths that are shown before the arm moves, motion by hand."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _HOLD = Path(__file__).parent / "hold.js"
 
 
 class ArmPanel:
-    """All of the arm."""
+    """All controls of the arm."""
 
     def __init__(self, visit: Visit) -> None:
         self._visit, self._bench = visit, visit.service.bench
@@ -48,7 +48,7 @@ class ArmPanel:
             self._hand = _Hand(visit)
 
     def show(self, state: dict[str, Any]) -> None:
-        """The bench's state."""
+        """Show the bench's state."""
         self._hand.show((state["arm"] or {}).get("enabling_switch"))
         if self._plan != self._bench.plan:
             self._plan = self._bench.plan
@@ -196,7 +196,7 @@ class _Hand:
         ).classes("small")
 
     def show(self, enabling_switch: bool | None) -> None:
-        """`enabling_switch`: whether the cell has one; None if that is not known."""
+        """`enabling_switch`: True if the cell has one; None if this is not known."""
         visit = self._visit
         self._switch.text = _ENABLING[enabling_switch]
         here = visit.address in visit.service.cell.rig.console.at_the_cell

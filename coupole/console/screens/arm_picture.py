@@ -1,4 +1,4 @@
-"""The arm in its cell: from the front and from above as drawings, and as a model that can be turned."""
+"""The arm in its cell: drawings from the front and from above, and a model that can be turned."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from coupole.plan.cell import Cell
 
 Points = NDArray[np.float64]
 _RADII_MM = (110.0, 110.0, 90.0, 80.0, 65.0, 60.0, 55.0, 60.0)
-"""Drawn, not those of the collision bodies: from joint to joint, the last from the flange to the camera."""
+"""Radii for the drawing, from joint to joint, the last from the flange to the camera. The collision bodies have
+others."""
 _MARGIN_MM = 60.0
 _INK, _WAY, _GOAL = "#e07b00", "#1c7ed6", "#7048e8"
 
 
 class ArmPicture:
-    """Shows postures in the support's frame, where z is up."""
+    """Shows postures in the support frame, where z is up."""
 
     def __init__(self, cell: Cell) -> None:
         support_from_base = np.linalg.inv(cell.rig.support.base_from_support.matrix())
@@ -45,7 +46,7 @@ class ArmPicture:
         self._model: _Model | None = None
 
     def show(self, links_mm: Sequence[Any], base_from_camera: Sequence[Any]) -> None:
-        """Origins [8, 3] in the base frame, and the camera's pose."""
+        """Show a posture: origins [8, 3] of the links in the base frame, mm, and the camera's pose."""
         camera_mm = np.array(base_from_camera)[:3, 3]
         arm_mm = self._in_support(np.vstack([np.array(links_mm), camera_mm]))
         if self._arm_mm is not None and np.abs(arm_mm - self._arm_mm).max() < 0.05:
@@ -56,7 +57,7 @@ class ArmPicture:
         self._words.text = f"The camera is at x {x:.0f}, y {y:.0f}, z {z:.0f} mm above the support's centre."
 
     def show_way(self, camera_mm: Sequence[Any] = (), links_mm: Sequence[Any] = ()) -> None:
-        """Show where the camera will go [n, 3], and the arm at its end [8, 3]; without these no path is shown."""
+        """Show the camera's path [n, 3], mm, and the arm at its end [8, 3]; without them, no path is shown."""
         self._way_mm = self._in_support(np.array(camera_mm)) if len(camera_mm) else None
         goal_mm = [*links_mm, camera_mm[-1]] if len(camera_mm) else None
         self._goal_mm = self._in_support(np.array(goal_mm)) if goal_mm else None
@@ -131,7 +132,7 @@ def _capsules(points_mm: Points, kind: str) -> str:
 
 
 class _Model:
-    """The same by WebGL, in metres; made only where somebody wants it."""
+    """The same as a WebGL model, in metres; made only if it is wanted."""
 
     def __init__(self, leds_mm: Points, radius_mm: float) -> None:
         self._scene = ui.scene(grid=False, background_color="#eef1f4").classes("arm-model")
@@ -164,7 +165,7 @@ class _Model:
 
 
 def _along(direction: Points) -> Points:
-    """A rotation that takes y, a cylinder's axis, to a direction."""
+    """Return a rotation that turns y, the axis of a cylinder, to a direction."""
     aside = np.cross(direction, [1.0, 0.0, 0.0] if abs(direction[0]) < 0.9 else [0.0, 0.0, 1.0])
     aside /= np.linalg.norm(aside)
     return np.stack([np.cross(direction, aside), direction, aside], axis=1)

@@ -1,4 +1,4 @@
-"""Opening and closing the cell's devices: the head of the screens that work with them."""
+"""Opening and closing the cell's devices: the top part of the screens that use them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _NOTHING = ""
 
 
 class BenchBar:
-    """Tells whether the devices are open, and opens and closes them."""
+    """Shows whether the devices are open, and opens and closes them."""
 
     def __init__(self, visit: Visit, show: Callable[[dict[str, Any] | None], object]) -> None:
-        """`show` is called with the bench's state when it changes; None: the devices are closed."""
+        """`show` is called with the bench's state when it changes; None means that the devices are closed."""
         self._visit, self._bench, self._show = visit, visit.service.bench, show
         self._shown: object = ()
         with panel(), ui.row().classes("bar"):

@@ -1,4 +1,4 @@
-"""Pictures of what is to be placed on the support for each step of a calibration: plain drawings from above."""
+"""Pictures of the things on the support for each step of a calibration: plain drawings from above."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _THINGS = {
 
 
 def support_svg(step: str) -> str:
-    """SVG of the support with what a step (by its name) wants on it."""
+    """Return an SVG of the support with the things that a step (by its name) needs."""
     thing, words, dark = _THINGS[step]
     return (
         f'<svg class="placed{" dark" if dark else ""}" viewBox="-80 -80 160 160" role="img" aria-label="{words}">'

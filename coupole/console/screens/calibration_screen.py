@@ -1,4 +1,5 @@
-"""Calibrations: what is in force and how well it holds, which plans it refuses, and how new records are made."""
+"""Calibrations: the records in force and their margins, the plans that they refuse, and the making of new
+records."""
 
 from __future__ import annotations
 
@@ -16,9 +17,9 @@ from coupole.console.screens.visit import Visit, in_thread
 from coupole.errors import CoupoleError
 
 _LOOK_EVERY_S, _SOON_DAYS, _NARROW = 5.0, 14.0, 0.1
-"""Expires soon, and a margin that is narrow."""
+"""Interval of updates; days before its end at which a record expires soon; margin that counts as narrow."""
 WORDS_OF = "calibrate"
-"""First word of a command that calibrates."""
+"""First word of a calibrating command."""
 
 
 def build(visit: Visit) -> None:

@@ -22,10 +22,10 @@ _MARK = """for (const one of document.querySelectorAll('.sheet [data-shot]')) {
 
 
 class ContactSheet:
-    """Thumbnails that are loaded as they come into sight."""
+    """Thumbnails that are loaded when they become visible."""
 
     def __init__(self, name: str, pick: Callable[[str], object]) -> None:
-        """`pick` is called with the shot of the thumbnail that was chosen."""
+        """`pick` is called with the shot of the chosen thumbnail."""
         self._name, self._frames, self._page, self._current = name, list[SheetFrame](), 0, ""
         with ui.row().classes("bar"):
             self._before = button("Before", lambda: self._turn(-1), name="page-before", icon="chevron_left")
@@ -39,12 +39,12 @@ class ContactSheet:
         self._sheet.on("click", on_choice, js_handler=_EMIT_CLICKED)
 
     def show(self, frames: Sequence[SheetFrame]) -> None:
-        """These, from the first page."""
+        """Show these frames, from the first page."""
         self._frames, self._page = list(frames), 0
         self._draw()
 
     def mark(self, shot: str) -> None:
-        """The frame that is looked at; its page is turned to."""
+        """Mark the chosen frame, and show its page."""
         self._current = shot
         place = next((k for k, frame in enumerate(self._frames) if frame.shot == shot), None)
         if place is not None and place // PER_PAGE != self._page:

@@ -39,7 +39,7 @@ class _Screen:
         self._arm.show(state)
 
     async def test(self, kind: str) -> None:
-        """Have a device test itself."""
+        """Run the self-test of a device."""
         card = self._cards[kind]
         card.busy(True)
         test_report = await self._visit.act(

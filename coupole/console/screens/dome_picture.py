@@ -1,4 +1,4 @@
-"""The dome as a picture: each LED where it stands, coloured by how bright its frame is."""
+"""The dome as a picture: each LED at its direction, coloured by the brightness of its frame."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ _MARK = """for (const one of document.querySelectorAll('.dome circle')) {
 
 
 class DomePicture:
-    """Seen from above: the zenith in the middle, elevation 0 at the rim, the support's x to the right."""
+    """The dome from above: the zenith in the middle, elevation 0 at the rim, the support's x to the right."""
 
     def __init__(self, pick: Callable[[str], object]) -> None:
-        """`pick` is called with the shot of an LED that was chosen."""
+        """`pick` is called with the shot of the chosen LED."""
         self._picture = ui.html("", sanitize=False).classes("dome").props("data-name=dome")
 
         def on_choice(event: events.GenericEventArguments) -> object:
@@ -57,16 +57,16 @@ class DomePicture:
     def show(
         self, places: Mapping[int, LedPlace], frames: Sequence[SheetFrame], means: Mapping[str, float]
     ) -> None:
-        """All LEDs; those with a frame in the colour of its mean, a share of full scale."""
+        """Show all LEDs; an LED with a frame has the colour of the frame's mean, a share of full scale."""
         self._picture.set_content(dome_svg(places, frames, means))
 
     def mark(self, shot: str) -> None:
-        """The frame that is looked at."""
+        """Mark the LED of the chosen frame."""
         ui.run_javascript(_MARK % shot)
 
 
 def dome_svg(places: Mapping[int, LedPlace], frames: Sequence[SheetFrame], means: Mapping[str, float]) -> str:
-    """A polar picture: the distance from the middle is the angle from the zenith."""
+    """Return a polar picture, in which the distance from the middle is the angle from the zenith."""
     of_led = {frame.led: frame for frame in reversed(frames) if frame.led is not None}
     most = max((means[frame.shot] for frame in frames if frame.shot in means), default=0.0)
     radius = min(_LARGEST, 0.55 / math.sqrt(max(1, len(places))))

@@ -13,10 +13,10 @@ from coupole.storage.run import Run
 
 
 class ExportDialog:
-    """The format, and what it needs to be told."""
+    """The format, and the options that it needs."""
 
     def __init__(self, run: Run, folder: Callable[[str], Path]) -> None:
-        """`folder`: where each format goes."""
+        """`folder` returns the folder of each format."""
         self._run, self._folder = run, folder
         with ui.dialog().props('aria-label="Export"') as self._dialog, ui.column().classes("panel ask"):
             heading(f"Export {run.folder.name}")
@@ -39,7 +39,7 @@ class ExportDialog:
         self._view.set_visibility("views" in FORMATS[form].options)
 
     async def command(self) -> list[str]:
-        """The arguments of `coupole` that do it; none if it was cancelled."""
+        """Return the arguments of `coupole` for the export; none if the dialog was cancelled."""
         is_confirmed = await self._dialog
         form, licence, view = self._form.value, self._licence.value, self._view.value
         self._dialog.delete()

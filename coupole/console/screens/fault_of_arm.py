@@ -1,4 +1,4 @@
-"""Panel after a fault of the arm, for the word of a named person who has been to the cell."""
+"""Panel after a fault of the arm, which a named person at the cell must confirm."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from coupole.storage.arm_faults import faults_of
 
 
 class FaultOfArm:
-    """Panel that is shown while a fault of the arm stands."""
+    """Panel that is shown until the arm's fault is confirmed."""
 
     def __init__(self, visit: Visit) -> None:
         self._visit = visit
@@ -27,7 +27,7 @@ class FaultOfArm:
             )
 
     def show(self, fault: str) -> None:
-        """`fault` is empty if none stands."""
+        """`fault` is empty if there is none."""
         self._panel.set_visibility(bool(fault))
         self._words.text = fault
         self._confirm.set_enabled(self._visit.may_act)

@@ -1,4 +1,5 @@
-"""Focus and expose: pictures one after the other, how sharp and how bright they are, and what light they cost."""
+"""Focus and expose: pictures one after the other, their sharpness and brightness, and their light on the
+object."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ from coupole.console.screens.visit import Visit, in_thread
 from coupole.errors import CoupoleError
 
 LIVE_S = 60.0
-"""Live pictures end when nobody has touched the page for this time, because each picture is light on the
+"""Live pictures end if nobody has touched the page for this time, s, because each picture puts light on the
 object."""
 _EVERY_S = 0.1
 
@@ -174,13 +175,13 @@ class _Screen:
 
     @property
     def _was_stopped(self) -> bool:
-        """True if a stop since live pictures began is known here; the bench refuses the next picture in any
+        """True if this page knows of a stop since live pictures began; the bench refuses the next picture in any
         case."""
         state = self._bench.state
         return state is not None and state["stops"] > self._stops
 
     async def _stopped_meanwhile(self) -> bool:
-        """The same, as the bench tells it now."""
+        """The same by the bench's present state."""
         try:
             return await in_thread(self._stops_so_far) > self._stops
         except CoupoleError:  # the devices are closed
@@ -261,7 +262,7 @@ class _Screen:
 
 
 def why_live_ends(*, is_watched: bool, untouched_s: float, is_stopped: bool) -> str:
-    """Return why no further picture is taken by itself; empty if one is."""
+    """Return why no further live picture is taken; empty if one is taken."""
     if not is_watched:
         return "the page was closed"
     if untouched_s > LIVE_S:

@@ -1,4 +1,4 @@
-"""Parts of all screens: the header with the cell's state, its dose, pause and stop, and the way to the others."""
+"""Parts of all screens: the header with the cell's state, its dose, pause and stop, and the navigation."""
 
 from __future__ import annotations
 
@@ -143,13 +143,14 @@ def _buttons(visit: Visit) -> None:
 
 
 def can_be_stopped(now: StateNow) -> bool:
-    """Something is at work, has the devices open, or may move and light by what the cell is lent for."""
+    """True if a run or a task is active, if devices are open, or if the cell is lent for work that may move and
+    light."""
     runs = any(entry.state == "running" for entry in now.queue)
     return runs or now.state in AT_WORK or bool(now.devices) or bool(now.lent_to)
 
 
 def light_words(now: StateNow) -> str:
-    """Return the header's words on light. They say that none is given only while nobody can give any."""
+    """Return the header's text about light. It says that no light is given only if nothing can give light."""
     if now.run:
         budget = f" of {now.dose_budget:g}" if now.dose_budget else ""
         return f"light on {now.object or 'the object'}: {now.dose_before + now.dose:.3f} lux h{budget}"
@@ -161,7 +162,7 @@ def light_words(now: StateNow) -> str:
 
 
 async def stop_bench(visit: Visit) -> None:
-    """Stop what the open devices do."""
+    """Stop the work of the open devices."""
     troubles = await visit.act("stop the devices", visit.service.bench.stop, acts=False)
     if troubles is not None:
         visit.say("; ".join(troubles) or "stopped: lights off, arm commanded to stop", bad=bool(troubles))

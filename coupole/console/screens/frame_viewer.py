@@ -22,7 +22,7 @@ _WIDTH_PX = 1280
 
 
 class FrameViewer:
-    """The frame that was picked, and the way to its neighbours."""
+    """The chosen frame, and buttons for its neighbours."""
 
     def __init__(self, visit: Visit, name: str, step: Callable[[int], object]) -> None:
         """`step` is called with -1 or 1."""
@@ -40,7 +40,7 @@ class FrameViewer:
             self._numbers = ui.html("", sanitize=False).style("width:100%")
 
     async def show(self, shot: str, light: str) -> None:
-        """A proven shot of the run."""
+        """Show a proven shot of the run."""
         self._shot = shot
         self._title.text = f"{light} · {shot}"
         self._draw()

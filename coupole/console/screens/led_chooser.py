@@ -1,4 +1,4 @@
-"""LEDs to be lit: by their ids, or on a small picture of the dome."""
+"""Choice of the LEDs to be lit: by their ids, or on a small picture of the dome."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _EMIT = """(e) => {
   emit([at.x, at.y]);
 }"""
 _NEAR = 0.06
-"""Greatest distance from an LED at which a click is meant for it, as a share of the dome's radius."""
+"""Greatest distance at which a click chooses an LED, as a share of the dome's radius."""
 
 
 class LedChooser:
-    """A field of ids and the dome from above say the same."""
+    """A field of ids, and the dome from above; both always show the same LEDs."""
 
     def __init__(self, places: Mapping[int, LedPlace], on_change: Callable[[], object]) -> None:
         self._places, self._on_change = places, on_change
@@ -38,7 +38,7 @@ class LedChooser:
 
     @property
     def leds(self) -> list[int]:
-        """Raises InputError: not numbers."""
+        """Ids of the chosen LEDs. Raises InputError if they are not numbers."""
         return numbers(str(self._field.value or ""), "LEDs")
 
     def _toggle_nearest(self, event: events.GenericEventArguments) -> None:
@@ -73,7 +73,7 @@ class LedChooser:
 
 
 def numbers(text: str, label: str) -> list[int]:
-    """Whole numbers with commas or blanks between them. Raises InputError."""
+    """Return whole numbers that are separated by commas or blanks. Raises InputError."""
     words = [word for word in re.split(r"[,;\s]+", text) if word]
     if strange := [word for word in words if not re.fullmatch(r"\d{1,9}", word)]:
         raise InputError(f"{label}: expected whole numbers, such as 3, 17; found {strange[0]!r}")
@@ -81,6 +81,6 @@ def numbers(text: str, label: str) -> list[int]:
 
 
 def _at(place: LedPlace) -> tuple[float, float]:
-    """Return the LED's place on the picture: the zenith in the middle, elevation 0 at a radius of 1."""
+    """Return the LED's position on the picture: the zenith in the middle, elevation 0 at a radius of 1."""
     far, angle = 1 - place.elevation_deg / 90, math.radians(place.azimuth_deg)
     return far * math.cos(angle), -far * math.sin(angle)

@@ -1,4 +1,4 @@
-"""The bench's newest picture with gridlines and a region, and a loupe into it."""
+"""The bench's newest picture with gridlines and a region, and a loupe."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _LOOK = Path(__file__).parent / "look.js"
 
 
 class LookPicture:
-    """A drag on it draws a region; a click opens the loupe there."""
+    """The picture. Dragging on it draws a region; a click opens the loupe at that point."""
 
     def __init__(self, visit: Visit, on_region: Callable[[list[int]], object]) -> None:
-        """`on_region` is called with x, y, width, height, in the sensor's pixels."""
+        """`on_region` is called with x, y, width and height, in pixels of the sensor."""
         self._visit, self._bench, self._on_region = visit, visit.service.bench, on_region
         sensor = visit.service.cell.rig.sensor
         self._size_px = sensor.width_px, sensor.height_px
@@ -38,12 +38,12 @@ class LookPicture:
         self._draw()
 
     def build_loupe(self) -> None:
-        """Build the place where the loupe is shown."""
+        """Build the element that shows the loupe."""
         self._loupe = with_name(ui.html("", sanitize=False), "loupe").classes("loupe")
         self._loupe.set_content('<p class="hint">Click on the picture: each pixel of the sensor is one here.</p>')
 
     def show(self, picture: dict[str, Any], gains: Sequence[float]) -> None:
-        """A picture that the bench has taken."""
+        """Show a picture that the bench has taken."""
         self._number, self._gains = picture["number"], gains
         name = Path(picture["picture"]).name
         self._image.props(
@@ -60,7 +60,7 @@ class LookPicture:
         self._draw()
 
     async def loupe(self, at_px: Sequence[int] | None = None) -> None:
-        """Show the last picture through the loupe at a point; without one, in the middle of the region, or of the
+        """Show the last picture through the loupe at a point; by default in the middle of the region, or of the
         picture."""
         if not self._number:
             return

@@ -1,4 +1,4 @@
-"""Metering the plan's exposure, and putting it into the plan."""
+"""Metering of the plan's exposure, and writing it into the plan."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coupole.console.screens.visit import Visit
 
 
 class MeterPanel:
-    """Panel that does what `coupole meter` does, with the devices that are open."""
+    """Panel for `coupole meter` with the devices that are open."""
 
     def __init__(self, visit: Visit) -> None:
         self._visit, self._bench = visit, visit.service.bench
@@ -28,7 +28,7 @@ class MeterPanel:
                 self._put = button("Put this exposure into the plan", self._keep, icon="edit_note", name="put")
 
     def show(self, work: dict[str, Any]) -> None:
-        """The bench's last work."""
+        """Show the bench's last work."""
         plan, may = self._bench.plan, self._visit.may_act
         state = work, plan, may
         if state == self._shown:

@@ -1,4 +1,4 @@
-"""The object: is it this one, how it lies on the support, and all light that it has received."""
+"""The object: its identity, its position on the support, and all light that it has received."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class _Screen:
                 self._budget()
 
     async def open_first(self) -> None:
-        """The object of the run at work, or else the first."""
+        """Open the object of the present run, or else the first one."""
         ids = await in_thread(self._objects.ids)
         if not ids:
             self._sums.set_content("<p>No plan, run or ledger names an object yet.</p>")

@@ -1,4 +1,4 @@
-"""Small pieces that several screens are made of."""
+"""Small parts that several screens use."""
 
 from __future__ import annotations
 
@@ -29,19 +29,20 @@ def button(
 
 
 def with_name(element: E, name: str) -> E:
-    """The element, with a `data-name` in the page."""
+    """Return the element, with a `data-name` in the page."""
     element._props["data-name"] = name
     return element
 
 
 def with_label(element: E, words: str) -> E:
-    """The element, with words for who does not see it. They may be anybody's: `props` would take them for more."""
+    """Return the element, with words for a screen reader. Words of people must not go through `props`, which would
+    read them as further properties."""
     element._props["aria-label"] = words
     return element
 
 
 def panel(title: str = "") -> ui.column:
-    """A box for one thing."""
+    """Build a box with a title."""
     box = ui.column().classes("panel")
     if title:
         with box:
@@ -54,7 +55,7 @@ def heading(words: str) -> None:
 
 
 def facts(rows: Mapping[str, str]) -> ui.html:
-    """Names and values."""
+    """Build a list of names and values."""
     return ui.html(facts_html(rows), sanitize=False).style("width:100%")
 
 
@@ -64,7 +65,7 @@ def facts_html(rows: Mapping[str, str]) -> str:
 
 
 def table_html(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A plain table of text; a cell may be of a class: `bad|words`."""
+    """Return a plain table of text; a cell may have a class: `bad|words`."""
 
     def cell(words: str) -> str:
         kind, mark, rest = words.partition("|")
@@ -81,13 +82,14 @@ def table_html(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def picture_address(run: str, shot: str, width_px: int, *, saturation: bool = False) -> str:
-    """Return the address at which the interface serves a shot's picture."""
+    """Return the address of a shot's picture."""
     saturation_query = "&saturation=true" if saturation else ""
     return f"/api/v1/runs/{quote(run)}/picture?shot={quote(shot, safe='')}&width={width_px}{saturation_query}"
 
 
 def histogram_svg(histograms: Mapping[str, Sequence[int]]) -> str:
-    """Lines by channel over `BINS` steps from 0 to full scale; counts by their logarithm."""
+    """Return a histogram with a line for each channel, over `BINS` steps from 0 to full scale; counts are
+    logarithmic."""
     import math
 
     most = math.log1p(max((max(counts) for counts in histograms.values()), default=1) or 1)
@@ -110,12 +112,12 @@ def histogram_svg(histograms: Mapping[str, Sequence[int]]) -> str:
 
 
 def clipping_words(saturated_shares: Mapping[str, float]) -> dict[str, str]:
-    """Share of pixels at full scale by channel."""
+    """Return the share of pixels at full scale of each channel, in words."""
     return {f"{name} clipped": f"{share:.3%}" if share else "none" for name, share in saturated_shares.items()}
 
 
 async def sure(title: str, words: str, yes: str) -> bool:
-    """Ask before something that cannot be undone, or takes long."""
+    """Ask for confirmation of an action that cannot be undone or takes long."""
     with with_label(ui.dialog(), title) as dialog, ui.column().classes("panel ask"):
         heading(title)
         ui.label(words)
@@ -133,12 +135,13 @@ def link(words: str, target: str, *, name: str, new_tab: bool = True) -> ui.link
 
 
 def moment(t: str) -> str:
-    """A time of UTC, ISO 8601, for people: `2026-11-23 15:04`."""
+    """Return a time (UTC, ISO 8601) for people: `2026-11-23 15:04`."""
     return t[:16].replace("T", " ")
 
 
 class Choice:
-    """One of several values, as the browser's own list: by keyboard, finger and screen reader."""
+    """Choice of one of several values by the browser's own list, which works by keyboard, finger and screen
+    reader."""
 
     def __init__(
         self,
@@ -149,8 +152,8 @@ class Choice:
         name: str,
         value: str = "",
     ) -> None:
-        """`options`: words of each value; `value` is chosen, or else the first; `name` is its `data-name` in the
-        page."""
+        """`options` has the words of each value. `value` is chosen, or else the first; `name` is its `data-name`
+        in the page."""
         self._words, self._name, self._on_change = words, name, on_change
         self._options, self.value = dict(options), value or next(iter(options), "")
         self._box = ui.html("", sanitize=False).classes("choice")
@@ -158,7 +161,7 @@ class Choice:
         self.set_options(options, self.value)
 
     def set_options(self, options: Mapping[str, str], value: str = "") -> None:
-        """Others; nobody is told."""
+        """Set other options without calling `on_change`."""
         self._options, self.value = dict(options), value or next(iter(options), "")
         inner = "".join(
             f'<option value="{html.escape(key)}"{" selected" if key == self.value else ""}>{html.escape(words)}'
@@ -181,5 +184,5 @@ class Choice:
 
 
 def count(number: int, noun: str) -> str:
-    """`1 day`, `2 days`."""
+    """Return a number with its noun: `1 day`, `2 days`."""
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"

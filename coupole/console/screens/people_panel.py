@@ -1,4 +1,4 @@
-"""Panel of the people who may sign in, for engineers: add, remove, change what they may do."""
+"""Panel of the people who may sign in, for engineers: add and remove accounts, change roles."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ _SIDES = ("x", "y", "width", "height")
 
 
 class PictureSettings:
-    """Fields of the screen; `request()` is what they say."""
+    """Fields of the screen; `request()` returns their values."""
 
     def __init__(self, on_change: Callable[[], object]) -> None:
         self._on_change = on_change
@@ -70,25 +70,25 @@ class PictureSettings:
 
     @property
     def region(self) -> list[int] | None:
-        """x, y, width, height; None if it is not given whole."""
+        """x, y, width, height of the region; None if not all four are given."""
         values = [self._region[side].value for side in _SIDES]
         return None if None in values else [int(value) for value in values]
 
     @property
     def light_words(self) -> str:
-        """Light and exposure in words, for the log and for people."""
+        """Return light and exposure in words, for the log and for people."""
         request = self.request()
         lights = [*(f"LED {led}" for led in request["lights"]), *(f"panel {panel}" for panel in request["panels"])]
         return f"{', '.join(lights) or 'no light'}, {request['exposure_us'] / 1000:g} ms"
 
     @property
     def comparison_key(self) -> object:
-        """Sharpness is comparable as long as this stays the same."""
+        """Return a key of the settings. Sharpness is comparable while it stays the same."""
         request = self.request()
         return request["lights"], request["panels"], request["region"]
 
     def request(self) -> dict[str, Any]:
-        """Fields of a `frame`. Raises InputError."""
+        """Return the fields of a `frame` command. Raises InputError."""
         exposure_ms = self._exposure.value
         if not exposure_ms or exposure_ms < _SHORTEST_MS:
             raise InputError(f"Exposure: expected at least {_SHORTEST_MS} ms")
@@ -104,7 +104,7 @@ class PictureSettings:
         }
 
     def set_white(self, gains: list[float] | None = None) -> None:
-        """White as a region has it; None: as the sensor sees it."""
+        """Set the white point to that of a region; None for the sensor's own colours."""
         self.gains = list(gains or _NEUTRAL)
         self._on_change()
 

@@ -1,4 +1,5 @@
-"""Plans: form and YAML side by side, mistakes at their lines, preflight as one types, the cell with the views."""
+"""Plans: form and YAML side by side, mistakes at their lines, preflight while the person types, the cell with the
+views."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ from coupole.errors import InputError, Problem
 
 _AFTER_TYPING_S = 0.6
 _LONG = 6000
-"""Characters of a text that is not read at every key."""
+"""A text with more characters is not read at every key."""
 _UNITS = {"mm": "mm", "m": "m", "um": "um"}
 _KINDS = {
     "round": "views all round an object",
@@ -188,7 +189,7 @@ class _Screen:
         self._filling = False
 
     def _filled_fields(self) -> PlanFields:
-        """Raises InputError: not numbers."""
+        """Return the values of the form. Raises InputError for fields that are not numbers."""
         return replace(
             self._fields,
             object_id=str(self._object.value or "").strip(),
@@ -204,7 +205,7 @@ class _Screen:
         )
 
     def _take_field(self) -> None:
-        """A field was left: its value goes into the text."""
+        """Take the value of a field that the person has left into the text."""
         if self._filling or not self._name:
             return
         try:
@@ -218,7 +219,8 @@ class _Screen:
             self._form_says.set_text(str(error))
 
     async def _all_round(self) -> None:
-        """Views at three elevations, looking at the middle of the mesh, from where the lens is focused."""
+        """Put views at three elevations into the text: they look at the middle of the mesh, by default from the
+        lens's focus distance."""
         if not self._visit.may_act:
             return
         path, rig = self._plans.path(self._name), self._visit.service.cell.rig
@@ -249,7 +251,7 @@ class _Screen:
             self._read_text()
 
     def _read_text(self) -> None:
-        """Show what the text says; preflight follows once nobody types."""
+        """Show the contents of the text; the preflight follows when the person stops typing."""
         self._state(self._visit.now)
         if not self._name:
             return
@@ -358,7 +360,7 @@ def _numbers_text(values: Sequence[float]) -> str:
 
 
 def _numbers(text: str | None, label: str) -> list[float]:
-    """Raises InputError."""
+    """Return the numbers of a field. Raises InputError."""
     try:
         numbers = [float(word) for word in str(text or "").replace(",", " ").split()]
     except ValueError:

@@ -8,7 +8,7 @@ from coupole.viewing.terminal import bytes_text, duration_text
 
 
 def figures_of(checked_plan: Checked) -> dict[str, str]:
-    """Return what the plan takes, by its preflight."""
+    """Return what the plan needs, by its preflight."""
     report = checked_plan.report
     dose = f"{report['dose_lux_h']:.3f} lux h"
     if report["dose_before_lux_h"]:
@@ -36,7 +36,7 @@ def figures_of(checked_plan: Checked) -> dict[str, str]:
 
 
 def view_table(checked_plan: Checked) -> str:
-    """A line for each view, in the order of the visits."""
+    """Return a line for each view, in the order of the visits."""
     framing_of_view = {
         view_framing["view"]: view_framing
         for view_framing in (checked_plan.report["object"] or {}).get("views", [])

@@ -1,4 +1,5 @@
-"""Plans in their order: when each begins and ends, what light and disk it takes, where it waits for a person."""
+"""Plans in their order: begin and end of each, its light and disk space, and where the queue waits for a
+person."""
 
 from __future__ import annotations
 
@@ -48,7 +49,7 @@ class _Screen:
         visit.follow(self._show)
 
     async def offer_plans(self) -> None:
-        """The plans of the folder, to choose from."""
+        """Offer the plans of the folder."""
         names = await in_thread(self._visit.service.plan_files.names)
         self._plan.set_options({name: name for name in names})
 

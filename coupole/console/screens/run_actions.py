@@ -1,4 +1,4 @@
-"""Actions on a run: go on with it, or begin a command of the command line on it."""
+"""Actions on a run: resume it, or run a command on it."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ async def resume(visit: Visit, name: str) -> None:
 
 
 class RunActions:
-    """Buttons for one run, and links to what there is of it."""
+    """Buttons for one run, and links to its results."""
 
     def __init__(self, visit: Visit, name: str, *, can_resume: bool, frames: int) -> None:
-        """`can_resume`: frames of it are left."""
+        """`can_resume`: True if frames of it remain to be taken."""
         self._visit, self._name = visit, name
         self._run: Run = visit.service.runs.run(name)
         self._cell = visit.service.cell
@@ -56,7 +56,7 @@ class RunActions:
         ui.timer(2.0, self._look)
 
     def _look(self) -> None:
-        """Links to the files that exist now."""
+        """Show links to the files that exist now."""
         run, page = self._run.folder, look_page(self._cell, self._run)
         there = [self._run.report_path.is_file(), (run / "README.txt").is_file(), stands_alone(page)]
         if there == self._there:
@@ -74,7 +74,7 @@ class RunActions:
     async def _begin(
         self, action: str, command: Sequence[str | Path], then: Callable[[Task], object] = lambda _: None
     ) -> None:
-        """Begin `coupole COMMAND` on this run; `then` is called when it has ended well."""
+        """Begin `coupole COMMAND` on this run; `then` is called if it ends without an error."""
         account, words = self._visit.account, f"{action} {self._name}"
         by = account.name if account else ""
         task = await self._visit.act(

@@ -1,4 +1,4 @@
-"""One run: what it is, its frames on a contact sheet and on the dome, one of them large, and what happened."""
+"""One run: its facts, its frames on a contact sheet and on the dome, one large frame, and the events."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from coupole.viewing.terminal import bytes_text, duration_text
 
 _EVENTS_SHOWN, _LOOK_EVERY_S = 200, 2.0
 _READ_UNASKED_BYTES = 2_000_000_000
-"""Greatest total size of frames whose means are read without being asked for."""
+"""Greatest total size of frames whose means are read without a request."""
 
 
 @dataclass(frozen=True)
 class _Known:
-    """Data that are read of a run before it is shown."""
+    """Data of a run that are read before it is shown."""
 
     run: Run
     row: RunRow
@@ -120,7 +120,7 @@ class _Page:
             TaskList(self._visit, lambda task: task.words.endswith(f" {self._name}"), empty="", most=4)
 
     async def _renew(self) -> None:
-        """Show what commands have changed since."""
+        """Show the changes that commands have made."""
         row = await in_thread(self._visit.service.runs.row, self._name)
         if row != self._row:
             self._row = row
@@ -152,7 +152,7 @@ class _Page:
                 button("Take this view again", self._retake, icon="replay", name="retake")
 
     async def _retake(self) -> None:
-        """A new plan with this view alone, as it was; in the queue."""
+        """Make a plan that takes only this view again, as before, and enter it in the queue."""
         service, view, run = self._visit.service, self._view.value, self._known.run
         plan_name = await self._visit.act(
             f"plan for {view} again", lambda: service.plan_files.retake(run, view), acts=False
@@ -207,7 +207,7 @@ class _Page:
         return [frame.shot for frame in self._frames if frame.led is not None]
 
     async def _fill_means(self) -> None:
-        """Read what is not known yet, and colour the dome."""
+        """Read the missing means, and colour the dome."""
         lit, frames, progress = self._lit(), self._frames, [0, 0]
         self._read_means.set_visibility(False)
 

@@ -1,4 +1,4 @@
-"""The run at work: its newest frame and how well that is exposed, progress by view, and what happened."""
+"""The present run: its newest frame and the frame's exposure, progress by view, and the events."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class _Screen:
             self._show_last(last)
 
     def _show_last(self, last: EntryNow | None) -> None:
-        """Show how the last entry ended, and what can be done about it."""
+        """Show how the last entry ended, and the possible actions."""
         self._after.clear()
         if last is None:
             return
@@ -149,7 +149,7 @@ class _Screen:
         )
 
     def _show_first_look(self, run_progress: Watched) -> None:
-        """The newest view's normals, anew when there are more."""
+        """Show the newest view's normals; they are loaded again when there are new ones."""
         processing = run_progress.processing
         views = 0 if processing is None else processing.views_done
         self._first_look_box.set_visibility(views > 0)

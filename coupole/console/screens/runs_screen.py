@@ -1,4 +1,4 @@
-"""The cell's runs: a table to search, and what can be done with each."""
+"""The cell's runs: a table with search, and the actions for each run."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from coupole.viewing.terminal import bytes_text
 
 _LOOK_EVERY_S, _SHOWN_AT_ONCE = 2.0, 50
 OF_RUNS = ("verify", "report", "archive", "export", "reflectance", "show")
-"""Commands that are begun on runs."""
+"""Commands on runs."""
 STATE_KINDS = {"done": "good", "failed": "bad", "damaged": "bad", "interrupted": "warm", "paused": "warm"}
 EMIT_NAMED = "(e) => { const one = e.target.closest('[data-%s]'); if (one) emit(one.dataset.%s) }"
-"""JavaScript handler of a click on a part of some HTML that has an attribute `data-...`."""
+"""JavaScript handler of a click on a part of HTML with an attribute `data-...`."""
 _HEADS = ("", "run", "state", "frames", "size", "verified", "archived", "")
 
 

@@ -1,4 +1,4 @@
-"""Sharpness while somebody turns the lens: now, the best so far, and how it went."""
+"""Sharpness while a person turns the lens: the present value, the best so far, and their history."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _KEPT = 120
 
 
 class Sharpness:
-    """Values that are comparable: the same region under the same light."""
+    """Comparable values: of the same region under the same light."""
 
     def __init__(self) -> None:
         self._values: list[float] = []
@@ -23,7 +23,7 @@ class Sharpness:
         self.reset()
 
     def add(self, value: float, of: object, words: str) -> None:
-        """A picture's value; values of something else before it are forgotten."""
+        """Add a picture's value; earlier values of other settings are forgotten."""
         if of != self._of:
             self._values, self._of = [], of
         self._values = [*self._values, value]

@@ -1,4 +1,5 @@
-"""The machine and the service: room, versions, the rig and what is to be measured of it, people, log, commands."""
+"""The machine and the service: disk space, versions, the rig and its values to be measured, people, log,
+commands."""
 
 from __future__ import annotations
 
@@ -104,7 +105,7 @@ def _rig(visit: Visit) -> None:
 
 
 class _Log:
-    """Panel of the log: who asked for what, the newest first."""
+    """Panel of the log: senders and their requests, the newest first."""
 
     def __init__(self, visit: Visit) -> None:
         self._path = visit.service.folder / "audit.jsonl"
@@ -151,7 +152,7 @@ def _notifications(visit: Visit) -> None:
 
 
 class _Bundle:
-    """Panel of the support bundle, a file for whoever is asked for help."""
+    """Panel of the support bundle, a file for those who help with a fault."""
 
     def __init__(self, visit: Visit) -> None:
         self._visit = visit

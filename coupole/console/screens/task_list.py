@@ -1,4 +1,4 @@
-"""Commands that people began at the console, as they go on: state, how long, what they print."""
+"""Commands that people began at the console: state, duration, output."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NONE = "No command was begun here since the console started."
 
 
 class TaskList:
-    """The newest first; it renews itself as long as the screen is open."""
+    """The tasks, the newest first; updated while the screen is open."""
 
     def __init__(
         self, visit: Visit, is_wanted: Callable[[Task], bool], *, empty: str = _NONE, most: int = 10

@@ -1,4 +1,4 @@
-"""One visit: a person who has a screen open, what they may do, and what the screen is to follow."""
+"""One visit: a person with an open screen, their rights, and the news that the screen follows."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ NEWS_EVERY_S = 0.3
 
 
 class Visit:
-    """Passed to whoever builds a screen."""
+    """Argument of the functions that build a screen."""
 
     def __init__(self, service: Service, request: Request) -> None:
         self.service = service
         self._secret = request.cookies.get(service.cookie, "")
         self._here, self.address = is_of_this_machine(request), address_of(request)
-        """Place of the browser: whether it is on this machine, and its address as this machine sees it."""
+        """True if the browser is on this machine; address of the browser as this machine sees it."""
         self._client: Client = ui.context.client
         self._followers: list[Callable[[StateNow], object]] = []
 
     @property
     def account(self) -> Account | None:
-        """None when the session is over."""
+        """Account of the person; None when the session is over."""
         session = self.service.sessions.of(self._secret, script=False, counts_as_use=False)
         return account_here(session.account, of_this_machine=self._here) if session else None
 
     @property
     def may_act(self) -> bool:
-        """An operator on this machine."""
+        """True for an operator on this machine."""
         account = self.account
         return account is not None and account.role >= Role.OPERATOR
 
@@ -61,13 +61,16 @@ class Visit:
         self.service.sessions.end(self._secret)
 
     def follow(self, show: Callable[[StateNow], object]) -> None:
-        """Call `show` now, and with each news of the cell, as long as the screen is open."""
+        """Call `show` now, and at each change of the cell's state, while the screen is open."""
         show(self.now)
         self._followers.append(show)
 
     def watch(self) -> None:
-        """Begin to tell the followers; called once the screen is built. By a loop of its own: the library's timers
-        stand still if the machine's clock is set back, and who looks must not take old news for new."""
+        """Begin to call the followers; called once when the screen is built.
+
+        The visit has its own loop, because the library's timers stop if the machine's clock is set back, and a
+        person must not take an old state for a new one.
+        """
         before, over = "", False
 
         def tell() -> None:
@@ -75,7 +78,7 @@ class Visit:
             nonlocal over
             if self.account is None:
                 if over:
-                    self._client.delete()  # it did not go: it is told nothing more
+                    self._client.delete()  # the message failed; this follower is not called any more
                 over = True
                 ui.navigate.to("/")
                 return
@@ -109,9 +112,11 @@ class Visit:
         done_text: str = "",
         urgent: bool = False,
     ) -> T | None:
-        """Do something in a thread, if this person may; it is logged with its outcome, and the screen says why it
-        was refused. `acts`: only for who is in control; `urgent`: it makes something stop, and waits for nothing
-        else. None if it was refused or failed."""
+        """Do something in a thread, if this person may; return None if it was refused or failed.
+
+        It is logged with its outcome, and the screen shows a refusal. `acts`: only the person in control may do
+        it. `urgent`: it stops something, and therefore waits for no other action.
+        """
         account, status = self.account, 200
         try:
             self.service.sessions.of(self._secret, script=False)
@@ -137,7 +142,7 @@ class Visit:
         return answer
 
     def require(self, action: str, role: Role = Role.OPERATOR, *, acts: bool = True) -> None:
-        """Raise NotAllowed if this person may not do something at this moment."""
+        """Raise NotAllowed if this person may not do something now."""
         account = self.account
         if account is None:
             raise NotAllowed(401, "the session is over: sign in again")
@@ -147,11 +152,11 @@ class Visit:
 
     @property
     def is_watched(self) -> bool:
-        """Tell whether the page is open in a browser at this moment."""
+        """Tell whether the page is now open in a browser."""
         return self._client.has_socket_connection
 
     def say(self, words: str, *, bad: bool = False) -> None:
-        """A word at the screen's foot; a bad one stays until it is closed."""
+        """Show a message at the foot of the screen; a message of trouble stays until it is closed."""
         if self._client.has_socket_connection:
             with self._client:
                 kind: Any = "negative" if bad else "positive"
@@ -159,7 +164,7 @@ class Visit:
 
 
 async def enter(visit: Visit, request: NewEntry, words: str) -> bool:
-    """Put something in the queue; preflight is made first. Whether it is in."""
+    """Enter something in the queue, after its preflight; return True if it was entered."""
     entering, account = visit.service.entering, visit.account
     by = account.name if account else ""
 
@@ -174,12 +179,12 @@ async def enter(visit: Visit, request: NewEntry, words: str) -> bool:
 
 
 async def in_thread(do: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Its result; the screens go on meanwhile."""
+    """Return the result of a function that runs in a thread, so that the screens go on."""
     return await _in(_READING, do, *args, **kwargs)
 
 
 async def in_long_thread(do: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """The same for what takes minutes: one of these at a time."""
+    """The same for functions that take minutes; only one of them runs at a time."""
     return await _in(_LONG, do, *args, **kwargs)
 
 
@@ -190,11 +195,11 @@ async def _in(pool: ThreadPoolExecutor, do: Callable[P, T], *args: P.args, **kwa
 _READING, _LONG = ThreadPoolExecutor(8, "reading"), ThreadPoolExecutor(1, "reading for long")
 _ACTING, _URGENT = ThreadPoolExecutor(16, "acting"), ThreadPoolExecutor(8, "stopping")
 _LOGGING = ThreadPoolExecutor(1, "log")
-"""Thread pools, kept apart: who looks can keep nobody from acting, and nobody can keep anybody from a stop."""
+"""Separate thread pools, so that looking never delays acting, and nothing delays a stop."""
 
 
 def in_background(work: Callable[[], Awaitable[object]]) -> None:
-    """Begin something that a screen does not wait for."""
+    """Begin work for which no screen waits."""
     task = asyncio.ensure_future(work())
     _UNDER_WAY.add(task)
     task.add_done_callback(_UNDER_WAY.discard)

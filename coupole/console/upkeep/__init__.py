@@ -1,1 +1,1 @@
-"""Upkeep of a console, and news for its people: notifications, facts of the system, support bundles."""
+"""Upkeep of a console: notifications, facts of the system, support bundles."""

@@ -1,6 +1,8 @@
-"""Messages to people who are not at the console: e-mail, a webhook, the desktop; and the file that says whom.
+"""Messages to people who are not at the console: by e-mail, webhook or desktop; and the file that names the
+receivers.
 
-`notifications.yaml` in the console's state folder, which only its owner may read, as it may hold a password::
+The file is `notifications.yaml` in the console's state folder. Only its owner may read it, because it may contain
+a password::
 
     schema_version: 1
     events: [plan-ended, fault, hold, arm-fault, disk-low]      # without it: all
@@ -45,22 +47,22 @@ Word = Annotated[str, Field(min_length=1, max_length=500, pattern=r"^[^\r\n]+$")
 
 
 class Email(Model):
-    """A mail server, and who gets mail."""
+    """A mail server, and the receivers of mail."""
 
     server: Word
-    """Its name."""
+    """Name of the server."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """Port of the server; without it 587, 465 or 25, by `security`."""
+    """Port of the server; by default 587, 465 or 25, depending on `security`."""
     security: Literal["starttls", "tls", "none"] = "starttls"
     """Protection of the connection; the server's certificate is checked."""
     user: str = ""
     """Name of the account at the server; empty if the server needs none."""
     password: str = ""
-    """Password of the user."""
+    """Password of that account."""
     sender: Word
-    """Address from which the mail comes."""
+    """Address of the sender."""
     to: Annotated[tuple[Word, ...], Field(min_length=1)]
-    """Addresses that get it."""
+    """Addresses of the receivers."""
 
     @model_validator(mode="after")
     def _no_open_password(self) -> Email:
@@ -72,16 +74,16 @@ class Email(Model):
 
 
 class Webhook(Model):
-    """An address that gets each message as JSON, by POST: `cell`, `event`, `subject`, `text`, `t`."""
+    """An address that receives each message as JSON, by POST: `cell`, `event`, `subject`, `text`, `t`."""
 
     url: Annotated[str, Field(pattern=r"^https?://[^\s/]+")]
-    """Its address."""
+    """The address."""
     headers: dict[str, Word] = Field(default_factory=dict)
-    """Sent with it, such as an authorization."""
+    """Headers sent with it, such as an authorization."""
 
 
 class Settings(Model):
-    """Whom to tell what."""
+    """Receivers and kinds of messages."""
 
     schema_version: Literal[1]
     """Version of this format."""
@@ -113,13 +115,13 @@ class Message:
 
 
 def console_folder(cell: Cell) -> Path:
-    """Return the folder where a cell's console keeps what it must remember."""
+    """Return the folder where a cell's console stores its state."""
     return cell.state_folder / "console"
 
 
 def read_settings(folder: Path) -> Settings | None:
-    """Read the settings of `folder`; None if there is no file. Raises InputError: it is wrong, or others may read
-    it."""
+    """Read the settings of `folder`; None if there is no file. Raises InputError if the file is wrong, or if
+    others may read it."""
     path = folder / NAME
     if not path.is_file():
         return None
@@ -129,8 +131,8 @@ def read_settings(folder: Path) -> Settings | None:
 
 
 def ways(settings: Settings) -> Mapping[str, Callable[[Message], None]]:
-    """Return the ways by which messages go out, by name; each raises OSError or ValueError if the message did not
-    go out, with what the other side said."""
+    """Return functions that send a message, by name. Each raises OSError or ValueError, with the other side's
+    words, if the message was not sent."""
     senders: dict[str, Callable[[Message], None]] = {}
     if settings.email is not None:
         senders[f"e-mail by {settings.email.server}"] = partial(_mail, settings.email)
@@ -162,7 +164,7 @@ def _mail(to: Email, message: Message) -> None:
 
 
 class _NoRedirect(HTTPRedirectHandler):
-    """A redirected POST would become a GET, and carry the headers elsewhere."""
+    """A redirected POST would become a GET, and send the headers to another place."""
 
     def redirect_request(self, *_: object) -> None:
         return None

@@ -1,4 +1,4 @@
-"""Notices events at a cell and notifies people, in separate threads: nothing else waits for them."""
+"""Notices events at a cell and notifies people, in separate threads, so that nothing else waits."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from coupole.storage.line_file import LineFile, utc_now
 
 _LOOK_EVERY_S, _TRIALS, _AGAIN_AFTER_S, _MOST_WAITING = 1.0, 3, 5.0, 100
 _RELIEF = 1.1
-"""Factor on the limit: this multiple of the limit must be free again before a disk can count as low once more."""
+"""Factor on the limit: a disk counts as low again only after this multiple of the limit was free."""
 
 
 class Occurrences:
-    """Search for new events at a cell since the last call."""
+    """Search for events at a cell since the last call."""
 
     def __init__(self, cell: Cell, plans: PlanQueue, disk_low_gb: float) -> None:
         self._cell, self._queue, self._low_bytes = cell, plans, disk_low_gb * 1e9
@@ -34,7 +34,7 @@ class Occurrences:
         self._disk_was_low = False
 
     def since(self) -> Iterator[Message]:
-        """Raises StorageError: the arm's faults cannot be read."""
+        """Return the new events. Raises StorageError if the arm's faults cannot be read."""
         for entry in self._queue.entries:
             if entry.ended and entry.id not in self._ended:
                 self._ended.add(entry.id)
@@ -83,7 +83,7 @@ class Occurrences:
 
 
 class Notifier:
-    """Sends events, while a context lasts. `trouble` says what the last message met; each delivery has a line in
+    """Sends events while its context lasts. `trouble` is the error of the last message; each delivery is a line in
     `notifications.jsonl`.
     """
 
@@ -101,7 +101,7 @@ class Notifier:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the threads; unsent messages are given up."""
+        """End the threads; messages that are not sent yet are given up."""
         self._ending.set()
         with contextlib.suppress(queue.Full):
             self._messages.put_nowait(None)
@@ -150,7 +150,7 @@ class Notifier:
 
 
 def send_test(settings: Settings, cell: str) -> dict[str, str]:
-    """A message by each way, once; what each met, empty if it was sent."""
+    """Send a message by each way, once; return the error of each, empty if it was sent."""
     message = Message.now(cell, "test", "a test of its notifications", "If you read this, they reach you.")
     error_of_way = {}
     for way, send in ways(settings).items():

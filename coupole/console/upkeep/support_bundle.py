@@ -1,5 +1,5 @@
-"""A zip for whoever is asked for help: rig, plans, journals, what was printed, versions, and who asked for what at
-the console; without frames, and without anything that lets somebody in."""
+"""A zip for those who help with a fault: rig, plans, journals, output, versions, and the log of requests at the
+console. It has no frames, and no secrets that allow a sign-in."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from coupole.storage.run_json import RUN_JSON
 MOST_RUNS, MOST_FILE_BYTES, _MOST_KEPT = 20, 20_000_000, 5
 OF_A_RUN = (RUN_JSON, "journal.jsonl", "README.txt", "manifest.sha256", "inputs/plan.yaml", "inputs/rig.yaml")
 OF_THE_CONSOLE = ("audit.jsonl", "queue.json", "output/*", "commands/*")
-"""Its accounts and the addresses of its notifications stay where they are."""
+"""Files of the console in the bundle. Accounts and the addresses of notifications are left out."""
 LEFT_OUT = "(left out)"
 _KEY = (
     r"(?<![\w.-])[\w.-]*(?:passw(?:or)?d|passphrase|pwd|secret|token|credential|api[_-]?key|private[_-]?key|"
@@ -60,7 +60,7 @@ tokens are replaced by {left_out}; accounts and notifications are not included.
 
 
 def without_secrets(text: str) -> str:
-    """The same text, with "(left out)" in place of values that let somebody in."""
+    """Return the text with "(left out)" in place of secrets."""
     for secret in _SECRETS:
         text = secret.sub(lambda match: f"{match[1]}{LEFT_OUT}", text)
     if not _IS_KEY.search(text):
@@ -79,7 +79,7 @@ def without_secrets(text: str) -> str:
 
 
 def _json_without(text: str) -> str | None:
-    """None if it is no document of JSON; unchanged if no key in it names a secret."""
+    """Return the document without secrets; None if it is not JSON; unchanged if no key names a secret."""
     try:
         document = json_of(text, "a text", allow_nan=True)
     except InputError:
@@ -102,8 +102,8 @@ def _value_without(value: Any) -> Any:
 
 
 def _line_without(line: str) -> tuple[str, tuple[int, bool] | None]:
-    """A line of YAML or of words, and the column beyond which lines after it are of a value left out (and whether
-    items of a list may stand at that column itself)."""
+    """Return a line of YAML or of text without secrets, and where the left-out value continues: the column beyond
+    which following lines belong to it, and whether items of a list may be at that column."""
     words, end = line.rstrip("\r\n"), line[len(line.rstrip("\r\n")) :]
     if (entry := _ENTRY.search(words)) is None:
         return line, None
@@ -119,7 +119,7 @@ def _line_without(line: str) -> tuple[str, tuple[int, bool] | None]:
 
 
 def _is_below(line: str, column: int, items: bool) -> bool:
-    """Tell whether a line goes on with a value whose key stands at this column."""
+    """Tell whether a line continues a value whose key is at this column."""
     lead = _LEAD.match(line)
     at = len(lead[0]) if lead else 0
     rest = line[at:]
@@ -127,15 +127,15 @@ def _is_below(line: str, column: int, items: bool) -> bool:
 
 
 class SupportBundles:
-    """They are made on request, and kept until there are newer ones."""
+    """Bundles are made on request, and kept until there are newer ones."""
 
     def __init__(self, cell: Cell, plans: Path, folder: Path) -> None:
-        """`folder`: of the console's state."""
+        """`folder`: state of the console."""
         self._cell, self._plans, self._console = cell, plans, folder
         self._folder = folder / "bundles"
 
     def make(self) -> str:
-        """Name of a new one. Raises StorageError."""
+        """Make a bundle; return its name. Raises StorageError."""
         name = f"coupole-support-{datetime.now(UTC).strftime('%Y%m%dT%H%M%S%fZ')}.zip"
         try:
             make_folder(self._folder)
@@ -152,14 +152,14 @@ class SupportBundles:
         return name
 
     def path(self, name: str) -> Path:
-        """Raises InputError: there is none of this name."""
+        """Return the path of a bundle. Raises InputError if there is none of this name."""
         path = self._folder / name
         if not re.fullmatch(r"coupole-support-\w+\.zip", name) or not path.is_file():
             raise InputError(f"{name!r}: no such support bundle")
         return path
 
     def _texts(self) -> Iterator[tuple[str, str]]:
-        """Names inside, and their texts."""
+        """Return the names of the texts in the bundle, and the texts."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
         yield "README.txt", _README.format(t=now, runs=MOST_RUNS, left_out=LEFT_OUT)
         yield "versions.json", json.dumps(versions(), indent=2)
@@ -196,7 +196,7 @@ class SupportBundles:
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """Return the versions of Coupole, Python, the system, and the packages that Coupole wants."""
+    """Return the versions of Coupole, Python, the system, and the packages that Coupole needs."""
     version_of = {"coupole": coupole.__version__, "python": sys.version.split()[0], "system": platform.platform()}
     for requirement in sorted(importlib.metadata.requires("coupole") or []):
         name = re.split(r"[\s<>=!~;\[]", requirement, maxsplit=1)[0]
@@ -213,7 +213,7 @@ def _below(inside: str, folder: Path, paths: Iterable[Path]) -> Iterator[tuple[s
 
 
 def _text(path: Path) -> str | None:
-    """None if the file is not there, is not text, or is too long to be sent."""
+    """Return the text of a file; None if it does not exist, is not text, or is too long to be sent."""
     try:
         if not path.is_file() or path.stat().st_size > MOST_FILE_BYTES:
             return None

@@ -1,4 +1,5 @@
-"""Facts about machine and rig for the console: room on the disk, lines still to be measured, the log."""
+"""Facts about machine and rig for the console: disk space, values of the rig that are not measured yet, the
+log."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ NOTIFICATIONS = "notifications.yaml"
 
 @dataclass(frozen=True)
 class Disk:
-    """Disk where the runs are; all sizes in bytes."""
+    """Disk with the runs; all sizes in bytes."""
 
     total: int
     free: int
@@ -36,13 +37,13 @@ class Disk:
 
     @property
     def frames_left(self) -> int:
-        """Room for frames of this rig, as they come from the camera."""
+        """Number of frames of this rig that fit on the disk, uncompressed."""
         return max(0, self.free - self.reserve) // self.frame
 
 
 @dataclass(frozen=True)
 class ToMeasure:
-    """A line of the rig whose comment says that it is to be measured."""
+    """A key of the rig whose comment says that its value must be measured."""
 
     line: int
     key: str
@@ -50,7 +51,7 @@ class ToMeasure:
 
 
 def disk_of(cell: Cell, rows: Sequence[RunRow]) -> Disk:
-    """Return the facts of the disk of the cell's storage folder, with these runs."""
+    """Return the facts of the disk with the cell's storage folder and these runs."""
     folder = cell.storage_folder
     while not folder.exists():
         folder = folder.parent
@@ -60,7 +61,7 @@ def disk_of(cell: Cell, rows: Sequence[RunRow]) -> Disk:
 
 
 def to_measure(rig: Path) -> list[ToMeasure]:
-    """Find the keys of a rig's file that stand below comments `# Measure: ...`."""
+    """Return the keys of a rig's file below comments `# Measure: ...`."""
     lines = rig.read_text(encoding="utf-8").splitlines()
     keys = []
     for number, line in enumerate(lines, 1):
@@ -75,7 +76,7 @@ def _is_entry(line: str) -> bool:
 
 
 def log_lines(path: Path) -> list[dict[str, Any]]:
-    """The newest lines of the console's log, the newest first."""
+    """Return the newest lines of the console's log, the newest first."""
     try:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _LOG_BYTES))
@@ -92,8 +93,8 @@ def log_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def notifications(folder: Path) -> dict[str, str]:
-    """Return who is notified, and of which events, by `notifications.yaml` in the console's folder, without its
-    passwords; empty if there is no such file.
+    """Return the receivers and the events of `notifications.yaml` in the console's folder, without passwords;
+    empty if there is no such file.
     """
     path = folder / NOTIFICATIONS
     if not path.is_file():

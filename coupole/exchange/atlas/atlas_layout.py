@@ -1,4 +1,4 @@
-"""The place of each triangle of a mesh lies in a texture, and what triangle each texel shows."""
+"""The place of each triangle of a mesh in a texture, and the triangle that each texel shows."""
 
 from __future__ import annotations
 
@@ -25,62 +25,63 @@ from coupole.exchange.atlas.charts import (
 from coupole.kernels import kernel
 
 PADDING_PX = 4
-"""Texels around a chart that continue it: mipmaps of three levels see nothing else."""
+"""Number of texels around a chart that continue it, so that mipmaps of three levels mix in no other chart."""
 _SAME_PLACE, _MOST_SHARED = 1e-6, 0.01
-"""The step in which given places are compared, and the share of the surface that may lie on others."""
+"""Step in which given places are compared, and greatest share of the surface whose places may coincide with
+others."""
 _MOST_ROUNDS = 12
 _FILL = 0.85
-"""Share of a texture that rectangles may be expected to fill; the side grows if they do not fit."""
+"""Share of a texture that rectangles are expected to fill. If they do not fit, the side grows."""
 
 
 @dataclass(frozen=True)
 class MapSize:
-    """Wanted width of texels, and the greatest width of a texture."""
+    """Wanted width of texels, and greatest width of a texture."""
 
     texel_mm: float
     most_side_px: int
     may_be_coarser: bool = False
-    """Texels become larger until the texture is narrow enough."""
+    """True if texels may become larger until the texture is narrow enough."""
 
 
 @dataclass(frozen=True)
 class Atlas:
-    """A texture of n triangles. Places in it are in px, rightwards and downwards from its top left corner, so the
+    """A texture of n triangles. Places in it are in px, to the right and down from its top left corner; so the
     first texel's centre is at (0.5, 0.5)."""
 
     side_px: int
     texel_mm: float
-    """Side of a texel on a surface that faces its chart's direction."""
+    """Width of a texel on a surface that is parallel to its chart's plane, mm."""
     chart: Integers
-    """[n] of the triangles."""
+    """[n] chart of each triangle."""
     corners_px: Floats
-    """[n, 3, 2]"""
+    """[n, 3, 2] places of the corners, px."""
     triangle_of_texel: Integers
-    """[side, side] -1 for none. Padding shows the nearest triangle, as if it went on."""
+    """[side, side] triangle that each texel shows; -1 for none. In the padding it is the nearest triangle."""
     is_inside: NDArray[np.bool_]
-    """[side, side] texels whose centre is on a triangle: no padding."""
+    """[side, side] True if the texel's centre is on a triangle; False in the padding."""
 
     def places_mm(self, corners_mm: Floats, texels: NDArray[np.int64]) -> Floats:
-        """[k, 3] places on triangles [n, 3, 3] that texels [k] show, counted row by row."""
+        """[k, 3] places, on triangles [n, 3, 3], that texels [k] show. Texels are counted row by row."""
         places = np.empty((len(texels), 3))
         _places(texels, self.triangle_of_texel, self.corners_px, corners_mm, places)
         return places
 
     @cached_property
     def handedness(self) -> Floats:
-        """[n] 1 where a triangle's outer side is up in the texture, -1 where it is mirrored."""
+        """[n] 1 if a triangle's outer side is up in the texture, -1 if it is mirrored."""
         return np.where(_double_areas_in_map(self.corners_px) > 0.0, -1.0, 1.0)
 
     def barycentric(self, texels: NDArray[np.int64]) -> Floats:
-        """[k, 3] weights of the corners of the triangles that texels [k] show, counted row by row."""
+        """[k, 3] weights of the corners of the triangles that texels [k] show. Texels are counted row by row."""
         return self.places_mm(np.broadcast_to(np.eye(3), (len(self.chart), 3, 3)), texels)
 
 
 def lay_out(corners_mm: Floats, triangles: NDArray[np.integer], size: MapSize) -> Atlas:
-    """Lay out triangles [n, 3, 3], whose corners are rows of vertices [n, 3]. No two places of the surface share a
-    texel.
+    """Lay out triangles [n, 3, 3], whose corners are rows of vertices [n, 3]. No texel shows two places of the
+    surface.
 
-    Raises InputError if the texture would be wider than it may be.
+    Raises InputError if the texture would be wider than allowed.
     """
     neighbours = neighbours_of(triangles)
     chart = cut_charts(corners_mm, neighbours)
@@ -98,10 +99,10 @@ def lay_out(corners_mm: Floats, triangles: NDArray[np.integer], size: MapSize) -
 
 
 def lay_out_given(places: Floats, corners_mm: Floats, triangles: NDArray[np.integer], size: MapSize) -> Atlas:
-    """The same, where the corners' places [n, 3, 2] in the texture are given: 0 to 1, rightwards and downwards.
-    Half of the surface has smaller texels than are wanted.
+    """The same for given places [n, 3, 2] of the corners in the texture: 0 to 1, to the right and down. Half of
+    the surface has texels smaller than the wanted width.
 
-    Raises InputError if the texture would be wider, or if triangles lie on each other in it.
+    Raises InputError if the texture would be wider than allowed, or if triangles overlap in it.
     """
     area_mm2 = np.linalg.norm(double_areas(corners_mm), axis=1)
     area = np.abs(_double_areas_in_map(places))
@@ -128,7 +129,8 @@ def lay_out_given(places: Floats, corners_mm: Floats, triangles: NDArray[np.inte
 
 
 def _double_areas_in_map(places: Floats) -> Floats:
-    """[n] of places [n, 3, 2]; below 0 where the triangle is seen from its outer side, as down is positive."""
+    """[n] twice the signed area of triangles with places [n, 3, 2], in which y goes down; below 0 if the outer
+    side is up."""
     ab, ac = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
     return np.asarray(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
 
@@ -140,7 +142,8 @@ def _median_by(values: Floats, weights: Floats) -> float:
 
 
 def _charts_by(places: Floats, triangles: NDArray[np.integer]) -> Integers:
-    """[n] charts: parts that are connected on the surface and in the texture, and have the same side up."""
+    """[n] chart of each triangle. A chart is connected both on the surface and in the texture, and one side of it
+    is up."""
     keys = np.concatenate([triangles.reshape(-1, 1), np.rint(places.reshape(-1, 2) / _SAME_PLACE)], axis=1)
     _, number = np.unique(keys.astype(np.int64), axis=0, return_inverse=True)
     is_mirrored = _double_areas_in_map(places) > 0.0
@@ -148,7 +151,7 @@ def _charts_by(places: Floats, triangles: NDArray[np.integer]) -> Integers:
 
 
 def _pack_charts(corners_mm: Floats, chart: Integers, size: MapSize) -> tuple[float, Floats, int]:
-    """Width of a texel, mm, places of the corners [n, 3, 2], px, and side of the texture, px."""
+    """Width of a texel, mm; places of the corners [n, 3, 2], px; side of the texture, px."""
     coarsest_mm, texel_mm = float(np.ptp(corners_mm.reshape(-1, 3), axis=0).max()), size.texel_mm
     while True:
         flat_px, sizes_px = _flatten(corners_mm, chart, texel_mm)
@@ -171,7 +174,8 @@ def _too_large(texel_mm: float, side_px: int, most_side_px: int) -> str:
 
 
 def _flatten(corners_mm: Floats, chart: Integers, texel_mm: float) -> tuple[Floats, NDArray[np.int64]]:
-    """[n, 3, 2] px of the corners in their charts' rectangles, and [charts, 2] widths and heights of these, px."""
+    """[n, 3, 2] places of the corners in their charts' rectangles, px, and [charts, 2] widths and heights of
+    these, px."""
     axes = chart_axes(corners_mm, chart)
     helper = np.where(np.abs(axes[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     right = np.cross(helper, axes)
@@ -188,7 +192,8 @@ def _flatten(corners_mm: Floats, chart: Integers, texel_mm: float) -> tuple[Floa
 
 
 def _turn_to_fit(corners_px: Floats) -> tuple[Floats, tuple[int, int]]:
-    """Turn a chart [n, 3, 2] so that its rectangle is small and lies; its size, with padding around."""
+    """Turn a chart [n, 3, 2] so that its rectangle is small and wider than high; return also its size with
+    padding."""
     fitted_px = corners_px @ _lying(corners_px.reshape(-1, 2))
     fitted_px += PADDING_PX - fitted_px.reshape(-1, 2).min(axis=0)
     width, height = np.ceil(fitted_px.reshape(-1, 2).max(axis=0)).astype(int) + PADDING_PX
@@ -196,13 +201,14 @@ def _turn_to_fit(corners_px: Floats) -> tuple[Floats, tuple[int, int]]:
 
 
 def _lying(points_px: Floats) -> Floats:
-    """[2, 2] turn `t` so that `points_px @ t`, of points [n, 2], fill the smallest rectangle, longer than high.
+    """[2, 2] rotation `t` for which `points_px @ t`, of points [n, 2], have the smallest bounding rectangle, wider
+    than high.
 
     One of its sides lies along an edge of the convex hull (Freeman and Shapira 1975).
     """
     try:
         hull = points_px[ConvexHull(points_px).vertices]
-    except QhullError:  # all on a line
+    except QhullError:  # all points are on a line
         hull = points_px[np.lexsort(points_px.T)[[0, -1]]]
     edges = np.roll(hull, -1, axis=0) - hull
     angles = np.arctan2(edges[:, 1], edges[:, 0])
@@ -214,7 +220,7 @@ def _lying(points_px: Floats) -> Floats:
 
 
 def _pack(sizes_px: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
-    """Side of a square for rectangles [charts, 2], and [charts, 2] their left upper corners: in rows, the highest
+    """Side of a square for rectangles [charts, 2], and their upper left corners [charts, 2]: in rows, the highest
     first."""
     order = np.argsort(-sizes_px[:, 1], kind="stable")
     side = max(int(math.sqrt(sizes_px.prod(axis=1).sum() / _FILL)), int(sizes_px.max()))
@@ -230,7 +236,7 @@ def _pack(sizes_px: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
 
 @kernel
 def _shelves(sizes_px, side_px):  # type: ignore[no-untyped-def]
-    """Left upper corners of rectangles in rows; none if they do not fit."""
+    """Upper left corners of rectangles in rows; None if they do not fit."""
     origins = np.empty((len(sizes_px), 2), np.int64)
     at_px, top_px, height_px = 0, 0, 0
     for number in range(len(sizes_px)):
@@ -246,7 +252,7 @@ def _shelves(sizes_px, side_px):  # type: ignore[no-untyped-def]
 
 @kernel(error_model="numpy")
 def _rasterise(corners_px, triangle_of_texel, is_expelled):  # type: ignore[no-untyped-def]
-    """Write each triangle into the texels whose centres it contains; mark triangles that meet others there."""
+    """Write each triangle into the texels whose centres it contains; mark triangles that overlap others there."""
     side = len(triangle_of_texel)
     for triangle in range(len(corners_px)):
         a, b, c = corners_px[triangle, 0], corners_px[triangle, 1], corners_px[triangle, 2]
@@ -269,13 +275,13 @@ def _rasterise(corners_px, triangle_of_texel, is_expelled):  # type: ignore[no-u
 
 
 def _pad(triangle_of_texel: Integers) -> Integers:
-    """The same with the nearest triangle in the texels around charts."""
+    """Return the map with the nearest triangle in the texels around charts."""
     nearest, distance_px = nearest_known(triangle_of_texel)
     return np.where(distance_px <= PADDING_PX, nearest, -1).astype(np.int32)
 
 
 def nearest_known(numbers: Integers) -> tuple[Integers, NDArray[np.float32]]:
-    """[h, w] the number of the nearest place of a map that has one (others are -1), and how far it is, px."""
+    """[h, w] the number of the nearest known place of a map (unknown ones are -1), and its distance, px."""
     is_unknown = numbers < 0
     if is_unknown.all() or not is_unknown.any():
         return numbers, np.zeros(numbers.shape, np.float32)

@@ -1,8 +1,8 @@
-"""Charts: parts of a mesh that a plane each shows without folds, as textures want them.
+"""Charts: parts of a mesh that can be projected on a plane without folds, for textures.
 
-A chart grows from a triangle to its neighbours as long as their directions stay near its own. Directions are means
-over some rings of neighbours, or the noise of a scan would cut it into single triangles. A chart is seen along its
-direction, so lengths shrink by the cosine of a triangle's slope at most (`_LEAST_FACING`).
+A chart grows from a triangle to its neighbours while their directions stay close to its own. Directions are means
+over some rings of neighbours; otherwise the noise of a scan would cut the mesh into single triangles. A chart is
+projected along its direction. So lengths shrink at most by the cosine of a triangle's slope (`_LEAST_FACING`).
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int32]
 
 _ROUNDS = 12
-"""Rings of neighbours over which directions are means."""
+"""Rings of neighbours over which directions are averaged."""
 _MOST_TURN = math.cos(math.radians(40.0))
 _LEAST_FACING = math.cos(math.radians(70.0))
 _LEAST_FACING_MERGED = math.cos(math.radians(86.0))
-"""Cosines: how far mean directions may turn within a chart, and how steep single triangles may stand on its plane,
-as it grows and as small charts are given to their neighbours."""
+"""Cosines of greatest angles: of mean directions within a chart; of single triangles to a chart's plane while the
+chart grows; and the same when small charts are merged into their neighbours."""
 _LEAST_TRIANGLES = 64
-"""Smallest number of triangles in a chart that is not given to its neighbours."""
+"""Fewest triangles of a chart; smaller ones are merged into their neighbours."""
 _MOST_SHARE = 1 / 100
-"""Largest share of all triangles in a chart, so that charts are round and rectangles have little beside them."""
+"""Largest share of all triangles in a chart. It keeps charts round, so that their rectangles are well filled."""
 _MERGE_PASSES, _ROUNDINGS = 6, 3
 
 
 def neighbours_of(triangles: NDArray[np.integer]) -> Integers:
-    """[n, 3] the triangle beyond each edge of triangles [n, 3] (from corner k to the next); -1 at a border, and
-    where more than two meet."""
+    """[n, 3] the triangle across each edge of triangles [n, 3] (from corner k to the next); -1 at a border, and
+    where more than two triangles meet."""
     count = len(triangles)
     ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     edges = ends[:, 0].astype(np.int64) * (int(triangles.max(initial=0)) + 1) + ends[:, 1]
@@ -49,18 +49,21 @@ def neighbours_of(triangles: NDArray[np.integer]) -> Integers:
 
 
 def double_areas(corners_mm: Floats) -> Floats:
-    """[n, 3] normals of triangles [n, 3, 3], twice as long as these have area."""
+    """[n, 3] normals of triangles [n, 3, 3]; their length is twice the triangle's area."""
     return np.asarray(np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]))
 
 
 def unit(vectors: NDArray[np.floating]) -> Floats:
-    """[..., 3] the same of length 1; 0 of those without a length."""
+    """[..., 3] the vectors with length 1; vectors of length 0 stay 0."""
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
 
 
 def cut_charts(corners_mm: Floats, neighbours: Integers) -> Integers:
-    """[n] the chart of each triangle [n, 3, 3], from 0. Charts are round, as rectangles around them are to be
-    full: they grow one by one, and then `_ROUNDINGS` times all together from their middles (Lloyd, 1982)."""
+    """[n] the chart of each triangle [n, 3, 3], from 0.
+
+    Charts are round, so that their rectangles are well filled. They grow one by one, and then `_ROUNDINGS` times
+    all together from their middles (Lloyd, 1982).
+    """
     normals, means = unit(double_areas(corners_mm)), _mean_normals(corners_mm, neighbours)
     most = max(int(_MOST_SHARE * len(normals)), _LEAST_TRIANGLES)
     no_seeds = np.empty(0, np.int64)
@@ -72,7 +75,7 @@ def cut_charts(corners_mm: Floats, neighbours: Integers) -> Integers:
 
 
 def _middles(corners_mm: Floats, chart: Integers) -> NDArray[np.int64]:
-    """The triangle of each larger chart that is nearest to its middle."""
+    """The triangle that is nearest to the middle of each larger chart."""
     centres_mm, sizes = corners_mm.mean(axis=1), np.bincount(chart)
     middles = np.stack([np.bincount(chart, column) for column in centres_mm.T], axis=1) / sizes[:, None]
     distance = np.linalg.norm(centres_mm - middles[chart], axis=1)
@@ -82,19 +85,19 @@ def _middles(corners_mm: Floats, chart: Integers) -> NDArray[np.int64]:
 
 
 def chart_axes(corners_mm: Floats, chart: Integers) -> Floats:
-    """[charts, 3] unit directions: the mean of each chart's triangles, by area."""
+    """[charts, 3] unit directions: the mean of the triangles' normals of each chart, weighted by area."""
     sums = [np.bincount(chart, column) for column in double_areas(corners_mm).T]
     return unit(np.stack(sums, axis=1))
 
 
 def split_off(neighbours: Integers, chart: Integers, is_expelled: NDArray[np.bool_]) -> Integers:
-    """The charts [n] after expelled triangles [n] are moved to charts of their own, one for each connected
+    """The charts [n] after the expelled triangles [n] have been moved to new charts, one for each connected
     part."""
     return parts_of(neighbours, np.where(is_expelled, chart + chart.max() + 1, chart).astype(np.int32))
 
 
 def parts_of(neighbours: Integers, kind: Integers) -> Integers:
-    """[n] number of each triangle's chart, from 0: a chart is connected triangles of one `kind` [n]."""
+    """[n] number of each triangle's chart, from 0. A chart is a set of connected triangles of one `kind` [n]."""
     parts: Integers = _numbered_parts(neighbours, kind)
     return parts
 
@@ -110,8 +113,8 @@ def _mean_normals(corners_mm: Floats, neighbours: Integers) -> Floats:
 
 @kernel(error_model="numpy")
 def _grow(normals, means, neighbours, seeds, most):  # type: ignore[no-untyped-def]
-    """Charts [n] of triangles, and the directions [charts, 3] along which they grew: from all seeds together, and
-    then one by one from what is left, each up to `most` triangles."""
+    """Charts [n] of triangles, and the directions [charts, 3] along which they grew. They grow from all seeds
+    together, then one by one from the remaining triangles; each has up to `most` triangles."""
     count = len(normals)
     chart, axes = np.full(count, -1, np.int32), np.empty_like(normals)
     queue, last = np.empty(count, np.int32), 0
@@ -129,7 +132,7 @@ def _grow(normals, means, neighbours, seeds, most):  # type: ignore[no-untyped-d
 
 @kernel(error_model="numpy")
 def _begin(seed, number, normals, means, chart, axes, queue, last):  # type: ignore[no-untyped-def]
-    """Begin a chart with a triangle; the length of the queue."""
+    """Begin a chart with a triangle; return the length of the queue."""
     axes[number] = means[seed]
     if _dot(means[seed], normals[seed]) <= _LEAST_FACING:
         axes[number] = normals[seed]
@@ -139,7 +142,7 @@ def _begin(seed, number, normals, means, chart, axes, queue, last):  # type: ign
 
 @kernel(error_model="numpy")
 def _fill_charts(normals, means, neighbours, chart, axes, queue, last, most):  # type: ignore[no-untyped-def]
-    """Give the neighbours of queued triangles to their charts, until `most` have been queued."""
+    """Add the neighbours of queued triangles to their charts, until `most` have been queued."""
     first = 0
     while first < last:
         triangle = queue[first]
@@ -156,7 +159,7 @@ def _fill_charts(normals, means, neighbours, chart, axes, queue, last, most):  #
 
 @kernel(error_model="numpy")
 def _merge(normals, neighbours, chart, axes):  # type: ignore[no-untyped-def]
-    """Give triangles of small charts to the largest neighbouring chart that they face."""
+    """Add the triangles of small charts to the largest neighbouring chart whose direction suits them."""
     for _ in range(_MERGE_PASSES):
         sizes = np.bincount(chart)
         for triangle in range(len(chart)):
@@ -174,7 +177,7 @@ def _merge(normals, neighbours, chart, axes):  # type: ignore[no-untyped-def]
 
 @kernel
 def _numbered_parts(neighbours, chart):  # type: ignore[no-untyped-def]
-    """[n] charts from 0, where each part of one that hangs together is one."""
+    """[n] charts from 0, in which each connected part of a chart is a chart."""
     parts = np.full(len(chart), -1, np.int32)
     queue = np.empty(len(chart), np.int32)
     count = 0

@@ -1,11 +1,10 @@
-"""A measured surface as programs of computer graphics take it: a mesh with smooth normals, and maps of its
-materials.
+"""A measured surface in the form that programs of computer graphics need: a mesh with smooth normals, and maps of
+its materials.
 
-The frame in which a normal map is written belongs to the mesh: at each vertex the mean normal N of the triangles
-around it, the tangent T along the map's columns, and N x T, which points up in the map (of a chart that a given
-texture has mirrored, T x N does). Within a triangle N and T
-are interpolated and made unit. Programs that make tangents themselves, from a triangle's places in the map, find
-the same T on flat parts.
+A normal map is written in the frame of the mesh. At each vertex this frame has the mean normal N of the triangles
+around it, the tangent T along the map's columns, and N x T, which points up in the map. (For a chart that a given
+texture has mirrored, T x N points up.) Within a triangle, N and T are interpolated and normalised. Programs that
+compute tangents themselves, from a triangle's places in the map, find the same T on flat parts.
 """
 
 from __future__ import annotations
@@ -33,43 +32,45 @@ Singles = NDArray[np.float32]
 
 MOST_SIDE_PX = 16384
 _MOST_U, _MOST_U_OF_TRIANGLE, _MOST_U_OF_WHITE = 0.4, 0.15, 0.03
-"""Standard uncertainties of kd from which on a material is no material: relative, of texels and of triangles,
-which may be off in one channel alone; and beside a white diffuser's kd."""
+"""A material is known if the standard uncertainty of its kd is below one of two limits: a relative one (the first
+for texels, the second for triangles, whose error may be in one channel only), or a share of a white diffuser's kd
+(the third)."""
 _BLOCK = 1 << 20
-"""Texels that are looked up together."""
+"""Number of texels that are looked up together."""
 
 
 @dataclass(frozen=True)
 class FlatMesh:
-    """A mesh of v vertices, each in one chart. Support frame, mm."""
+    """A mesh of v vertices, each of which belongs to one chart. Support frame, mm."""
 
     places_mm: Floats
     """[v, 3]"""
     normals: Floats
-    """[v, 3] unit; the same for all vertices of one place."""
+    """[v, 3] unit normals; the same for all vertices at one place."""
     tangents: Floats
     """[v, 3] unit, along the columns of the maps."""
     handedness: Floats
-    """[v] 1, or -1 in charts that are mirrored: N x T times it points up in the map."""
+    """[v] 1, or -1 in mirrored charts: the factor by which N x T points up in the map."""
     map_places: Floats
-    """[v, 2] 0 to 1, rightwards and downwards from the maps' top left corner."""
+    """[v, 2] places in the maps, 0 to 1, to the right and down from the top left corner."""
     triangles: NDArray[np.int64]
     """[m, 3]"""
     numbers: NDArray[np.int64]
-    """[m] of the triangles in the result's mesh."""
+    """[m] numbers of the triangles in the result's mesh."""
     open_sky: Floats
-    """[v] share of the light of an even sky that nothing of the object hides."""
+    """[v] share of the light of a uniform sky that reaches the vertex past the object."""
 
 
 @dataclass(frozen=True)
 class FlatSurface:
-    """A mesh, and the materials of the k texels that have one."""
+    """A mesh, and the materials of the k texels with a known material."""
 
     mesh: FlatMesh
     side_px: int
     texel_mm: float
     texel_of_place: NDArray[np.int32]
-    """[side, side] the texel that stands for a place of the maps: the nearest, within padding; -1 for none."""
+    """[side, side] the texel whose material a place of the maps has: within the padding the nearest one; -1 for
+    none."""
     kd: Singles
     """[k, 3] 1/sr, red, green, blue."""
     ks: Singles
@@ -79,28 +80,29 @@ class FlatSurface:
     normals: Singles
     """[k, 3] unit, support frame."""
     normals_in_frames: Singles
-    """[k, 3] unit, in the frames of the mesh: along the map's columns, up in the map, outwards."""
+    """[k, 3] unit normals in the frames of the mesh: along the map's columns, up in the map, outwards."""
     uncertain: Singles
-    """[k, 4] standard uncertainties, all parts together: of kd and ks (relative), normal (rad), alpha (relative).
-    """
+    """[k, 4] standard uncertainties from all sources: of kd and ks (relative), normal (rad), alpha (relative)."""
     numbers: NDArray[np.int64]
-    """[k] of the triangles that texels are on, in the result's mesh."""
+    """[k] triangles of the texels, in the result's mesh."""
     open_sky: Singles
     """[k]"""
     measured_share: float
-    """Share of the texels on triangles that pixels of a view gave; the others have their triangle's material."""
+    """Share of the texels on triangles that have a material from the pixels of a view; the others have the
+    material of their triangle."""
 
     def map_of(self, values: NDArray[Any], nothing: Any = 0) -> NDArray[Any]:
-        """[side, side, c] of values of texels [k, c], of their type; `nothing` where there is none."""
+        """[side, side, c] map of the values [k, c] of texels, with their type; `nothing` where there is no
+        texel."""
         last = np.broadcast_to(np.asarray(nothing, values.dtype), (1, values.shape[1]))
         return np.asarray(np.concatenate([values, last])[self.texel_of_place])
 
 
 def flatten(surface: MeasuredSurface) -> FlatSurface:
-    """Lay a surface out in maps. Texels are as wide as its options say; or as those that were made in
-    the finest view, or as a map of the width that they allow.
+    """Lay a surface out in maps. The width of texels is that of the options. By default, it is the width of those
+    in the finest view, or it follows from the allowed width of the map.
 
-    Raises InputError if the maps would be wider than the options say, or than `MOST_SIDE_PX`, or if nothing has a
+    Raises InputError if the maps would be wider than the options or `MOST_SIDE_PX` allow, or if nothing has a
     material.
     """
     textured_mesh = read_textured_mesh(surface.options.uv_mesh) if surface.options.uv_mesh else None
@@ -115,7 +117,8 @@ def flatten(surface: MeasuredSurface) -> FlatSurface:
 def _lay_out(
     surface: MeasuredSurface, rows: NDArray[np.int64], views: list[TexelView], textured_mesh: TexturedMesh | None
 ) -> tuple[NDArray[np.int64], Atlas]:
-    """Places of triangles `rows`; with a mesh that has texture coordinates, of those that it shares."""
+    """Places of the triangles `rows`; if there is a mesh with texture coordinates, of the triangles that both
+    have."""
     options = surface.options
     corners_mm = surface.vertices_mm[surface.triangles[rows]]
     texel_mm = options.texel_mm or _finest_mm(views, corners_mm)
@@ -152,7 +155,7 @@ def _has_certain_material(surface: MeasuredSurface) -> NDArray[np.bool_]:
 
 
 def _is_certain(u_kd: NDArray[np.floating], kd: NDArray[np.floating], most_u: float) -> NDArray[np.bool_]:
-    """[n] of relative standard uncertainties [n] and kd [n, channels], 1/sr."""
+    """[n] True if kd [n, channels], 1/sr, is certain, by its relative standard uncertainties [n]."""
     of_white = np.pi * u_kd * kd.mean(axis=1)
     return np.asarray((u_kd < most_u) | (of_white < _MOST_U_OF_WHITE))
 
@@ -160,8 +163,8 @@ def _is_certain(u_kd: NDArray[np.floating], kd: NDArray[np.floating], most_u: fl
 def _seen_there(
     surface: MeasuredSurface, views: list[TexelView], places_mm: Floats
 ) -> tuple[Gathered, NDArray[np.bool_]]:
-    """Materials that views show at places [k, 3] of the support frame, with normals of the base frame; where they
-    are certain."""
+    """Materials that views show at places [k, 3] of the support frame, where they are certain. Their normals are
+    in the base frame."""
     gathered_there = gather(views, apply(surface.result.base_from_support, places_mm))
     u_kd = np.sqrt(gathered_there.covariance[:, VARIANCES[2]])
     is_certain = (gathered_there.materials.alpha > 0.0) & _is_certain(u_kd, gathered_there.materials.kd, _MOST_U)
@@ -169,7 +172,7 @@ def _seen_there(
 
 
 def _finest_mm(views: list[TexelView], corners_mm: Floats) -> float:
-    """Width of texels in the finest view, as they were made; of triangles, half their edge."""
+    """Width of the texels of the finest view; for triangles, half the length of their edge."""
     if views:
         return min(view.texel_mm for view in views)
     return float(np.median(np.linalg.norm(corners_mm[:, 1] - corners_mm[:, 0], axis=1))) / 2.0
@@ -199,7 +202,7 @@ def _fill(surface: MeasuredSurface, rows: NDArray[np.int64], atlas: Atlas, known
 
 @dataclass(frozen=True)
 class _Values:
-    """Materials of texels; roughness is 0 where there is none."""
+    """Materials of texels; a roughness of 0 means that there is none."""
 
     normals: Singles
     kd: Singles
@@ -219,7 +222,7 @@ class _Values:
 
 
 class _Known:
-    """Materials that are known of a surface's triangles `rows` [n], whose corners are `corners_mm` [n, 3, 3]."""
+    """Known materials of a surface's triangles `rows` [n], whose corners are `corners_mm` [n, 3, 3]."""
 
     def __init__(
         self, surface: MeasuredSurface, views: list[TexelView], rows: NDArray[np.int64], corners_mm: Floats
@@ -228,7 +231,7 @@ class _Known:
         self._has_material = _has_certain_material(surface) if views else surface.has_material
 
     def look_up(self, atlas: Atlas, texels: NDArray[np.int64], values: _Values) -> None:
-        """Fill the values of texels: from the views' pixels, or else from their triangles."""
+        """Fill the values of texels: from the views' pixels or, if there are none, from their triangles."""
         surface, triangle = self._surface, self._rows[atlas.triangle_of_texel.reshape(-1)[texels]]
         has_material = self._has_material[triangle]
         of_triangles = triangle[has_material]
@@ -241,7 +244,7 @@ class _Known:
             self._look_up_views(atlas.places_mm(self._corners_mm, texels), values)
 
     def _look_up_views(self, places_mm: Floats, values: _Values) -> None:
-        """Fill what views are certain of at places [k, 3]."""
+        """Fill the certain values of views at places [k, 3]."""
         gathered_there, is_certain = _seen_there(self._surface, self._views, places_mm)
         materials = gathered_there.materials
         values.is_measured[:] = is_certain
@@ -258,17 +261,17 @@ class _Known:
 
 @dataclass(frozen=True)
 class _Mesh:
-    """A flat mesh, and the corners of all of the atlas' triangles in it."""
+    """A flat mesh, and its vertices for the corners of all triangles of the atlas."""
 
     flat: FlatMesh
     corners: NDArray[np.int64]
-    """[n, 3] vertices."""
+    """[n, 3] vertices of the corners."""
 
 
 def _mesh(
     surface: MeasuredSurface, rows: NDArray[np.int64], atlas: Atlas, known_texels: NDArray[np.int64]
 ) -> _Mesh:
-    """The mesh, without the triangles of which nothing is known."""
+    """Build the mesh, without triangles that have no known texel."""
     triangles = surface.triangles[rows]
     keys = triangles * (int(atlas.chart.max()) + 1) + atlas.chart[:, None]
     _, first, number = np.unique(keys, return_index=True, return_inverse=True)
@@ -286,7 +289,7 @@ def _mesh(
 
 
 def _vertex_normals(surface: MeasuredSurface) -> Floats:
-    """[vertices, 3] means of the triangles around, by area."""
+    """[vertices, 3] means of the normals of the triangles around, weighted by area."""
     areas = double_areas(surface.vertices_mm[surface.triangles])
     count = len(surface.vertices_mm)
     sums = [np.bincount(surface.triangles.reshape(-1), np.repeat(column, 3), count) for column in areas.T]
@@ -294,8 +297,8 @@ def _vertex_normals(surface: MeasuredSurface) -> Floats:
 
 
 def _tangents(corners_mm: Floats, corners_px: Floats, corners: NDArray[np.int64], normals: Floats) -> Floats:
-    """[v, 3] means over a vertex's triangles of the way on them that is along the map's columns, at right angles
-    to its normal."""
+    """[v, 3] tangents: the mean, over a vertex's triangles, of the direction along the map's columns,
+    perpendicular to the vertex's normal."""
     ab_mm, ac_mm = corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]
     ab_px, ac_px = corners_px[:, 1] - corners_px[:, 0], corners_px[:, 2] - corners_px[:, 0]
     turn = np.sign(ab_px[:, 0] * ac_px[:, 1] - ab_px[:, 1] * ac_px[:, 0])
@@ -310,7 +313,7 @@ def _tangents(corners_mm: Floats, corners_px: Floats, corners: NDArray[np.int64]
 
 
 def _in_frames(mesh: _Mesh, atlas: Atlas, texels: NDArray[np.int64], normals: Singles) -> tuple[Singles, Singles]:
-    """Normals of texels in the frames of the mesh, turned to its outer side; and the open sky there."""
+    """Normals of texels in the frames of the mesh, turned to its outer side, and the open sky of the texels."""
     local = np.empty_like(normals)
     sky = np.empty(len(texels), np.float32)
     for first in range(0, len(texels), _BLOCK):
@@ -330,7 +333,7 @@ def _in_frames(mesh: _Mesh, atlas: Atlas, texels: NDArray[np.int64], normals: Si
 
 
 def _nearest(atlas: Atlas, known_texels: NDArray[np.int64]) -> NDArray[np.int32]:
-    """[side, side] the nearest known texel, for all that triangles or padding show; -1 elsewhere."""
+    """[side, side] the nearest known texel, for all texels on triangles or in padding; -1 elsewhere."""
     number = np.full(atlas.side_px**2, -1, np.int32)
     number[known_texels] = np.arange(len(known_texels), dtype=np.int32)
     picture = number.reshape(atlas.side_px, atlas.side_px)

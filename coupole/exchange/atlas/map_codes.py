@@ -1,4 +1,4 @@
-"""Maps of a flat surface as picture files have them."""
+"""Maps of a flat surface, encoded for picture files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _UPRIGHT = (0.0, 0.0, 1.0)
 
 
 def colour_map(flat: FlatSurface) -> NDArray[np.uint8]:
-    """[side, side, 3] sRGB of pi kd, raised by what a specular layer takes."""
+    """[side, side, 3] sRGB of pi kd, raised by the share that a specular layer takes."""
     return flat.map_of(_codes8(srgb(under_a_layer(flat.kd, flat.ks))))
 
 
@@ -39,13 +39,13 @@ def sky_map(flat: FlatSurface) -> NDArray[np.uint8]:
 
 
 def packed_map(flat: FlatSurface) -> NDArray[np.uint8]:
-    """[side, side, 3] open sky, roughness, no metal: as glTF packs them."""
+    """[side, side, 3] open sky, roughness, no metal, in the order of glTF."""
     columns = (flat.open_sky, np.sqrt(flat.alpha), np.zeros_like(flat.alpha))
     return flat.map_of(_codes8(np.stack(columns, axis=1)))
 
 
 def normal_map(flat: FlatSurface, bits: int) -> NDArray[np.uint8 | np.uint16]:
-    """[side, side, 3] of (n + 1) / 2, as integers of 8 or 16 bits; upright where there is nothing."""
+    """[side, side, 3] (n + 1) / 2 as integers of 8 or 16 bits; the normal of the mesh where there is no texel."""
     most = 2**bits - 1
     kind = np.uint8 if bits == 8 else np.uint16
     return flat.map_of(
@@ -54,14 +54,14 @@ def normal_map(flat: FlatSurface, bits: int) -> NDArray[np.uint8 | np.uint16]:
 
 
 def png(picture: NDArray[np.integer]) -> bytes:
-    """A picture [h, w, 1 or 3], red first, as PNG of 8 or 16 bits."""
+    """Encode a picture [h, w, 1 or 3], red first, as PNG of 8 or 16 bits."""
     if picture.dtype == np.uint8:
         buffer = io.BytesIO()
         Image.fromarray(picture if picture.shape[2] == 3 else picture[..., 0]).save(
             buffer, "PNG", compress_level=1
         )
         return buffer.getvalue()
-    import cv2  # Pillow has no colours of 16 bits
+    import cv2  # Pillow has no colour pictures of 16 bits
 
     pixels = np.ascontiguousarray(picture[..., ::-1])
     is_encoded, content = cv2.imencode(".png", pixels)

@@ -1,4 +1,4 @@
-"""Ambient occlusion: what share of an even sky's light reaches places of a mesh past the mesh itself."""
+"""Ambient occlusion: the share of a uniform sky's light that reaches places of a mesh past the mesh itself."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ Floats = NDArray[np.float64]
 
 RAYS = 64
 _OFF = 1e-4
-"""Distance at which rays begin, as a share of the object's size."""
+"""Distance from the surface at which rays begin, as a share of the object's size."""
 _BLOCK = 1 << 16
 
 
 def open_sky(corners_mm: Floats, places_mm: Floats, normals: Floats) -> Floats:
-    """[n] shares, 0 to 1, at places [n, 3] with unit normals [n, 3], among triangles [m, 3, 3]; light counts by
-    its cosine. `RAYS` rays, the same about each normal."""
+    """[n] shares, 0 to 1, at places [n, 3] with unit normals [n, 3], among triangles [m, 3, 3].
+
+    Light is weighted by its cosine. `RAYS` rays are used, the same around each normal.
+    """
     mesh = PacketMesh(corners_mm)
     width_mm = float(np.ptp(corners_mm.reshape(-1, 3), axis=0).sum())
     off_mm, local = _OFF * width_mm, width_mm * _cosine_ways(RAYS)
@@ -32,7 +34,8 @@ def open_sky(corners_mm: Floats, places_mm: Floats, normals: Floats) -> Floats:
 
 
 def _cosine_ways(count: int) -> Floats:
-    """[count, 3] directions about z, as dense as their cosine: Vogel's spiral on the disk, lifted (Malley)."""
+    """[count, 3] directions around z, with a density proportional to their cosine: Vogel's spiral on the disk,
+    lifted (Malley)."""
     number = np.arange(count) + 0.5
     radius, angle = np.sqrt(number / count), number * np.pi * (3.0 - np.sqrt(5.0))
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius**2)], axis=1)

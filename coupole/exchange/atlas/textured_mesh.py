@@ -1,9 +1,10 @@
-"""A mesh with texture coordinates of its own, such as a museum's model has; its triangles among those of a result.
+"""A mesh with its own texture coordinates, such as a museum's model, matched to the triangles of a result.
 
-Modelling programs write the same mesh in other units, turned, and with its triangles in another order. So a
-triangle is known by the ratios of its edges, which few share on a scan. Those that are alone with theirs give the
-similarity (Umeyama 1991, "Least-squares estimation of transformation parameters between two point patterns") that
-leads from the file into the support frame. There triangles are the same if their corners are.
+Modelling programs write the same mesh in other units, rotated, and with its triangles in another order. So a
+triangle is identified by the ratios of its edges, which are rarely the same for two triangles of a scan. Triangles
+with unique ratios give the similarity transform (Umeyama 1991, "Least-squares estimation of transformation
+parameters between two point patterns") from the file to the support frame. There, triangles are the same if their
+corners coincide.
 """
 
 from __future__ import annotations
@@ -23,30 +24,29 @@ Floats = NDArray[np.float64]
 
 SUFFIXES = (".obj", ".ply", ".glb", ".gltf")
 _OFF, _OFF_OF_SIZE = 1e-2, 3e-6
-"""Greatest distance of corners that are the same, as a share of the median edge and of the object's size: files
-have
-six digits, or single precision."""
+"""Greatest distance between corners that count as the same, as a share of the median edge and of the object's
+size. Files have six digits, or single precision."""
 _NEAR = 0.1
-"""Greatest distance of the middles of triangles that are the same, before corners are compared. It is also the
-greatest ratio of the distance to the matching triangle and the distance to the next one."""
+"""Greatest distance between the middles of triangles that may be the same, before corners are compared. It is also
+the greatest ratio of the distances to the best and to the second-best match."""
 _LEAST_ALONE, _MOST_ALONE = 16, 4000
 _ROUNDS = 8
 _LEAST_SHARE = 0.5
-"""The share of the result's triangles that the file has to have."""
+"""Least share of the result's triangles that the file must have."""
 
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """Triangles of a mesh file, and where they lie in its texture."""
+    """Triangles of a mesh file, and their places in its texture."""
 
     path: Path
     corners: Floats
     """[m, 3, 3] in the file's units and frame."""
     places: Floats
-    """[m, 3, 2] 0 to 1, rightwards and downwards from the texture's top left corner."""
+    """[m, 3, 2] 0 to 1, to the right and down from the texture's top left corner."""
 
     def shared_with(self, corners_mm: Floats) -> tuple[NDArray[np.int64], Floats]:
-        """Rows of the triangles [n, 3, 3] that the file has, and their corners' places [k, 3, 2].
+        """Return the rows of triangles [n, 3, 3] that the file has, and their corners' places [k, 3, 2].
 
         Raises InputError if the file has fewer than half of them.
         """
@@ -68,13 +68,13 @@ class TexturedMesh:
         return best
 
     def _by_order(self, corners_mm: Floats) -> tuple[float, Floats, Floats] | None:
-        """The similarity, if triangles stand in the same order."""
+        """The similarity transform if triangles have the same order."""
         if len(self.corners) != len(corners_mm):
             return None
         return _similarity(self.corners.reshape(-1, 3), corners_mm.reshape(-1, 3))
 
     def _by_shape(self, corners_mm: Floats, edge_mm: float) -> tuple[float, Floats, Floats] | None:
-        """The similarity by triangles that no other resembles."""
+        """The similarity transform from triangles with a unique shape."""
         file_ratios, first_in_file = _ratios(self.corners)
         result_ratios, first_in_result = _ratios(corners_mm)
         if len(file_ratios) < _LEAST_ALONE:
@@ -87,7 +87,7 @@ class TexturedMesh:
         places_mm = _from_first(corners_mm, first_in_result)[rows].reshape(-1, 3)
         points = _from_first(self.corners, first_in_file)[number[rows, 0]].reshape(-1, 3)
         similarity = _similarity(points, places_mm)
-        for _ in range(_ROUNDS):  # some are alike by chance
+        for _ in range(_ROUNDS):  # some triangles resemble each other by chance
             off_mm = np.linalg.norm(_apply(points, similarity) - places_mm, axis=1)
             is_near = off_mm <= max(float(np.median(off_mm)), _OFF * edge_mm)
             similarity = _similarity(points[is_near], places_mm[is_near])
@@ -101,7 +101,7 @@ class TexturedMesh:
         rows = np.flatnonzero(distance_mm <= _NEAR * edge_mm)
         candidates_mm, places = file_corners_mm[number[rows]], self.places[number[rows]]
         best_off_mm, best_places = np.full(len(rows), np.inf), places
-        for turn in range(3):  # the same triangle may begin with another corner
+        for turn in range(3):  # the same triangle may begin at another corner
             off_mm = np.linalg.norm(np.roll(candidates_mm, turn, axis=1) - corners_mm[rows], axis=2).max(axis=1)
             is_better = off_mm < best_off_mm
             best_off_mm = np.where(is_better, off_mm, best_off_mm)
@@ -137,14 +137,14 @@ def read_textured_mesh(path: Path) -> TexturedMesh:
 
 
 def _parts(path: Path) -> list[tuple[Floats, Any]]:
-    """Corners [m, 3, 3] of each mesh of the file where its scene has them, and their u and v [m, 3, 2], upwards;
-    None if it has none."""
+    """Corners [m, 3, 3] of each mesh of the file, placed as in its scene, and their u and v [m, 3, 2], with v
+    upwards; None if the mesh has no texture coordinates."""
     import trimesh
 
     parts = []
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # of vertices in no triangle
+            warnings.simplefilter("ignore", RuntimeWarning)  # of vertices that belong to no triangle
             scene = trimesh.load_scene(path, process=False)
         for node in scene.graph.nodes_geometry:
             transform, name = scene.graph[node]
@@ -154,14 +154,14 @@ def _parts(path: Path) -> list[tuple[Floats, Any]]:
                 uv = getattr(mesh.visual, "uv", None)
                 has_uv = uv is not None and len(uv) > 0
                 parts.append((vertices[faces], np.asarray(uv, np.float64)[faces] if has_uv else None))
-    except Exception as error:  # trimesh's readers raise whatever a bad file makes them meet
+    except Exception as error:  # trimesh's readers raise many kinds of errors for bad files
         raise InputError(f"--uv {path}: cannot be read: {reason(error) or type(error).__name__}") from error
     return parts
 
 
 def _ratios(corners: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """[n, 2] the second and third edge of triangles [n, 3, 3] over the longest, which has no unit; and the corner
-    where the longest begins."""
+    """[n, 2] ratios of the second and third edge of triangles [n, 3, 3] to the longest edge, and the corner where
+    the longest edge begins."""
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     first = np.argmax(lengths, axis=1)
     ratios = np.take_along_axis(lengths, (first[:, None] + np.arange(3)) % 3, axis=1)
@@ -173,7 +173,7 @@ def _from_first(corners: Floats, first: NDArray[np.int64]) -> Floats:
 
 
 def _similarity(points: Floats, places: Floats) -> tuple[float, Floats, Floats]:
-    """Scale, rotation and shift that lead points [n, 3] to places [n, 3] (Umeyama 1991, eqs. 40 to 43)."""
+    """Scale, rotation and translation that map points [n, 3] to places [n, 3] (Umeyama 1991, eqs. 40 to 43)."""
     centre, aim = points.mean(axis=0), places.mean(axis=0)
     u, singular, v_transposed = np.linalg.svd((places - aim).T @ (points - centre) / len(points))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(v_transposed)) or 1.0])

@@ -1,1 +1,1 @@
-"""Photographs of one scene with several exposure times, merged into one picture of linear values."""
+"""Photographs of one scene with several exposure times, merged into one picture with linear values."""

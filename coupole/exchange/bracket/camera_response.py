@@ -1,13 +1,17 @@
 """A camera's response from photographs of one scene with several exposure times.
 
 Debevec and Malik, "Recovering high dynamic range radiance maps from photographs" (SIGGRAPH 1997), Eq. 3: the
-logarithm of exposure g(z) of each value z, such that g(z) = ln E + ln t for all pixels and photographs. The
-difference is that the pixels' ln E are eliminated, so thousands of pixels cost no more than a few. Noise is that
-of values: g is looked up at the value that a pixel's mean predicts, and the noisy value only adds g' times its
-difference (where g is looked up at noisy values, least squares prefers stairs and waves, which steps of 4 do not
-contradict). And g is a Gaussian process: its slope over ln z wanders by an unknown amount, and each amount counts
-by how likely it makes the photographs. Where photographs cannot tell, as with waves of the period of all steps,
-this is what the uncertainty holds. A power law costs nothing, so that a linear sensor comes out straight.
+logarithm of exposure g(z) of each value z is found such that g(z) = ln E + ln t for all pixels and photographs.
+This module differs in three points:
+
+- The pixels' ln E are eliminated, so thousands of pixels cost little more than a few.
+- The values are noisy. g is evaluated at the value that a pixel's mean predicts; the noisy value only adds g'
+  times its difference. If g were evaluated at noisy values, least squares would prefer stairs and waves, which
+  exposure steps of 4 do not contradict.
+- g is a Gaussian process whose slope over ln z varies by an unknown amount. Each amount is weighted by the
+  likelihood of the photographs under it. Some shapes, such as waves with the period of all exposure steps, cannot
+  be determined from the photographs; the uncertainty includes them. A power law has no cost, so the response of a
+  linear sensor comes out straight.
 """
 
 from __future__ import annotations
@@ -23,62 +27,64 @@ from coupole.exchange.bracket.photographs import Photographs
 Array = NDArray[np.float64]
 NODES = 256
 SATURATED, DARK = 0.98, 0.01
-"""A pixel gives only a bound if its value is at least the first, or at most the second, of these."""
+"""A pixel gives only a bound if its value is at least the first or at most the second of these."""
 _PIXELS = 3000
 _WIDE = 2.6
-"""Least factor between exposure times that leaves waves of the response open: 4 does, 2 does not."""
+"""Smallest factor between exposure times for which waves of the response stay undetermined: 4 is such a factor, 2
+is not."""
 _ROUNDS, _SMOOTH_ROUNDS, _OUTLIER = 10, 6, 4.0
-"""Rounds of the fit, of which the first have a stiff response; standard deviations from which on a sample counts
-for less in the next round."""
+"""Number of rounds of the fit; number of first rounds, which have a stiff response; standard deviations above
+which a sample has less weight in the next round."""
 _LEAST_FITTED, _MOST_FITTED = 0.02, 0.97
-"""Predicted values between which a sample is fitted; a choice by noisy values would favour high noise."""
+"""Range of predicted values in which samples are fitted. A selection by the noisy values would favour those with
+high noise."""
 _STIFF, _WANDERS = -2.0, np.arange(-7.0, 2.1, 0.25)
-"""ln of the wander of the slope: in the first rounds, and those that are averaged after them."""
+"""ln of the slope's variation: in the first rounds, and the values that are averaged afterwards."""
 _POWER_WIDTH = 0.35
-"""Width of the window in ln z over which a slope is taken for weights."""
+"""Width of the window in ln z over which a slope is computed for weights."""
 _LEAST_POWER, _MOST_POWER = 0.3, 8.0
 _QUANTIZATION = 0.29
 """Standard deviation of rounding, in levels."""
 _MIDDLE = NODES // 2
 _LOG_NODES = np.log(np.maximum(np.arange(NODES), 0.5))
-"""ln of the nodes' values in steps; between nodes g is linear over it."""
+"""ln of the nodes' values in steps; between nodes, g is linear in ln z."""
 _OTHERS = np.arange(NODES) != _MIDDLE
-"""g is 0 at the middle."""
+"""Nodes other than the middle one, where g is 0."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """ln of exposure by value, for red, green and blue; 0 at half of the largest value."""
+    """ln of exposure as a function of the value, for red, green and blue; 0 at half of the largest value."""
 
     log_exposure: Array
     """[NODES, 3] at evenly spaced values from 0 to 1."""
     covariance: Array
-    """[3, NODES, NODES], of `log_exposure`."""
+    """[3, NODES, NODES] covariance of `log_exposure`."""
     is_shown: NDArray[np.bool_]
-    """[NODES, 3], false where no photograph has such values."""
+    """[NODES, 3] False where no photograph has such values."""
     noise: Array
-    """[3], standard deviation of values, as the fit leaves it over."""
+    """[3] standard deviation of values, from the residuals of the fit."""
 
     @property
     def uncertainty(self) -> Array:
-        """[NODES, 3], standard, of `log_exposure`; inf where no photograph has such values."""
+        """[NODES, 3] standard uncertainty of `log_exposure`; inf where no photograph has such values."""
         sigma = np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2).T, 0.0))
         return np.where(self.is_shown, sigma, np.inf)
 
     def exposure(self, values: NDArray[np.floating], channel: int) -> Array:
-        """Relative exposure of values."""
+        """Return the relative exposure of values."""
         return np.asarray(np.exp(_at(self.log_exposure[:, channel], values)))
 
     def slope(self, values: NDArray[np.floating], channel: int) -> Array:
-        """d ln(exposure) / d value."""
+        """Return d ln(exposure) / d value."""
         return _slope(_powers(self.log_exposure[:, channel]), values)
 
     def value(self, exposure: Array, channel: int) -> Array:
-        """The value of an exposure."""
+        """Return the value of an exposure."""
         return _value_of(np.log(np.maximum(exposure, 1e-300)), self.log_exposure[:, channel])
 
     def straightness(self) -> float:
-        """Most relative departure from a straight line through 0, for values of 0.1 to 0.9."""
+        """Greatest relative deviation from a straight line through 0, for values of 0.1 to 0.9."""
         z = np.linspace(0.0, 1.0, NODES)
         inside = (z >= 0.1) & (z <= 0.9)
         off = self.log_exposure[inside] - np.log(z[inside])[:, None]
@@ -92,7 +98,7 @@ def linear_response(noise: Array) -> Response:
 
 
 def found_response(photographs: Photographs) -> Response:
-    """Raises InputError where the photographs have too little in common."""
+    """Return the response. Raises InputError if the photographs have too little in common."""
     least_noise = _QUANTIZATION / (photographs.levels - 1)
     channels = [
         _solve_curve(_samples(photographs.values[..., channel]), np.log(photographs.exposure_s), least_noise)
@@ -103,10 +109,11 @@ def found_response(photographs: Photographs) -> Response:
 
 
 def left_open(exposure_s: Array) -> str:
-    """Return, in words, which part of a response photographs of these times cannot determine; empty if none.
+    """Return, in words, the part of a response that photographs with these times cannot determine; empty if there
+    is none.
 
-    With all times a factor apart, g(z) may have any wave of that period in ln E, which no pixel contradicts; the
-    uncertainty has what waves the smoothness of the response leaves.
+    If all times are the same factor apart, g(z) may contain any wave with that period in ln E, because no pixel
+    contradicts it. The uncertainty includes the waves that the smoothness of the response allows.
     """
     factor = float(np.exp(np.diff(np.sort(np.log(exposure_s))).min()))
     if factor < _WIDE:
@@ -124,7 +131,7 @@ def hat(values: Array) -> Array:
 
 
 def _samples(values: NDArray[np.float32]) -> Array:
-    """[pixels, photographs] of pixels in flat surroundings, evenly by their brightness."""
+    """[pixels, photographs] values of pixels in uniform surroundings, evenly distributed over brightness."""
     middle = values[len(values) // 2]
     steep = np.hypot(*np.gradient(middle)) if min(middle.shape) > 1 else np.zeros_like(middle)
     useful = (hat(values.astype(float)) > 0.0).sum(axis=0) >= 2
@@ -141,18 +148,18 @@ def _samples(values: NDArray[np.float32]) -> Array:
 
 @dataclass(frozen=True)
 class _Fit:
-    """The state that one round hands to the next."""
+    """The state that one round passes to the next."""
 
     g: Array
     robust: Array
-    """[pixels, photographs], weights of what did not move."""
+    """[pixels, photographs] weights, which are small for outliers."""
     noise: float
 
 
 def _solve_curve(
     samples: Array, log_t: Array, least_noise: float
 ) -> tuple[Array, Array, NDArray[np.bool_], float]:
-    """g [NODES], its covariance, where it is shown, and the noise of values."""
+    """g [NODES], its covariance, the nodes that photographs show, and the noise of values."""
     start = 1.5 * (_LOG_NODES - _LOG_NODES[_MIDDLE])
     fit = _Fit(start, np.ones_like(samples), max(1.0 / 255.0, least_noise))
     for number in range(_ROUNDS):
@@ -169,7 +176,7 @@ def _solve_curve(
 def _next_fit(
     fit: _Fit, samples: Array, log_t: Array, wanders: Array, least_noise: float
 ) -> tuple[_Fit, Array, Array]:
-    """One round: the fit, its covariance without the middle, and the weights."""
+    """Do one round: return the fit, its covariance without the middle node, and the weights."""
     rising, powers = np.maximum.accumulate(fit.g) + 1e-9 * np.arange(NODES), _powers(fit.g)
     weights = ((samples > DARK) & (samples < SATURATED)) * fit.robust
     predicted_values = _predict_values(samples, weights, log_t, rising, powers)
@@ -184,7 +191,7 @@ def _next_fit(
 
 
 def _predict_values(samples: Array, weights: Array, log_t: Array, g: Array, powers: Array) -> Array:
-    """[pixels, photographs], the values that each pixel's mean predicts; in three steps, as slopes are there."""
+    """[pixels, photographs] the values that each pixel's mean predicts, in three steps with the local slopes."""
     predicted_values = samples
     for _ in range(3):
         slope = _slope(powers, predicted_values)
@@ -194,7 +201,8 @@ def _predict_values(samples: Array, weights: Array, log_t: Array, g: Array, powe
 
 
 def _with_noise(g: Array, weights: Array, off: Array, slope: Array, least_noise: float) -> _Fit:
-    """The fit with the noise that samples have left over; `off` are their ln of exposure less that of the time."""
+    """Return the fit with the noise of its residuals. `off` is the samples' ln of exposure minus that of the
+    time."""
     free = 1.0 - weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
     residuals = (off - _pixel_means(weights, off)) / slope / np.sqrt(np.maximum(free, 1e-3))
     noise = max(float(1.4826 * np.median(np.abs(residuals[(weights > 0.0) & (free > 0.2)]))), least_noise)
@@ -208,7 +216,8 @@ def _pixel_means(weights: Array, logs: Array) -> Array:
 
 
 def _normal_equations(predicted_values: Array, weights: Array, target: Array) -> tuple[Array, Array, float]:
-    """Matrix and right side of g alone, and the sum of squares: each pixel's ln E is its weighted mean."""
+    """Matrix and right side of the equations for g alone, and the sum of squares. Each pixel's ln E is its
+    weighted mean."""
     from scipy.sparse import csr_matrix
 
     pixels, photographs = predicted_values.shape
@@ -228,8 +237,9 @@ def _normal_equations(predicted_values: Array, weights: Array, target: Array) ->
 
 
 def _average_curve(matrix: Array, right: Array, squares: float, wanders: Array) -> tuple[Array, Array]:
-    """g [NODES] and its covariance without the middle: the mean over wanders by how likely each makes the samples,
-    which all count alike beforehand (Hoeting et al., "Bayesian model averaging", Stat. Sci. 14, 382, 1999)."""
+    """g [NODES] and its covariance without the middle node: the mean over all amounts of variation, weighted by
+    the likelihood of the samples. All amounts have the same prior (Hoeting et al., "Bayesian model averaging",
+    Stat. Sci. 14, 382, 1999)."""
     matrix, right, roughness = matrix[np.ix_(_OTHERS, _OTHERS)], right[_OTHERS], _roughness()
     log_likelihoods, curves = np.zeros(len(wanders)), np.zeros((len(wanders), NODES - 1))
     inverses = np.zeros((len(wanders), NODES - 1, NODES - 1))
@@ -250,9 +260,9 @@ def _average_curve(matrix: Array, right: Array, squares: float, wanders: Array) 
 
 
 def _roughness() -> Array:
-    """[NODES - 1, NODES - 1], squares of the change of slope over ln z, which a power law does not have.
+    """[NODES - 1, NODES - 1] matrix of the squared changes of the slope over ln z, which are 0 for a power law.
 
-    The slope wanders most at small values: the variance of a step is that of z, over the root of z.
+    The slope may vary most at small values: the variance of a step is that of z, divided by the root of z.
     """
     step = np.diff(_LOG_NODES)
     change = np.zeros((NODES - 2, NODES))
@@ -266,7 +276,7 @@ def _roughness() -> Array:
 
 
 def _powers(g: Array) -> Array:
-    """[NODES], d g / d ln z by straight lines over a window."""
+    """[NODES] d g / d ln z from straight lines over a window."""
     even = np.linspace(_LOG_NODES[0], _LOG_NODES[-1], 600)
     at_even = np.interp(even, _LOG_NODES, g)
     window = np.exp(-0.5 * ((even[:, None] - even) / _POWER_WIDTH) ** 2)
@@ -286,12 +296,12 @@ def _value_of(log_exposure: Array, g: Array) -> Array:
 
 
 def _at(nodes: Array, values: NDArray[np.floating]) -> Array:
-    """Return the nodes' quantity at values: linear over ln z."""
+    """Return a quantity of the nodes at values, by linear interpolation in ln z."""
     return np.asarray(np.interp(_logs(values), _LOG_NODES, nodes))
 
 
 def _place(values: Array) -> tuple[NDArray[np.intp], Array]:
-    """The node below each value, and the share of the one above."""
+    """Return the node below each value, and the weight of the node above."""
     low = np.minimum((np.clip(values, 0.0, 1.0) * (NODES - 1)).astype(int), NODES - 2)
     share = (_logs(values) - _LOG_NODES[low]) / (_LOG_NODES[low + 1] - _LOG_NODES[low])
     return low, np.clip(share, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Photographs of one scene merged: each pixel's mean by the variance that its exposure leads one to expect."""
+"""Merges photographs of one scene: each pixel is a mean, weighted by the variance expected for its exposure."""
 
 from __future__ import annotations
 
@@ -11,30 +11,32 @@ from coupole.exchange.bracket.camera_response import DARK, NODES, SATURATED, Res
 from coupole.exchange.bracket.photographs import Photographs
 
 _CONTRADICTS = 5.0
-"""Standard deviations from the median of photographs."""
+"""Standard deviations from the median of the photographs at which a value contradicts them."""
 _LEAST_CONTRADICTION = 0.05
-"""Relative."""
+"""Least relative difference that counts as a contradiction."""
 _LEAST_WEIGHT = 0.1
-"""Hat weight of values below which noise is no longer Gaussian; such a value contradicts nobody."""
+"""Hat weight of values below which noise is no longer Gaussian; such values are not tested for contradiction."""
 _ROUNDS = 2
 _MARGIN = 4.0
-"""Standard deviations of noise from both ends within which a value says nothing: noise is cut off there."""
+"""Distance from both ends of the range, in standard deviations of the noise, within which a value is not used,
+because noise is cut off there."""
 
 
 @dataclass(frozen=True)
 class Merged:
-    """Relative radiance, in a unit in which half of the largest value is 1 at one second."""
+    """Relative radiance. Its unit is the radiance that gives half of the largest value in one second."""
 
     radiance: NDArray[np.float32]
     """[h, w, 3]."""
     uncertainty: NDArray[np.float32]
-    """[h, w, 3], standard, relative, of noise and response."""
+    """[h, w, 3] relative standard uncertainty from noise and response."""
     saturation_mask: NDArray[np.bool_]
-    """[h, w, 3], in all photographs: the radiance is a lower bound."""
+    """[h, w, 3] True if saturated in all photographs: the radiance is then a lower bound."""
     dark: NDArray[np.bool_]
-    """[h, w, 3], in all photographs: hardly more than noise."""
+    """[h, w, 3] True if dark in all photographs: the value is hardly more than noise."""
     contradicting: NDArray[np.bool_]
-    """[photographs, h, w], left out there, because others say otherwise: something moved."""
+    """[photographs, h, w] True where a photograph was left out because it contradicts the others: something
+    moved."""
 
 
 def merge_exposures(photographs: Photographs, response: Response) -> Merged:
@@ -66,8 +68,8 @@ def _mean(
     response: Response,
     channel: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weighted mean and its relative uncertainty. Weights follow from the mean, not from the pixel's own values,
-    whose noise would favour the darker of two."""
+    """Weighted mean and its relative uncertainty. The weights follow from the mean, because the noise of a pixel's
+    own values would favour the darker one."""
     noise = float(response.noise[channel])
     mean = np.where(usable, radiances, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     for _ in range(_ROUNDS):
@@ -87,7 +89,8 @@ def _mean(
 def _response_variance(
     shares: list[NDArray[np.float64]], values: list[NDArray[np.float64]], covariance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Relative variance that the response gives a mean with these shares, at these values; by the nearest node."""
+    """Relative variance of a mean that the response contributes, for photographs with these weights and values; by
+    the nearest node."""
     nodes = [np.rint(value * (NODES - 1)).astype(np.int32) for value in values]
     variance = np.zeros_like(values[0])
     for first, (share, node) in enumerate(zip(shares, nodes, strict=True)):
@@ -104,7 +107,8 @@ def _contradicting(
     response: Response,
     channel: int,
 ) -> NDArray[np.bool_]:
-    """[photographs, h, w] of those that lie beyond `_CONTRADICTS` deviations of the best exposed ones' median."""
+    """[photographs, h, w] True for values more than `_CONTRADICTS` deviations from the median of the best-exposed
+    ones."""
     logs = np.where(usable, np.log(np.maximum(radiances, 1e-300)), np.nan)
     lonely = usable.sum(axis=0) < 2
     weights = np.where(usable, hat(values.astype(float)), 0.0)

@@ -1,11 +1,11 @@
-"""Two lobes of facets over a diffuse body: a first guess of a finish, which a table then corrects.
+"""Two lobes of facets over a diffuse body: a first model of a finish, which a table then corrects.
 
-The wider lobe has GGX's distribution, the narrower one a tail of its own between that of GGX and a Gaussian's: D
-is proportional to (1 + tan^2(theta_h)/(alpha^2 (g - 1)))^-g / cos^4(theta_h), GGX for g = 2, Beckmann for large g
+The wider lobe has GGX's distribution. The narrower one has a tail between those of GGX and a Gaussian: D is
+proportional to (1 + tan^2(theta_h)/(alpha^2 (g - 1)))^-g / cos^4(theta_h), GGX for g = 2, Beckmann for large g
 (Student's distribution of slopes; Ribardiere and others, Computer Graphics Forum 36, 2017). Shadowing is Smith's
-for GGX, the rise to grazing angles Schlick's, less the dip that metals have before it (Lazanyi and Szirmay-Kalos,
-"Fresnel term approximations for metals", WSCG 2005). The fit is of log f, robust, and does not know the truth: the
-table takes its residual.
+for GGX. The rise towards grazing angles is Schlick's, minus the dip that metals have before it (Lazanyi and
+Szirmay-Kalos, "Fresnel term approximations for metals", WSCG 2005). The fit is a robust one of log f. The model
+need not be exact, because the table takes its residual.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from coupole.appearance.matter.brdf import half_vector
 Array = NDArray[np.float64]
 _GGX_TAIL = 2.0
 _STARTS = (0.06, 0.2, 0.5)
-"""Alphas of the narrow lobe from which the fit begins; the wide one is three times as wide."""
+"""Alphas of the narrow lobe with which the fit begins; the wide lobe begins with three times this alpha."""
 _FIT_SAMPLES, _STEPS = 1500, 60
 _TOLERATED = 0.1
 """Difference of log f above which a sample has less weight."""
 _LEAST_FRESNEL = 0.05
 _CELL_DEG, _CELLS_H = 3.0, 64
-"""Samples are drawn evenly over cells of difference and half angle: a peak has few pixels."""
+"""Samples are drawn evenly over cells of difference and half angle, because a peak has few pixels."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class Lobes:
     strengths: Array
     """[2, 3], of the lobes, at normal incidence."""
     rise: Array
-    """[3], how much stronger the lobes are at grazing incidence, as a share of their strength."""
+    """[3] increase of the lobes at grazing incidence, as a share of their strength."""
     dip: Array
-    """[3], what c (1 - c)^6 takes of it, c the cosine to the half vector."""
+    """[3] factor of the dip c (1 - c)^6, where c is the cosine to the half vector."""
 
     def reflectance(self, ways_in: Array, ways_out: Array) -> Array:
         """1/sr [n, 3] for unit directions [n, 3] above the surface."""
@@ -57,7 +57,7 @@ class Lobes:
 
 
 def fitted_lobes(ways_in: Array, ways_out: Array, f: Array, alphas: tuple[float, ...] = _STARTS) -> Lobes:
-    """The lobes nearest to samples of f [n, 3], 1/sr, in logarithms; the fit begins at each of `alphas`."""
+    """The lobes nearest to samples of f [n, 3], 1/sr, in logarithms. The fit begins at each of `alphas`."""
     from scipy.optimize import least_squares
 
     picks = _even_picks(ways_in, ways_out)
@@ -88,7 +88,8 @@ def _lobes_of(parameters: Array) -> Lobes:
 
 
 def _lobe(ways_in: Array, ways_out: Array, half_z: Array, alpha: float, tail: float) -> Array:
-    """D G/(4 z_i z_o) [n]; D is normalised for the tail of GGX only, which the lobe's strength makes good."""
+    """[n] D G/(4 z_i z_o). D is normalised only for the tail of GGX; for other tails the lobe's strength
+    compensates."""
     alpha2 = alpha**2
     z_h = np.maximum(half_z, 1e-6)
     z_i, z_o = np.maximum(ways_in[:, 2], 1e-9), np.maximum(ways_out[:, 2], 1e-9)

@@ -1,12 +1,13 @@
 """A table over half angle, difference angle and its azimuth, fitted to scattered samples of an isotropic finish.
 
 Rusinkiewicz, "A new change of variables for efficient BRDF representation" (1998). A photograph of a sphere under
-one light from afar has one difference angle: half the angle between light and camera. In these coordinates its
-samples fill one layer of the table, and what lies between two photographs is what is smooth along theta_d. In
-coordinates about the mirror direction a photograph lies aslant, and a peak between two of them is lost.
+one distant light has one difference angle: half the angle between light and camera. In these coordinates its
+samples fill one layer of the table, and values between two photographs are those that are smooth along theta_d. In
+coordinates about the mirror direction, the samples of a photograph would be oblique, and a peak between two
+photographs would be lost.
 
-The azimuth goes from 0 to 90 degrees only: exchange of the directions and the mirror image map the rest there, so
-that the table is reciprocal as it stands.
+The azimuth goes only from 0 to 90 degrees. Exchange of the directions and mirror symmetry map the rest to this
+range, so the table is always reciprocal.
 """
 
 from __future__ import annotations
@@ -27,13 +28,14 @@ _NODES = (
     0.5 * np.pi * np.linspace(0.0, 1.0, _PHIS),
 )
 _BENDS = ((0, 1.0), (1, 10.0), (2, 10.0))
-"""Axes, and what a second difference along each costs."""
+"""Axes, and the cost of a second difference along each."""
 _MIXED = 30.0
-"""Cost of a change of the dependence on theta_d with theta_h: within a lobe it is Fresnel's alone."""
+"""Cost of a change with theta_h of the dependence on theta_d, because within a lobe only Fresnel's factor depends
+on theta_d."""
 _POLE = 30.0
-"""Cost of a change where the half vector is the normal: there is no azimuth there, and the table is level."""
+"""Cost of a change with azimuth where the half vector is the normal, because there is no azimuth there."""
 _VALUE = 1e-3
-"""Cost of a value: where nothing is known, the table corrects nothing."""
+"""Cost of a value, so that the table corrects nothing where nothing is known."""
 
 
 def half_coordinates(ways_in: Array, ways_out: Array) -> tuple[Array, Array, Array]:
@@ -51,7 +53,7 @@ def half_coordinates(ways_in: Array, ways_out: Array) -> tuple[Array, Array, Arr
 
 
 def interpolation(ways_in: Array, ways_out: Array) -> Any:
-    """Sparse [n, entries]: each direction's shares of the nodes about it."""
+    """Sparse [n, entries]: weights of the nodes around each direction."""
     from scipy.sparse import coo_matrix
 
     coordinates = half_coordinates(ways_in, ways_out)
@@ -68,7 +70,8 @@ def interpolation(ways_in: Array, ways_out: Array) -> Any:
 
 
 def smooth_table(design: Any, values: Array, smoothness: float) -> Array:
-    """[entries, bands] nearest to `values` [n, bands] at the rows of `design`, smooth where there are none."""
+    """[entries, bands] table that is nearest to `values` [n, bands] at the rows of `design`, and smooth where
+    there are none."""
     from scipy.sparse.linalg import splu
 
     per_entry = len(values) / np.prod(SHAPE)
@@ -77,7 +80,7 @@ def smooth_table(design: Any, values: Array, smoothness: float) -> Array:
 
 
 def _roughness() -> Any:
-    """[entries, entries]: the squares of what a table shall not do."""
+    """[entries, entries] matrix of the squared terms that the fit keeps small."""
     from scipy.sparse import diags, eye, kron
 
     unit = [eye(count) for count in SHAPE]

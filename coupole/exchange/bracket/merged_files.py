@@ -1,4 +1,4 @@
-"""Files of a merged bracket: OpenEXR of linear values, and a picture of the camera's response."""
+"""Files of a merged bracket: OpenEXR with linear values, and a picture of the camera's response."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ _COLOURS = ("tab:red", "tab:green", "tab:blue")
 
 
 def write_exr(path: Path, merged_picture: Merged, comment: str) -> None:
-    """Channels R, G, B; `u.R`, `u.G`, `u.B`, relative standard uncertainties, inf for bounds; `saturated`, `dark`
-    and `contradicting`, 1 where a channel, or a photograph, is. Raises StorageError."""
+    """Write channels R, G, B; `u.R`, `u.G`, `u.B`, relative standard uncertainties, inf for bounds; and
+    `saturated`, `dark` and `contradicting`, which are 1 where this holds for a channel or a photograph. Raises
+    StorageError."""
     channels: dict[str, Any] = {}
     for number, name in enumerate("RGB"):
         channels[name] = np.ascontiguousarray(merged_picture.radiance[..., number])
@@ -38,7 +39,7 @@ def write_exr(path: Path, merged_picture: Merged, comment: str) -> None:
 
 
 def read_known(path: Path) -> NDArray[np.float32]:
-    """[h, w, 3] R, G, B of an OpenEXR, NaN where it says `saturated` or `dark`. Raises InputError."""
+    """[h, w, 3] R, G, B of an OpenEXR, NaN where `saturated` or `dark` is set. Raises InputError."""
     try:
         channels = OpenEXR.File(str(path), separate_channels=True).channels()
         picture = np.stack([np.asarray(channels[name].pixels, np.float32) for name in "RGB"], axis=2)
@@ -53,7 +54,7 @@ def read_known(path: Path) -> NDArray[np.float32]:
 
 
 def draw_response(path: Path, response: Response, title: str) -> None:
-    """PNG: exposure by value, with 95 % intervals. Raises StorageError."""
+    """Write a PNG of exposure by value, with 95 % intervals. Raises StorageError."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 4.4), layout="constrained")

@@ -1,4 +1,4 @@
-"""The photographs of a bracket: values, 0 to 1, with the exposure times that their EXIF or their owner gives."""
+"""The photographs of a bracket: values from 0 to 1, with exposure times from EXIF or from the user."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ _LEAST_RATIO = 1.2
 
 @dataclass(frozen=True)
 class Photographs:
-    """Photographs of one scene, by rising exposure time."""
+    """Photographs of one scene, in the order of increasing exposure time."""
 
     paths: tuple[Path, ...]
     values: NDArray[np.float32]
-    """[photographs, h, w, 3] red, green, blue as stored, over the largest value that the file can hold."""
+    """[photographs, h, w, 3] red, green, blue as stored, divided by the largest value that the file can hold."""
     exposure_s: NDArray[np.float64]
     """[photographs]."""
     levels: int
     """Number of levels that a value can have."""
     raw: bool
-    """True if the values are a sensor's, without a transfer curve: a pixel for each 2 x 2 cells."""
+    """True if the values are those of a sensor, without a transfer curve; a pixel is then a cell of 2 x 2."""
 
 
 def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None = None) -> Photographs:
-    """Raises InputError for files that cannot be read, of several kinds or sizes, or of unknown exposure."""
+    """Read photographs. Raises InputError for files that cannot be read, of several kinds or sizes, or without a
+    known exposure."""
     if len(paths) < 2:
         raise InputError(f"bracket: expected two photographs or more, found {len(paths)}")
     if exposure_s is not None and len(exposure_s) != len(paths):
@@ -75,7 +76,7 @@ def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None =
 
 
 def read_photograph(path: Path) -> tuple[NDArray[np.float32], int]:
-    """[h, w, 3] as stored, over the largest value, and how many levels. Raises InputError."""
+    """[h, w, 3] values as stored, divided by the largest value, and the number of levels. Raises InputError."""
     if path.suffix.lower() not in PLAIN:
         return read_raw(path), 65536
     import cv2
@@ -92,8 +93,8 @@ def read_photograph(path: Path) -> tuple[NDArray[np.float32], int]:
 
 
 def read_raw(path: Path) -> NDArray[np.float32]:
-    """[h, w, 3] the sensor's values less black, over white less black, of each cell of 2 x 2 pixels; greens are
-    averaged. Raises InputError."""
+    """[h, w, 3] the sensor's values minus black, divided by white minus black, of each cell of 2 x 2 pixels;
+    greens are averaged. Raises InputError."""
     import rawpy
 
     try:
@@ -114,7 +115,7 @@ def read_raw(path: Path) -> NDArray[np.float32]:
 
 
 def _exif(path: Path) -> dict[int, float]:
-    """Time, aperture and ISO, as far as they are there."""
+    """Read time, aperture and ISO, as far as they exist."""
     from PIL import Image, UnidentifiedImageError
 
     try:

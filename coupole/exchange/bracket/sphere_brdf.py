@@ -1,10 +1,10 @@
-"""The BRDF of a finish from linear photographs of a sphere of it (seed 002, section 3.1).
+"""The BRDF of a finish from linear photographs of a coated sphere (seed 002, section 3.1).
 
-Each pixel of the sphere has a normal of its own, so that one photograph under one light from afar has thousands of
-samples of an isotropic BRDF; several lights cover it. Two lobes of facets are fitted first (`finish_lobes`), then
-a table of the logarithm of what they miss (`half_angle_table`): it is nearly level, so that smoothness between
-photographs costs a peak nothing. The mean over a pixel lowers the peak; the lobes correct this. Each photograph is
-also predicted from the others, which tells what the finish is worth between two of them.
+Each pixel of the sphere has a different normal. So one photograph under one distant light has thousands of samples
+of an isotropic BRDF, and several lights cover it. Two lobes of facets are fitted first (`finish_lobes`), then a
+table of the residual's logarithm (`half_angle_table`). This residual is nearly constant, so smoothness between
+photographs does not flatten a peak. The mean over a pixel lowers the peak; the lobes correct this. Each photograph
+is also predicted from the others. This shows the error of the finish between two photographs.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ _LEAST_COSINE = 0.12
 _MOST_SAMPLES = 60_000
 _SMOOTHNESSES = (2e-4, 2e-3, 2e-2)
 _ROUNDS = 2
-"""Rounds in which a pixel is given what its mean takes from a peak, by the lobes of the round before."""
+"""Rounds of the correction for the mean over a pixel, which lowers a peak; each round uses the lobes of the one
+before."""
 _GAUSS = ((-np.sqrt(0.15), 5.0 / 18.0), (0.0, 8.0 / 18.0), (np.sqrt(0.15), 5.0 / 18.0))
-"""Places and weights of Gauss' rule over a side of 1."""
+"""Nodes and weights of Gauss' rule over an interval of length 1."""
 _NEAREST = 0.005
-"""Share of a photograph's samples that are taken as its peak."""
+"""Share of a photograph's samples that count as its peak."""
 _FEWEST = 1000
 _AT_ONCE = 100_000
 
@@ -41,23 +42,23 @@ class _Model(BaseModel):
 
 
 class Lit(_Model):
-    """A photograph of the sphere under one light from afar."""
+    """A photograph of the sphere under one distant light."""
 
     path: Path
     """OpenEXR with R, G, B, as `coupole bracket` writes it."""
     to_light: tuple[float, float, float]
-    """x to the right of the picture, y up, z to the camera."""
+    """Direction to the light: x to the right of the picture, y up, z to the camera."""
 
 
 class White(_Model):
-    """A white at the sphere's place that faced the light, photographed in the same way."""
+    """A white surface at the point of the sphere that faces the light, photographed in the same way."""
 
     values: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
     reflectance: Annotated[float, Field(gt=0, le=1)] = 0.99
 
 
 class SphereSample(_Model):
-    """A sphere in photographs from so far away that they are orthographic."""
+    """A sphere in photographs from so far away that the projection is orthographic."""
 
     photographs: Annotated[tuple[Lit, ...], Field(min_length=1)]
     centre_px: tuple[float, float]
@@ -68,7 +69,7 @@ class SphereSample(_Model):
 
 @dataclass(frozen=True)
 class Samples:
-    """Pixels' directions in their own frames, and what they reflect."""
+    """Directions of pixels in the frames of their normals, and their reflectance."""
 
     ways_in: Array
     """[n, 3]."""
@@ -76,16 +77,16 @@ class Samples:
     f: Array
     """[n, 3] 1/sr."""
     photograph: NDArray[np.intp]
-    """[n], the number of the photograph that each is from."""
+    """[n] number of the photograph of each sample."""
     places: Array
-    """[n, 2], of the pixels' middles: right and up from the sphere's centre, in radii."""
+    """[n, 2] middles of the pixels: right and up from the sphere's centre, in radii."""
     to_lights: Array
     """[photographs, 3], unit vectors in the camera's frame."""
     pixel_radii: float
     """Side of a pixel, in radii of the sphere."""
 
     def of(self, picks: NDArray[np.intp]) -> Samples:
-        """Return the samples of these numbers."""
+        """Return the samples with these numbers."""
         arrays = {
             name: getattr(self, name)[picks] for name in ("ways_in", "ways_out", "f", "photograph", "places")
         }
@@ -94,22 +95,22 @@ class Samples:
 
 @dataclass(frozen=True)
 class LeftOutPrediction:
-    """A test of the table: all other photographs predict one."""
+    """A test of the table: one photograph, predicted by all others."""
 
     photograph: int
     incidence_deg: float
     """Half of the angle between light and camera, which is the incidence at the peak."""
     nearest_to_peak_deg: float
-    """Half angle of the sample that is nearest to the peak."""
+    """Half angle of the photograph's sample that is nearest to the peak."""
     median_miss: float
-    """Median over its samples, relative."""
+    """Median relative error of its samples."""
     peak_miss: float
-    """Median over the samples nearest to the peak, relative, signed."""
+    """Median relative error, with sign, of the samples nearest to the peak."""
 
 
 @dataclass(frozen=True)
 class Finish:
-    """A finish: lobes, times the exponential of a table of `half_angle_table`."""
+    """A finish: lobes multiplied by the exponential of a table of `half_angle_table`."""
 
     lobes: Lobes
     log_correction: Array
@@ -118,10 +119,10 @@ class Finish:
 
 
 def samples_of(sample: SphereSample, pictures: Sequence[NDArray[np.float32]]) -> Samples:
-    """Take samples from linear pictures [h, w, 3], NaN where nothing is known. Samples near the horizon of the
-    light or of the camera are left out.
+    """Take samples from linear pictures [h, w, 3], NaN where a pixel is not known. Samples near the horizon of
+    light or camera are left out.
 
-    Raises InputError where the sphere is not in the picture, or too few pixels say anything.
+    Raises InputError if the sphere is not in the picture, or if too few pixels are usable.
     """
     parts = []
     to_lights = np.array([lit.to_light for lit in sample.photographs])
@@ -152,7 +153,7 @@ def samples_of(sample: SphereSample, pictures: Sequence[NDArray[np.float32]]) ->
 
 
 def finish_of(samples: Samples) -> Finish:
-    """Fit lobes, then a table of their residual. The table's smoothness is the one that predicts left-out
+    """Fit lobes, then a table of their residual. The smoothness of the table is the one that predicts left-out
     photographs best.
     """
     samples = samples.of(np.random.default_rng(1).permutation(len(samples.f))[:_MOST_SAMPLES])
@@ -178,9 +179,9 @@ def finish_of(samples: Samples) -> Finish:
 
 
 def at_middles_over_means(samples: Samples, lobes: Lobes) -> Array:
-    """[n, 3]: the radiance of lobes at each pixel's middle over their mean radiance in the pixel.
+    """[n, 3] the radiance of the lobes at each pixel's middle, divided by their mean radiance in the pixel.
 
-    A pixel near the sphere's edge has many normals: a peak at 60 degrees is dulled four times as much as at 0.
+    A pixel near the sphere's edge covers many normals: a peak at 60 degrees is lowered four times as much as at 0.
     """
     mean = np.zeros_like(samples.f)
     for number, to_light in enumerate(samples.to_lights):
@@ -195,7 +196,7 @@ def at_middles_over_means(samples: Samples, lobes: Lobes) -> Array:
 
 
 def _left_out(design: Any, log_misses: Array, of_photograph: NDArray[np.intp], smoothness: float) -> Array:
-    """Predict each photograph's samples by a table of the others; with one photograph, by the lobes alone."""
+    """Predict each photograph's samples by a table of the others; with only one photograph, by the lobes alone."""
     guess = np.zeros_like(log_misses)
     numbers = np.unique(of_photograph)
     for number in numbers if len(numbers) > 1 else []:
@@ -220,7 +221,7 @@ def _prediction(
 
 
 def finish_function(finish: Finish) -> Callable[[Array, Array], Array]:
-    """The finish as a function of directions [n, 3], in parts that fit into memory."""
+    """The finish as a function of directions [n, 3]; it is computed in parts that fit into memory."""
 
     def reflectance(ways_in: Array, ways_out: Array) -> Array:
         blocks = []
@@ -234,15 +235,15 @@ def finish_function(finish: Finish) -> Callable[[Array, Array], Array]:
 
 
 def misses(samples: Samples, finish: Finish) -> tuple[float, float]:
-    """Median and 95 % of the relative differences between finish and samples."""
+    """Median and 95 % quantile of the relative differences between finish and samples."""
     off = np.abs(finish_function(finish)(samples.ways_in, samples.ways_out) / samples.f - 1.0)
     median, most = np.quantile(off, [0.5, 0.95])
     return float(median), float(most)
 
 
 def _ways(places: Array, to_light: Array) -> tuple[Array, Array]:
-    """Ways to the light and to the camera [n, 3] at places [n, 2] of the sphere, each in a frame of the normal
-    there; beside the sphere, those at its edge."""
+    """Directions to the light and to the camera [n, 3] at places [n, 2] of the sphere, each in a frame of the
+    normal there; outside the sphere, those at its edge."""
     radius = np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1.0)
     up = np.sqrt(np.maximum(1.0 - np.sum(places**2, axis=1, keepdims=True), 0.0))
     frames = _frames(np.concatenate([places / radius, up], axis=1))

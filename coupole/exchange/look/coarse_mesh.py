@@ -1,4 +1,4 @@
-"""A mesh of few triangles that stands for one of many, for the first picture of a page."""
+"""A coarse mesh in place of a fine one, for the first picture of a page."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from numpy.typing import NDArray
 
 MOST_TRIANGLES = 20_000
 _FINER = 1.25
-"""Factor by which there are more cells on a side at each further trial."""
+"""Factor by which the number of cells on a side grows at each trial."""
 
 
 @dataclass(frozen=True)
 class CoarseMesh:
-    """Places that lie in one cell of a grid become one (Rossignac and Borrel, Multi-resolution 3D approximations
-    for rendering complex scenes, 1993); triangles that are left without area go."""
+    """All places in one cell of a grid become one (Rossignac and Borrel, Multi-resolution 3D approximations for
+    rendering complex scenes, 1993). Triangles that lose their area are removed."""
 
     places: NDArray[np.uint16]
     """[m, 3]"""
     triangles: NDArray[np.uint32]
-    """[n, 3] places."""
+    """[n, 3] numbers of the places."""
     stands_for: NDArray[np.int64]
-    """[n] a triangle of the fine mesh that each was."""
+    """[n] for each triangle, one triangle of the fine mesh from which it came."""
 
 
 def coarse_mesh(
     places: NDArray[np.uint16], triangles: NDArray[np.uint32], most: int = MOST_TRIANGLES
 ) -> CoarseMesh:
-    """Make a coarse mesh from places [m, 3] in steps of a grid and triangles [n, 3]: the finest trial of at most
-    `most` triangles."""
+    """Make a coarse mesh from places [m, 3] in steps of a grid and triangles [n, 3]. It is the finest of the
+    trials with at most `most` triangles."""
     cells = 4.0
     trial = _clustered_mesh(places, triangles, cells)
     while len(trial.triangles) <= most and cells < 1 << 16:
@@ -52,7 +52,7 @@ def _clustered_mesh(places: NDArray[np.uint16], triangles: NDArray[np.uint32], c
 
 
 def _first_of_each(rows: NDArray[Any]) -> NDArray[np.int64]:
-    """[n] rows of [m, 3] small numbers that were not there before."""
+    """[n] numbers of the rows of [m, 3] small numbers that did not occur before."""
     number = rows.astype(np.uint64)
     if len(number) and number.max() >= 1 << 21:
         return np.arange(len(rows))

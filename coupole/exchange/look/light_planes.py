@@ -1,8 +1,9 @@
-"""A view under any of its LEDs, and between them, from a few pictures: principal components of its frames.
+"""A view under any of its LEDs, and under lights between them, from a few pictures: principal components of its
+frames.
 
-Roots of shares of the camera's range are decomposed: where light is counted, they have the same noise everywhere.
-Components have a number for each LED and channel; between LEDs these are interpolated by thin plates (as Ponchio
-and others, Compact representation of relightable images for the Web, 2018, do with Gaussians).
+The decomposition uses square roots of shares of the camera's range, because photon noise is then the same
+everywhere. Each component has a coefficient for each LED and channel. Between LEDs these are interpolated by thin
+plates (Ponchio and others, Compact representation of relightable images for the Web, 2018, use Gaussians).
 """
 
 from __future__ import annotations
@@ -23,15 +24,16 @@ Picture = NDArray[np.float32]
 PLANES = 27
 KERNEL = "thin plate"
 _MOST_PLACES = 2000
-"""Pixels of which components are found."""
+"""Number of pixels from which components are computed."""
 _BAND_ROWS = 256
 _APART = 8
-"""Every eighth LED is left out, to measure the error of interpolation."""
+"""Every eighth LED is left out to measure the error of interpolation."""
 
 
 @dataclass(frozen=True)
 class LightPlanes:
-    """Decomposition of a view's pixels and LEDs: root of the share = `means` + sum of `of_leds` times `planes`."""
+    """Decomposition over a view's pixels and LEDs: root of the share = `means` + sum of `of_leds` times
+    `planes`."""
 
     planes: NDArray[np.float32]
     """[planes, h, w]"""
@@ -40,12 +42,14 @@ class LightPlanes:
     of_leds: Floats
     """[planes, leds, 3]"""
     missed_between: tuple[float, float]
-    """Median and rms of the shares of the camera's range that are missed under LEDs that were left out and
-    interpolated from the others; NaN if there are too few."""
+    """Median and rms error, as shares of the camera's range, under LEDs that were left out and interpolated from
+    the others; NaN if there are too few."""
 
     def bases(self, ways: Floats) -> NDArray[np.float32]:
-        """[leds + 4, planes + 1, 3] factors of thin plates r^2 log r of distances to LEDs, and of 1, x, y, z;
-        their sum is the means (first) and the numbers of components under a light from x, y, z."""
+        """[leds + 4, planes + 1, 3] factors of thin plates r^2 log r of the distances to LEDs, and of 1, x, y, z.
+
+        Under a light from x, y, z, their sum gives the means (first) and the coefficients of the components.
+        """
         values = np.concatenate([self.means[None], self.of_leds]).transpose(1, 0, 2)
         count = len(ways)
         tail = np.hstack([np.ones((count, 1)), ways])
@@ -66,9 +70,11 @@ def light_planes(
     say: Callable[[str, int, int], None],
     planes: int = PLANES,
 ) -> LightPlanes:
-    """Find the planes of frames [h, w, 3], shares of the camera's range, that `frame` reads by number, under LEDs
-    towards `ways` [n, 3]. Each frame is read twice, and seen once by `see`. Memory is for `planes` pictures of one
-    channel.
+    """Compute the planes of frames [h, w, 3], in shares of the camera's range, under LEDs in the directions `ways`
+    [n, 3].
+
+    `frame` reads a frame by its number; each frame is read twice, and passed once to `see`. The memory needed is
+    that of `planes` pictures of one channel.
     """
     count = len(ways)
     places = None
@@ -100,7 +106,7 @@ def light_planes(
 
 
 def _components(apart: Floats, count: int) -> Floats:
-    """[count, m] orthonormal rows that leave least of `apart` [n, m]."""
+    """[count, m] orthonormal rows that leave the smallest residual of `apart` [n, m]."""
     low = len(apart) - count
     powers, of_rows = eigh(apart @ apart.T, subset_by_index=(low, len(apart) - 1))
     firm = powers > max(powers.max(), 0.0) * 1e-12
@@ -123,6 +129,6 @@ def _missed_between(roots: Floats, ways: Floats, planes: int) -> tuple[float, fl
 
 
 def error_figures(computed_values: Floats, measured_values: Floats) -> tuple[float, float]:
-    """Median and root of the mean square of what differs."""
+    """Median, and root of the mean square, of the differences."""
     off = np.abs(computed_values - measured_values)
     return float(np.median(off)), float(np.sqrt(np.mean(off**2)))

@@ -1,4 +1,5 @@
-"""Light from all around for a page: as many directions as it averages, the denser the brighter."""
+"""Light from all directions for a page: as many directions as it averages, with a density proportional to the
+light."""
 
 from __future__ import annotations
 
@@ -16,12 +17,13 @@ SAMPLES = 64
 
 
 def with_environment(look: Look, path: Path | None, axes: NDArray[np.float64]) -> Look:
-    """The same with the light of a file; `axes` [3, 3] are its middle, left and up. Raises InputError, as
-    `read_environment`."""
+    """Return the contents with the light of a file. `axes` [3, 3] are the directions of its middle, its left and
+    up. Raises the InputError of `read_environment`."""
     if path is None:
         return look
     ways, radiances, density = read_environment(path, axes, np.ones(3)).sample(SAMPLES)
-    order = np.argsort(np.arange(SAMPLES) * 0.6180339887498949 % 1.0)  # so that the first few stand for all
+    # shuffled, so that the first few represent all
+    order = np.argsort(np.arange(SAMPLES) * 0.6180339887498949 % 1.0)
     irradiances = SAMPLES * radiances / density[:, None]
     about = {"name": path.name, "ways": ways[order].tolist(), "irradiances": irradiances[order].tolist()}
     facts = look.about["told"] | {"Surroundings": f"{path.name}, {SAMPLES} directions of it"}

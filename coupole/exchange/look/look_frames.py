@@ -1,7 +1,7 @@
-"""Measured frames of a result of runs, for a page to show beside the fit's prediction for the same LED.
+"""Measured frames of a result of runs, which a page shows beside the fit's prediction for the same LED.
 
-A frame lies on the object: the page finds a place's pixel by the polynomial that is fitted here, of what pixels of
-the view see.
+A frame is projected on the object: for each place the page computes the pixel by a polynomial, which is fitted
+here to the places that the view's pixels see.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _WHITE_QUANTILE = 0.999
 def frames_of_view(
     result: RunResult, view: ViewSamples, support_from_base: Floats
 ) -> tuple[dict[str, Any], list[Block]] | None:
-    """Return what the page knows of a view and its frames, and their pictures; None if the view has none."""
+    """Return the page's facts of a view and its frames, and the frames' pictures; None if the view has none."""
     path = result.folder / FRAMES / view.path.name
     if not path.exists():
         return None
@@ -74,9 +74,11 @@ def frames_of_view(
 
 
 def _lens(surface: Surface) -> tuple[Floats, Floats]:
-    """[3, 3] rows: axes of directions from the camera, the last forward; [21, 2] coefficients of x^i y^j (all j
-    of an i, then the next) that give column and row, as shares of the picture, of a direction's x and y where z
-    is 1."""
+    """[3, 3] rows: axes of the camera, the last forward; and [21, 2] coefficients of x^i y^j (all j for one i,
+    then the next i).
+
+    They give column and row, as shares of the picture, from a direction's x and y where its z is 1.
+    """
     rows, columns = np.nonzero(surface.triangle_of_pixel >= 0)
     some = slice(None, None, max(1, len(rows) // _MOST_PLACES))
     rows, columns = rows[some], columns[some]
@@ -96,8 +98,8 @@ def _lens(surface: Surface) -> tuple[Floats, Floats]:
 
 
 def block_means(share: NDArray[np.float32], step: int) -> NDArray[np.float64]:
-    """Means of step x step pixels that have a value in all channels; NaN where none has. The last row and column
-    are of what is left over."""
+    """Means over step x step pixels with values in all channels; NaN where none has. The last row and column are
+    means over the remaining pixels."""
     height, width = share.shape[:2]
     is_finite = np.isfinite(share).all(axis=2, keepdims=True)
     sums, counts = (
@@ -112,7 +114,7 @@ def block_means(share: NDArray[np.float32], step: int) -> NDArray[np.float64]:
 
 
 def _srgb_codes(small: Floats) -> tuple[NDArray[np.uint8], float]:
-    """[h, w, 3] in sRGB's steps up to the peak that is returned, from 1; 0 where there is no value."""
+    """[h, w, 3] codes in sRGB steps, from 1 to the returned peak; 0 where there is no value."""
     is_finite = np.asarray(np.isfinite(small).all(axis=2))
     peak = max(float(np.quantile(small[is_finite], _WHITE_QUANTILE)) if is_finite.any() else 1.0, 1e-9)
     encoding = srgb(np.where(is_finite[..., None], small, 0.0) / peak)

@@ -1,4 +1,4 @@
-"""Contents of a page on a run that nothing was fitted to: its frames, and each view between its LEDs."""
+"""Contents of a page of a run without fits: its frames, and each view under lights between its LEDs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]
 FRAME_QUALITY, PLANE_QUALITY = 85, 90
 _CHECKED = 8
-"""LEDs for which what is written is compared with the frames."""
+"""Number of LEDs for which the written data are compared with the frames."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ class Frames:
         return min(frame.exposure_us for frame in self.frame_of_led.values())
 
     def share(self, led: int) -> NDArray[np.float32]:
-        """[h, w, 3] as at the shortest exposure; colours between a Bayer filter's pixels are interpolated."""
+        """[h, w, 3] shares, scaled to the shortest exposure; colours between a Bayer filter's pixels are
+        interpolated."""
         frame, run = self.frame_of_led[led], self.of_run
         steps = 65535.0 / (run.white_dn - run.black_dn)
         linear = np.clip((frame.read() - self.dark(frame)) * np.float32(steps), 0, 65535)
@@ -61,10 +62,11 @@ class Frames:
 
 
 def look_of_run(folder: Path, patterns: Sequence[str], say: Said) -> Look:
-    """Return the page's contents for the views of a run that match one of the patterns, or for all. Places are
-    nominal; no calibration is used.
+    """Return the page's contents for the views of a run that match one of the patterns, or for all views.
+    Positions are nominal; no calibration is used.
 
-    Raises InputError: no run, no such view, too few LEDs; StorageError, ChecksumMismatch for damaged frames.
+    Raises InputError if there is no run or no such view, or if there are too few LEDs; StorageError,
+    ChecksumMismatch for damaged frames.
     """
     run = Run(folder)
     frames = open_light_frames([folder])
@@ -151,7 +153,7 @@ def _target_mm(frames: Frames, focus_distance_mm: float) -> Floats:
 
 
 def _towards(frames: Frames, target_mm: Floats, places_mm: Floats) -> Floats:
-    """[n, 3] unit vectors from the target to places: x right of the picture, y up, z to the camera."""
+    """[n, 3] unit vectors from the target to places: x to the right of the picture, y up, z to the camera."""
     into_camera = inverse(next(iter(frames.frame_of_led.values())).base_from_camera)
     apart = (apply(into_camera, places_mm) - apply(into_camera, target_mm)) * (1.0, -1.0, -1.0)
     ways: Floats = apart / np.linalg.norm(apart, axis=1, keepdims=True)
@@ -165,7 +167,7 @@ def _ways(frames: Frames, leds: LedTable, target_mm: Floats) -> Floats:
 def _view(
     frames: Frames, name: str, ways: Floats, say: Said
 ) -> tuple[dict[str, Any], Block, list[Block], list[Block]]:
-    """Return what the page knows of a view; its block of lights; tiles; pictures of frames."""
+    """Return the page's facts of a view, its block of lights, its tiles, and the pictures of its frames."""
     leds = sorted(frames.frame_of_led)
     frame_facts: list[dict[str, Any]] = []
     pictures: list[Block] = []
@@ -205,7 +207,7 @@ def _view(
 
 
 def _frame(name: str, share: NDArray[np.float32]) -> tuple[Block, dict[str, Any]]:
-    """A picture of a frame, and what is said of it."""
+    """Return the picture of a frame, and the facts about it."""
     small = block_means(share, math.ceil(max(share.shape) / MOST_PX))
     peak = max(float(small.max()), 1e-9)
     codes = np.rint(255.0 * srgb(small / peak)).astype(np.uint8)
@@ -216,7 +218,7 @@ def _frame(name: str, share: NDArray[np.float32]) -> tuple[Block, dict[str, Any]
 def _plane_tiles(
     planes: NDArray[np.float32], name: str, low: NDArray[np.float32], step: NDArray[np.float32], say: Said
 ) -> Iterator[Block]:
-    """Tiles of planes, one under the other in 8 bit from `low` in steps."""
+    """Return tiles of planes, one below the other, in 8 bits, in steps from `low`."""
     total = sum(-(-w // TILE_PX) * -(-h // TILE_PX) for w, h in levels_of(planes.shape[2], planes.shape[1]))
     for count, tile in enumerate(tiles_of(planes), start=1):
         codes = np.rint((tile.values - low[:, None, None]) / step[:, None, None])
@@ -233,7 +235,7 @@ def _missed_as_written(
     low: NDArray[np.float32],
     step: NDArray[np.float32],
 ) -> tuple[float, float]:
-    """Median and rms of the shares that the page's first tile misses under some LEDs."""
+    """Median and rms error, in shares, of the page's first tile under some LEDs."""
     picture = Image.open(io.BytesIO(base64.b64decode(tiles[0].text)))
     codes = np.asarray(picture.convert("L")).reshape(-1, TILE_PX, TILE_PX).astype(np.float64)
     planes = codes * step[:, None, None] + low[:, None, None]
@@ -248,8 +250,8 @@ def _missed_as_written(
 
 
 def _apart_deg(ways: Floats) -> float:
-    """Return the greatest angle of a light to the nearest LED at which it is still between the LEDs: twice what
-    nearly all LEDs have to their nearest neighbour."""
+    """Return the greatest angle between a light and its nearest LED at which the light counts as between the LEDs.
+    It is twice the 95 % quantile of the angle between neighbouring LEDs."""
     cosines = ways @ ways.T
     np.fill_diagonal(cosines, -1.0)
     nearest = np.degrees(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)))
@@ -257,7 +259,8 @@ def _apart_deg(ways: Floats) -> float:
 
 
 def _shots(run: Run, frames: Frames, view: str, leds: LedTable, target_mm: Floats) -> dict[str, Any]:
-    """LEDs of the view whose frame is not there: not proven, or hidden; and how many shots are proven."""
+    """LEDs of the view without a frame, because it is not proven or the LED is hidden; and the number of proven
+    shots."""
     proven = run.proven()
     plan_shots = [shot for shot in run.expected_shots() if shot.view == view and isinstance(shot.light, Led)]
     missing = {shot.light.id for shot in plan_shots if isinstance(shot.light, Led)} - set(frames.frame_of_led)

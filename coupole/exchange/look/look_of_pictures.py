@@ -1,4 +1,4 @@
-"""Contents of a page on a result of pictures: a flat picture, and the material of each of its pixels."""
+"""Contents of a page of a result of pictures: a flat picture, and the material of each of its pixels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from coupole.reflectance.picture_result import MATERIALS, PictureResult, open_re
 
 
 def look_of_pictures(folder: Path) -> Look:
-    """Return the page's contents for a whole result. Raises InputError if it is none, or has no materials."""
+    """Return the page's contents for a complete result. Raises InputError if it is not one, or has no
+    materials."""
     result = PictureResult(folder)
     about, mask = result.about, result.mask
     height, width = mask.shape
@@ -66,7 +67,7 @@ def _level(block: Block) -> int:
 
 
 def _material_tiles(fields: NDArray[np.float32]) -> Iterator[Block]:
-    """Give the tiles of [11, h, w] normal, kd, ks, alpha, residual: [10, TILE_PX, TILE_PX] of 16 bits each."""
+    """Yield the tiles of [11, h, w] normal, kd, ks, alpha, residual: [10, TILE_PX, TILE_PX] of 16 bits each."""
     for tile in tiles_of(fields):
         flat = tile.values.reshape(_FIELDS, -1).astype(np.float64)
         codes = np.zeros((_FIELDS - 1, flat.shape[1]), np.uint16)

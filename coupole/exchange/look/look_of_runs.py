@@ -1,5 +1,4 @@
-"""Contents of a page on a result of runs: the mesh, and for each triangle its material and how well it is
-known."""
+"""Contents of a page of a result of runs: the mesh, and the material of each triangle with its uncertainty."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]
 
 PLACES = 65535
-"""Steps of a coordinate along the longest side of the object."""
+"""Number of steps of a coordinate along the longest side of the object."""
 
 
 @dataclass(frozen=True)
@@ -41,14 +40,16 @@ class PageChoice:
     """Choices of what a page shows of a result of runs."""
 
     fit: str | None = None
-    """The material; None: texels if there are any, else the best, or the one that a residual is added to."""
+    """The fit. By default: texels if there are any; otherwise the best fit, or the one to which a residual is
+    added."""
     planes: int | None = None
-    """Planes of the residual, 0 for none; None: `PLANES` if triangles are shown, and if there is one."""
+    """Number of planes of the residual, 0 for none. By default `PLANES`, if triangles are shown and have a
+    residual."""
     with_samples: bool = False
     map_px: int = MOST_PX
     """Greatest width of maps."""
     coarse_over: int = MOST_TRIANGLES
-    """Triangles of a mesh above which a coarse one is shown first."""
+    """Number of triangles above which a coarse mesh is shown first."""
     beside: OtherState | None = None
 
 
@@ -58,15 +59,15 @@ class OtherState:
 
     folder: Path
     first_from_other: Floats
-    """[4, 4] between the support frames of both results, mm."""
+    """[4, 4] transform from the other result's support frame to the first one's, mm."""
     remark: str
-    """Sentence on how the two were brought together."""
+    """Sentence about the alignment of the two."""
 
 
 def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice | None = None) -> Look:
-    """Return the page's contents for a whole result.
+    """Return the page's contents for a complete result.
 
-    Raises InputError if it is none, or has no material, or a residual is asked for with texels.
+    Raises InputError if it is not one, if it has no material, or if a residual is asked for together with texels.
     """
     choice = choice or PageChoice()
     source_about = read_about(folder)
@@ -126,7 +127,7 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
 
 
 def _facts(result: RunResult, triangles_text: str, is_simulated: object) -> dict[str, str]:
-    """Return facts for the reader of the page."""
+    """Return facts that the page states in text."""
     return {
         "Object": "simulated" if is_simulated else "measured",
         "Triangles": triangles_text,
@@ -137,7 +138,7 @@ def _facts(result: RunResult, triangles_text: str, is_simulated: object) -> dict
 
 
 def _box_steps(corners_mm: Floats, origin_mm: Floats, step_mm: float) -> list[list[int]]:
-    """Return the box of all corners, in steps from the origin."""
+    """Return the bounding box of all corners, in steps from the origin."""
     ends_mm = np.stack([corners_mm.min(axis=0), corners_mm.max(axis=0)])
     box: list[list[int]] = np.rint((ends_mm - origin_mm) / step_mm).astype(int).tolist()
     return box
@@ -146,7 +147,7 @@ def _box_steps(corners_mm: Floats, origin_mm: Floats, step_mm: float) -> list[li
 def _texels_of(
     result: RunResult, choice: PageChoice, say: Said, turn: Floats | None = None, prefix: str = ""
 ) -> LookTexels | None:
-    """Texels, unless triangles are to be shown. A rotation [3, 3] turns their normals."""
+    """Return the texels, unless triangles are to be shown. A rotation [3, 3] is applied to their normals."""
     if choice.fit not in (None, TEXELS) or (choice.fit is None and (choice.planes or not has_texels(result))):
         return None
     if choice.planes:
@@ -174,7 +175,7 @@ _ERRORS = {
 
 
 def _residuals(result: RunResult, fit: str, planes: int, about: dict[str, Any], say: Said) -> list[Block]:
-    """Blocks of what a fit leaves; what is known of it goes into `about`."""
+    """Return blocks of the residuals of a fit; facts about them are added to `about`."""
     about["residual"], blocks = residual_blocks(result, planes, say)
     about["told"]["Residual"] = (
         f"what {fit} leaves of each view's samples, as {planes} planes, which have "
@@ -185,7 +186,8 @@ def _residuals(result: RunResult, fit: str, planes: int, about: dict[str, Any], 
 
 
 def _materials(result: RunResult, fit: str, support_from_base: Floats) -> dict[str, NDArray[Any]]:
-    """Numbers of all triangles by name, 0 of those without a material. Raises InputError for an unknown fit."""
+    """Return numbers of all triangles by name; 0 for those without a material. Raises InputError for an unknown
+    fit."""
     if fit not in MATERIALS:
         raise InputError(f"--fit: expected {', '.join((*MATERIALS, TEXELS))}; got {fit}")
     path = result.materials_path(fit)
@@ -213,7 +215,7 @@ def _coarse_blocks(
     *,
     has_maps: bool,
 ) -> tuple[Block, ...]:
-    """Blocks of a coarse mesh, which has no maps; none of a mesh that is not larger than `over`."""
+    """Return blocks of a coarse mesh, which has no maps; none if the mesh has at most `over` triangles."""
     if len(triangles) <= over:
         return ()
     coarse = coarse_mesh(places, triangles, over)
@@ -226,7 +228,7 @@ def _coarse_blocks(
 
 @dataclass(frozen=True)
 class _Other:
-    """The other state in the frame of the first."""
+    """The other state, in the frame of the first one."""
 
     name: str
     remark: str
@@ -237,8 +239,8 @@ class _Other:
     texels: LookTexels | None
 
     def blocks(self, both_mm: Floats, about_page: dict[str, Any]) -> list[Block]:
-        """Return its blocks, and put what the page knows of it into `about_page`; `both_mm` are the corners of
-        both states."""
+        """Return the blocks of the state, and add its facts to `about_page`. `both_mm` are the corners of both
+        states."""
         places, triangles, _, _ = weld_corners(self.corners_mm, both_mm)
         arrays: dict[str, NDArray[Any]] = {"places": places, "triangles": triangles, **self.of_triangles}
         if self.texels:
@@ -253,8 +255,8 @@ _BESIDE = "beside-"
 
 
 def _other_state(choice: PageChoice, fit_of_first: str, say: Said) -> _Other:
-    """Read the other state, by the same fit as the first one if it has this fit. Raises InputError as
-    `look_of_result` does."""
+    """Read the other state, with the fit of the first one if it has that fit. Raises the InputError of
+    `look_of_result`."""
     assert choice.beside is not None
     folder, first_from_other = choice.beside.folder, choice.beside.first_from_other
     read_about(folder)
@@ -272,9 +274,12 @@ def _other_state(choice: PageChoice, fit_of_first: str, say: Said) -> _Other:
 def weld_corners(
     corners_mm: Floats, within_mm: Floats | None = None
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint32], Floats, float]:
-    """Weld corners [3 n, 3] of triangles. Returns places [m, 3] in steps from an origin, each once, in the order
-    of their first use; triangles [n, 3] as numbers of places; [3] origin and step, mm, which are those of all
-    places `within_mm` [m, 3] (of the corners, without them)."""
+    """Weld corners [3 n, 3] of triangles.
+
+    Returns places [m, 3] in steps from an origin, each once, in the order of their first use; triangles [n, 3] as
+    numbers of places; and [3] origin and step, mm. Origin and step are those of all places `within_mm` [m, 3]; by
+    default, of the corners.
+    """
     within_mm = corners_mm if within_mm is None else within_mm
     origin_mm = within_mm.min(axis=0)
     step_mm = max(float(np.ptp(within_mm, axis=0).max()), 1e-6) / PLACES
@@ -298,7 +303,7 @@ def _pair(first: Floats, second: Floats) -> Floats:
 
 
 def _spread_values(values: NDArray[Any], at: NDArray[np.int64], count: int) -> NDArray[Any]:
-    """[count, ...] 0 but where triangles have values."""
+    """[count, ...] the values of triangles at their numbers; 0 for all others."""
     all_of_them = np.zeros((count, *values.shape[1:]), values.dtype)
     all_of_them[at] = values
     return all_of_them

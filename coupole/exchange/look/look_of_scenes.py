@@ -1,4 +1,5 @@
-"""Contents of a page on a scene: its triangles, and tables of what their layers reflect under each illuminant."""
+"""Contents of a page of a scene: its triangles, and tables of the reflectance of their layers under each
+illuminant."""
 
 from __future__ import annotations
 
@@ -38,11 +39,11 @@ from coupole.exchange.look.scene_start import illuminants, start_of
 from coupole.exchange.look.urushi_layers import coarse_grains, lacquered_corners, nashiji_layers
 
 _BALL_PARTS = 48
-"""A ball has 20 times their square of triangles."""
+"""A ball has 20 times the square of this number of triangles."""
 _WHOLE = 65535
 """Code of a share of 1."""
 _PATH = float(1.0 / np.sqrt(1.0 - indices.URUSHI**-2))
-"""Longest way of light from the face to a depth, over the depth."""
+"""Longest path of light from the face to a depth, as a multiple of the depth."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +53,13 @@ class _Part:
     corners_mm: Array
     number: int
     casts: bool = True
-    """False for a sheet that other things stand on."""
+    """False for a sheet on which other things stand."""
     share: Array | None = None
-    """[n], of the material's first layer, where each triangle has its own."""
+    """[n] share of the material's first layer, if each triangle has its own."""
 
 
 class _Materials:
-    """Materials in the order of their numbers, each once."""
+    """Different materials, in the order of their numbers."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -73,7 +74,7 @@ class _Materials:
         return self._numbers[key]
 
     def add(self, layers: Sequence[tuple[Layer, ...]], name: str, *, is_drawn: bool = False) -> int:
-        """Several for one name; the number of the first."""
+        """Add several materials with one name; return the number of the first."""
         first = len(self.layers)
         self.layers += [(stack, is_drawn) for stack in layers]
         self.names += [name] * len(layers)
@@ -81,8 +82,8 @@ class _Materials:
 
 
 def look_of_scene(scene: Scene, folder: Path) -> Look:
-    """Return the page's contents for a scene whose paths are relative to `folder`. Raises InputError, with what
-    can be shown."""
+    """Return the page's contents for a scene, whose paths are relative to `folder`. Raises InputError, which lists
+    what a page can show."""
     scene = with_plain_lights(scene, folder)
     materials, face = _Materials(folder), None
     parts: list[_Part] = []
@@ -127,7 +128,7 @@ def look_of_scene(scene: Scene, folder: Path) -> Look:
 
 
 def describe_material(material: Material) -> str:
-    """Describe a material in a few words, without values that are the defaults."""
+    """Describe a material in a few words; default values are left out."""
     values = material.model_dump(mode="json", exclude_defaults=True)
     values.pop("kind", None)
     return f"{material.kind} {', '.join(f'{name} {_plain(value)}' for name, value in values.items())}".strip()
@@ -181,7 +182,7 @@ def _opaque(piece: Piece | Ball, materials: _Materials, casts: bool) -> _Part:
 
 
 def _makie(thing: MakieTile, materials: _Materials) -> list[_Part]:
-    """The drawing as shares of metal over lacquer, in place of grains."""
+    """The drawing as shares of metal over lacquer, instead of single grains."""
     tile = samples.makie_tile(thing.side_mm, thing.triangles, thing.petals, thing.seed)
     metal = Metal(kind="metal", roughness=thing.roughness)
     black = Lacquer(kind="lacquer")
@@ -208,7 +209,7 @@ def _sprinkled_part(thing: Makie, materials: _Materials) -> _Part:
 
 
 def _lacquered_part(thing: Nashiji, materials: _Materials) -> _Part:
-    """Flakes as the mean over many."""
+    """Flakes as the mean over many flakes."""
     number = materials.add(
         [nashiji_layers(thing, materials.folder)], f"mean of flakes of {describe_material(thing.metal)} in urushi"
     )
@@ -217,7 +218,7 @@ def _lacquered_part(thing: Nashiji, materials: _Materials) -> _Part:
 
 
 def _nashiji(thing: NashijiSlab, materials: _Materials) -> tuple[list[_Part], dict[str, Any]]:
-    """Flakes and what lies under the lacquer; the lacquer's face, which the page refracts at."""
+    """Flakes and the ground under the lacquer, and the lacquer's face, at which the page refracts light."""
     longest_mm = 2.0 * _PATH * thing.depth_mm
     rotation = thing.scene_from_thing()[:3, :3]
     parts, flakes = [], None
@@ -252,7 +253,7 @@ def _box(parts: Sequence[_Part]) -> list[list[float]]:
 
 
 def _material_codes(parts: Sequence[_Part]) -> NDArray[np.uint16]:
-    """[n, 2] of triangles: number of the material, code of the first layer's share."""
+    """[n, 2] for triangles: number of the material, and code of the first layer's share."""
     blocks = []
     for part in parts:
         block = np.full((len(part.corners_mm), 2), _WHOLE, np.uint16)

@@ -1,7 +1,7 @@
-"""The page itself: its scripts, shaders and style, and what it shows, in one HTML file.
+"""The page itself: its scripts, shaders, style and data, in one HTML file.
 
-Data that would make the file larger than `MOST_BYTES` are put beside it, into `NAME.data/`, as scripts that the
-page loads by script tags: a page that is opened from a disk may load nothing else.
+If the data would make the file larger than `MOST_BYTES`, they are put beside it, into `NAME.data/`, as scripts
+that the page loads by script tags. A page that is opened from a disk can load nothing else.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from coupole.exchange.look.look_blocks import SCRIPT_BEGINS, Block, Look, in_scr
 from coupole.storage.durable import make_folder, sync_folder, write_synced
 
 MOST_BYTES = 25_000_000
-"""Greatest size of a page that stands alone."""
+"""Greatest size of a page with all data inside, bytes."""
 _EARLY_BYTES = 3_000_000
 SCRIPTS = (
     "vectors.js",
@@ -53,7 +53,7 @@ SCRIPTS = (
     "app.js",
     "main.js",
 )
-"""Scripts in the order in which they are read."""
+"""Scripts in the order in which a browser reads them."""
 SHADERS = (
     "common.glsl",
     "surface.vert",
@@ -74,9 +74,10 @@ SHADERS = (
 
 
 def write_page(look: Look, title: str, path: Path, most_bytes: int = MOST_BYTES) -> list[Path]:
-    """Write the page; the files that it needs, itself first. The data of an earlier page stay until it is written.
+    """Write the page; return its files, the page first. The data of an earlier page stay until the new page is
+    written.
 
-    Raises InputError if its name does not end in .html, or if there is a folder of its data that is not one;
+    Raises InputError if the name does not end in .html, or if the folder for its data contains other files;
     StorageError if it cannot be written.
     """
     if path.suffix.lower() != ".html":
@@ -102,7 +103,7 @@ def write_page(look: Look, title: str, path: Path, most_bytes: int = MOST_BYTES)
 
 
 def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
-    """The HTML; `data` is the folder of what is not inside, empty if all is."""
+    """Return the HTML; `data` is the folder of the blocks outside the page, empty if there are none."""
     shaders = {name: _part(name) for name in SHADERS}
     names = [block.name for block in look.blocks]
     about = {**look.about, "title": title, "errors": look.errors, "blocks": names, "data": data}
@@ -127,8 +128,8 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
 
 
 def _early(look: Look, inside: list[Block]) -> int:
-    """Count the blocks inside the page that stand before the scripts: the scripts begin with them while the rest
-    is read."""
+    """Number of blocks in the page that stand before the scripts: the scripts begin with them while the rest is
+    read."""
     if look.first:
         return 0
     sizes = accumulate(len(block.script) for block in inside)
@@ -136,8 +137,11 @@ def _early(look: Look, inside: list[Block]) -> int:
 
 
 def _shared_out(look: Look, most_bytes: int) -> tuple[list[Block], list[Block]]:
-    """Share out the blocks: those that go into the page, and those that go beside it. All that a page needs to
-    begin goes into it, or none of it; then as many of the others as have room, in their order."""
+    """Return the blocks that go into the page, and those that go beside it.
+
+    The blocks that a page needs to begin go into it all together, or not at all. Then the others go into it in
+    their order, while there is room.
+    """
     start_bytes = sum(len(block.script) for block in (*look.first, *look.blocks))
     free = most_bytes - _own_bytes() - len(json.dumps(look.about)) - start_bytes
     if free < 0:
@@ -159,7 +163,7 @@ def _own_bytes() -> int:
 
 
 def _earlier(data: Path) -> list[Path]:
-    """Data of an earlier page. Raises InputError if the folder holds anything else."""
+    """Return the files of an earlier page's data. Raises InputError if the folder contains other files."""
     if not data.exists() and not data.is_symlink():
         return []
     paths = list(data.iterdir()) if data.is_dir() and not data.is_symlink() else [data]

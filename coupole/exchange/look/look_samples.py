@@ -1,4 +1,4 @@
-"""Measured samples of a result of runs, for a page to draw when a point is clicked."""
+"""Measured samples of a result of runs, which a page draws when a point is clicked."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from coupole.reflectance.sample_sources import channel_samples, triangles_beside
 from coupole.reflectance.sample_uncertainty import bounds
 
 ROWS = 64
-"""Triangles of a block."""
+"""Number of triangles in a block."""
 _BAND, _LEDS = 4096, 8
-"""Triangles and LEDs that are read together: as they lie in the file."""
+"""Numbers of triangles and LEDs that are read together, as in the chunks of the file."""
 _QUANTILE_95 = 1.959964
 _FAR = 10.0
-"""Greatest value that is written for an end of an interval that is not bounded."""
+"""Value that is written for an unbounded end of an interval."""
 
 
 def samples_of_result(
@@ -29,7 +29,7 @@ def samples_of_result(
     scan_noise_um: float,
     say: Callable[[str, int, int], None],
 ) -> tuple[list[dict[str, Any]], list[Block]]:
-    """Return what the page knows of the samples of all views, and their blocks."""
+    """Return the page's facts of the samples of all views, and their blocks."""
     view_facts, blocks = [], []
     for view in result.views:
         of_view, view_blocks = samples_of_view(result, view, support_from_base, scan_noise_um, say)
@@ -45,12 +45,13 @@ def samples_of_view(
     scan_noise_um: float,
     say: Callable[[str, int, int], None],
 ) -> tuple[dict[str, Any], list[Block]]:
-    """Return what the page knows of a view's samples, and its blocks. These are the numbers of triangles, places
-    of LEDs, and for each `ROWS` triangles codes [3, ROWS, leds]: the channels' mean f cos_i, and how far below and
-    above it its 95 % interval ends, as shares of it. The interval is by all sources, as if all channels were off
-    to the same side.
+    """Return the page's facts of a view's samples, and its blocks.
 
-    Raises InputError for samples that an earlier version made.
+    The blocks are numbers of triangles, places of LEDs, and codes [3, ROWS, leds] for each `ROWS` triangles. The
+    codes are the channels' mean f cos_i, and how far the ends of its 95 % interval are below and above it, as
+    shares of it. The interval includes all sources, with the errors of all channels in the same direction.
+
+    Raises InputError for samples of an earlier version.
     """
     name, count = view.path.stem, len(view.triangles)
     blocks = [
@@ -72,7 +73,7 @@ def samples_of_view(
 def _codes(
     result: RunResult, view: ViewSamples, rows: NDArray[np.int64], scan_noise_um: float
 ) -> NDArray[np.uint8]:
-    """[3, rows, leds]"""
+    """[3, rows, leds] codes of these triangles."""
     beside = triangles_beside(result, view, rows)
     mean = result.view_samples(view, slice(int(rows[0]), int(rows[-1]) + 1)).values.mean(axis=2, dtype=np.float64)
     codes = np.zeros((3, len(rows), len(view.leds)), np.uint8)

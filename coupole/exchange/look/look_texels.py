@@ -1,5 +1,5 @@
-"""Maps of texels for a page: square tiles that it reads one after the other, and what its triangles have until
-then."""
+"""Maps of texels for a page: square tiles that it reads one after the other, and means that its triangles show
+until then."""
 
 from __future__ import annotations
 
@@ -15,32 +15,33 @@ from coupole.exchange.look.look_blocks import Block, block_of, halves, jpeg_of, 
 from coupole.exchange.srgb import srgb
 
 MOST_PX = 4096
-"""Width of a page's maps: what every graphics card and browser takes."""
+"""Greatest width of a page's maps, px, which every graphics card and browser supports."""
 TILE_PX = 1024
 NOWHERE = 0xFFFFFFFF
-"""Place in the maps of a corner that has none."""
+"""Place in the maps for a corner without one."""
 _QUALITY = 92
 _STEPS = 4095
-"""Codes of a coordinate of a normal: 12 bits."""
+"""Number of codes of a coordinate of a normal: 12 bits."""
 
 
 @dataclass(frozen=True)
 class LookTexels:
-    """Texels as a page has them: maps in tiles, and means for its triangles."""
+    """Texels in the form that a page needs: maps in tiles, and means for its triangles."""
 
     about: dict[str, Any]
     remark: str
     map_places: NDArray[np.uint32]
-    """[n, 3] of the corners of the mesh's triangles: column, and row by 65536, each as a share of 65535; or
+    """[n, 3] places of the corners of the mesh's triangles: column, and row by 65536, each as a share of 65535; or
     `NOWHERE`."""
     of_triangles: dict[str, NDArray[Any]]
-    """Numbers of triangles [n, ...] as a page has them: means of their texels; 0 of those without."""
+    """Numbers of triangles [n, ...]: means of their texels; 0 for triangles without texels."""
     blocks: list[Block]
-    """Tiles, in the order in which they are wanted."""
+    """Tiles, in the order in which a page needs them."""
 
 
 def look_texels(flat: FlatSurface, count: int, prefix: str = "") -> LookTexels:
-    """Make them from maps, for a mesh of `count` triangles; `prefix` begins the names of their blocks."""
+    """Make the texels of a page from maps, for a mesh of `count` triangles; the names of the blocks begin with
+    `prefix`."""
     peaks = [max(float(np.quantile(values, 0.9999)), 1e-6) for values in (flat.kd, flat.ks)]
     about: dict[str, Any] = {"side_px": flat.side_px, "tile_px": TILE_PX, "peaks": peaks, "tiles": []}
     blocks = []
@@ -81,7 +82,7 @@ def _means(flat: FlatSurface, count: int) -> dict[str, NDArray[Any]]:
 
 
 def _tiles(flat: FlatSurface, peaks: list[float], prefix: str) -> Iterator[tuple[int, int, list[Block]]]:
-    """Column and row of each tile in which there is something, and its blocks: shape, kd and ks."""
+    """Column and row of each tile that is not empty, and its blocks: shape, kd and ks."""
     shape = _shape_codes(flat)
     colours = [
         np.rint(255.0 * srgb(values / peak)).astype(np.uint8)
@@ -103,7 +104,7 @@ def _tiles(flat: FlatSurface, peaks: list[float], prefix: str) -> Iterator[tuple
 
 
 def _shape_codes(flat: FlatSurface) -> NDArray[np.uint8]:
-    """[k, 4] of texels: the upper 8 bits of the two coordinates of the normal's octahedron, their lower 4 bits
+    """[k, 4] codes of texels: the upper 8 bits of the two octahedral coordinates of the normal, their lower 4 bits
     together, and 1 to 255 for the root of alpha, 0 to 1."""
     coordinates = np.rint(octahedral(flat.normals.astype(np.float64)) / 65535.0 * _STEPS).astype(np.uint16)
     codes = np.empty((len(coordinates), 4), np.uint8)

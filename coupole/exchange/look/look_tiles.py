@@ -1,4 +1,5 @@
-"""A large picture as square tiles in levels, each half as wide as the one before: a page loads what it shows.
+"""A large picture as square tiles in levels, each half as wide as the one before; a page loads only the visible
+tiles.
 
 Level 0 is the whole picture; row 0 of a tile is its uppermost.
 """
@@ -16,7 +17,7 @@ TILE_PX = 256
 
 @dataclass(frozen=True)
 class Tile:
-    """A square of a level; what lies outside of the picture is NaN."""
+    """A square of a level; values outside the picture are NaN."""
 
     level: int
     column: int
@@ -25,12 +26,12 @@ class Tile:
     """[n, TILE_PX, TILE_PX]"""
 
     def name(self, of: str) -> str:
-        """Return the name of its block."""
+        """Return the name of the tile's block."""
         return f"{of}-{self.level}-{self.column}-{self.row}"
 
 
 def levels_of(width: int, height: int) -> list[list[int]]:
-    """Width and height, pixels, of each level; the last fits into one tile."""
+    """Return width and height, px, of each level; the last level fits into one tile."""
     sizes = [[width, height]]
     while max(sizes[-1]) > TILE_PX:
         sizes.append([-(-side // 2) for side in sizes[-1]])
@@ -38,7 +39,7 @@ def levels_of(width: int, height: int) -> list[list[int]]:
 
 
 def tiles_of(values: NDArray[np.float32]) -> Iterator[Tile]:
-    """Give the tiles of a picture's values [n, h, w], NaN where there is none."""
+    """Yield the tiles of a picture's values [n, h, w], NaN where there is none."""
     height, width = values.shape[1:]
     for level, _ in enumerate(levels_of(width, height)):
         if level:
@@ -53,7 +54,7 @@ def tiles_of(values: NDArray[np.float32]) -> Iterator[Tile]:
 
 
 def halve_pictures(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[n, ceil(h / 2), ceil(w / 2)] means of those of 2 x 2 pixels that have a value."""
+    """[n, ceil(h / 2), ceil(w / 2)] means over those of 2 x 2 pixels that have a value."""
     count, height, width = values.shape
     means = np.empty((count, -(-height // 2), -(-width // 2)), np.float32)
     for whole, half in zip(values, means, strict=True):

@@ -1,9 +1,9 @@
-"""Residuals that GGX leaves of each triangle, for a page: a few principal components of all residuals of a view.
+"""Residuals of GGX for each triangle, for a page: a few principal components of all residuals of a view.
 
-A result's fit `ggx_rbf` gives each triangle, seen by one view, a share of its GGX and a hundred radial functions
-of the light's direction (`coupole.reflectance.slice_fit`). The components minimise the error of f cos_i over
-the half sphere, which is what a picture shows. Each component is a plane: a table of reflectance by the light's
-direction in the triangle's own frame. Each triangle has a number for each plane.
+A result's fit `ggx_rbf` gives each triangle, for each view, a share of its GGX and coefficients of a hundred
+radial functions of the light's direction (`coupole.reflectance.slice_fit`). The components minimise the error of f
+cos_i over the hemisphere, which is what a picture shows. Each component is a plane: a table of reflectance by the
+light's direction in the triangle's own frame. Each triangle has a coefficient for each plane.
 """
 
 from __future__ import annotations
@@ -30,37 +30,39 @@ Floats = NDArray[np.float64]
 
 FIT = SLICES["ggx_rbf"]
 PLANES = 9
-"""Default number of planes: with three shares of GGX they fill whole groups of four bytes."""
+"""Default number of planes. With three shares of GGX, they fill whole groups of four bytes."""
 SIDE = 48
 """Number of entries on a side of a plane's table."""
 _STEPS = 127
 _SHARE_STEPS = 254
 _LEARNT, _JUDGED = 20_000, 1500
-"""Triangles of a view that planes are found by, and that they are judged by."""
+"""Numbers of triangles of a view: those from which planes are computed, and those on which their error is
+measured."""
 _BLOCK = 1 << 14
 _DIRECTIONS = 600
-"""Number of lights all around, by which planes are judged."""
+"""Number of lights in all directions for measuring the error of planes."""
 _FAR_MM = 1e5
 
 
 @dataclass(frozen=True)
 class ResidualPlanes:
-    """Planes of a view's triangles: f cos_i = max(share f_GGX cos_i + z sum_k number_k plane_k(light), 0), with z
-    the cosine of the light to the mesh's normal."""
+    """Planes of a view's triangles: f cos_i = max(share f_GGX cos_i + z sum_k number_k plane_k(light), 0), where z
+    is the cosine of the light to the mesh's normal."""
 
     planes: NDArray[np.float16]
-    """[planes, SIDE, SIDE, 3] 1/sr by y and x of `table_directions`, times the greatest number of the plane."""
+    """[planes, SIDE, SIDE, 3] 1/sr by y and x of `table_directions`, multiplied by the greatest coefficient of the
+    plane."""
     codes: NDArray[np.uint8]
-    """[3 + planes, n] of shares by channel (1 to 255: 0 to 1; 0: no residual), and of numbers: 128 + 127 times the
-    root of their share of the greatest one, with their sign."""
+    """[3 + planes, n] codes: of the shares by channel (1 to 255 for 0 to 1; 0 for no residual), and of the
+    coefficients. The code of a coefficient is 128 + 127 times the signed root of its share of the greatest one."""
     missed_energy: float
-    """Sum of the squares of what pages leave of the fit, over some triangles, directions and channels."""
+    """Sum of the squared errors of pages relative to the fit, over some triangles, directions and channels."""
     energy: float
-    """The same of what GGX alone leaves of it: of the residual."""
+    """The same sum for GGX alone: the energy of the residual."""
 
 
 def residual_fit(result: RunResult) -> str | None:
-    """The material that residuals are added to; None where a view has no such fit."""
+    """The material to which residuals are added; None if no view has such a fit."""
     whole = all(result.slices_path(FIT.name, view).exists() for view in result.views)
     return FIT.over.name if FIT.over and whole and result.views else None
 
@@ -68,8 +70,11 @@ def residual_fit(result: RunResult) -> str | None:
 def residual_blocks(
     result: RunResult, planes: int, say: Callable[[str, int, int], None]
 ) -> tuple[dict[str, Any], list[Block]]:
-    """Return what a page knows of residuals, and two blocks of each view: codes [3 + planes, triangles of the
-    mesh] and planes. `kept` is the share of the energy of all views' residuals."""
+    """Return a page's facts of residuals, and two blocks of each view: codes [3 + planes, triangles of the mesh]
+    and planes.
+
+    Among the facts, `kept` is the share of the energy of all views' residuals that the planes contain.
+    """
     views, blocks, missed_energy, energy = [], [], 0.0, 0.0
     support_from_base = inverse(result.base_from_support)
     for number, view in enumerate(result.views):
@@ -87,7 +92,7 @@ def residual_blocks(
 
 
 def residual_planes(result: RunResult, view: ViewSamples, count: int) -> ResidualPlanes:
-    """`count` planes of a view's residuals."""
+    """Compute `count` planes of a view's residuals."""
     coefficients = result.slices(FIT.name, view)
     rows_of_fit = np.flatnonzero(np.isfinite(coefficients).all(axis=(1, 2)))
     channels = coefficients.shape[1]
@@ -115,8 +120,8 @@ def residual_planes(result: RunResult, view: ViewSamples, count: int) -> Residua
 
 
 def table_directions() -> Floats:
-    """[SIDE, SIDE, 3] of lights in the triangle's frame: Lambert's azimuthal projection of equal areas, x and y
-    from -1 to 1, in which the half sphere is a disk of radius 1; beside it, lights from below."""
+    """[SIDE, SIDE, 3] directions of lights in the triangle's frame: Lambert's azimuthal equal-area projection, x
+    and y from -1 to 1. The hemisphere is a disk of radius 1; outside the disk are lights from below."""
     line = np.linspace(-1.0, 1.0, SIDE)
     u, v = np.meshgrid(line, line)
     square = u * u + v * v
@@ -125,9 +130,11 @@ def table_directions() -> Floats:
 
 
 def _components(learnt_coefficients: Floats, count: int) -> tuple[Floats, Floats]:
-    """Find the components of coefficients [n, channels, COUNT]. Returns rows [count, channels * COUNT] that give
-    numbers of components, and the way back: coefficients of each component. Where there are fewer, the rest is
-    0."""
+    """Find the components of coefficients [n, channels, COUNT].
+
+    Returns rows [count, channels * COUNT] that map coefficients to components, and the coefficients of each
+    component, which map back. If there are fewer components, the rest is 0.
+    """
     channels = learnt_coefficients.shape[1]
     root = _metric()
     apart = (learnt_coefficients @ root).reshape(len(learnt_coefficients), -1)
@@ -143,7 +150,8 @@ def _components(learnt_coefficients: Floats, count: int) -> tuple[Floats, Floats
 
 @cache
 def _metric() -> Floats:
-    """[COUNT, COUNT] lower root of the integral over the half sphere of the squares of functions times cosine."""
+    """[COUNT, COUNT] lower root of the integral, over the hemisphere, of the products of functions times the
+    cosine."""
     directions = _half_sphere(4000)
     values = _functions(directions) * directions[:, 2]
     gram = values @ values.T * (2.0 * math.pi / len(directions))
@@ -152,7 +160,7 @@ def _metric() -> Floats:
 
 
 def _functions(directions: Floats) -> Floats:
-    """[COUNT, n]"""
+    """[COUNT, n] values of the radial functions."""
     rows = np.empty((COUNT, len(directions)))
     x, y, z = np.ascontiguousarray(directions.T)
     functions(FIT.basis.harmonic, x, y, z, rows)
@@ -160,7 +168,7 @@ def _functions(directions: Floats) -> Floats:
 
 
 def _half_sphere(count: int) -> Floats:
-    """[count, 3] a Fibonacci spiral."""
+    """[count, 3] directions on a Fibonacci spiral."""
     number = np.arange(count) + 0.5
     z = 1.0 - number / count
     azimuth = number * math.pi * (3.0 - math.sqrt(5.0))

@@ -1,7 +1,7 @@
-"""Materials of a scene as layers that a page lights: spectra by angle, and their colours under each illuminant.
+"""Materials of a scene as layers for a page: spectra by angle, and their colours under each illuminant.
 
-A layer is GGX facets over a Lambertian body. Its colours are made here, from 81 bands, the illuminant and the
-observer: the page looks them up, and never multiplies a colour of a light with one of a material.
+A layer has GGX facets over a Lambertian body. Its colours are computed here, from 81 bands, the illuminant and the
+observer. The page only looks them up; it never multiplies a colour of a light by one of a material.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from coupole.errors import InputError
 
 ANGLES = 33
 COSINES: Array = np.maximum(np.linspace(0.0, 1.0, ANGLES) ** 2, 1e-9)
-"""Cosines of the angles of incidence at which a table has values; their roots have equal steps."""
+"""Cosines of the angles of incidence of a table; their square roots have equal steps."""
 LAYERS = 2
 """Number of layers of each material."""
 COLUMNS = ANGLES + 2
 PATHS = 17
-"""Lengths of way through lacquer for which a flake has values, from 0 to the longest."""
+"""Number of path lengths through lacquer for which a flake has values, from 0 to the longest."""
 SHOWN = "gilding, metals, films, paints, lacquer, makie, nashiji, and one nashiji_slab beside opaque things"
 
 
@@ -43,19 +43,20 @@ class Layer:
     mirror: Array
     """[ANGLES, 81], reflectance of the facets at `COSINES`."""
     passing: Array
-    """[ANGLES], share of light that the face lets pass at an angle, inwards as outwards."""
+    """[ANGLES] share of light that passes the face at an angle, the same inwards and outwards."""
     body: Array
-    """[81], reflectance of the body, without what the face keeps by `passing`."""
+    """[81] reflectance of the body, without the loss at the face, which `passing` contains."""
     roughness: float
     """GGX's alpha."""
 
     def times(self, share: float) -> Layer:
-        """A layer that covers a share of the surface."""
+        """Return a layer that covers only a share of the surface."""
         return Layer(share * self.mirror, self.passing, share * self.body, self.roughness)
 
 
 def layers_of(material: Material, folder: Path) -> tuple[Layer, ...]:
-    """One or two layers, whose sum the material is; paths are relative to `folder`. Raises InputError."""
+    """Return the one or two layers whose sum is the material; paths are relative to `folder`. Raises
+    InputError."""
     match material:
         case Diffuse():
             return (_layer_with_body(np.zeros((ANGLES, BANDS)), matt(material.reflectance, folder).values, 1.0),)
@@ -77,8 +78,8 @@ def layers_of(material: Material, folder: Path) -> tuple[Layer, ...]:
 
 
 def flake_layers(gold: float, roughness: float, longest_mm: float) -> list[tuple[Layer, ...]]:
-    """A metal under urushi, behind ways of 0 to `longest_mm` through it: `PATHS` materials. Without the lacquer's
-    face, which the page refracts at."""
+    """Return a metal under urushi, seen through paths of 0 to `longest_mm` of lacquer, as `PATHS` materials. The
+    lacquer's face is not included, because the page refracts there."""
     index = materials.metal_index(gold) / indices.URUSHI
     mirror, absorption = fresnel.reflectance(COSINES[:, None], index), lacquer.urushi_absorption()
     ways_mm = np.linspace(0.0, longest_mm, PATHS)
@@ -93,8 +94,8 @@ def tables(
     """[illuminants, materials, LAYERS, COLUMNS, 4] linear sRGB of white 1 under each illuminant.
 
     Columns: `mirror` at `COSINES` with `passing` as fourth number; body (1/sr) and roughness; then 1 if each
-    triangle has its own share of the first layer and the second has the rest, else 0, and the colour of white.
-    Colours outside the gamut have numbers below 0.
+    triangle has its own share of the first layer (the second layer has the rest), otherwise 0; and the colour of
+    white. Colours outside the gamut have numbers below 0.
     """
     numbers = np.zeros((len(powers), len(layers_of_materials), LAYERS, COLUMNS, 4), np.float32)
     numbers[..., :ANGLES, 3] = 1.0
@@ -113,7 +114,8 @@ def tables(
 
 
 def colours(spectral: Array, power: Array, observer: light.Observer) -> Array:
-    """Linear sRGB [..., 3] of reflectances [..., 81] under a light; Y of the perfect white is 1. No adaptation."""
+    """Linear sRGB [..., 3] of reflectances [..., 81] under a light; Y of the perfect white is 1. There is no
+    chromatic adaptation."""
     return light.linear_srgb(light.tristimulus(spectral, power, light.observer(observer)))
 
 
@@ -132,7 +134,7 @@ def _coated_layer(body: InternalReflectance, material: Paint | Lacquer, folder: 
 
 
 def _under_face(body: InternalReflectance, index: Array, roughness: float) -> Layer:
-    """A body under a glossy face, with all reflections between them (Saunderson), as `materials.coated` has it."""
+    """A body under a glossy face, with all reflections between them (Saunderson), like `materials.coated`."""
     face = fresnel.reflectance(COSINES, indices.at_d_line(index.astype(complex)))
     reflectance = materials.under_face(body, index)
     return Layer(np.repeat(face[:, None], BANDS, axis=1), 1.0 - face, reflectance, roughness)
@@ -154,7 +156,7 @@ def _stack(films: Sequence[Film], base: Complex) -> Array:
 
 
 def _gilt(material: Gilt, folder: Path) -> tuple[Layer, ...]:
-    """Leaf with the bole's light that comes through it, and bare bole, by their shares."""
+    """Leaf, with the light of the bole that passes through it, and bare bole, by their shares."""
     gilding, index = materials.gilt_of(material, folder)
     bare = _under_face(gilding.bole, np.full(BANDS, indices.EGG_WHITE), material.bole_roughness)
     if material.thickness_nm < materials.THINNEST_NM or material.uncovered == 1.0:

@@ -1,4 +1,4 @@
-"""Start of a page of a scene: the scene's first camera, and its lights as the page has them."""
+"""Initial state of a scene's page: the scene's first camera, and its lights in the form that the page has."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from coupole.errors import InputError
 
 MOST_LIGHTS = 10
 _WIDEST_DEG = 30.0
-"""Radius of the page's widest disk."""
+"""Radius of the widest disk of a page, degrees."""
 
 
 @dataclass(frozen=True)
 class _Lamp:
-    """A light from afar, as the target of the first camera has it."""
+    """A distant light, as seen from the target of the first camera."""
 
     to_light: Array
     illuminance_lux: float
@@ -38,7 +38,7 @@ class _Lamp:
 
 
 def illuminants(scene: PlainScene, folder: Path) -> dict[str, Array]:
-    """Spectral power [81] by name: the scene's own first, then those that a page always offers."""
+    """Spectral power [81] by name: first the scene's own, then those that every page offers."""
     powers = {spectrum_name(light.spectrum): power(light.spectrum, folder) for light in scene.lights}
     offers = {name: known_light.illuminant(name) for name in ("D65", "A")}
     offers |= {"LED of the dome": spectral_power(LedSpectrum())}
@@ -47,7 +47,7 @@ def illuminants(scene: PlainScene, folder: Path) -> dict[str, Array]:
 
 
 def spectrum_name(spectrum: Power) -> str:
-    """Return the name that the page has for a spectrum."""
+    """Return the page's name for a spectrum."""
     match spectrum:
         case Illuminant() | Source() | Values():
             return spectrum.name
@@ -63,7 +63,7 @@ def spectrum_name(spectrum: Power) -> str:
 
 
 def start_of(scene: PlainScene, folder: Path) -> dict[str, Any]:
-    """The page's first state. Raises InputError for more lamps than the page has."""
+    """Return the page's initial state. Raises InputError if the scene has more lamps than the page."""
     target = np.asarray(scene.cameras[0].target_mm)
     lamps = [lamp for light in scene.lights for lamp in _lamps(light, folder, target)]
     if len(lamps) > MOST_LIGHTS:
@@ -118,7 +118,7 @@ def _lamps(light: PlainLight, folder: Path, target: Array) -> Iterator[_Lamp]:
 
 
 def _square(way: Array, facing: Array, area_mm2: float, intensity_cd_mm2_m2: float, spectrum: Power) -> _Lamp:
-    """A Lambertian square, by its luminance times area in cd/m^2 mm^2, as a disk of the same solid angle."""
+    """A Lambertian square, with its luminance times area in cd/m^2 mm^2, as a disk of the same solid angle."""
     apart_mm = float(np.linalg.norm(way))
     cosine = max(float(-(way @ facing) / (apart_mm * np.linalg.norm(facing))), 0.0)
     radius_deg = math.degrees(math.atan(math.sqrt(area_mm2 * cosine / math.pi) / apart_mm))
@@ -142,7 +142,8 @@ def _dark(illuminant: str) -> dict[str, Any]:
 
 
 def _camera(camera: Camera) -> dict[str, Any]:
-    """The page's camera has z up; its `field`, across a window's shorter side, is the scene's longer one."""
+    """The page's camera, with z up. Its `field` spans a window's shorter side and equals the scene's field across
+    the longer side."""
     back = np.asarray(camera.position_mm) - np.asarray(camera.target_mm)
     distance = float(np.linalg.norm(back))
     half = math.tan(math.radians(camera.field_deg() / 2.0))

@@ -1,11 +1,11 @@
-"""Urushi as a page shows it: the mean over many grains or flakes, which does not flicker however small they are.
+"""Urushi on a page: the mean over many grains or flakes, which does not flicker, however small they are.
 
-Makie has its drawing's share of metal on each triangle. Nashiji has two layers: the lacquer's face over the
-ground, and the lobe of its flakes. Seen from air, a flake's tilt turns its mirror image n times as far as it
-would without the lacquer (Snell, for small angles), so that the lobe's roughness is n times that of tilts and
-facets together; its strength has both passages of the face, the metal's reflectance inside, and the mean of
-Beer and Lambert's law over depths. Flakes do not hide each other but by their covered share, and no single
-flake sparkles: `coupole render` shows them.
+Makie has the drawing's share of metal on each triangle. Nashiji has two layers: the lacquer's face over the
+ground, and the lobe of its flakes. Seen from air, a flake's tilt turns its mirror image n times as far as without
+the lacquer (Snell, for small angles). So the roughness of the lobe is n times that of tilts and facets together.
+Its strength contains both passages of the face, the metal's reflectance inside, and the mean of the Beer-Lambert
+law over depths. Flakes hide each other only through their covered share, and no single flake sparkles; `coupole
+render` shows sparkles.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from coupole.errors import InputError
 from coupole.exchange.look.scene_layers import ANGLES, COSINES, Layer
 
 _TRIANGLES = 200_000
-"""Approximate number of triangles of a body that is drawn on."""
+"""Approximate number of triangles of a body with a drawing."""
 _FACE_ROUGHNESS = 0.02
 _RADIUS_SPREAD = 0.3
-"""`nashiji.Slab.radius_spread`: flakes' areas are on average larger than that of the median radius."""
+"""`nashiji.Slab.radius_spread`: the mean area of flakes is larger than the area for the median radius."""
 
 
 def coarse_grains(thing: Makie, folder: Path) -> Grains:
-    """The drawing's shares on triangles as coarse as a page can hold, in the object's frame. Raises InputError."""
+    """The drawing's shares on triangles as coarse as a page needs, in the object's frame. Raises InputError."""
     area_mm2 = float(skin_of(body_corners(thing.body, folder)).areas_mm2().sum())
     grain_mm = max(thing.grain_mm, float(np.sqrt(4.0 * area_mm2 / _TRIANGLES)))
     grains = makie_grains(thing.model_copy(update={"grain_mm": grain_mm}), folder)
@@ -41,7 +41,7 @@ def coarse_grains(thing: Makie, folder: Path) -> Grains:
 
 
 def lacquered_corners(thing: Nashiji, folder: Path) -> Array:
-    """[n, 3, 3] of the lacquer's face, in the object's frame. Raises InputError."""
+    """[n, 3, 3] triangles of the lacquer's face, in the object's frame. Raises InputError."""
     return grown(skin_of(body_corners(thing.body, folder)), thing.depth_mm).corners_mm
 
 
@@ -70,6 +70,6 @@ def nashiji_layers(thing: Nashiji, folder: Path) -> tuple[Layer, Layer]:
 
 
 def _covered_share(thing: Nashiji) -> float:
-    """Share of the surface that flakes cover, seen from above: discs at random places."""
+    """Share of the surface that flakes cover, seen from above, for disks at random places."""
     area_mm2 = np.pi * thing.flake_radius_mm**2 * np.exp(2.0 * _RADIUS_SPREAD**2)
     return float(-np.expm1(-thing.flakes_per_mm2 * area_mm2))

@@ -1,2 +1,2 @@
-"""Results of runs for other programs: a module for each format, with `write(surface, folder)`, which gives the
-files it has written."""
+"""Results of runs for other programs: a module for each format, with `write(surface, folder)`, which returns the
+written files."""

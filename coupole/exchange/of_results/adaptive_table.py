@@ -1,10 +1,11 @@
-"""A table of RGL's format that adapts to its material: as small as misses it by no more than is asked.
+"""A table in RGL's format that adapts to its material: the smallest one whose error is at most the wanted one.
 
-The stored value is f cos(theta_o) over `ndf`, the part that depends on the half vector's own elevation. The reader
-multiplies with it again. It is small, because it depends on one angle: 2 x 2048 nodes. The quotient changes little
-within a lobe. Angles of incidence crowd towards the horizon, where f changes most with them. Their number, how
-much they crowd, and the number of half vectors grow until the table, as its readers read it, misses the material
-by no more than is asked. Half vectors are not warped by `vndf`: that missed more (decision 38).
+The stored value is f cos(theta_o) divided by `ndf`, the part that depends only on the half vector's own elevation;
+a reader multiplies by it again. `ndf` is small, because it depends on one angle: 2 x 2048 nodes. The quotient
+changes little within a lobe. Angles of incidence are dense near the horizon, where f changes most with them. Their
+number, their density near the horizon, and the number of half vectors grow until the table, as readers interpolate
+it, has at most the wanted error. Half vectors are not warped by `vndf`, because this gave larger errors (decision
+38).
 """
 
 from __future__ import annotations
@@ -32,16 +33,16 @@ from coupole.exchange.of_results.measured_surface import Floats
 THETAS = (16, 24, 32, 48, 64, 96, 128)
 SIDES = (24, 32, 48, 64, 96, 128, 192)
 CROWDINGS = (1.0, 1.3)
-"""Angles of incidence are pi/2 (1 - (1 - t)^c) of even steps t."""
+"""Values of c: angles of incidence are pi/2 (1 - (1 - t)^c) for even steps t."""
 SHARE = 0.95
-"""Share of the pairs of directions that miss less than is asked."""
+"""Share of the pairs of directions whose error must be at most the wanted one."""
 _NDF_NODES = 2048
 _PAIRS, _LOWEST_Z = 2000, 0.1
 
 
 @dataclass(frozen=True)
 class Checked:
-    """Pairs of directions with what the material reflects there."""
+    """Pairs of directions, and the material's reflectance there."""
 
     ways_in: Floats
     """[n, 3]"""
@@ -50,13 +51,13 @@ class Checked:
     """[n, 3]"""
 
     def misses(self, table: RglTable) -> Floats:
-        """[n, 3] relative errors."""
+        """Return the relative errors [n, 3] of a table."""
         return np.asarray(np.abs(table(self.ways_in, self.ways_out) - self.f) / np.maximum(self.f, 1e-12))
 
 
 @dataclass(frozen=True)
 class AdaptiveTable:
-    """A material at angles of incidence and half vectors of some number."""
+    """A material tabulated at some numbers of angles of incidence and half vectors."""
 
     material: Material
     thetas: int
@@ -70,7 +71,7 @@ class AdaptiveTable:
 
     @cached_property
     def ndf(self) -> NDArray[np.float32]:
-        """[2, nodes] the channels' mean of kd + ks D / 4, GGX's D of the half vector's elevation."""
+        """[2, nodes] the channels' mean of kd + ks D / 4, with GGX's D of the half vector's elevation."""
         cosine = np.cos(0.5 * np.pi * np.linspace(0.0, 1.0, _NDF_NODES) ** 2)
         alpha2 = self.material.alpha**2
         facets = alpha2 / (np.pi * (1.0 - cosine**2 * (1.0 - alpha2)) ** 2)
@@ -90,11 +91,11 @@ class AdaptiveTable:
 
     @property
     def size_bytes(self) -> int:
-        """Size of the file without its small fields."""
+        """Size of the file in bytes, without its small fields."""
         return 4 * 4 * self.thetas * self.side**2
 
     def decoded_table(self) -> RglTable:
-        """Return the table as readers of the file have it."""
+        """Return the table in the form that readers of the file have."""
         planes = np.ascontiguousarray(np.moveaxis(self.rgb, 2, -1))
         flat = np.ones((1, self.thetas, 2, 2))
         quarter = np.full((2, 2), 0.25)
@@ -117,7 +118,7 @@ class AdaptiveTable:
 
 
 def encode_adaptive(material: Material, most_error: float, description: str = "") -> bytes:
-    """The file; its description says what it misses. Raises InputError if no table is large enough."""
+    """Return the file, whose description states its error. Raises InputError if no table is large enough."""
     pairs = tuple(_pairs(material))
     table, errors = _smallest(material, most_error, pairs)
     text = (
@@ -130,7 +131,8 @@ def encode_adaptive(material: Material, most_error: float, description: str = ""
 def _smallest(
     material: Material, most_error: float, check_pairs: tuple[Checked, ...]
 ) -> tuple[AdaptiveTable, Floats]:
-    """A table that misses no more; from the smallest on it grows by what helps more for its bytes."""
+    """Return a table with at most the wanted error. The table grows from the smallest by the step that reduces the
+    error most for its bytes."""
     table = AdaptiveTable(material, THETAS[0], SIDES[0], CROWDINGS[0])
     errors = _relative_errors(table, check_pairs)
     while errors[1::2].max() > most_error:
@@ -151,7 +153,7 @@ def _smallest(
 
 
 def _larger(table: AdaptiveTable) -> Iterator[AdaptiveTable]:
-    """Give tables with the next number of angles of incidence, of half vectors, or both, crowded or not."""
+    """Yield tables with the next number of angles of incidence, of half vectors, or of both, for each density."""
     thetas = [n for n in THETAS if n > table.thetas][:1]
     sides = [n for n in SIDES if n > table.side][:1]
     for crowding in CROWDINGS:
@@ -164,14 +166,14 @@ def _larger(table: AdaptiveTable) -> Iterator[AdaptiveTable]:
 
 
 def _relative_errors(table: AdaptiveTable, check_pairs: tuple[Checked, ...]) -> Floats:
-    """Median and `SHARE` of the relative errors, of each set of pairs."""
+    """Median and `SHARE` quantile of the relative errors, for each set of pairs."""
     reflectance = table.decoded_table()
     return np.concatenate([np.quantile(pairs.misses(reflectance), [0.5, SHARE]) for pairs in check_pairs])
 
 
 def _pairs(material: Material) -> Iterator[Checked]:
-    """Give pairs of directions: first of all directions alike, then about the mirror direction, by half vectors
-    drawn from GGX's D."""
+    """Yield sets of pairs of directions: first uniformly distributed ones, then ones near the mirror direction,
+    with half vectors drawn from GGX's D."""
     random = np.random.default_rng(1)
     ways = random.normal(size=(2, 2 * _PAIRS, 3))
     ways[..., 2] = np.abs(ways[..., 2])

@@ -1,6 +1,6 @@
-"""Text for ALTA (Belcour, Barla, Pacanowski 2013 on): samples of triangles as they were measured, with bounds.
+"""Text for ALTA (Belcour, Barla, Pacanowski 2013 on): measured samples of triangles, with bounds.
 
-A file for each channel, as ALTA reads bounds of the first value alone.
+There is one file for each channel, because ALTA reads bounds of the first value only.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ _OPEN = float(np.finfo(np.float32).max)
 
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
-    """`triangleN_red.alta` and so on (`_grey` of a sensor without filter): theta_l, theta_v cos dphi, theta_v sin
-    dphi (rad, about the mesh's normal), f (1/sr), its lower and upper bound at 95 %; an open bound is the
-    largest number that float32 can hold."""
+    """Write `triangleN_red.alta` and so on (`_grey` for a sensor without filter).
+
+    The columns are theta_l, theta_v cos dphi, theta_v sin dphi (rad, about the mesh's normal), f (1/sr), its lower
+    and its upper bound at 95 %. An unbounded value is the largest number of float32.
+    """
     paths = []
     for triangle in chosen_triangles(surface):
         samples = samples_of(surface, int(triangle), _QUANTILE)
         angles = _angles(samples)
         for number, channel in enumerate(channels_of(surface)):
             f = samples.f[:, number]
-            with np.errstate(invalid="ignore"):  # 0 with an open bound
+            with np.errstate(invalid="ignore"):  # 0 if the bound is open
                 bounds = f[:, None] * np.stack([samples.low[:, number], samples.high[:, number]], axis=1)
             bounds = np.sort(np.clip(np.nan_to_num(bounds, nan=_OPEN), -_OPEN, _OPEN), axis=1)
             lines = np.column_stack([angles, f, bounds])[np.isfinite(f)]
@@ -48,7 +50,8 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
 
 
 def _angles(samples: SamplesOfTriangle) -> Floats:
-    """[n, 3] theta_l, theta_v cos dphi, theta_v sin dphi; dphi from the light's azimuth to the camera's."""
+    """[n, 3] theta_l, theta_v cos dphi, theta_v sin dphi; dphi is counted from the light's azimuth to the
+    camera's."""
     light, camera = samples.towards_light, samples.towards_camera
     theta_l, theta_v = (np.arccos(np.clip(ways[:, 2], -1.0, 1.0)) for ways in (light, camera))
     dphi = np.arctan2(camera[:, 1], camera[:, 0]) - np.arctan2(light[:, 1], light[:, 0])

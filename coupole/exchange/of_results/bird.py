@@ -1,7 +1,7 @@
-"""The metrologists' Universal BRDF data format (EMPIR project BiRD, 16NRM08, schema 1.0 of 2021), JSON: samples of
-triangles as they were measured, with standard uncertainties.
+"""The metrologists' Universal BRDF data format (EMPIR project BiRD, 16NRM08, schema 1.0 of 2021), JSON: measured
+samples of triangles, with standard uncertainties.
 
-The schema knows wavelengths, not channels of a camera: a file for each channel.
+The schema has wavelengths, but no channels of a camera; therefore there is one file for each channel.
 """
 
 from __future__ import annotations
@@ -27,16 +27,18 @@ SCHEMA = (
 _DECIMALS = 6
 """Decimals of angles in degrees."""
 _NOT_SAID = "NA"
-"""The format's own word."""
+"""Word of the format for a fact that is not given."""
 _NOBODY = "not-stated@example.invalid"
-"""The schema demands an address."""
+"""Placeholder, because the schema demands an address."""
 
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
-    """`triangleN_red.brdf` and so on (`_grey` of a sensor without filter): theta_i, phi_i of the light, theta_r,
-    phi_r of the camera (deg, about the mesh's normal), BRDF and uBRDF (1/sr). Left out, and counted in the
-    comments: samples that noise made negative, which the schema does not take, and those whose upper bound is
-    open."""
+    """Write `triangleN_red.brdf` and so on (`_grey` for a sensor without filter).
+
+    The columns are theta_i, phi_i of the light, theta_r, phi_r of the camera (degrees, about the mesh's normal),
+    BRDF and uBRDF (1/sr). Two kinds of samples are left out, and counted in the comments: samples that noise made
+    negative, which the schema does not allow, and samples with an open upper bound.
+    """
     paths = []
     for triangle in chosen_triangles(surface):
         samples = samples_of(surface, int(triangle), 1.0)
@@ -75,7 +77,7 @@ def _data(samples: SamplesOfTriangle, channel: int) -> dict[str, Any]:
 
 
 def _polar(ways: Floats) -> tuple[NDArray[Any], NDArray[Any]]:
-    """[n] zenith angle and azimuth from 0 to below 360, degrees."""
+    """[n] zenith angle, and azimuth from 0 to below 360, degrees."""
     theta = np.degrees(np.arccos(np.clip(ways[:, 2], -1.0, 1.0)))
     phi = np.degrees(np.arctan2(ways[:, 1], ways[:, 0])) % 360.0
     return np.asarray(np.round(theta, _DECIMALS)), np.asarray(np.round(phi, _DECIMALS) % 360.0)

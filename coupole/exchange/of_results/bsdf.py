@@ -1,6 +1,6 @@
 """RGL's tensor format (Dupuy and Jakob, An adaptive parameterization for efficient material acquisition and
-rendering, 2018), as a plain table: the fields by which a measured table adapts to its material are constant.
-`adaptive_table` has one that adapts."""
+rendering, 2018), as a plain table: the fields that adapt a measured table to its material are constant.
+`adaptive_table` makes tables that adapt."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ from coupole.exchange.of_results.measured_surface import MeasuredSurface
 from coupole.storage.durable import write_synced
 
 THETAS, SIDE = 64, 128
-"""Angles of incidence; rows and columns of half vectors at each."""
+"""Number of angles of incidence; numbers of rows and columns of half vectors at each."""
 
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
-    """`NAME.bsdf` for each material: some 17 MB, or what `surface.options.most_error` needs."""
+    """Write `NAME.bsdf` for each material. A file has about 17 MB, or the size that `surface.options.most_error`
+    needs."""
     paths = []
     for material in materials_of(surface):
         paths.append(folder / f"{material.name}.bsdf")
@@ -38,8 +39,8 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
 
 
 def encode(material: Material, description: str = "") -> bytes:
-    """f cos(theta_o) for isotropic incidence at `THETAS` angles; half vectors at azimuth (2 u - 1) pi by rows, and
-    elevation pi/2 v^2 by columns."""
+    """Return f cos(theta_o) for isotropic incidence at `THETAS` angles. Rows are half vectors at azimuth (2 u - 1)
+    pi, columns at elevation pi/2 v^2."""
     theta_i = np.linspace(0.0, 0.5 * np.pi, THETAS, dtype=np.float32)
     values = cosine_weighted(material.reflectance, theta_i, half_vectors(SIDE))
     rgb = nodes_for_linear_reading(values, theta_i)

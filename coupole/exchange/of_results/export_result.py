@@ -22,10 +22,10 @@ def export_result(
     options: ExportChoice | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write a result in another format into `folder`; the files.
+    """Write a result in another format into `folder`; return the files.
 
-    Raises InputError for a format that there is none of, a folder that has files (unless `overwrite`), a result
-    without the fit, maps that would be too large; DiskFull or StorageError.
+    Raises InputError for an unknown format, for a folder that is not empty (unless `overwrite`), for a result
+    without the fit, and for maps that would be too large; DiskFull or StorageError.
     """
     export_format = format_named(to, Source.RESULT, Writer.RESULT)
     refuse_others_options(export_format, ["triangle"] if options and options.triangles else [])

@@ -1,4 +1,4 @@
-"""OpenEXR, several parts in a file, float32: what each pixel of a measured view shows."""
+"""OpenEXR, several parts in a file, float32: the values at each pixel of a measured view."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
 """glTF 2.0, binary: the measured surface with its maps.
 
-Colour is pi kd, roughness the square root of GGX's alpha, ks stands as the reflectance at normal incidence
-(KHR_materials_specular over an index of 1.5). glTF's own model differs from the fit: its specular part grows
-towards grazing by Schlick's formula and takes from the diffuse one what it reflects; what it takes at normal
-incidence is made up for in the colour.
+Colour is pi kd, and roughness is the square root of GGX's alpha. ks is stored as the reflectance at normal
+incidence (KHR_materials_specular for an index of 1.5). glTF's own model differs from the fit: its specular part
+grows towards grazing by Schlick's formula, and reduces the diffuse part by what it reflects. The colour
+compensates this loss at normal incidence.
 
-A material of triangles has one texel for each. With texels, or with a mesh's own texture coordinates, there are
-also maps of the normal and of ambient occlusion.
+A material of triangles has one texel for each triangle. With texels, or with a mesh's own texture coordinates,
+there are also maps of the normal and of ambient occlusion.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ class _Contents:
     attributes: dict[str, Floats]
     """[v, k] of vertices, by glTF's names."""
     triangles: NDArray[np.int64] | None
-    """[m, 3]; None: each three vertices are one."""
+    """[m, 3] vertices of triangles; None if each three vertices are one triangle."""
     pictures: list[bytes]
-    """PNG: colour; occlusion, roughness, metal; specular; and, if there is one, normal."""
+    """PNG pictures: colour; occlusion, roughness, metal; specular; and normal, if there is one."""
     most_ks: float
-    """Value of the brightest code of the specular picture, over `_F0`."""
+    """Value of the brightest code of the specular picture, divided by `_F0`."""
     filters: tuple[int, int]
-    """Filters by which pictures are enlarged, and made smaller."""
+    """Filters for magnifying and for minifying pictures."""
 
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
-    """`surface.glb`: metres, y up. Triangles without a material are left out."""
+    """Write `surface.glb`: metres, y up. Triangles without a material are left out."""
     contents = _of_maps(flatten(surface)) if surface.has_maps else _of_triangles(surface)
     arrays = [values.astype("<f4") for values in contents.attributes.values()]
     if contents.triangles is not None:
@@ -159,7 +159,7 @@ def _material(name: str, contents: _Contents) -> dict[str, Any]:
 
 
 def _png_of_triangles(values: Floats) -> bytes:
-    """[n, 3] of 0..1 as texels."""
+    """Values [n, 3] of 0 to 1 as texels."""
     return png(np.rint(255 * np.clip(texture(values), 0.0, 1.0)).astype(np.uint8))
 
 

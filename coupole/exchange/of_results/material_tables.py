@@ -1,4 +1,4 @@
-"""Single materials of a result, and what their GGX gives in any pair of directions."""
+"""Single materials of a result, and the reflectance of their GGX for any pair of directions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from coupole.reflectance.cluster_file import CLUSTERS
 from coupole.reflectance.ggx import lobe
 
 _MOST = 64
-"""Files that nobody has asked for by name."""
+"""Greatest number of files that are written without being named."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,8 @@ class Material:
     alpha: float
 
     def reflectance(self, ways_in: Floats, ways_out: Floats) -> Floats:
-        """[n, 3] f, 1/sr, of unit directions [n, 3] to the light and to the viewer, z the normal; 0 from below."""
+        """[n, 3] f, 1/sr, for unit directions [n, 3] to the light and to the viewer, z the normal; 0 from
+        below."""
         values = np.zeros(len(ways_in))
         _lobes(np.ascontiguousarray(ways_in), np.ascontiguousarray(ways_out), self.alpha, values)
         above = (ways_in[:, 2] > 0.0) & (ways_out[:, 2] > 0.0)
@@ -38,8 +39,10 @@ class Material:
 
 
 def materials_of(surface: MeasuredSurface) -> Iterator[Material]:
-    """Give the materials of the chosen triangles, else those of all clusters. Raises InputError if a triangle has
-    none, or if nothing is chosen and there are no clusters, or too many."""
+    """Return the materials of the chosen triangles or, by default, those of all clusters.
+
+    Raises InputError if a triangle has none, or if nothing is chosen and there are no clusters, or too many.
+    """
     chosen_triangles(surface, optional=True)
     for number in surface.options.triangles:
         yield Material(f"triangle{number}", surface.kd[number], surface.ks[number], float(surface.alpha[number]))
@@ -60,7 +63,8 @@ def materials_of(surface: MeasuredSurface) -> Iterator[Material]:
 
 
 def chosen_triangles(surface: MeasuredSurface, *, optional: bool = False) -> NDArray[np.int64]:
-    """Raises InputError for one that is not there or has no material, or if none is named."""
+    """Return the chosen triangles. Raises InputError if one does not exist or has no material, or if none is
+    named."""
     if not surface.options.triangles and not optional:
         raise InputError("--triangle: expected the numbers of triangles whose samples are exported")
     for number in surface.options.triangles:

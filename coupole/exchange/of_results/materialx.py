@@ -1,10 +1,11 @@
-"""MaterialX 1.39: a document with OpenPBR's surface model, textures, and the mesh. A material of triangles has one
-texel for each; of texels there are maps with a normal too.
+"""MaterialX 1.39: a document with OpenPBR's surface model, textures, and the mesh.
 
-OpenPBR (Academy Software Foundation, 1.1): colour of the base is pi kd and what the layer keeps from it at normal
-incidence, roughness the square root of GGX's alpha. The specular weight scales the reflectance of an index of 1.5
-at normal incidence to a triangle's ks, of which the specular colour has the hue. Like glTF's, its specular part
-grows towards grazing and takes from the diffuse one what it reflects.
+A material of triangles has one texel for each triangle; a material of texels has maps, also of the normal.
+
+OpenPBR (Academy Software Foundation, 1.1): the base colour is pi kd, plus the share that the layer takes from it
+at normal incidence; roughness is the square root of GGX's alpha. The specular weight scales the reflectance of an
+index of 1.5 at normal incidence to a triangle's ks; the specular colour has the hue of ks. As in glTF, the
+specular part grows towards grazing, and reduces the diffuse part by what it reflects.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
 
 
 def _columns(colours: NDArray[Any], ks: NDArray[Any], alpha: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """[n, 1 or 3] values of texels by OpenPBR's names."""
+    """Values [n, 1 or 3] of texels, by OpenPBR's names."""
     most = ks.max(axis=1, keepdims=True)
     return {
         "base_color": colours,

@@ -1,4 +1,5 @@
-"""Surface that exporters take of a result of runs: the whole mesh, and for each triangle what is known of it."""
+"""The surface that exporters get from a result of runs: the whole mesh, and the known material of each
+triangle."""
 
 from __future__ import annotations
 
@@ -24,52 +25,52 @@ Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]
 _LEAST_PASSED = 0.05
 Y_UP_FROM_SUPPORT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Rotation for the programs of computer graphics, in which y is up."""
+"""Rotation for programs of computer graphics, in which y is up."""
 
 
 def _say_nothing(_step: str, _count: int, _total: int) -> None:
-    """Progress that nobody watches."""
+    """Report no progress."""
 
 
 def _tell_nobody(_line: str) -> None:
-    """A line that nobody reads."""
+    """Ignore a message."""
 
 
 @dataclass(frozen=True)
 class ExportChoice:
-    """Options of an export, beside its format."""
+    """Options of an export, besides its format."""
 
     triangles: tuple[int, ...] = ()
-    """Triangles that are asked for by name."""
+    """Triangles that the user has named."""
     most_error: float | None = None
-    """Relative, of tables that adapt to their material; None: plain ones."""
+    """Greatest relative error of tables that adapt to their material; None for plain tables."""
     texel_mm: float | None = None
-    """Side of a map's texels; None: as the views have it."""
+    """Width of a map's texels; None for that of the views."""
     map_px: int | None = None
-    """Greatest width of maps; None: as large as need be."""
+    """Greatest width of maps; None for no limit."""
     uv_mesh: Path | None = None
-    """The same mesh with texture coordinates, in which the maps are laid out; None: on charts of our own."""
+    """The same mesh with texture coordinates, which place the maps; None for charts of our own."""
     say: Said = _say_nothing
     tell: Callable[[str], None] = _tell_nobody
-    """Takes a line for whoever asked for the export."""
+    """Function that takes a message for the user."""
 
 
 @dataclass(frozen=True)
 class MeasuredSurface:
-    """Places and directions are in the support frame (z up, mm). Values are NaN where no material is known."""
+    """Positions and directions are in the support frame (z up, mm). Values are NaN where no material is known."""
 
     result: RunResult
     fit: str
-    """The materials are those of this fit, one of `fits.MATERIALS`; with `TEXELS`, triangles have those of the
-    best."""
+    """The fit of the materials, one of `fits.MATERIALS`. With `TEXELS`, triangles have the materials of the best
+    other fit."""
     about: dict[str, Any]
-    """result.json"""
+    """Content of result.json."""
     vertices_mm: Floats
     """[v, 3]"""
     triangles: NDArray[np.int64]
-    """[n, 3] rows of the vertices; all of the mesh."""
+    """[n, 3] rows of the vertices; all triangles of the mesh."""
     normals: Floats
-    """[n, 3] as fitted; the mesh's where no material is known."""
+    """[n, 3] fitted normals; normals of the mesh where no material is known."""
     kd: Floats
     """[n, 3] red, green, blue; 1/sr. f = kd + ks D V, GGX's D and the height-correlated V of `ggx`."""
     ks: Floats
@@ -77,8 +78,8 @@ class MeasuredSurface:
     alpha: Floats
     """[n] GGX's roughness."""
     uncertain: dict[str, Floats]
-    """[n] standard uncertainties, all parts together: `u_kd`, `u_ks`, `u_alpha` relative (the channels' mean),
-    `u_normal` rad."""
+    """[n] standard uncertainties from all sources: `u_kd`, `u_ks`, `u_alpha` relative (the channels' mean),
+    `u_normal` in rad."""
     options: ExportChoice = ExportChoice()
 
     @cached_property
@@ -88,12 +89,12 @@ class MeasuredSurface:
 
     @property
     def has_maps(self) -> bool:
-        """Formats that can give each triangle one texel give maps instead."""
+        """True if maps are written instead of one texel for each triangle, by formats that can do both."""
         return self.fit == TEXELS or self.options.uv_mesh is not None
 
     @property
     def remark(self) -> str:
-        """Remark that files make on themselves, where their format lets them."""
+        """Remark in files about themselves, if their format allows it."""
         kind = "simulated" if self.about.get("simulated") else "measured"
         version, runs = self.about["software"]["coupole"], ", ".join(sorted(self.about["runs"]))
         growing = so_far.words(self.about)
@@ -101,8 +102,8 @@ class MeasuredSurface:
 
 
 def under_a_layer(kd: NDArray[np.floating], ks: NDArray[np.floating]) -> Floats:
-    """[n, 3] colour, 0 to 1, of the diffuse part where a model's specular layer keeps light from it: pi kd, and
-    more by what a layer of the brightest ks reflects at normal incidence."""
+    """[n, 3] colour, 0 to 1, of the diffuse part under a model's specular layer. It is pi kd, increased by the
+    share that a layer with the brightest ks reflects at normal incidence."""
     passes = np.maximum(1.0 - ks.max(axis=1, keepdims=True), _LEAST_PASSED)
     return np.asarray(np.clip(np.pi * kd / passes, 0.0, 1.0))
 
@@ -110,8 +111,9 @@ def under_a_layer(kd: NDArray[np.floating], ks: NDArray[np.floating]) -> Floats:
 def read_surface(
     folder: Path, fit: str | None = None, options: ExportChoice | None = None, *, takes_texels: bool = False
 ) -> MeasuredSurface:
-    """Read the surface of a whole result, with the material of the smallest error unless a fit is named;
-    `takes_texels` if that may be `TEXELS`. Raises InputError if there is no such fit."""
+    """Read the surface of a complete result. The material is that of the named fit, or of the fit with the
+    smallest error; `takes_texels` tells whether this may be `TEXELS`. Raises InputError if there is no such
+    fit."""
     about = read_about(folder)
     result = RunResult(folder)
     name = fit or _best(result, takes_texels=takes_texels)
@@ -155,9 +157,8 @@ def read_surface(
 
 
 def _best(result: RunResult, *, takes_texels: bool) -> str:
-    """The material with the smallest error in the check; texels unless they were compared with it there, and
-    missed
-    more."""
+    """Return the material with the smallest error in the check. Texels come first, unless they were compared there
+    and had a larger error."""
     of_triangles = best_fit(result, MATERIALS)
     mae = read_texel_errors(result.folder)
     texels_miss, triangles_miss = mae.get(TEXELS), mae.get(of_triangles)

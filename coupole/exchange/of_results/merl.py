@@ -13,13 +13,14 @@ from coupole.exchange.of_results.measured_surface import Floats, MeasuredSurface
 from coupole.storage.durable import write_synced
 
 SIZE = (90, 90, 180)
-"""Steps of theta_h, theta_d and phi_d; phi_d covers 180 degrees, as light and viewer may be exchanged."""
+"""Number of steps of theta_h, theta_d and phi_d. phi_d covers 180 degrees, because light and viewer may be
+exchanged."""
 SCALES = (1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0)
-"""A reader multiplies red, green and blue with them."""
+"""Factors by which a reader multiplies red, green and blue."""
 
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
-    """`NAME.binary` for each material; directions below the surface are -1."""
+    """Write `NAME.binary` for each material; the value for directions below the surface is -1."""
     paths = []
     for material in materials_of(surface):
         paths.append(folder / f"{material.name}.binary")
@@ -32,13 +33,13 @@ def encode(material: Material) -> bytes:
 
 
 def encode_reflectance(reflectance: Callable[[Floats, Floats], Floats]) -> bytes:
-    """Encode a function of unit directions [n, 3] to light and viewer, 1/sr [n, 3]: its values in the middle of
-    each step."""
+    """Encode a function of unit directions [n, 3] to light and viewer, which returns 1/sr [n, 3], by its values in
+    the middle of each step."""
     theta_h = 0.5 * np.pi * ((np.arange(SIZE[0]) + 0.5) / SIZE[0]) ** 2
     theta_d = 0.5 * np.pi * (np.arange(SIZE[1]) + 0.5) / SIZE[1]
     phi_d = np.pi * (np.arange(SIZE[2]) + 0.5) / SIZE[2]
     h, d, phi = (angle.ravel() for angle in np.meshgrid(theta_h, theta_d, phi_d, indexing="ij"))
-    # The light about the half vector as pole, turned about y to where that one stands.
+    # The light in a frame whose pole is the half vector, turned about y to the half vector's direction.
     about_half = np.stack([np.sin(d) * np.cos(phi), np.sin(d) * np.sin(phi), np.cos(d)], axis=1)
     ways_in, ways_out = about_half.copy(), about_half * [-1.0, -1.0, 1.0]
     for ways in (ways_in, ways_out):

@@ -1,7 +1,7 @@
 """Wavefront OBJ with a material library: the mesh with smooth normals, and maps as PNG.
 
-The library has what its authors gave it, and the words for roughness and normals that others added since
-(`map_Pr`, `norm`). Programs that do not know these show the colour.
+The library has the keywords of the format's authors, and later ones for roughness and normals (`map_Pr`, `norm`).
+Programs that do not know the later ones show only the colour.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
 
 
 def write_maps(flat: FlatSurface, folder: Path, most_ks: float) -> list[Path]:
-    """Write the maps; the brightest code of `specular.png` is a ks of `most_ks`."""
+    """Write the maps; the brightest code of `specular.png` means a ks of `most_ks`."""
     return [
         write_png(folder / "base_color.png", colour_map(flat)),
         write_png(folder / "specular.png", specular_map(flat, most_ks)),
@@ -48,7 +48,7 @@ def write_maps(flat: FlatSurface, folder: Path, most_ks: float) -> list[Path]:
 
 
 def mesh_text(mesh: FlatMesh, remark: str, library: str | None) -> str:
-    """The mesh as OBJ: metres, y up."""
+    """Return the mesh as OBJ: metres, y up."""
     places = (mesh.places_mm @ Y_UP_FROM_SUPPORT.T) * 1e-3
     normals = mesh.normals @ Y_UP_FROM_SUPPORT.T
     lines = [f"# {remark}", "# metres, y up"]

@@ -26,8 +26,8 @@ _FACE = np.dtype(
 
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
-    """`surface.ply`: mm, z up; kd in 1/sr, f = kd + ks D V; red, green, blue is sRGB of pi kd, for viewers. NaN,
-    and grey 128, where no material is known."""
+    """Write `surface.ply`: mm, z up; kd in 1/sr, f = kd + ks D V. Red, green and blue are sRGB of pi kd, for
+    viewers. If no material is known, values are NaN and colours are grey 128."""
     faces = np.zeros(len(surface.triangles), _FACE)
     faces["count"], faces["vertex_indices"] = 3, surface.triangles
     colours = np.where(surface.has_material[:, None], np.rint(255 * srgb(np.pi * np.nan_to_num(surface.kd))), 128)

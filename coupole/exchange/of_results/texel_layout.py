@@ -1,4 +1,4 @@
-"""Places of triangles' values in a square texture, one texel for each."""
+"""Positions of triangles' values in a square texture, one texel for each triangle."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def side_of(count: int) -> int:
 
 
 def middles(count: int) -> Floats:
-    """[count, 2] of the texels, 0 to 1, rightwards and downwards from the top left."""
+    """[count, 2] middles of the texels, 0 to 1, to the right and down from the top left."""
     side = side_of(count)
     row, column = np.divmod(np.arange(count), side)
     return np.asarray((np.stack([column, row], axis=1) + 0.5) / side)
 
 
 def texture(values: Floats) -> NDArray[np.float64]:
-    """[side, side, k] of [n, k], row by row; 0 where there is no triangle."""
+    """[side, side, k] texture of values [n, k], row by row; 0 where there is no triangle."""
     side = side_of(len(values))
     texels = np.zeros((side * side, values.shape[1]))
     texels[: len(values)] = values

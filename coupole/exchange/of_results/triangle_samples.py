@@ -1,4 +1,4 @@
-"""The samples of one triangle as they were measured, in its own frame, with bounds."""
+"""The measured samples of one triangle, in its own frame, with bounds."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ from coupole.reflectance.sample_uncertainty import bounds
 
 @dataclass(frozen=True)
 class SamplesOfTriangle:
-    """Samples of one triangle, of all views and LEDs that gave one; n of them."""
+    """The n samples of one triangle, from all views and LEDs that gave one."""
 
     towards_light: Floats
     """[n, 3] unit; z is the mesh's normal, x is the support's x axis, projected onto the triangle."""
     towards_camera: Floats
     """[n, 3]"""
     f: Floats
-    """[n, channels] 1/sr; NaN where a channel gave none."""
+    """[n, channels] 1/sr; NaN for a channel without a sample."""
     low: Floats
-    """[n, channels] lower bound over f."""
+    """[n, channels] lower bound of f."""
     high: Floats
-    """[n, channels] upper bound over f; infinite where the light grazes too much to tell."""
+    """[n, channels] upper bound of f; infinite if the light is too grazing for a bound."""
 
 
 def channels_of(surface: MeasuredSurface) -> tuple[str, ...]:
-    """Names of the channels, as files are named."""
+    """Names of the channels, as in file names."""
     return ("red", "green", "blue") if surface.result.channels == 3 else ("grey",)
 
 
 def samples_of(surface: MeasuredSurface, triangle: int, quantile: float) -> SamplesOfTriangle:
-    """Bounds are `quantile` standard deviations away. Raises InputError if the result has no bounds."""
+    """Return the samples with bounds that are `quantile` standard deviations away. Raises InputError if the result
+    has no bounds."""
     views = [view for view in surface.result.views if triangle in view.triangles]
     along_x = surface.result.base_from_support[:3, 0]
     scan_noise_um = float(surface.about["scan_noise_um"])
@@ -78,7 +79,8 @@ def _of_view(
 
 
 def _frame(normal: Floats, along_x: Floats) -> Floats:
-    """[3, 3] rows x, y, z of the triangle's frame; y in place of x where the normal is along the support's x."""
+    """[3, 3] rows x, y, z of the triangle's frame. If the normal is along the support's x axis, y takes the place
+    of x."""
     x = along_x - (along_x @ normal) * normal
     if np.linalg.norm(x) < 1e-3:
         x = np.cross(normal, np.roll(normal, 1))

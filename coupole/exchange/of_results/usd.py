@@ -1,7 +1,7 @@
-"""USD: a .usdz of the mesh with UsdPreviewSurface and its maps, which USD's programs and telephones open.
+"""USD: a .usdz of the mesh with UsdPreviewSurface and its maps, for USD's programs and telephones.
 
-UsdPreviewSurface (Pixar, 2.6) is used by its specular workflow: the specular colour is the reflectance at normal
-incidence, so ks. Its specular part grows towards grazing by Schlick's formula.
+UsdPreviewSurface (Pixar, 2.6) is used in its specular workflow: the specular colour is the reflectance at normal
+incidence, which is ks. The specular part grows towards grazing by Schlick's formula.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _ROOT = "/measured"
 
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
-    """`surface.usdz`: metres, y up. Raises InputError without the package usd-core."""
+    """Write `surface.usdz`: metres, y up. Raises InputError without the package usd-core."""
     pxr = _library()
     flat = flatten(surface)
     most_ks = max(float(flat.ks.max()), 1e-6)
@@ -38,9 +38,9 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
         pxr.UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
         stage.GetRootLayer().Save()
         package = Path(aside) / path.name
-        archives = pxr.Sdf if hasattr(pxr.Sdf, "ZipFileWriter") else pxr.Usd  # Usd until 25.5
+        archives = pxr.Sdf if hasattr(pxr.Sdf, "ZipFileWriter") else pxr.Usd  # its name up to usd-core 25.5
         writer = archives.ZipFileWriter.CreateNew(str(package))
-        for file in (Path(stage.GetRootLayer().realPath), *maps):  # the layer first, as the format wants it
+        for file in (Path(stage.GetRootLayer().realPath), *maps):  # the format demands the layer first
             writer.AddFile(str(file), file.name)
         if not writer.Save():
             raise StorageError(f"{path}: USD could not pack its files")
@@ -50,7 +50,7 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
 
 
 def _library() -> Any:
-    """The package `pxr`, with its modules that are used."""
+    """Return the package `pxr` with the modules that this file uses."""
     try:
         names = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "Vt")
         return SimpleNamespace(**{name: importlib.import_module(f"pxr.{name}") for name in names})

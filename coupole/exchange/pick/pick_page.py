@@ -17,11 +17,11 @@ from coupole.exchange.look.look_blocks import in_script
 from coupole.scan.simplify import simplified_mesh
 
 MOST_TRIANGLES = 100_000
-"""Greatest number of triangles of a page. A finer mesh is simplified, and takes its parts from the nearest
-triangle."""
+"""Greatest number of triangles of a page. A finer mesh is simplified; each of its triangles then gets the part of
+the nearest simplified triangle."""
 SCRIPTS = ("surface.js", "brush.js", "parts.js", "pick.js")
 _SHARED = ("vectors.js", "camera.js")
-"""Scripts of the page to relight."""
+"""Scripts shared with the page to relight."""
 
 
 def write_pick_page(
@@ -32,10 +32,10 @@ def write_pick_page(
     names: Sequence[str] = (),
     most_triangles: int = MOST_TRIANGLES,
 ) -> int:
-    """Write the page of a mesh, vertices [n, 3] and triangles [m, 3]; how many triangles it has.
+    """Write the page of a mesh, vertices [n, 3] and triangles [m, 3]; return the number of its triangles.
 
-    `names` are parts that the page begins with; without any it begins with one to be named. Raises InputError for
-    a name that does not end in .html, StorageError if it cannot be written.
+    `names` are the parts with which the page begins; without names, it begins with one unnamed part. Raises
+    InputError for a name that does not end in .html, StorageError if it cannot be written.
     """
     if path.suffix.lower() != ".html":
         raise InputError(f"--out {path}: expected a name that ends in .html")
@@ -55,7 +55,7 @@ def write_pick_page(
 def page_text(
     points_mm: NDArray[np.float64], triangles: NDArray[np.int64], title: str, names: Sequence[str] = ()
 ) -> str:
-    """The HTML."""
+    """Return the HTML."""
     mesh = {
         "title": title,
         "names": list(names),

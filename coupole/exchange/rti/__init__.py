@@ -1,1 +1,1 @@
-"""Views under many lights for programs that relight pictures (RTI), and for viewers of pictures."""
+"""Views under many lights, for programs that relight pictures (RTI) and for viewers of pictures."""

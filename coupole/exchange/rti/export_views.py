@@ -1,4 +1,4 @@
-"""Views of a run, or the one of a result of pictures, for programs that relight or show pictures."""
+"""Export of a run's views, or the view of a result of pictures, to programs that relight or show pictures."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class HowShown:
 
 @dataclass
 class Written:
-    """Files, and of each view the rms in steps of 8 bits of what its file misses of its pictures."""
+    """Written files, and for each view the rms error of its file against its pictures, in steps of 8 bits."""
 
     paths: list[Path] = field(default_factory=list)
     misses_dn: dict[str, float] = field(default_factory=dict)
@@ -43,16 +43,16 @@ def export_views(
     to: str,
     out: Path,
     views: Sequence[str],
-    how: HowShown = HowShown(),  # frozen
+    how: HowShown = HowShown(),  # the default is frozen
     *,
     overwrite: bool,
     say: Said,
 ) -> Written:
     """Write the views of a run that match one of the patterns, or a result of pictures, into `out`.
 
-    Raises InputError, before anything is written, for a format or options that do not fit the source, no such
-    view, discarded frames, too few lights, files that stand there (unless `overwrite`); StorageError for damaged
-    frames or a disk that cannot be written.
+    Raises InputError, before anything is written, if format or options do not fit the source, if there is no such
+    view, if frames were discarded, if there are too few lights, or if files exist (unless `overwrite`);
+    StorageError for damaged frames or a disk that cannot be written.
     """
     kind = source_of(source)
     of_result = kind is Source.PICTURES
@@ -69,7 +69,7 @@ def export_views(
     if to == "lp":
         return Written(rti_pictures.export_rti(source, out, names, say))
     export = Written()
-    with writing_into(out), threadpool_limits(1, "blas"):  # its threads only wait for each other here
+    with writing_into(out), threadpool_limits(1, "blas"):  # its threads would only wait for each other
         if to == "dome":
             export.paths = [rti_pictures.write_dome(Run(source), name, out / f"{name}.dome") for name in names]
         elif to == "iiif":
@@ -83,13 +83,13 @@ def export_views(
 
 
 def _refuse_incomplete(run: Run, views: Sequence[str], to: str) -> None:
-    """Raise InputError if one of these views cannot be written: frames of it were discarded (a `dome` needs none),
-    or too few LEDs are before its camera."""
+    """Raise InputError if one of these views cannot be written: its frames were discarded (a `dome` needs none),
+    or too few LEDs are in front of its camera."""
     if to != "dome":
         refuse_discarded_lights(run, views, to)
     for view in views:
         lights_mm = lights_of_view(run.folder, view).lights_mm
-        if to not in ("dome", "lp"):  # these two have the lights behind the picture's plane too
+        if to not in ("dome", "lp"):  # these two also have lights behind the picture's plane
             refuse_few_lights(view, lights_mm)
 
 
@@ -106,7 +106,8 @@ def _first_file(out: Path, to: str, name: str) -> Path:
 
 
 def _write(view: LitView, to: str, out: Path, how: HowShown, say: Said) -> tuple[list[Path], float]:
-    """Files of one view, and what they miss. A format of one file for each view is the module of its name."""
+    """Write the files of one view; return them with their error. A format with one file for each view is the
+    module of that name."""
     if to == "relight":
         folder = out / view.name
         folder.mkdir(exist_ok=True)

@@ -1,5 +1,5 @@
-"""IIIF: a manifest (Presentation API 3) and its pictures as static tiles (Image API 3, level 0), for a folder that
-a web server gives out as it is."""
+"""IIIF: a manifest (Presentation API 3) and its pictures as static tiles (Image API 3, level 0), in a folder that
+a web server can serve unchanged."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ EXAMPLE_URL = "https://example.org/iiif"
 _OF_ADDRESSES = re.compile(r"(?:[A-Za-z0-9\-._~:/?#\[\]@!$&'()*+,;=]|%[0-9A-Fa-f]{2})+")
 _TILE_PX = 512
 _LARGEST_WHOLE_PX = 1024
-"""Largest size of the scaled pictures that can be had in one piece, besides the full one."""
+"""Largest size of scaled pictures that are stored in one piece, besides the full one."""
 _QUALITY = 92
 _RAKING_ELEVATION_DEG = 25.0
 _SIDES = {"left": (-1.0, 0.0), "top": (0.0, 1.0), "right": (1.0, 0.0), "bottom": (0.0, -1.0)}
 
 
 def write(views: Iterable[LitView], out: Path, base_url: str, say: Said) -> list[Path]:
-    """Write a canvas for each view, with a choice of pictures: soft light, raking light from four sides, normals
-    where they are known. Ids begin with `base_url`, where the folder will be. The files, the manifest last.
+    """Write a canvas for each view, with a choice of pictures: soft light, raking light from four sides, and
+    normals if they are known.
 
-    Raises InputError for a base that is no http address.
+    Ids begin with `base_url`, the future address of the folder. Returns the files, the manifest last. Raises
+    InputError if the base is not an http address.
     """
     base = checked_base(base_url)
     paths: list[Path] = []
@@ -61,7 +62,7 @@ def write(views: Iterable[LitView], out: Path, base_url: str, say: Said) -> list
 
 
 def write_tiles(codes: NDArray[np.uint8], folder: Path, url: str) -> list[Path]:
-    """Write a picture [h, w, 3] as tiles, scaled pictures and `info.json`, under their canonical addresses."""
+    """Write a picture [h, w, 3] as tiles, scaled pictures and `info.json`, at their canonical addresses."""
     import cv2
 
     height, width = codes.shape[:2]
@@ -103,7 +104,7 @@ def write_tiles(codes: NDArray[np.uint8], folder: Path, url: str) -> list[Path]:
 
 
 def _pictures(view: LitView, say: Said) -> Iterator[tuple[str, str, NDArray[np.uint8]]]:
-    """Kind, label, codes [h, w, 3]."""
+    """Yield kind, label and codes [h, w, 3] of each picture."""
     total = np.zeros((view.size_px[1], view.size_px[0], 3), np.float32)
     for number in range(len(view)):
         total += view.linear(number)
@@ -179,12 +180,12 @@ def _text(words: str) -> dict[str, list[str]]:
 
 
 def checked_base(base_url: str) -> str:
-    """Return the base without slashes at its end. Raises InputError if it is no http address, or has what
-    addresses do not hold (RFC 3986, appendix A)."""
+    """Return the base without slashes at its end. Raises InputError if it is not an http address, or has
+    characters that an address must not have (RFC 3986, appendix A)."""
     try:
         parts = urlsplit(base_url)
         fits = parts.scheme in ("http", "https") and parts.hostname and (parts.port or 1) > 0
-    except ValueError:  # brackets or a port that are none
+    except ValueError:  # invalid brackets, or an invalid port
         fits = False
     if not fits or "?" in base_url or "#" in base_url or not _OF_ADDRESSES.fullmatch(base_url):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Functions of the direction to a light, of which viewers take sums with the coefficients of each pixel.
+"""Functions of the direction to a light. Viewers add them up with the coefficients of each pixel.
 
 Directions are unit vectors: x right, y up, z to the camera.
 """
@@ -17,18 +17,19 @@ Floats = NDArray[np.float64]
 _KERNEL = "linear"
 _DENSE_PER_NODE = 20
 _UNLIT_WEIGHT = 0.03
-"""Weight of directions far from any light, where interpolation says little, beside those among the lights."""
+"""Weight of directions far from any light, where interpolation is unreliable, relative to directions among the
+lights."""
 
 
 def ptm(directions: Floats) -> Floats:
-    """[n, 6] of 1, x, y, x2, xy, y2 (Malzbender and others 2001, equation 1)."""
+    """[n, 6] values of 1, x, y, x2, xy, y2 (Malzbender and others 2001, equation 1)."""
     x, y, _ = directions.T
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
 def hsh(directions: Floats) -> Floats:
-    """[n, 9] hemispherical harmonics of degrees 0 to 2 (Gautron and others 2004): spherical ones of the elevation
-    2 cos(theta) - 1, the order within a degree cos, zonal, sin."""
+    """[n, 9] hemispherical harmonics of degrees 0 to 2 (Gautron and others 2004): spherical harmonics of the
+    elevation 2 cos(theta) - 1; within a degree, the order is cos, zonal, sin."""
     x, y, z = directions.T
     phi, cos = np.arctan2(y, x), np.clip(z, 0.0, 1.0)
     side = np.sqrt(cos - cos * cos)
@@ -55,8 +56,8 @@ def gaussian(directions: Floats, lights: Floats, sigma: float) -> Floats:
 
 
 def bilinear(directions: Floats, resolution: int) -> Floats:
-    """[n, resolution^2] shares of the nodes of a grid, row by row: the octahedron's upper half, seen from above
-    and turned by 45 degrees, so that it fills the square."""
+    """[n, resolution^2] weights of the nodes of a grid, row by row: the octahedron's upper half, seen from above
+    and rotated by 45 degrees, so that it fills the square."""
     across, up, _ = (directions / np.abs(directions).sum(axis=1, keepdims=True)).T
     place = (np.stack([across + up, up - across], axis=1) + 1.0) / 2.0 * (resolution - 1)
     corner = np.clip(np.floor(place).astype(np.int64), 0, resolution - 2)
@@ -71,8 +72,8 @@ def bilinear(directions: Floats, resolution: int) -> Floats:
 
 
 def bilinear_nodes(lights: Floats, resolution: int) -> Floats:
-    """[resolution^2, lights] by which values under the lights give values of the nodes: the bilinear function that
-    is nearest to interpolation by radial functions, over the half sphere."""
+    """[resolution^2, lights] matrix from values under the lights to values of the nodes. It gives the bilinear
+    function that is nearest to interpolation by radial functions over the hemisphere."""
     directions = _half_sphere(_DENSE_PER_NODE * resolution * resolution)
     between = np.sort(np.linalg.norm(lights[:, None] - lights[None], axis=2), axis=1)[:, 1]
     away = np.array([np.linalg.norm(lights - direction, axis=1).min() for direction in directions])

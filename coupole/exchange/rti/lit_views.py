@@ -26,11 +26,11 @@ Picture = NDArray[np.float32]
 Said = Callable[[str, int, int], None]
 
 WHITE_QUANTILE = 0.999
-"""Quantile of the pixels' brightest values (under any light) that counts as white."""
+"""Quantile, over pixels, of the brightest value under any light; this value counts as white."""
 _BATCH = 8
-"""Pictures that are held at a time."""
+"""Number of pictures held in memory."""
 _BLOCK = 1 << 16
-"""Pixels whose planes are added to at a time."""
+"""Number of pixels whose planes are updated together."""
 
 
 @dataclass(frozen=True)
@@ -39,22 +39,22 @@ class LitView:
 
     name: str
     origin: str
-    """Measured or simulated, as far as it is known, and of which run or pictures."""
+    """Measured or simulated, if this is known, and the run or the pictures."""
     size_px: tuple[int, int]
     """Width, height."""
     pixel_mm: float | None
     directions: Floats
     """[lights, 3] unit vectors: x right, y up, z to the camera; all above the picture's plane."""
     linear: Callable[[int], Picture]
-    """[h, w, 3] of a light, white 1; brighter values are above."""
+    """Function of the number of a light; returns [h, w, 3]. White is 1; brighter values are above 1."""
     normals: Picture | None = None
-    """[h, w, 3] where they were fitted; NaN outside the mask."""
+    """[h, w, 3] fitted normals; NaN outside the mask."""
 
     def __len__(self) -> int:
         return len(self.directions)
 
     def encoded_picture(self, number: int) -> Picture:
-        """[h, w, 3] as displays take it: sRGB, 0 to 1."""
+        """[h, w, 3] picture encoded for displays: sRGB, 0 to 1."""
         picture: Picture = srgb(self.linear(number))
         return picture
 
@@ -63,7 +63,7 @@ class LitView:
         return slice(None, None, -(-self.size_px[0] * self.size_px[1] // most))
 
     def samples(self, pixels: slice, say: Said) -> Picture:
-        """[lights, pixels, 3] encoded."""
+        """[lights, pixels, 3] encoded values."""
         values = []
         for number in range(len(self)):
             values.append(srgb(self.linear(number).reshape(-1, 3)[pixels]))
@@ -88,7 +88,8 @@ class LitView:
 
 
 def chosen_views(run: Run, patterns: Sequence[str]) -> list[str]:
-    """Names of the views that match one of the patterns; all without patterns. Raises InputError if none does."""
+    """Return the names of the views that match one of the patterns, or all views without patterns. Raises
+    InputError if none matches."""
     names = list(dict.fromkeys(shot.view for shot in run.proven()))
     matches = [
         name for name in names if not patterns or any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
@@ -99,8 +100,8 @@ def chosen_views(run: Run, patterns: Sequence[str]) -> list[str]:
 
 
 def lit_views(source: Path, patterns: Sequence[str], scratch: Path, say: Said) -> Iterator[LitView]:
-    """Views of a run, whose pictures lie in a folder under `scratch` while they are used; or the one of a result
-    of pictures. Raises InputError, StorageError for damaged frames."""
+    """Yield the views of a run, whose pictures are stored in a folder under `scratch` while they are used; or the
+    view of a result of pictures. Raises InputError, StorageError for damaged frames."""
     if source_of(source) is Source.PICTURES:
         yield view_of_result(PictureResult(source.resolve()), say)
         return
@@ -111,8 +112,8 @@ def lit_views(source: Path, patterns: Sequence[str], scratch: Path, say: Said) -
 
 
 def view_of_run(run: Run, name: str, folder: Path, say: Said) -> LitView:
-    """A view whose pictures are written into `folder`: nominal places of LEDs, values divided by their nominal
-    light. Raises InputError for too few LEDs before the camera."""
+    """Return a view whose pictures are written into `folder`: nominal positions of LEDs, values divided by their
+    nominal light. Raises InputError if too few LEDs are in front of the camera."""
     pictures = write_pictures(run.folder, name, folder, lambda step, done, of: say(f"{name}: {step}", done, of))
     directions = pictures.lights_mm / np.linalg.norm(pictures.lights_mm, axis=1, keepdims=True)
     strengths = read_rows(folder / INTENSITIES, (3,))
@@ -135,7 +136,7 @@ def view_of_run(run: Run, name: str, folder: Path, say: Said) -> LitView:
 
 
 def view_of_result(result: PictureResult, say: Said) -> LitView:
-    """The view of a result of pictures; black outside its mask."""
+    """Return the view of a result of pictures; it is black outside its mask."""
     about, height, width = result.about, *result.mask.shape
     kinds: dict[Any, str] = {True: "simulated", False: "measured"}
     kind = kinds.get(about.get("simulated"), "not known whether measured or simulated")
@@ -153,7 +154,7 @@ def view_of_result(result: PictureResult, say: Said) -> LitView:
 
 
 def refuse_few_lights(name: str, lights: Floats) -> NDArray[np.int64]:
-    """Return the numbers of the lights [n, 3] (directions or places) that are before the picture's plane. Raises
+    """Return the numbers of the lights [n, 3] (directions or positions) in front of the picture's plane. Raises
     InputError if they are too few."""
     above = np.flatnonzero(lights[:, 2] > 0.0)
     if len(above) < FEWEST_LIGHTS:
@@ -166,7 +167,8 @@ def refuse_few_lights(name: str, lights: Floats) -> NDArray[np.int64]:
 def _lit_view(
     *, linear: Callable[[int], Picture], directions: Floats, name: str, say: Said, **about: Any
 ) -> LitView:
-    """Return the view with the lights that viewers can have, those above the picture's plane, and white 1."""
+    """Return the view with white 1, and only with lights in front of the picture's plane, because viewers can have
+    no others."""
     above = refuse_few_lights(name, directions)
     brightest = linear(int(above[0])).max(axis=2)
     for count, number in enumerate(above):

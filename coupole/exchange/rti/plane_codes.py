@@ -1,6 +1,7 @@
-"""Coefficients of each pixel, as planes, from its values under lights, and the viewers' pictures from them.
+"""Planes of coefficients of each pixel, computed from its values under lights, and the viewers' pictures from
+them.
 
-Viewers show the sums as they are, so that values are encoded for displays (sRGB) before anything is fitted.
+Viewers show the sums unchanged; therefore values are encoded for displays (sRGB) before the fit.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from coupole.exchange.rti.lit_views import LitView, Picture, Said
 Floats = NDArray[np.float64]
 
 RESOLUTION = 20
-"""Nodes of the bilinear grid a side; docs/decisions/0037-rti-exports.md tells why not 8."""
+"""Number of nodes on a side of the bilinear grid; docs/decisions/0037-rti-exports.md explains why it is not 8."""
 SIGMA = 0.125
-"""Width of Gaussians between lights, in unit vectors: relight's own default."""
+"""Width of the Gaussians between lights, in unit vectors; the default of relight."""
 CHECKED_PIXELS = 10_000
-"""Pixels by which a file is compared with its view's pictures."""
+"""Number of pixels at which a file is compared with its view's pictures."""
 _LEAST_SINGULAR = 1e-4
 
 
@@ -37,28 +38,28 @@ class PlaneCode:
     offset: Floats
     """[planes]"""
     functions: Floats
-    """[lights, 3, planes]: what a viewer multiplies planes with, at the lights."""
+    """[lights, 3, planes] factors by which a viewer multiplies the planes, for each light."""
     base: Floats
     """[lights, 3]"""
     about: dict[str, Any]
     """Facts about the functions, for `info.json`."""
     ranges: tuple[float, ...] = ()
-    """[planes] factors that bring the tables of functions to 8 bit; empty without tables."""
+    """[planes] factors that scale the tables of functions to 8 bits; empty without tables."""
 
     def planes_of(self, view: LitView, say: Said) -> Picture:
-        """[h, w, planes] of a view."""
+        """Return the planes [h, w, planes] of a view."""
         planes = view.weighted_sums(self.weights, say)
         planes -= self.offset.astype(np.float32)
         return planes
 
     def misses_dn(self, samples: Picture, planes: Floats) -> float:
-        """Rms of what planes [pixels, planes] miss of encoded values [lights, pixels, 3], in steps of 8 bits."""
+        """Rms error of planes [pixels, planes] against encoded values [lights, pixels, 3], in steps of 8 bits."""
         decoding = np.einsum("lcp,np->lnc", self.functions, planes) + self.base[:, None]
         return 255.0 * float(np.sqrt(np.mean((np.clip(decoding, 0.0, 1.0) - samples) ** 2)))
 
 
 def eight_bits(values: Picture, low: Any, scale: Any) -> NDArray[np.uint8]:
-    """Codes of values from `low`, which has 0, to `low + scale`, which has 255; in single precision."""
+    """Codes of values: 0 for `low`, 255 for `low + scale`; in single precision."""
     codes = values - np.asarray(low, np.float32)
     codes *= np.asarray(255.0 / scale, np.float32)
     np.clip(np.rint(codes, out=codes), 0.0, 255.0, out=codes)
@@ -66,7 +67,7 @@ def eight_bits(values: Picture, low: Any, scale: Any) -> NDArray[np.uint8]:
 
 
 def of_terms(terms: Floats, name: str) -> PlaneCode:
-    """Return the code of functions [lights, terms] that all pixels and channels share: plane 3 t + c has term t of
+    """Return the code of functions [lights, terms] that all pixels and channels share. Plane 3 t + c has term t of
     channel c, by least squares over the lights."""
     lights, count = terms.shape
     if np.linalg.matrix_rank(terms, tol=_LEAST_SINGULAR * np.sqrt(lights)) < count:
@@ -82,7 +83,7 @@ def of_terms(terms: Floats, name: str) -> PlaneCode:
 
 def of_principal_parts(samples: Picture, lights: Floats, name: str, planes: int) -> PlaneCode:
     """Return the code of principal components of encoded values [lights, pixels, 3] (relight's `mrgb`). Functions
-    of light are tables of 8 bit, over the lights (`rbf`) or the nodes of a grid (`bilinear`)."""
+    of light are tables of 8 bits, over the lights (`rbf`) or over the nodes of a grid (`bilinear`)."""
     count = len(lights)
     lit_samples = samples[:, samples.any(axis=(0, 2))]
     values = lit_samples.transpose(1, 0, 2).reshape(lit_samples.shape[1], -1)
@@ -108,7 +109,8 @@ def of_principal_parts(samples: Picture, lights: Floats, name: str, planes: int)
 
 
 def _principal(values: Picture, count: int) -> Floats:
-    """[count, dimensions] of values [pixels, dimensions], the largest first; zeros where there are no more."""
+    """[count, dimensions] principal components of values [pixels, dimensions], the largest first; zeros if there
+    are fewer."""
     vectors = np.zeros((count, values.shape[1]))
     if count < min(values.shape):
         _, sizes, components = scipy.sparse.linalg.svds(values, k=count, random_state=0)

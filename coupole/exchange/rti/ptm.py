@@ -15,14 +15,14 @@ from coupole.storage.durable import write_synced
 Floats = NDArray[np.float64]
 
 _PTM_ORDER = (3, 5, 4, 1, 2, 0)
-"""x2, y2, xy, x, y, 1 among the terms of `light_functions.ptm`."""
+"""Places of x2, y2, xy, x, y, 1 among the terms of `light_functions.ptm`."""
 _BLOCK = 1 << 16
-"""Pixels whose colours are found at a time."""
+"""Number of pixels whose colours are computed together."""
 
 
 def write(view: LitView, path: Path, say: Said) -> float:
-    """Write polynomials of luminance and a colour for each pixel, the bottom row first (Malzbender and others, PTM
-    file format, 1.2); the rms error against the view's own pictures, in steps of 8 bits.
+    """Write polynomials of luminance, and a colour for each pixel, the bottom row first (Malzbender and others,
+    PTM file format, 1.2). Return the rms error against the view's own pictures, in steps of 8 bits.
 
     Raises InputError if the lights do not determine the polynomials.
     """
@@ -48,9 +48,11 @@ def write(view: LitView, path: Path, say: Said) -> float:
 
 
 def _one_colour(term_planes: Picture, triangular: Floats) -> tuple[Floats, Floats]:
-    """Luminance [pixels, 6] and colour [pixels, 3], the largest channel 1, whose product is nearest to
-    `term_planes` [pixels, 6, 3] over the lights; `triangular` is R of the terms' QR: the first singular vectors of
-    R `term_planes`."""
+    """Luminance [pixels, 6] and colour [pixels, 3], with 1 as largest channel, whose product is nearest to
+    `term_planes` [pixels, 6, 3] over the lights.
+
+    They are the first singular vectors of R `term_planes`; `triangular` is R of the QR decomposition of the terms.
+    """
     projections = np.einsum("ij,pjc->pic", triangular.astype(np.float32), term_planes)
     products = np.einsum("pic,pid->pcd", projections, projections)
     vectors = np.linalg.eigh(products)[1][..., -1].astype(np.float64)
@@ -63,8 +65,8 @@ def _one_colour(term_planes: Picture, triangular: Floats) -> tuple[Floats, Float
 
 
 def _with_whole_bias(values: Picture) -> tuple[Floats, NDArray[np.int64], NDArray[np.uint8]]:
-    """Scales [6], biases [6] and codes of values [pixels, 6] = (code - bias) scale / 255; biases of a PTM are
-    whole codes, so that 0 is one."""
+    """Scales [6], biases [6] and codes of values [pixels, 6] = (code - bias) scale / 255. The biases of a PTM are
+    whole codes, so that 0 has a code."""
     low = 255.0 * np.minimum(values.min(axis=0), 0.0).astype(np.float64)
     high = 255.0 * np.maximum(values.max(axis=0), 0.0).astype(np.float64)
     scale = np.maximum(high - low, 1e-3) / 254.0

@@ -1,7 +1,7 @@
 """relight's planes for browsers: `info.json` and JPEGs of three planes each, as OpenLIME reads them.
 
-A plane's value is (code / 255 - bias) scale. The JPEGs hold red, green and blue themselves (Adobe's marker says
-so): channels are coefficients, which a change to luminance and chroma would mix.
+A plane's value is (code / 255 - bias) scale. The JPEGs store red, green and blue directly, which Adobe's marker
+states: the channels are coefficients, and a conversion to luminance and chroma would mix them.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from coupole.storage.durable import write_synced
 
 BASES = ("bilinear", "rbf", "ptm", "hsh")
 PLANES = (27, 18)
-"""Numbers of principal parts, of `bilinear` and `rbf`."""
+"""Allowed numbers of principal components for `bilinear` and `rbf`."""
 QUALITY = 95
 _MOST_SAMPLES = 30_000_000
-"""Values of pixels that principal parts are found from."""
+"""Greatest number of pixel values from which principal components are computed."""
 
 
 def write(view: LitView, folder: Path, basis: str, planes: int, say: Said) -> tuple[list[Path], float]:
@@ -76,7 +76,7 @@ def _code(view: LitView, samples: Picture, basis: str, planes: int) -> PlaneCode
 
 
 def rgb_jpeg(codes: NDArray[np.uint8]) -> bytes:
-    """[h, w, 3] without change of colours and at full resolution of each."""
+    """JPEG of [h, w, 3] without conversion of colours, with full resolution of each channel."""
     content = io.BytesIO()
     Image.fromarray(codes).save(content, "JPEG", quality=QUALITY, subsampling=0, keep_rgb=True)
     return content.getvalue()

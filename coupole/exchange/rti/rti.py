@@ -13,9 +13,12 @@ from coupole.storage.durable import write_synced
 
 
 def write(view: LitView, path: Path, say: Said) -> float:
-    """Write nine hemispherical harmonics for each channel, the top row first; the rms error against the view's own
-    pictures, in steps of 8 bits. The layout is that of RTIBuilder's fitter: lines of header, scales and biases in
-    float32, nine bytes a channel for each pixel."""
+    """Write nine hemispherical harmonics for each channel, the top row first. Return the rms error against the
+    view's own pictures, in steps of 8 bits.
+
+    The layout is that of RTIBuilder's fitter: header lines, scales and biases in float32, and nine bytes for each
+    channel of each pixel.
+    """
     width, height = view.size_px
     code = of_terms(light_functions.hsh(view.directions), "hsh")
     planes = code.planes_of(view, say).reshape(-1, 9, 3)

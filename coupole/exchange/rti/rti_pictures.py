@@ -1,5 +1,5 @@
-"""Pictures of a view under each LED with the LEDs' directions, as programs for RTI take them: `.lp`, and relight's
-`.dome` with the LEDs' places."""
+"""Pictures of a view under each LED with the LEDs' directions, for programs for RTI: `.lp`, and relight's `.dome`
+with the LEDs' positions."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from coupole.storage.durable import write_synced
 from coupole.storage.run import Run
 
 LINEAR = "linear"
-"""Folder of the pictures of 16 bit, with lights, intensities and mask, from which `--pictures` makes a result."""
+"""Folder of the pictures of 16 bits, with lights, intensities and mask; `--pictures` makes a result from it."""
 _JPEG_QUALITY = 95
 
 
 def export_rti(folder: Path, out: Path, views: Sequence[str], say: Callable[[str, int, int], None]) -> list[Path]:
-    """Write `VIEW/` for each of these views of a run: `led0417.jpg` and so on (8 bit, sRGB,
-    one white for all), `VIEW.lp`, `VIEW.dome`, and `linear/`. Nominal places of the LEDs; no calibration is used.
+    """Write `VIEW/` for each of these views of a run: `led0417.jpg` and so on (8 bit, sRGB, one white for all),
+    `VIEW.lp`, `VIEW.dome`, and `linear/`. Positions of the LEDs are nominal; no calibration is used.
 
-    Raises InputError: too few LEDs, a folder with other pictures; StorageError for damaged frames
-    or a disk that cannot be written.
+    Raises InputError if there are too few LEDs, or if the folder has other pictures; StorageError for damaged
+    frames or a disk that cannot be written.
     """
     run = Run(folder)
     paths: list[Path] = []
@@ -64,8 +64,8 @@ def _export_view(run: Run, view: str, out: Path, say: Callable[[str, int, int], 
 
 
 def write_dome(run: Run, view: str, path: Path) -> Path:
-    """Write relight's file of the places of the LEDs that lit a view, in the order of their numbers. Raises
-    InputError for too few LEDs."""
+    """Write relight's file of the positions of the LEDs that lit a view, in the order of their numbers. Raises
+    InputError if there are too few LEDs."""
     return _write_dome(run, view, lights_of_view(run.folder, view), path)
 
 
@@ -102,5 +102,5 @@ def _read_picture(path: Path) -> NDArray[np.uint16]:
 
 
 def _srgb_codes(white: float) -> NDArray[np.uint8]:
-    """[65536] 8-bit codes of linear values; `white` has 255."""
+    """[65536] 8-bit codes of linear values; the code of `white` is 255."""
     return np.rint(255.0 * srgb(np.arange(1 << 16) / max(white, 1.0))).astype(np.uint8)

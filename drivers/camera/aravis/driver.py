@@ -70,7 +70,8 @@ class AravisCamera:
     # -- opening and closing ------------------------------------------------------------------------------
 
     def _set_up(self) -> None:
-        with contextlib.suppress(DeviceRefused):  # a client that died may have left an acquisition running
+        # an earlier client that died may have left an acquisition running
+        with contextlib.suppress(DeviceRefused):
             self._features.execute("AcquisitionStop")
         if self._is_gige:
             self._set_packets()

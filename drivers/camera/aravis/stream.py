@@ -38,8 +38,7 @@ _SLICE_S = 0.05
 
 
 class Pool:
-    """Page-aligned memory for `slots` images of `payload_bytes` each. It is kept from one acquisition to the
-    next."""
+    """Page-aligned memory for `slots` images of `payload_bytes` each. It is reused by the next acquisition."""
 
     def __init__(self, slots: int, payload_bytes: int) -> None:
         self.slots, self.payload_bytes = slots, payload_bytes

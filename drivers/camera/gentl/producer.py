@@ -13,7 +13,7 @@ from coupole.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.camera.gentl.settings import Settings
 
 _LOG = logging.getLogger("harvesters")
-"""Logger that replaces harvesters' own, which prints errors that are raised here anyway."""
+"""Logger in place of harvesters' own, whose errors are raised here anyway."""
 _LOG.addHandler(logging.NullHandler())
 
 

@@ -118,7 +118,7 @@ class KukaEki:
         slower = self.settings.velocity_percent() / percent
         move_s = move_duration_s(self.arm, status.joints_deg, target_deg) * slower + self._stop_s()
         with self._sending:
-            if self._stops != stops:  # by another thread, since this call began
+            if self._stops != stops:  # another thread has called `stop` since this call began
                 raise overtaken()
             self._motion_s = move_s * _slower(status)
             self._attention.begin()
@@ -128,7 +128,8 @@ class KukaEki:
         settings, watch = self.settings, self._watch
         order = watch.order
         with self._sending:
-            with self._link.changed:  # only statuses sent after the controller has taken ASK count
+            # statuses count only if they were sent after the controller took the command ASK
+            with self._link.changed:
                 watch.note_command(self._number + 1)
             self._send(wire.ASK)
         self._wait_taken()
@@ -250,7 +251,8 @@ class KukaEki:
         due = time.monotonic() - self._sent_s > _BEAT_EVERY_S
         if self._attention.look() is None or not due or not self._watch.moving:
             return
-        if self._sending.acquire(blocking=False):  # else another thread sends a command, which is as good
+        # otherwise another thread is sending a command, which serves as well
+        if self._sending.acquire(blocking=False):
             try:
                 self._link.beat(self._command(wire.BEAT))
             finally:
@@ -281,7 +283,7 @@ class KukaEki:
         return status
 
     def _wait_taken(self) -> None:
-        watch, patience_s = self._watch, 2.0 * self.settings.link_timeout_s  # a lost link is noticed before that
+        watch, patience_s = self._watch, 2.0 * self.settings.link_timeout_s  # a lost link is noticed before this
 
         def is_taken() -> bool:
             self._look()

@@ -42,7 +42,7 @@ def connect(
             while True:
                 listener.settimeout(max(_LOOK_S, give_up - time.monotonic()))
                 try:
-                    if strangers and time.monotonic() > give_up:  # they may knock without pause
+                    if strangers and time.monotonic() > give_up:  # strangers may connect without pause
                         raise TimeoutError
                     link, (caller, _) = listener.accept()
                 except TimeoutError:
@@ -127,7 +127,7 @@ class Link:
                 if (silent_s := silence.after(message_count)) > self._timeout_s:
                     self._lose(f"link lost: no status for {silent_s:.2f} s")
                     return
-                if not ready:  # or this process was frozen: `select` then says so without another look
+                if not ready:  # or this process was frozen: `select` then reports nothing without looking again
                     continue
                 data = self._link.recv(65536)
             except OSError as error:

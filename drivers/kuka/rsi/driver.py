@@ -125,7 +125,7 @@ class KukaRsi:
         # If the arm is moving it brakes first, which lengthens the motion by up to twice the braking time.
         motion_s = move_duration_s(self.arm, state.measured_deg, target_deg) / speed + self._stop_s()
         with self._sending:
-            if self._stops != stops:  # by another thread, since this call began
+            if self._stops != stops:  # another thread has called `stop` since this call began
                 raise overtaken()
             self._target_deg, self._motion_s = target_deg, motion_s
             self._lapses = state.lapses

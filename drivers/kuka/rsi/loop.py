@@ -97,7 +97,8 @@ class Leaving:
                 config.velocity_deg_s, config.acceleration_deg_s2, config.jerk_deg_s3, strict=True
             )
         )
-        # With answers that are late the axes wait, so twice the time; beyond it they will not come to rest here.
+        # If answers are late, the axes wait, so twice the time is allowed. After that the axes will not come to
+        # rest here.
         self._most_packets = round(2.0 * longest_s / config.cycle_s) + _MOST_STOP_ANSWERS
         self._first_packet = self._packets = self._heard_ns = 0
         self._rested_ns: int | None = None

@@ -173,7 +173,8 @@ class RsiSession:
         self._remembered.append(hash(data))
         self._ipoc, self._packet_ns, self.delay = int(packet.ipoc), now_ns, packet.delay or 0
         if mismatch := self._cycle.packet(now_ns, advance, cycles):
-            # What moves the arm at rest and in motion is a cycle's step: of another cycle none is right.
+            # At rest and in motion, the arm moves by one cycle's step per answer. With another cycle, no answer is
+            # right.
             self._session_over |= self._cycle.measured_ns > 0
             self.fail(shared_state.WRONG_CYCLE, mismatch)
         self._ipoc_step = self._cycle.ipoc_step or self._ipoc_step

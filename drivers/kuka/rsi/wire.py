@@ -56,7 +56,7 @@ def packet_parser(measured_tag: str, delay_tag: str) -> Callable[[bytes], Packet
                 return None
         except (KeyError, ValueError):
             return None
-        if not all(abs(angle) <= _LARGEST_DEG for angle in joints_deg):  # also false for a NaN
+        if not all(abs(angle) <= _LARGEST_DEG for angle in joints_deg):  # this is also false for a NaN
             return None
         if match := usual_tail.search(packet):
             late, ipoc = match[1], match[2]

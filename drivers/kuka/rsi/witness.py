@@ -1,19 +1,22 @@
-"""The invariant of every answer with respect to the arm itself, even if one side has lost count:
+"""The invariant that ties every answer to the arm itself, even if one side has lost count:
 
     An answer starts from the arm. It is sent on two conditions. The controller's own packet must prove that
     corrections still count from this session's start. And the distance from the axes that this packet reports to
     the answer's place must be at most the lag of the arm plus one cycle's step.
 
-*Proves* has three conditions. The controller's counter of late answers contains every cycle of its IPOC that was
-not answered since the last answered packet. The counter has not decreased. A silence on the machine's clock is
-also a silence by the IPOC. A controller that restarts RSI needs some cycles for it, counts none of them, and
-begins its counter at 0. The old corrections would then lead as far from the arm as it had moved.
+*Proof.* A packet proves this if three conditions hold. First, the controller's counter of late answers contains
+every cycle of the IPOC since the last answered packet that was not answered. Second, the counter has not
+decreased, unless it counts only late answers in a row. Third, every silence on the machine's clock is also a
+silence by the IPOC.
 
-*Lag* means: the arm is between the places to which the answers led within the last `follow_lag_s`, within
+The reason is a restart of RSI: the controller needs some cycles for it, counts none of them as late, and begins
+its counter at 0. The old corrections would then be wrong by as much as the arm had moved before.
+
+*Lag.* The arm must be between the places to which the answers of the last `follow_lag_s` led, with a tolerance of
 `follow_deg`. If it is not there, no answer leads farther away from it.
 
-`rsi_session` counts nothing of this. The witness itself keeps the last answered packet and the places of the
-answers.
+The witness uses no count of `rsi_session`. It stores the last answered packet and the places of the answers
+itself.
 """
 
 from __future__ import annotations
@@ -29,13 +32,13 @@ from drivers.kuka.rsi.wire import Packet
 Six = tuple[float, ...]
 
 _PATIENT_PACKETS = 5
-"""Number of packets that are left unanswered until the IPOC has caught up with a silence, because this machine may
-be busy."""
+"""Number of packets that are left unanswered after a silence, so that the IPOC can catch up with it. A busy
+machine causes such silences too."""
 _SURE = 10
-"""Number of answers after which the smallest step of the IPOC counts as its step, because a packet may be lost on
-the network."""
+"""Number of answers after which the smallest step of the IPOC so far counts as its step per cycle. Before that, a
+packet may have been lost on the network."""
 _ROUNDING = 2e-5
-"""Numbers on the wire have six decimals."""
+"""Allowance for rounding: numbers on the wire have six decimals."""
 _NOWHERE: Six = (0.0,) * 6
 
 
@@ -64,9 +67,9 @@ class ArmWitness:
         counts_in_a_row: bool,
         unaccounted_s: float,
     ) -> None:
-        """`place_at` gives the place at reported axes; `between` gives the correction from one place to another.
-        `counts_in_a_row` says that an answer in time sets the counter of late answers to 0. `unaccounted_s` is the
-        silence that ends the session; 0: never."""
+        """`place_at` returns the place at reported axes; `between` returns the correction from one place to
+        another. `counts_in_a_row`: an answer in time sets the counter of late answers to 0. `unaccounted_s` is the
+        length of a silence that ends the session; 0: no silence ends it."""
         self._reported, self._between = place_at, between
         self._follow = bounds.follow
         self._follow_and_step: Six = tuple(map(float.__add__, bounds.follow, bounds.step))
@@ -78,8 +81,8 @@ class ArmWitness:
         self._last_ns = self._step = self._answered = self._waits = 0
 
     def break_reason(self, packet: Packet, now_ns: int) -> str:
-        """Return why, by this packet, corrections may no longer count from the session's start; "" if it proves
-        that they do."""
+        """Return the reason why this packet does not prove that corrections still count from the session's start;
+        "" if it proves this."""
         last = self._last
         if last is None:
             return ""
@@ -115,8 +118,9 @@ class ArmWitness:
         return ""
 
     def waits(self, packet: Packet, now_ns: int) -> bool:
-        """True for a packet after a silence that its IPOC has not counted yet. It is left unanswered: if this
-        machine was busy, the answer would be late, and the next packets account for the silence."""
+        """True for a packet after a silence that its IPOC does not count yet. Such a packet is left unanswered: if
+        only this machine was busy, an answer would be late, and the IPOC of the next packets counts the
+        silence."""
         last = self._last
         if last is None or not self._unaccounted_s or not self._step:
             return False
@@ -127,12 +131,12 @@ class ArmWitness:
         return True
 
     def strays(self, joints_deg: Six) -> bool:
-        """True if the arm is not where it was led. It must not be led on."""
+        """True if the arm is not where it was led. Then no further motion must be commanded."""
         return bool(self._led) and any(self._beyond(self._reported(joints_deg), self._led[-1], self._follow))
 
     def violation(self, packet: Packet, place: Any, now_ns: int) -> str:
-        """Return why an answer to `packet` that leads to `place` must not be sent. Otherwise return "", and the
-        answer counts as sent."""
+        """Return the reason why an answer to `packet` that leads to `place` must not be sent. If there is none,
+        return "", and count the answer as sent."""
         if why := self.break_reason(packet, now_ns):
             return why
         arm = self._reported(packet.joints_deg)
@@ -153,7 +157,7 @@ class ArmWitness:
         return ""
 
     def _beyond(self, arm: Any, place: Any, within: Six) -> list[bool]:
-        """Tell for each number of a place whether the arm is neither there nor within its lag."""
+        """Tell whether the arm is further from a place than the lag allows, for each number of the place."""
         off = self._between(arm, place)
         behind = self._between(self._led[0], self._led[-1]) if self._led else _NOWHERE
         return [not abs(away) <= limit + abs(lag) for away, lag, limit in zip(off, behind, within, strict=True)]

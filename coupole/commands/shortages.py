@@ -17,8 +17,8 @@ _NO_THREAD = "can't start new thread"
 
 def shortage_behind(error: BaseException) -> ResourceShortage | StorageError | None:
     """Return what ran short, in words, if that is behind an error; None if it is not known to be a shortage."""
-    for one in _chain(error):
-        words = _shortage(one)
+    for link in _chain(error):
+        words = _shortage(link)
         if words is not None:
             return words
     return None
@@ -31,9 +31,9 @@ def place_of(error: BaseException) -> str:
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    seen: set[int] = set()
-    while error is not None and id(error) not in seen:
-        seen.add(id(error))
+    ids: set[int] = set()
+    while error is not None and id(error) not in ids:
+        ids.add(id(error))
         yield error
         error = error.__cause__ or error.__context__
 
@@ -41,8 +41,8 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
 def _shortage(error: BaseException) -> ResourceShortage | StorageError | None:
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.ENOSPC, errno.EDQUOT):
-        named = getattr(error, "filename", None)
-        return DiskFull(f"{f'{named}: ' if named else ''}the disk is full. Free space on it, then run this again.")
+        path = getattr(error, "filename", None)
+        return DiskFull(f"{f'{path}: ' if path else ''}the disk is full. Free space on it, then run this again.")
     if number == errno.EMFILE:
         limit = _limit(resource.RLIMIT_NOFILE)
         return ResourceShortage(

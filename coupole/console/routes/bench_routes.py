@@ -67,7 +67,7 @@ class _Hold:
         self._number: int | None = None
         self._asked: dict[str, Any] = {}
         self._next_word = ""
-        """What the next renewal must have."""
+        """Word that the next renewal must have."""
 
     async def serve(self) -> None:
         outcome, is_moving = "the button was released", False

@@ -305,5 +305,5 @@ def start_threads() -> None:
 
 
 if __name__ == "__main__":
-    sys.path[:0] = [str(REPO), str(REPO / "tests" / "faults")]
+    sys.path[:0] = [str(REPO), str(REPO / "tests" / "faults"), str(REPO / "tests" / "runs")]
     serve(socket.socket(fileno=os.dup(0)), ForkAccount(Path(sys.argv[1])) if sys.argv[1:] else None)

@@ -184,7 +184,7 @@ class Texels:
 
 def _of_runs(request: RunRequest, out: Path, scheduler: str | None, say: Said, texels: Texels) -> Made:
     from coupole.reflectance.result_pages import run_reflectance_page
-    from coupole.scripting.analyses import fit_runs
+    from coupole.reflectance.whole_result import fit_runs
 
     about = fit_runs(request, out, scheduler, say, texels=texels.size, tell=texels.tell)
     return about, list(run_reflectance_page.remarks(about)), run_reflectance_page.write(out)

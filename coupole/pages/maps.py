@@ -18,6 +18,8 @@ WIDTH_PX = 480
 GAMMA = 2.2
 BRIGHTEST = 0.999
 """Quantile of a picture that is shown as white."""
+_PNG_LEVEL = 4
+"""Level of zlib. Maps are about 3 % larger than by level 9, which takes seven times as long."""
 
 
 def value_map(
@@ -115,5 +117,5 @@ def _some_pixels(values: NDArray[Any]) -> NDArray[np.float64]:
 
 def _png(image: Any, **options: Any) -> bytes:
     buffer = io.BytesIO()
-    image.save(buffer, "PNG", optimize=True, **options)
+    image.save(buffer, "PNG", compress_level=_PNG_LEVEL, **options)
     return buffer.getvalue()

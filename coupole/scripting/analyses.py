@@ -8,7 +8,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from coupole.calibration.record import Record
 from coupole.errors import InputError
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from coupole.calibration.lens.images import Found
     from coupole.calibration.sources import Sources
     from coupole.heritage.analysis.references import References
-    from coupole.reflectance.run_job import RunRequest
-    from coupole.reflectance.texels.texel_forecast import TexelForecast
-    from coupole.reflectance.texels.texel_size import TexelSize
 
 CalibrationRecord = Record
 AnyPath = str | os.PathLike[str]
@@ -59,6 +56,7 @@ def fit_reflectance(
     from coupole.reflectance.result_pages import run_reflectance_page
     from coupole.reflectance.run_job import RunRequest
     from coupole.reflectance.texels.texel_size import TexelSize
+    from coupole.reflectance.whole_result import fit_runs
     from coupole.scripting.opened_result import open_result
 
     request = RunRequest(
@@ -204,44 +202,6 @@ def compare(
 
 
 # -- parts that the commands share ------------------------------------------------------------------------------
-
-
-def fit_runs(
-    request: RunRequest,
-    out: Path,
-    scheduler: str | None,
-    progress: Progress,
-    *,
-    texels: TexelSize | None,
-    tell: Callable[[TexelForecast], None] | None = None,
-) -> dict[str, Any]:
-    """Make a result, or its missing parts; return the content of `result.json`.
-
-    The forecast of the texels' time and size is given to `tell` before the work begins. Raises the errors of
-    `fit_reflectance`.
-    """
-    from coupole.reflectance.run_job import reflectance_of
-
-    forecast = None
-    if texels is not None:
-        from coupole.reflectance.discarded_frames import refuse_texels
-        from coupole.reflectance.texels.texel_forecast import foresee_texels, refuse_full_disk
-        from coupole.storage.run import Run
-
-        for run in request.runs:
-            refuse_texels(Run(run), out)
-        forecast = foresee_texels(request, out, texels)
-        if forecast is not None:
-            if tell is not None:
-                tell(forecast)
-            refuse_full_disk(forecast, out)
-    about = reflectance_of(request, out, scheduler=scheduler, say=progress)
-    if texels is not None:
-        from coupole.reflectance.texels.texel_job import add_texels
-
-        about |= {"texels": add_texels(request, out, texels, scheduler=scheduler, say=progress)}
-        about["texels"]["foreseen"] = forecast and forecast.document()
-    return about
 
 
 def references_of(library: Path, classes: Path | None) -> References:

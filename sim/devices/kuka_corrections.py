@@ -63,11 +63,15 @@ class _AxesSum:
         self.clamped = ""
         self._limits = limits
         self._sum_deg: Axes6 = _NOTHING
+        self._values: Axes6 | None = None
+        """Corrections that were applied last."""
 
     def add(self, values: Axes6) -> str:
         return self.replace(tuple(map(float.__add__, self._sum_deg, values)))
 
     def replace(self, values: Axes6) -> str:
+        if values == self._values:  # of an arm that stands
+            return ""
         clamps = self._limits.axis_clamp_deg
         self._sum_deg = tuple(max(-c, min(c, value)) for c, value in zip(clamps, values, strict=True))
         self.clamped = "" if self._sum_deg == values else f"to {np.round(self._sum_deg, 3).tolist()} deg"
@@ -75,6 +79,7 @@ class _AxesSum:
             if not abs(value) <= most:
                 return f"AXISCORRMON: correction of A{axis} by {value:.3f} deg"
         self.axes_deg = tuple(map(float.__add__, self._start_deg, self._sum_deg))
+        self._values = values
         return ""
 
 

@@ -133,10 +133,11 @@ class Reactor:
     def _run_due_timers(self) -> None:
         paced_ns = self.clock.paced_ns()
         for _ in range(_TIMERS_PER_POLL):
-            if self._next_ns() > paced_ns:
+            next_ns = self._next_ns()
+            if next_ns > paced_ns:
                 break
-            if not self._timers or self._timers[0].t_ns > self._next_ns():
-                self._now_ns = self._next_ns()
+            if not self._timers or self._timers[0].t_ns > next_ns:
+                self._now_ns = next_ns
                 continue
             timer = heapq.heappop(self._timers)
             self._now_ns = max(self._now_ns, timer.t_ns)

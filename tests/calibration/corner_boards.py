@@ -8,13 +8,14 @@ blur's centre of gravity.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from lazily import lazily
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
+signal: Any = lazily("scipy.signal")
 Floats = NDArray[np.float64]
 FINE = 8
 SIDE_PX, CORNERS, SQUARE_PX = 216, 6, 26.0
@@ -79,7 +80,7 @@ def _normal(x: Floats, y: Floats, sigma_x: float, sigma_y: float) -> Floats:
 
 
 def _spread(kernel: Floats, sigma: float, x: Floats, y: Floats) -> Floats:
-    spread = fftconvolve(kernel, _normal(x, y, sigma, sigma), mode="same")
+    spread = signal.fftconvolve(kernel, _normal(x, y, sigma, sigma), mode="same")
     return np.asarray(spread / spread.sum())
 
 
@@ -99,7 +100,7 @@ def draw(stratum: Stratum, seed: int) -> Drawn:
     light = _checks(u) * _checks(v)
     squares = 0.5 * (CORNERS + 1)
     light = np.where((np.abs(u) > squares) | (np.abs(v) > squares), 1.0, light)
-    light = 0.5 + 0.5 * np.asarray(fftconvolve(light, blur_kernel(stratum.blur), mode="same"))
+    light = 0.5 + 0.5 * np.asarray(signal.fftconvolve(light, blur_kernel(stratum.blur), mode="same"))
     pixels = light.reshape(SIDE_PX, FINE, SIDE_PX, FINE).mean(axis=(1, 3))
     numbers = np.arange(CORNERS) - 0.5 * (CORNERS - 1)
     grid = np.stack([*np.meshgrid(numbers, numbers), np.ones((CORNERS, CORNERS))], axis=-1).reshape(-1, 3)

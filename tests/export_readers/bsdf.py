@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-import mitsuba
 import numpy as np
+from lazily import lazily
+
+mitsuba: Any = lazily("mitsuba")
 
 MOST_LOST = 3e-3
 

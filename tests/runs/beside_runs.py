@@ -18,13 +18,21 @@ LOW = {**cells.LOW, "elevation_deg": 55}
 OF_ITS_MAKING = {"seconds", "peak_memory_bytes"}
 
 
-def cell_of_three_views(folder: Path, **plan: Any) -> CellFolder:
-    cell = shipped_cell(folder)
+def cell_of_three_views(folder: Path, relief: Path = cells.COARSE_RELIEF, **plan: Any) -> CellFolder:
+    """415 triangles: two blocks of work for each fit, and a tenth of the work that the whole relief is."""
+    cell = shipped_cell(folder, relief)
     cell.write(
         views=[cells.TOP, SIDE, LOW],
         calibrations=[str(RECORDS / f"{kind}.yaml") for kind in KINDS],
         **{"lights": {"kind": "every", "every": 24}, **plan},
     )
+    return cell
+
+
+def acquired_run(folder: Path) -> CellFolder:
+    """The cell, with a run that nothing has processed."""
+    cell = cell_of_three_views(folder)
+    assert cell.acquire().code == 0
     return cell
 
 

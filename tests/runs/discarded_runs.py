@@ -19,8 +19,8 @@ KEPT_LEDS = (96, 384, 672, 960)  # every twelfth of the plan's LEDs, from the fi
 DISCARDED = 45 - len(KEPT_LEDS)
 
 
-def discarding_cell(folder: Path, **plan: object) -> CellFolder:
-    return cell_of_three_views(folder, discard="after_fit", **plan)
+def discarding_cell(folder: Path, relief: Path = cells.COARSE_RELIEF, **plan: object) -> CellFolder:
+    return cell_of_three_views(folder, relief, discard="after_fit", **plan)
 
 
 def frames(run: Path) -> Iterator[tuple[str, bool, bool]]:

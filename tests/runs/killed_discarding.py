@@ -1,5 +1,4 @@
-"""Takes the samples of a run and discards its frames, and is killed at a step: `killed_discarding.py STEP RUN
-OUT`.
+"""Takes the samples of a run and discards its frames, and is killed at a step, in a process of the nursery.
 
 A step is the name of a function, and whether SIGKILL comes `before` or `after` its first call.
 """
@@ -9,7 +8,6 @@ from __future__ import annotations
 import importlib
 import os
 import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -61,16 +59,12 @@ def _append_half(file: LineFile, lines: list[str]) -> None:
     die()
 
 
-def main() -> None:
-    step, run, out = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3])
+def discard(step: str, run: str, out: str) -> None:
+    """To its end, if the step has no name here."""
     whole = {**STEPS, **REWRITTEN}
-    request = RunRequest((run,))
+    request = RunRequest((Path(run),))
     if step in REWRITTEN:
-        extract_runs(request, out)
+        extract_runs(request, Path(out))
     if step in whole:
         die_at(whole[step])
-    (reflectance_of if step in REWRITTEN else extract_runs)(request, out)
-
-
-if __name__ == "__main__":
-    main()
+    (reflectance_of if step in REWRITTEN else extract_runs)(request, Path(out))

@@ -21,15 +21,15 @@ DIFFUSE, F0, ROUGHNESS = (0.5, 0.35, 0.2), (0.05, 0.05, 0.05), 0.3
 SIDE = {**cells.TOP, "name": "side", "azimuth_deg": -60, "elevation_deg": 55}
 
 
-def shipped_cell(folder: Path, **world: Any) -> CellFolder:
+def shipped_cell(folder: Path, relief: Path = cells.RELIEF, **world: Any) -> CellFolder:
     """A cell with the camera of `sim.yaml`, for which the records hold, and a quarter of its relief: a high dome
     with lower ones around it."""
     cell = CellFolder(folder, speed=10.0)
-    relief = trimesh.load(cells.RELIEF, process=False)
-    x, y, _ = relief.triangles_center.T
-    relief.update_faces((x > 10) & (y > -20))
-    relief.remove_unreferenced_vertices()
-    relief.export(folder / "relief.ply")
+    mesh = trimesh.load(relief, process=False)
+    x, y, _ = mesh.triangles_center.T
+    mesh.update_faces((x > 10) & (y > -20))
+    mesh.remove_unreferenced_vertices()
+    mesh.export(folder / "relief.ply")
     cell.plan_data["object"]["mesh"] = str(folder / "relief.ply")
     shipped = {"width_px": 512, "height_px": 384, "pixel_pitch_um": 44.0}
     cell.rig_data["sensor"] |= shipped

@@ -142,7 +142,7 @@ def test_choices_follow_from_the_frames(whole: CellFolder) -> None:
 @pytest.mark.parametrize("frames", in_part([30, 3, 75], 30))
 def test_a_killed_run_goes_on_as_its_frames_ask(tmp_path: Path, frames: int) -> None:
     cell = _cell(tmp_path, speed=2.0)
-    process = cell.start_acquire(anew=True)
+    process = cell.start_acquire()
     run = cell.run_folder
     cells.wait_until(lambda: cells.frame_lines(run) >= frames, "proven frames")
     process.kill()

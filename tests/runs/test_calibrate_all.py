@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cells
 import pytest
@@ -20,14 +19,9 @@ STEPS = ("--only", "darks", "--only", "response")
 @pytest.fixture
 def rig(tmp_path: Path) -> Path:
     """The imperfect cell with small frames, faster than life."""
-    content: dict[str, Any] = cells.shipped_rig("sim-imperfect")
-    content["sensor"] |= {"width_px": 256, "height_px": 192, "pixel_pitch_um": 88.0}
-    content["dome"]["leds"] = str(cells.REPO / "configs/domes/coupole.csv")
-    content["ledbox"]["settings"]["watchdog_s"] = 40.0
-    content["world"]["settings"] |= {"speed": 5.0}
     path = tmp_path / "rig.yaml"
     with path.open("w") as file:
-        YAML().dump(content, file)
+        YAML().dump(cells.imperfect_rig(256, speed=5.0), file)
     return path
 
 

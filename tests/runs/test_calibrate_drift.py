@@ -33,14 +33,11 @@ def rig(
 ) -> Path:
     """The imperfect cell with small frames, faster than life; slower where boards cool while a session begins, of
     which a busy machine makes several seconds."""
-    content: dict[str, Any] = cells.shipped_rig("sim-imperfect")
-    content["sensor"] |= {"width_px": 256, "height_px": 192, "pixel_pitch_um": 88.0}
-    content["dome"]["leds"] = str(cells.REPO / "configs/domes/coupole.csv")
-    content["ledbox"]["settings"]["watchdog_s"] = 60.0
+    content = cells.imperfect_rig(256, speed=5.0 if warm_k else 20.0)
     content["storage"]["folder"] = str(folder / "runs")
     boards = {"ambient_c": ambient_c, "warm_k": warm_k, "thermal_time_constant_s": COOLING_S}
     settings = content["world"]["settings"]
-    settings |= {"speed": 5.0 if warm_k else 20.0, "things": things, "ledbox": boards}
+    settings |= {"things": things, "ledbox": boards}
     settings["leds"] = {"hours_shone": hours_shone}
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "rig.yaml"

@@ -31,20 +31,16 @@ def make_rig(scale: Callable[[int, int], int]) -> Callable[..., Path]:
     hand-eye record."""
 
     def make(folder: Path, *things: Mapping[str, Any]) -> Path:
-        content: dict[str, Any] = cells.shipped_rig("sim-imperfect")
         width_px = scale(512, 2048)
-        pitch_um = 22.0 * 1024 / width_px
-        content["sensor"] |= {"width_px": width_px, "height_px": width_px * 3 // 4, "pixel_pitch_um": pitch_um}
-        content["dome"]["leds"] = str(cells.REPO / "configs/domes/coupole.csv")
-        content["ledbox"]["settings"]["watchdog_s"] = 60.0
+        content = cells.imperfect_rig(width_px, speed=20.0)
         content["storage"]["folder"] = str(folder / "runs")
-        content["world"]["settings"] |= {"speed": 20.0, "things": [dict(thing) for thing in things]}
+        content["world"]["settings"]["things"] = [dict(thing) for thing in things]
         content["world"]["settings"]["camera"]["samples_per_side"] = scale(2, 3)
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / "rig.yaml"
         with path.open("w") as file:
             YAML().dump(content, file)
-        write_record(folder / "hand-eye.yaml", true_hand_eye(width_px, pitch_um))
+        write_record(folder / "hand-eye.yaml", true_hand_eye(width_px, content["sensor"]["pixel_pitch_um"]))
         return path
 
     return make

@@ -6,8 +6,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterable
@@ -30,6 +28,7 @@ from discarded_runs import (
     resume,
 )
 from killed_discarding import REWRITTEN, STEPS
+from nursery import NURSERY
 
 from coupole.errors import ChecksumMismatch, StorageError
 from coupole.preflight.discard_room import discard_room
@@ -103,8 +102,8 @@ def spoil(samples: Path) -> None:
 
 
 def killed(step: str, run: Path, out: Path) -> int:
-    program = Path(__file__).with_name("killed_discarding.py")
-    return subprocess.run([sys.executable, program, step, run, out], check=False).returncode
+    with NURSERY.function("killed_discarding:discard", [step, str(run), str(out)]) as process:
+        return process.wait()
 
 
 # -- the run --------------------------------------------------------------------------------------------------
@@ -118,8 +117,6 @@ def test_frames_are_discarded_when_their_samples_are_safe_and_all_commands_under
     assert ended.document["reflectance"]["is_whole"], ended.err
     run, result = cell.run_folder, result_of(cell)
     all_discarded(run, result)
-
-    bounds_hold(cell, run, result)
 
     told = cells.here("status", run, "--json").document
     assert told["frames_discarded"] == 3 * DISCARDED
@@ -168,6 +165,15 @@ def test_frames_are_discarded_when_their_samples_are_safe_and_all_commands_under
     assert verified.document["ok"]
     assert verified.document["discarded"] == 3 * DISCARDED
     assert cells.here("reflectance", run, "--out", result).code == 0
+
+
+def test_preflight_bounds_the_room_that_is_taken(tmp_path: Path) -> None:
+    """Of the whole relief, whose samples take as much room as frames; of so few LEDs no material is fitted."""
+    cell = discarding_cell(tmp_path, cells.RELIEF, lights={"kind": "every", "every": 60})
+    process, _ = begun(cell)
+    ended = cells.finish(process)
+    assert ended.document["reflectance"]["is_whole"], ended.err
+    bounds_hold(cell, cell.run_folder, result_of(cell))
 
 
 def test_the_result_is_the_same_as_that_of_all_frames(

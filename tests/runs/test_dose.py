@@ -70,7 +70,7 @@ class RealCell:
 
 LONGEST_FLASH_S = 0.02
 """Of the live view at its default exposure."""
-RELIEF = {"id": "relief", "mesh": str(cells.REPO / "configs/objects/relief.ply")}
+RELIEF = {"id": "relief", "mesh": str(cells.COARSE_RELIEF)}
 
 
 @pytest.fixture(scope="module")

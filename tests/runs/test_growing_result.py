@@ -10,7 +10,8 @@ from typing import Any
 import cells
 import numpy as np
 import pytest
-from beside_runs import begun, cell_of_three_views, files, result_of, same_result
+from beside_runs import acquired_run, begun, cell_of_three_views, files, result_of, same_result
+from cells import CellFolder
 
 from coupole.reflectance.beside.growing import Growth, fit_so_far
 from coupole.reflectance.light_paths import Ahead
@@ -19,6 +20,12 @@ from coupole.reflectance.run_result import RunResult
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("hurried")]
 MEMORY_BYTES = 2_000_000_000
+
+
+@pytest.fixture(scope="module")
+def acquired(tmp_path_factory: pytest.TempPathFactory) -> CellFolder:
+    """A run that is only read."""
+    return acquired_run(tmp_path_factory.mktemp("acquired"))
 
 
 def said_by(*arguments: str | Path) -> dict[str, Any]:
@@ -57,14 +64,14 @@ def is_told_when_it_is_replaced(so_far: Path, out: Path) -> None:
     assert "a result of more views has replaced it" in refused.err
 
 
-def test_without_room_on_the_disk_none_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_room_on_the_disk_none_is_made(
+    acquired: CellFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Frames and samples of the views to come are more important."""
-    cell = cell_of_three_views(tmp_path)
-    assert cell.acquire().code == 0
     result = tmp_path / "result"
-    extract_beside(cell.run_folder, "top", result)
-    growth = Growth.of_views(cell.run_folder, result, ("top",), 3)
-    view_bytes = (cell.run_folder / "views/top.h5").stat().st_size
+    extract_beside(acquired.run_folder, "top", result)
+    growth = Growth.of_views(acquired.run_folder, result, ("top",), 3)
+    view_bytes = (acquired.run_folder / "views/top.h5").stat().st_size
     total = shutil.disk_usage(result)
     for free_bytes, has_room in ((2**30 + 2 * view_bytes, False), (2**30 + 20 * view_bytes, True)):
         monkeypatch.setattr(shutil, "disk_usage", lambda _, free=free_bytes: total._replace(free=free))
@@ -100,10 +107,10 @@ def test_a_run_that_goes_on_has_a_result_of_its_views_so_far(tmp_path: Path) -> 
     same_result(result, afterwards)
 
 
-def test_what_is_known_ahead_and_given_up_changes_no_bit_of_the_result(tmp_path: Path) -> None:
-    cell = cell_of_three_views(tmp_path)
-    assert cell.acquire().code == 0
-    run, result = cell.run_folder, tmp_path / "result"
+def test_what_is_known_ahead_and_given_up_changes_no_bit_of_the_result(
+    acquired: CellFolder, tmp_path: Path
+) -> None:
+    run, result = acquired.run_folder, tmp_path / "result"
     ahead, views = Ahead(), ("top", "side")
     for view in views:
         look_ahead(run, view)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 from dask_cluster import cluster
-from relief_cells import DIFFUSE, F0, RECORDS, ROUGHNESS, SIDE, Made, glossy_result, shipped_cell, unit, walter
+from relief_cells import DIFFUSE, F0, RECORDS, ROUGHNESS, SIDE, Made, shipped_cell, unit, walter
 
 from coupole.calibration.light.frames import open_light_frames
 from coupole.reflectance.fits import FITS, MATERIALS
@@ -30,8 +30,8 @@ from coupole.reflectance.uncalibrated import FILES, write_pictures
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    return glossy_result(tmp_path_factory.mktemp("cell"))
+def made(glossy: Made) -> Made:
+    return glossy
 
 
 @pytest.mark.parametrize("view", ["top", "side"])

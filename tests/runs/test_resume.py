@@ -47,7 +47,7 @@ def _self_contained_cell(folder: Path, *, write: bool = True) -> CellFolder:
     cell.plan_data["object"]["mesh"] = "relief.ply"
     if write:
         shutil.copy(cells.REPO / "configs/domes/coupole.csv", folder)
-        shutil.copy(cells.REPO / "configs/objects/relief.ply", folder)
+        shutil.copy(cells.COARSE_RELIEF, folder)
         cell.write(views=[TOP, SIDE], lights=MANY_LIGHTS)
     return cell
 

@@ -69,7 +69,7 @@ def test_a_plan_that_cannot_be_processed_beside_is_refused(
 
 
 def test_preflight_tells_the_space_at_a_time_and_refuses_less(tmp_path: Path, small_disk: Path) -> None:
-    cell = discarding_cell(tmp_path)
+    cell = discarding_cell(tmp_path, cells.RELIEF)  # samples that take as much room as frames
     cell.rig_data["storage"]["folder"] = str(small_disk)
     cell.write()
     checked = cells.here("check", cell.plan, "--json")
@@ -87,7 +87,7 @@ def test_preflight_tells_the_space_at_a_time_and_refuses_less(tmp_path: Path, sm
 def test_a_run_waits_for_room_and_ends_clearly_if_none_comes(
     tmp_path: Path, small_disk: Path, ending: str
 ) -> None:
-    cell = discarding_cell(tmp_path)
+    cell = discarding_cell(tmp_path, cells.RELIEF)  # samples that take as much room as frames
     cell.rig_data["storage"]["folder"] = str(small_disk)
     cell.write()
     (tmp_path / "storage").symlink_to(small_disk)

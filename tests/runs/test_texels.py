@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from dask_cluster import cluster
 from lazily import lazily
-from relief_cells import DIFFUSE, RECORDS, Made, glossy_result
+from relief_cells import DIFFUSE, RECORDS, Made
 from scipy.ndimage import gaussian_filter
 from texel_truth import seen_by
 
@@ -170,8 +170,8 @@ def test_a_job_that_was_stopped_goes_on_and_ends_alike(made: Made, tmp_path: Pat
         assert (copy / "texels" / name).read_bytes() == (out / "texels" / name).read_bytes()
 
 
-def test_plain_materials_get_no_worse(tmp_path: Path) -> None:
-    cell, out, _ = glossy_result(tmp_path)
+def test_plain_materials_get_no_worse(glossy: Made) -> None:
+    cell, out, _ = glossy
     about = add_texels(RunRequest((cell.run_folder,), None, records_named([RECORDS])), out)
     (other,) = set(about["mae"]) - {TEXELS}
     assert about["mae"][TEXELS] < 1.03 * about["mae"][other]

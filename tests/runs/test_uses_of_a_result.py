@@ -16,7 +16,7 @@ import pytest
 import trimesh
 from arms import KR10_R1100_SIXX
 from lazily import lazily
-from relief_cells import DIFFUSE, RECORDS, Made, frame_share, glossy_result, unit, walter
+from relief_cells import DIFFUSE, RECORDS, Made, frame_share, unit, walter
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
@@ -34,8 +34,8 @@ pycolmap: Any = lazily("pycolmap")
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    return glossy_result(tmp_path_factory.mktemp("cell"))
+def made(glossy: Made) -> Made:
+    return glossy
 
 
 @pytest.mark.parametrize("view", ["top", "side"])

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from lazily import lazily
 
 from coupole.scan.registration.joint_fit import JointFit
 from coupole.scan.registration.loop_errors import PairAlone, sliding_pairs, with_loops
 
+stats: Any = lazily("scipy.stats")
 SCANS = 40
 PAIRS = [(a, b) for a in range(SCANS) for b in range(a + 1, SCANS)]
 """So many that what all have in common is a small part of each pair's difference."""
@@ -65,7 +67,7 @@ def test_what_targets_say_is_not_enlarged() -> None:
 
 def test_the_three_pairs_of_one_loop_share_its_error() -> None:
     """Each takes a third of the squared error, so what is left of a pair is smaller than its own error."""
-    usual = chi2.median(6) / 3
+    usual = stats.chi2.median(6) / 3
     pairs = [PairAlone(*pair, np.eye(4), 4 * usual) for pair in ((0, 1), (0, 2), (1, 2))]
     assert with_loops(fit(), pairs, 3)[1] == pytest.approx(2.0)
 

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
-from scipy.stats import chi2
+from scipy.special import chdtri  # scipy.stats takes half a second to import
 
 from coupole.scan.registration.control import Sightings
 from coupole.scan.registration.joint_fit import JointFit, Say, adjust
@@ -68,7 +68,7 @@ def with_loops(fit: JointFit, pairs: Sequence[PairAlone], count: int) -> tuple[J
     loops = len(pairs) - (count - 1)
     if loops < 1:
         return fit, 1.0
-    usual_surprise = chi2.median(6) * loops / len(pairs)
+    usual_surprise = chdtri(6, 0.5) * loops / len(pairs)
     factor = max(1.0, float(np.sqrt(np.median([pair.surprise for pair in pairs]) / usual_surprise)))
     more = (factor**2 - 1.0) * fit.overlap_covariance
     return replace(fit, covariance=fit.covariance + more, overlap_covariance=fit.overlap_covariance + more), factor
@@ -76,7 +76,7 @@ def with_loops(fit: JointFit, pairs: Sequence[PairAlone], count: int) -> tuple[J
 
 def sliding_pairs(pairs: Sequence[PairAlone], factor: float) -> list[PairAlone]:
     """Pairs that by themselves end elsewhere than all together: farther than one in a million would by chance."""
-    return [pair for pair in pairs if pair.surprise > factor**2 * chi2.isf(_CHANCE, 6)]
+    return [pair for pair in pairs if pair.surprise > factor**2 * chdtri(6, _CHANCE)]
 
 
 def find_loops(scans: Sequence[PreparedScan], pairs: Sequence[PairAlone]) -> list[Loop]:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
+from lazily import lazily
 from numpy.typing import NDArray
-from scipy import special, stats
+from scipy import special
 
 from coupole.kernels import kernel
 from sim.optics import noise
 
+stats: Any = lazily("scipy.stats")
 FRAME = 3
 TABLES = (noise.INVERSE_NORMAL, noise.SMALL_MEANS, noise.SMALL_STARTS)
 

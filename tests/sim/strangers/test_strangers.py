@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
+from lazily import lazily
 from pydantic import ValidationError
-from scipy.stats import t as student
 
 from sim.devices.kuka_axes import Axes
 from sim.devices.kuka_kinematics import PoseErrors, flange_pose
@@ -26,6 +28,7 @@ from sim.strangers.sensor_stranger import SensorStranger
 from sim.strangers.target_stranger import TargetStranger
 from sim.world.config import Settings
 
+stats: Any = lazily("scipy.stats")
 BROWN = (-0.03, 0.02, 5e-4, -3e-4, 0.0)
 ODD = LensStranger(rational=(0.3, -0.1, 0.05), prism=(2e-3, -4e-3, -1e-3, 3e-3))
 PLAIN = Lens(160, 120, 200.0, BROWN)
@@ -226,7 +229,7 @@ def test_noise_has_the_tails_of_student_s_distribution() -> None:
     SensorStranger(tails_dn=10.0).add_tails(frame, 7, 4095)
     off = (frame.astype(float) - 1000.0) / 10.0
     for limit in (1.0, 5.0, 20.0):
-        assert np.mean(np.abs(off) > limit + 0.05) == pytest.approx(2 * student(2.5).sf(limit + 0.05), rel=0.15)
+        assert np.mean(np.abs(off) > limit + 0.05) == pytest.approx(2 * stats.t(2.5).sf(limit + 0.05), rel=0.15)
     again = np.full((400, 500), 1000, np.uint16)
     SensorStranger(tails_dn=10.0).add_tails(again, 8, 4095)
     assert (again != frame).mean() > 0.9

@@ -162,7 +162,7 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
         """Views of the plan; those of its grids one by one."""
         return [
             view
-            for entry in self.plan.views
+            for entry in self.plan.view_entries
             for view in (views_of_grid(entry) if isinstance(entry, Grid) else [entry])
         ]
 

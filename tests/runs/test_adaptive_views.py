@@ -13,6 +13,9 @@ import pytest
 from cells import CellFolder
 from in_part import in_part
 
+import coupole
+from coupole.console.runs.run_files import RunFiles
+from coupole.console.runs.run_watch import RunWatch
 from coupole.plan.view_choices import ChosenView
 from coupole.preflight.job import read_job, without_hidden
 from coupole.reflectance.next_views.next_views import NextViews
@@ -141,6 +144,53 @@ def test_a_complete_run_is_not_gone_on_with(whole: CellFolder) -> None:
     assert '"frame"' not in added
 
 
+def _ended_early(run: Path, copy: Path, *, with_line: bool) -> None:
+    """Copy a run as if its machine had failed before, or right after, the line of its second choice."""
+    lines = (run / "journal.jsonl").read_text().splitlines()
+    chosen_places = [place for place, line in enumerate(lines) if '"chosen_view"' in line]
+    kept_lines = lines[: chosen_places[1] + with_line]
+    later_views = {f"{view}.h5" for view in Run(run).views[1:]}
+    shutil.copytree(run, copy, ignore=lambda _, names: later_views & set(names))
+    (copy / "journal.jsonl").write_text("\n".join(kept_lines) + "\n")
+    listed = [line for line in (run / "manifest.sha256").read_text().splitlines() if "inputs/" in line]
+    (copy / "manifest.sha256").write_text("\n".join(listed) + "\n")
+
+
+@pytest.mark.parametrize("with_line", [False, True])
+def test_a_run_that_ended_between_two_views_goes_on_to_the_same_views(
+    tmp_path: Path, whole: CellFolder, *, with_line: bool
+) -> None:
+    run = tmp_path / "run"
+    _ended_early(whole.run_folder, run, with_line=with_line)
+    status = _status(run)
+    assert (status["state"], status["wants_views"], status["most_views"]) == ("interrupted", True, 3)
+    assert f"--resume {run}" in status["go_on"]
+    assert not verify(Run(run)).ok
+    refused = cells.here("archive", run)
+    assert refused.code == 5
+    assert ("frames are missing" if with_line else "its views are not all chosen yet") in refused.err
+    allowed = cells.here("check", whole.plan, "--json").document
+    ended = whole.acquire("--resume", run)
+    assert ended.code == 0, ended.err
+    assert Run(run).chosen_views() == Run(whole.run_folder).chosen_views()
+    assert len(cells.events(run, "frame")) == allowed["frames"]
+    assert verify(Run(run)).ok
+    assert _status(run)["dose_lux_h"] <= 1.0001 * allowed["dose_lux_h"]
+
+
+def test_console_and_scripts_see_the_chosen_views_alone(whole: CellFolder, tmp_path: Path) -> None:
+    run = whole.run_folder
+    watched = RunWatch(RunFiles(run.parent, tmp_path)).of(run.name)
+    assert [view for view, _, _ in watched.views] == Run(run).views
+    assert all(proven == expected > 12 for _, proven, expected in watched.views)
+    said = [words for _, words in watched.events]
+    assert any(words.startswith(f"next view {Run(run).views[0]}: lowers") for words in said)
+    assert any(words.startswith("no more views: enough by `views`") for words in said)
+    opened = coupole.open_run(run)
+    assert list(opened.views) == Run(run).views
+    assert (opened.wants_views, opened.missing) == (False, ())
+
+
 @pytest.mark.parametrize("frames", in_part([10, 1, 25, 45], 25))
 def test_a_killed_run_goes_on_to_the_same_views(tmp_path: Path, whole: CellFolder, frames: int) -> None:
     cell = _cell(tmp_path, speed=2.0)
@@ -219,6 +269,22 @@ def test_lights_may_be_chosen_too(tmp_path: Path) -> None:
     assert (run.open_views(), run.wants_views) == ([], False)
     assert verify(run).ok
     assert _status(run.folder)["dose_lux_h"] <= run.chosen_views()[-1].figures["lux_h"]
+
+
+def test_exposures_may_be_chosen_too(tmp_path: Path) -> None:
+    cell = _cell(tmp_path, views=2)
+    cell.write(
+        exposure={"kind": "auto", "shortest_us": 2000, "longest_us": 16000}, lights={"kind": "every", "every": 45}
+    )
+    allowed = cells.here("check", cell.plan, "--json").document
+    ended = cell.acquire()
+    assert ended.code == 0, ended.err
+    run = Run(cell.run_folder)
+    assert len(run.views) == 2
+    assert set(run.choices()) == set(run.views)
+    assert verify(run).ok
+    assert _status(run.folder)["dose_lux_h"] <= 1.0001 * allowed["dose_lux_h"]
+    assert len(cells.events(run.folder, "frame")) <= allowed["frames"]
 
 
 @pytest.mark.parametrize(

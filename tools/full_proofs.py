@@ -115,6 +115,11 @@ PROOFS = (
         "tools/prove_adaptive_lights.py",
     ),
     Proof(
+        "adaptive-views",
+        "views chosen in the run, beside spread and random ones, on two objects of three materials",
+        "tools/prove_adaptive_views.py",
+    ),
+    Proof(
         "watching",
         "50 faults in a measurement found within the view and named, 200 clean views without alarm",
         "tools/prove_watching.py",

@@ -81,7 +81,7 @@ def _led_views(cell: Cell, led_boards: int | None, folder: Path) -> Sequence[Any
     cell = replace(cell, leds=some_leds(cell.leds, cell.leds.boards[::6][nearest]))
     plan = folder / "leds.yaml"
     plan.write_text(led_plan(cell, name="leds", rig=str(RIG)))
-    return tuple(read_job(plan).plan.views)
+    return tuple(read_job(plan).plan.view_entries)
 
 
 def some_leds(table: LedTable, boards: Sequence[int] | NDArray[np.int64]) -> LedTable:

@@ -86,6 +86,16 @@ class ArmSupervisor:
             raise PreflightRefused(itinerary.refusals)
         return itinerary
 
+    def way_to(self, view: ViewPose) -> Visit:
+        """Return the visit of a view of the plan from where the next leg begins, if the order of the views is not
+        known beforehand. Raises PreflightRefused if there is no path."""
+        leg, visit = self._paths.ways.leg(self._from_deg, view), self._paths.ways.visit(view)
+        if leg.contact is not None:
+            raise PreflightRefused(
+                [f"view {view.name}: no path to it was found from where the arm is: {leg.contact}"]
+            )
+        return Visit(visit.joints_deg, leg)
+
     def begin_here(self) -> Joints:
         """Let the next leg begin where the arm is now; return its joint angles."""
         self._from_deg = np.array(self._robot.measured().joints_deg)

@@ -34,10 +34,31 @@ class BurstsOfViews:
         self._boards = BoardHeat(job.cell.rig.led_limits, job.cell.leds)
         """Heat of the boards after the session's chosen bursts. Moves and waits, in which the boards cool, are not
         counted."""
+        self._taken_views: set[str] | None = (
+            {choice.view for choice in job.chosen_views} if job.plan.chooses_views else None
+        )
+        """Names of the views that are taken, if views are chosen in the run; None if all are taken."""
         recorder.sample_frames(is_wanted=self._chooser is not None)
 
+    def take(self, view: str) -> None:
+        """Note that a view is taken, by its name, if views are chosen in the run."""
+        if self._taken_views is not None:
+            self._taken_views.add(view)
+            self._frames.clear()
+
+    def schedule_so_far(self) -> schedule.Schedule:
+        """Return the job's schedule, with the chosen bursts in views that have enough."""
+        whole = self._job.schedule
+        return whole if self._chooser is None else whole.with_choices(self._choices)
+
+    def is_taken(self, number: int) -> bool:
+        """True if a view is taken, as far as this is known."""
+        return self._taken_views is None or self._job.schedule.views[number].name in self._taken_views
+
     def bursts(self, number: int) -> tuple[Burst, ...]:
-        """All bursts of a view, as far as they are known."""
+        """All bursts of a view, as far as they are known; none of a view that is not taken."""
+        if not self.is_taken(number):
+            return ()
         if self._chooser is None:
             return self._job.schedule.bursts[number]
         return chosen_bursts(self._open_view(number), self._choices_of(number))
@@ -48,7 +69,7 @@ class BurstsOfViews:
 
     def may_want_more(self, number: int) -> bool:
         """True if more bursts may be chosen."""
-        return self._chooser is not None and not has_enough(self._choices_of(number))
+        return self._chooser is not None and self.is_taken(number) and not has_enough(self._choices_of(number))
 
     def bound(self, number: int) -> tuple[Burst, ...]:
         """Return bursts that cost at least as much as all bursts of a view."""
@@ -57,7 +78,7 @@ class BurstsOfViews:
     def expected_frames(self, number: int) -> int:
         """Return the frames that a view gets, as far as this is known. If nothing is chosen yet, it is one frame
         for each LED, and marks."""
-        if self._chooser is None or self._choices_of(number):
+        if self._chooser is None or self._choices_of(number) or not self.is_taken(number):
             return self._frames.get(number) or self._frames.setdefault(number, _frames(self.bursts(number)))
         return len(self._open_view(number).burst(0).labels)
 

@@ -96,6 +96,7 @@ def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
         "views": [view.name for view in job.schedule.views],
         "labels": [] if job.schedule.is_open else _labels(job.schedule),
         "chosen_in_the_run": job.schedule.is_open,
+        **({"most_views": job.schedule.view_count} if job.plan.chooses_views else {}),
         "hidden_leds": job.hidden_leds,
         "expected": {"shots": job.schedule.shots, "frames": job.schedule.frames},
     }

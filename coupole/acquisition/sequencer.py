@@ -8,7 +8,7 @@ rest and measured, camera armed, lights. At the end it is reversed. On every exi
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from coupole.acquisition.observer import Control, Held, Observer, Unwatched
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.acquisition.verdict import NOTHING_TO_MATCH, Verdict
+from coupole.acquisition.visits_in_order import NextVisit, chosen_visits, planned_visits
 from coupole.acquisition.watching.watched_run import WatchedRecorder
 from coupole.devices import FrameFormat
 from coupole.errors import DeviceError, UnprovenError
@@ -103,26 +104,20 @@ class Sequencer:
     def acquire(self) -> Outcome:
         """Take all frames that are not proven yet. Raises UnprovenError if some remain missing, or a
         CoupoleError."""
-        schedule = self._job.schedule
-        remaining_bursts = {n: self._remaining(n) for n in range(len(schedule.views))}
-        numbers = [n for n, bursts in remaining_bursts.items() if bursts or self._bursts.may_want_more(n)]
-        itinerary = self._arm.itinerary([schedule.views[n] for n in numbers])
-        self._ahead_s = sum(
-            self._motion_s(itinerary.visits[index]) + self._expected_s(numbers[index]) for index in itinerary.order
-        )
+        visits: Iterable[NextVisit]
+        if self._job.plan.chooses_views:
+            visits = chosen_visits(self._job, self._arm, self._bursts, self._recorder)
+        else:
+            visits = planned_visits(self._job, self._arm, self._bursts)
         start_ns = self._cell.clock.now_ns()
         try:
             with collected_when_asked() as collect:
-                for count, index in enumerate(itinerary.order):
+                for next_visit in visits:
                     collect()  # the arm is at rest, nothing shines
-                    number, visit = numbers[index], itinerary.visits[index]
-                    assert visit is not None
-                    view = schedule.views[number]
-                    self._view_number, self._view_name = (
-                        len(schedule.views) - len(numbers) + count,
-                        view.name,
-                    )
-                    self._acquire_view(view, visit, number, remaining_bursts[number])
+                    view = self._job.schedule.views[next_visit.number]
+                    self._view_number, self._view_name = next_visit.place, view.name
+                    self._ahead_s = self._expected_from(next_visit)
+                    self._acquire_view(view, next_visit.visit, next_visit.number, next_visit.bursts)
         except BaseException:
             self._cell.make_safe()
             raise
@@ -151,12 +146,6 @@ class Sequencer:
         on the disk. For a burst under way the planned light counts."""
         self._dose.give_up()
         self.conclude(proven_shots)
-
-    def _remaining(self, number: int) -> list[Burst]:
-        """Return the bursts that are left of a view. If an earlier session has fired all its bursts, more bursts
-        are chosen now. For a view that has not begun, bursts are chosen when the arm is about to go there."""
-        bursts = self._bursts.bursts_left(number)
-        return bursts or (self._bursts.more(number) if self._bursts.bursts(number) else [])
 
     def _acquire_view(self, view: ViewPose, visit: Visit, number: int, next_bursts: list[Burst]) -> None:
         occlusion = self._job.motion.occlusions.at(visit.joints_deg)
@@ -271,6 +260,16 @@ class Sequencer:
         bursts = self._bursts.bound(number) if is_open else self._bursts.bursts_left(number)
         return sum(map(_expected_s, bursts))
 
+    def _expected_from(self, next_visit: NextVisit) -> float:
+        """Longest duration of the rest of the run, with this view. Views that are not chosen yet count as this
+        one."""
+        here_s = self._motion_s(next_visit.visit) + self._expected_s(next_visit.number)
+        if self._job.plan.chooses_views:
+            return here_s * max(1, self._job.schedule.view_count - next_visit.place)
+        return here_s + sum(
+            self._motion_s(visit) + self._expected_s(number) for number, visit in next_visit.following
+        )
+
     def _motion_s(self, visit: Visit | None) -> float:
         """Expected duration of the motion to a view, until the arm has settled."""
         leg_s = visit.leg.duration_s if visit else 0.0
@@ -312,7 +311,7 @@ class Sequencer:
 
     def _tell_figures(self, light: str, dose_lux_h: float, left_s: float) -> None:
         schedule, proven = self._job.schedule, len(self._recorder.proven())
-        place = (self._view_name, self._view_number, len(schedule.views))
+        place = (self._view_name, self._view_number, schedule.view_count)
         frames = sum(self._bursts.expected_frames(number) for number in range(len(schedule.views)))
         self._observer.progress(Progress(*place, proven, frames, light, dose_lux_h, left_s))
 

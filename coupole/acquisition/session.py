@@ -115,7 +115,7 @@ def acquire_plan(job: Job, console: Console, request: SessionRequest, figures: d
             run.refuse_changes(job.inputs)
             refuse_lost(run.folder, run.proven().values())
         job = without_hidden(job, run.hidden_leds if run else None)
-        job = with_choices(job, run.choices() if run else {})
+        job = with_choices(job, run.choices() if run else {}, run.chosen_views() if run else ())
         _acquire_into(run, job, console, request, figures, stack)
 
 
@@ -138,7 +138,7 @@ def _acquire_into(
     preflight.refusals += beside.refusals() if beside is not None else _refuse_without_result(job)
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     refuse(preflight)
-    if run is not None and not preflight.frames and not run.open_views():
+    if run is not None and not preflight.frames and not run.open_views() and not run.wants_views:
         _close_complete(run, job, console, beside, figures)
         return
     faults_of(job.cell).refuse(job.cell.document.path)
@@ -249,7 +249,7 @@ def _acquire(
         if remote.trouble:
             console.print(remote.trouble, markup=False)
         try:
-            with key_actions(keys) as keys_read, observer.showing(job.schedule.frames, len(job.schedule.views)):
+            with key_actions(keys) as keys_read, observer.showing(job.schedule.frames, job.schedule.view_count):
                 if keys_read:
                     console.print("keys: p pauses after the burst, and continues; q stops")
                 try:
@@ -349,7 +349,7 @@ def rehearse(job: Job, console: Console, *, speed: float, figures: dict[str, Any
         outcome = sequencer.outcome
         started_s = time.monotonic()
         try:
-            with obeyed_by(control, cell.halt), observer.showing(job.schedule.frames, len(job.schedule.views)):
+            with obeyed_by(control, cell.halt), observer.showing(job.schedule.frames, job.schedule.view_count):
                 run_bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
         finally:
             machine_s = time.monotonic() - started_s

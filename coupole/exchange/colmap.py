@@ -73,7 +73,7 @@ def export_colmap(
     `overwrite`); StorageError.
     """
     run = Run(folder)
-    refuse_discarded_lights(run, run.about["views"], "colmap")
+    refuse_discarded_lights(run, run.views, "colmap")
     measured_run = read_measured_run(folder, records=records)
     if refined_folder is not None:
         measured_run = read_refined(refined_folder).of(measured_run)

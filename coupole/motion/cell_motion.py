@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from coupole.motion.collisions import CellBodies
 from coupole.motion.itinerary import Itinerary, bodies_of, plan_itinerary
 from coupole.motion.occlusion import Occlusion, Occlusions, occlusions_of
+from coupole.motion.ways_from_home import WaysFromHome
 from coupole.plan.cell import Cell
 from coupole.plan.schedule import ViewPose
 
@@ -27,11 +28,14 @@ class CellMotion:
         object_corners_mm: NDArray[np.float64],
         targets_mm: Sequence[Sequence[float]],
         order: Literal["fastest", "as_written"],
+        *,
+        is_order_open: bool = False,
     ) -> None:
         """`object_corners_mm` [triangles, 3, 3] and `targets_mm` are in the support frame; the targets replace an
-        object without a mesh."""
+        object without a mesh. `is_order_open`: views and their order are chosen in the run, so that
+        `planned_itinerary` has a way from home to each."""
         self._cell, self._object_corners_mm, self._order = cell, object_corners_mm, order
-        self._targets_mm = targets_mm
+        self._targets_mm, self._is_order_open = targets_mm, is_order_open
         self._planned: list[tuple[tuple[str, ...], Sequence[float], Itinerary]] = []
 
     @cached_property
@@ -50,6 +54,21 @@ class CellMotion:
         """Return ids of the LEDs that light nothing that a view shows."""
         return [int(led) for led in self._cell.leds.ids[occlusion.occluded_leds()]]
 
+    @cached_property
+    def ways(self) -> WaysFromHome:
+        """Ways among views whose order is not known beforehand."""
+        return WaysFromHome(self._cell.rig, self.bodies)
+
+    def planned_itinerary(self, views: Sequence[ViewPose], *, paths: bool = True) -> Itinerary:
+        """Return the itinerary that is planned before a run, from home. Without `paths`, collisions are not
+        checked."""
+        rig = self._cell.rig
+        if self._is_order_open:
+            return (self.ways if paths else WaysFromHome(rig, None)).itinerary(views)
+        if paths:
+            return self.itinerary(views, rig.motion.home_joints_deg)
+        return plan_itinerary(views, rig, None, rig.motion.home_joints_deg, self._order)
+
     def itinerary(self, views: Sequence[ViewPose], start_deg: Sequence[float]) -> Itinerary:
         """Return collision-free paths to views from the arm's posture. They are cached: if the arm is at home,
         preflight's paths from home are used again."""
@@ -60,7 +79,3 @@ class CellMotion:
         itinerary = plan_itinerary(views, self._cell.rig, self.bodies, start_deg, self._order)
         self._planned.append((names, tuple(start_deg), itinerary))
         return itinerary
-
-    def unchecked_itinerary(self, views: Sequence[ViewPose], start_deg: Sequence[float]) -> Itinerary:
-        """Return postures and durations, without collision checks."""
-        return plan_itinerary(views, self._cell.rig, None, start_deg, self._order)

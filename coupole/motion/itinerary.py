@@ -50,7 +50,9 @@ class Itinerary:
     refusals: tuple[str, ...]
     order: tuple[int, ...]
     """Indices of the views in the order of the visits; each leg begins at the previous visit. Refused views are
-left out."""
+    left out."""
+    is_from_home: bool = False
+    """True if each leg begins at home instead, because the order of the visits is not known beforehand."""
 
 
 def arm_of(rig: Rig) -> kinematics.Arm:
@@ -146,7 +148,7 @@ def plan_itinerary(
     """
     arm = arm_of(rig)
     planner = PathPlanner(arm, bodies, [rig.motion.home_joints_deg])
-    refusals = _rig_refusals(rig)
+    refusals = rig_refusals(rig)
     choices: dict[int, NDArray[np.float64]] = {}
     for index, view in enumerate(views):
         postures, why_not = postures_of(view, rig, bodies)
@@ -177,7 +179,7 @@ def plan_itinerary(
     return Itinerary(tuple(visits), tuple(refusals), tuple(visit_indices))
 
 
-def _rig_refusals(rig: Rig) -> list[str]:
+def rig_refusals(rig: Rig) -> list[str]:
     """Refusals that concern the rig and not the plan."""
     refusals = []
     if violation := kinematics.limit_violations(arm_of(rig), rig.motion.home_joints_deg):

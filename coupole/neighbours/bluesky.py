@@ -165,7 +165,7 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
         """Names of the plan's views, including each view of its grids."""
         return [
             view
-            for entry in self.plan.views
+            for entry in self.plan.view_entries
             for view in (views_of_grid(entry) if isinstance(entry, Grid) else [entry])
         ]
 

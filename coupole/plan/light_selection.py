@@ -29,7 +29,7 @@ from coupole.plan.watch import SENTINELS
 
 def leds_of_plan(plan: Plan, leds: LedTable, base_from_support: Transform) -> NDArray[np.int64]:
     """Return the rows of the LED table that any view of the plan lights. Raises KeyError like `select_leds`."""
-    rows = [select_leds(view.lights or plan.lights, leds, base_from_support) for view in plan.views]
+    rows = [select_leds(view.lights or plan.lights, leds, base_from_support) for view in plan.view_entries]
     return np.unique(np.concatenate(rows))
 
 
@@ -113,7 +113,9 @@ def missing_lights(
     """Return key path and message for each light of the plan that the dome does not have, and for a cone without
     any LED."""
     view_lights = [
-        (("views", i, "lights"), view.lights) for i, view in enumerate(plan.views) if view.lights is not None
+        ((*plan.views_key, i, "lights"), view.lights)
+        for i, view in enumerate(plan.view_entries)
+        if view.lights is not None
     ]
     return [
         (where + key, message)

@@ -72,6 +72,47 @@ class Joints(Model):
 
 
 View = Annotated[LookAt | Grid | Joints, Field(discriminator="kind")]
+_Candidates = Annotated[tuple[View, ...], Field(min_length=1)]
+
+
+class EnoughViews(Model):
+    """Limits that end the choice of views. The first one that is reached ends it. Time, light and frames are those
+    of the plan: frames that are taken again are not counted."""
+
+    views: Annotated[int, Field(ge=1, le=400)]
+    """Greatest number of views."""
+    frames: Annotated[int, Field(ge=1)] | None = None
+    """Greatest number of frames, dark frames included."""
+    seconds: Annotated[float, Field(gt=0)] | None = None
+    """Greatest time of motions and bursts."""
+    lux_h: Annotated[float, Field(gt=0)] | None = None
+    """Greatest light at the object's point that receives most, by the LED table."""
+    coverage: Annotated[float, Field(gt=0, le=1)] | None = None
+    """Share of the surface that is shown sharply and not too obliquely by a view, of all that the candidates
+    show."""
+    gain: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """Expected decrease of the uncertainty by the best further view, as a share. A smaller decrease is not worth a
+    view."""
+
+
+class AdaptiveViews(Model):
+    """Views that are chosen in the run, one after the other."""
+
+    kind: Literal["adaptive"]
+    """Views that are chosen in the run, one after the other."""
+    candidates: _Candidates
+    """Views that may be chosen. All of them get the plan's lights."""
+    until: EnoughViews
+    """Limits at which the choice ends."""
+
+    @field_validator("candidates")
+    @classmethod
+    def _plan_lights(cls, candidates: tuple[View, ...]) -> tuple[View, ...]:
+        if names := [view.name for view in candidates if view.lights is not None]:
+            raise ValueError(
+                f"candidates without `lights` of their own: all get the plan's; found some in {names}"
+            )
+        return candidates
 
 
 class MeasuredObject(Model):
@@ -117,8 +158,8 @@ class Plan(Model):
     """The intended lens settings."""
     calibrations: Literal["none"] | tuple[FilePath, ...] | None = None
     """Records that must be in force. Without it, the records that the rig names are used."""
-    views: Annotated[tuple[View, ...], Field(min_length=1)]
-    """Views from which the camera takes its pictures."""
+    views: Annotated[tuple[View, ...], Field(min_length=1)] | AdaptiveViews
+    """Views from which the camera takes its pictures, or the way to choose them."""
     order: Literal["fastest", "as_written"] = "fastest"
     """Order of the views: on the shortest path, or as written."""
     lights: Lights
@@ -150,7 +191,9 @@ class Plan(Model):
     @field_validator("watch")
     @classmethod
     def _no_sentinels_of_choices(cls, watch: bool | Watch, info: ValidationInfo) -> bool | Watch:
-        selections = [view.lights or info.data.get("lights") for view in info.data.get("views", ())]
+        views = info.data.get("views", ())
+        entries = views.candidates if isinstance(views, AdaptiveViews) else views
+        selections = [view.lights or info.data.get("lights") for view in entries]
         has_choice = any(isinstance(selection, AdaptiveLights) for selection in selections)
         if _way(watch).frames == "all" and (has_choice or isinstance(info.data.get("exposure"), AutoExposure)):
             raise ValueError(
@@ -161,10 +204,25 @@ class Plan(Model):
 
     @model_validator(mode="after")
     def _something_to_shoot(self) -> Plan:
-        lights = [view.lights or self.lights for view in self.views]
+        lights = [view.lights or self.lights for view in self.view_entries]
         if any(isinstance(selection, NoLights) for selection in lights) and self.darks_per_view == 0:
             raise ValueError("lights, or at least one dark frame per view: otherwise a view takes no frame")
         return self
+
+    @property
+    def view_entries(self) -> tuple[View, ...]:
+        """The entries of `views`. If views are chosen in the run, these are the candidates."""
+        return self.views.candidates if isinstance(self.views, AdaptiveViews) else self.views
+
+    @property
+    def chooses_views(self) -> bool:
+        """True if views are chosen in the run."""
+        return isinstance(self.views, AdaptiveViews)
+
+    @property
+    def views_key(self) -> tuple[str | int, ...]:
+        """Key path of the entries of `views`."""
+        return ("views", "candidates") if isinstance(self.views, AdaptiveViews) else ("views",)
 
     @property
     def why_with_result(self) -> str:
@@ -195,7 +253,25 @@ class Plan(Model):
     @property
     def chooses_lights(self) -> bool:
         """True if LEDs of some view are chosen in the run."""
-        return any(isinstance(view.lights or self.lights, AdaptiveLights) for view in self.views)
+        return any(isinstance(view.lights or self.lights, AdaptiveLights) for view in self.view_entries)
+
+    @model_validator(mode="after")
+    def _an_object_to_choose_views_of(self) -> Plan:
+        if not isinstance(self.views, AdaptiveViews):
+            return self
+        if self.object is None or self.object.mesh is None:
+            raise ValueError(
+                "an object with a `mesh` with `views: {kind: adaptive}`: views are chosen by what they show of it"
+            )
+        if self.lights.kind in ("none", "panels"):
+            raise ValueError("LEDs with `views: {kind: adaptive}`; panels and darks alone cannot be judged")
+        if self.order == "as_written":
+            raise ValueError("no `order: as_written` with `views: {kind: adaptive}`, which chooses the order too")
+        if self.discard is not None:
+            raise ValueError(
+                "no `discard` with `views: {kind: adaptive}`: how much disk space it needs is not known beforehand"
+            )
+        return self
 
     @model_validator(mode="after")
     def _one_exposure_of_chosen_lights(self) -> Plan:
@@ -203,7 +279,7 @@ class Plan(Model):
             return self
         if not isinstance(self.exposure, FixedExposure) or self.repeats > 1:
             raise ValueError("`exposure: {kind: fixed}` and `repeats: 1` with `lights: {kind: adaptive}`")
-        if any(isinstance(view.lights or self.lights, NoLights | Panels) for view in self.views):
+        if any(isinstance(view.lights or self.lights, NoLights | Panels) for view in self.view_entries):
             raise ValueError("LEDs in each view with `lights: {kind: adaptive}` in one; no panels, no darks alone")
         return self
 
@@ -211,7 +287,7 @@ class Plan(Model):
     def _lights_to_expose_for(self) -> Plan:
         if not isinstance(self.exposure, AutoExposure):
             return self
-        lights = [view.lights or self.lights for view in self.views]
+        lights = [view.lights or self.lights for view in self.view_entries]
         if any(isinstance(selection, NoLights | Panels) for selection in lights):
             raise ValueError(
                 "LEDs in each view with `exposure: {kind: auto}`; exposures of panels and darks cannot be chosen"

@@ -13,13 +13,15 @@ from coupole.plan.exposures import AutoExposure
 from coupole.plan.led_table import LedTable
 from coupole.plan.light_selection import first_lights, lit_in_bursts, sentinels_among
 from coupole.plan.marks import MARKS, Marks
-from coupole.plan.plan import Grid, Joints, LookAt, Plan, View
+from coupole.plan.plan import AdaptiveViews, Grid, Joints, LookAt, Plan, View
 from coupole.plan.plan_lights import AdaptiveLights, Lights
 from coupole.plan.shot_id import MAX_CHARACTERS, Led, Panel, PanelMark, Sentinel, ShotId, ShotLabel
 from coupole.plan.watch import SENTINELS
 
 MOST_VIEWS, MOST_FRAMES = 2000, 5_000_000
 """Largest numbers of views and frames of one plan. This number fits into memory."""
+MOST_CANDIDATES = 400
+"""Largest number of views among which a run chooses."""
 TAKEN_TWICE = 4
 """Each fourth light of a first pass is taken twice, because noise is measured from pairs."""
 
@@ -48,15 +50,27 @@ class Schedule:
     """Bursts from which those of each view are chosen in the run; empty if the plan gives all bursts."""
     burst_sizes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     """Number of LEDs of the bursts in a view's bound, by the view's name, for views whose LEDs are chosen."""
+    most_views: int | None = None
+    """Greatest number of the views that are taken, if views are chosen in the run; None if all are taken."""
+
+    @property
+    def view_count(self) -> int:
+        """Greatest number of views that are taken."""
+        return len(self.views) if self.most_views is None else min(self.most_views, len(self.views))
 
     @property
     def shots(self) -> int:
-        """Number of frames under a light, without darks and marks."""
-        return sum(int(b.is_light().sum()) for bursts in self.bursts for b in bursts)
+        """Number of frames under a light, without darks and marks; the greatest one if views are chosen."""
+        return self.most_of([sum(int(b.is_light().sum()) for b in bursts) for bursts in self.bursts])
 
     @property
     def frames(self) -> int:
-        return sum(len(b.labels) for bursts in self.bursts for b in bursts)
+        """Number of frames; the greatest one if views are chosen."""
+        return self.most_of([sum(len(b.labels) for b in bursts) for bursts in self.bursts])
+
+    def most_of(self, figure_of_views: Sequence[int]) -> int:
+        """Return the sum of a figure of each view. If views are chosen, it is the greatest possible sum."""
+        return sum(sorted(figure_of_views, reverse=True)[: self.view_count])
 
     @property
     def is_open(self) -> bool:
@@ -115,12 +129,23 @@ class Schedule:
         contain only these."""
         remaining_bursts = [bursts_left(bursts, proven) for bursts in self.bursts]
         numbers = [n for n, bursts in enumerate(remaining_bursts) if bursts]
+        taken_count = len(self.views) - len(numbers)
+        most_views = None if self.most_views is None else max(0, self.most_views - taken_count)
+        of_views = self._some(numbers, most_views)
+        return replace(of_views, bursts=tuple(tuple(remaining_bursts[n]) for n in numbers))
+
+    def only_views(self, names: Collection[str]) -> Schedule:
+        """Return the schedule of these views alone, all of which are taken."""
+        return self._some([n for n, view in enumerate(self.views) if view.name in names], None)
+
+    def _some(self, numbers: Sequence[int], most_views: int | None) -> Schedule:
         return replace(
             self,
             views=tuple(self.views[n] for n in numbers),
-            bursts=tuple(tuple(remaining_bursts[n]) for n in numbers),
+            bursts=tuple(self.bursts[n] for n in numbers),
             labels=tuple(self.labels[n] for n in numbers),
             choosable=tuple(self.choosable[n] for n in numbers if self.choosable),
+            most_views=most_views,
         )
 
 
@@ -192,7 +217,7 @@ def build_schedule(
     hardware = plan.trigger == "hardware"
     marks: Marks = "coded" if hardware else "none" if runs_tables else "plain"
     is_auto = isinstance(plan.exposure, AutoExposure)
-    for view in plan.views:
+    for view in plan.view_entries:
         lights = view.lights or plan.lights
         if lights not in bursts_of:
             lit = _with_sentinels(lit_in_bursts(lights, leds, base_from_support), plan, leds)
@@ -215,7 +240,8 @@ def build_schedule(
     labels = tuple(
         tuple(label for burst in view_bursts for label in burst.labels if label) for view_bursts in bursts
     )
-    schedule = Schedule(tuple(views), tuple(map(tuple, bursts)), labels)
+    most_views = plan.views.until.views if isinstance(plan.views, AdaptiveViews) else None
+    schedule = Schedule(tuple(views), tuple(map(tuple, bursts)), labels, most_views=most_views)
     if isinstance(plan.exposure, AutoExposure):
         return _with_open_exposures(schedule, plan.exposure, leds)
     return _with_open_lights(schedule, plan) if plan.chooses_lights else schedule
@@ -236,7 +262,7 @@ def _with_open_lights(schedule: Schedule, plan: Plan) -> Schedule:
     """Return the schedule of a plan that chooses the LEDs of some of its views in the run."""
     burst_sizes = {
         pose.name: lights.burst_sizes
-        for view in plan.views
+        for view in plan.view_entries
         if isinstance(lights := view.lights or plan.lights, AdaptiveLights)
         for pose in expand_view(view)
     }
@@ -263,12 +289,18 @@ def _with_open_exposures(schedule: Schedule, exposure: AutoExposure, leds: LedTa
 def too_large(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
     """Return key path and message if a plan has more views or frames than can be planned."""
     sizes = [
-        len(view.azimuths_deg) * len(view.elevations_deg) if isinstance(view, Grid) else 1 for view in plan.views
+        len(view.azimuths_deg) * len(view.elevations_deg) if isinstance(view, Grid) else 1
+        for view in plan.view_entries
     ]
     if sum(sizes) > MOST_VIEWS:
         return [(("views",), f"expected at most {MOST_VIEWS} views in one plan, found {sum(sizes)}; split it")]
+    view_count = sum(sizes)
+    if isinstance(plan.views, AdaptiveViews):
+        if view_count > MOST_CANDIDATES:
+            return [(plan.views_key, f"expected at most {MOST_CANDIDATES} candidates, found {view_count}")]
+        view_count = min(view_count, plan.views.until.views)
     exposures = plan.repeats * plan.exposure.frames_of_light
-    frames = sum(sizes) * (exposures * len(leds.ids) + plan.darks_per_view)
+    frames = view_count * (exposures * len(leds.ids) + plan.darks_per_view)
     if frames > MOST_FRAMES:
         message = f"expected at most {MOST_FRAMES} frames in one plan, found up to {frames}; split it"
         return [(("repeats",) if plan.repeats > 1 else ("views",), message)]
@@ -286,7 +318,10 @@ def names_too_long(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ..
         labels.append(ShotLabel(last, longest.exposure, longest.repeat))
     room = MAX_CHARACTERS - 1 - max(len(str(label)) for label in labels)
     return [
-        (("views", number, "name"), f"{name}: a view's name may have {room} characters here, found {len(name)}")
-        for number, view in enumerate(plan.views)
+        (
+            (*plan.views_key, number, "name"),
+            f"{name}: a view's name may have {room} characters here, found {len(name)}",
+        )
+        for number, view in enumerate(plan.view_entries)
         if len(name := max((pose.name for pose in expand_view(view)), key=len)) > room
     ]

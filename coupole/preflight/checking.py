@@ -96,11 +96,9 @@ def check_job(
     """Return preflight's report on a job, without the `proven` frames of its run, for this state of the disk. Also
     return the job at the pace that LEDs and disk allow."""
     rig = job.cell.rig
-    home_deg = rig.motion.home_joints_deg
     views = job.schedule.without_proven(proven).views if proven else job.schedule.views
-    plan_views = job.motion.itinerary if paths else job.motion.unchecked_itinerary
-    itinerary = plan_views(views, home_deg)
-    all_views = job.motion.unchecked_itinerary(job.schedule.views, home_deg) if proven else None
+    itinerary = job.motion.planned_itinerary(views, paths=paths)
+    all_views = job.motion.planned_itinerary(job.schedule.views, paths=False) if proven else None
     history = ledger_of(job.cell, job.plan.object.id).read_history() if job.plan.object else History()
     object_light = ObjectLight(job.shape.dose_points_mm, history.total_lux_h, history.budget_lux_h)
 
@@ -111,7 +109,7 @@ def check_job(
             return paced_job, checking(Course(paced_job.schedule, itinerary))
         of_all = checking(Course(paced_job.schedule, all_views))
         whole = Whole(
-            len(of_all.views), of_all.shots, of_all.frames, of_all.bytes, of_all.duration_s, of_all.dose_lux_h
+            of_all.view_count, of_all.shots, of_all.frames, of_all.bytes, of_all.duration_s, of_all.dose_lux_h
         )
         remaining_schedule = paced_job.schedule.without_proven(proven)
         return paced_job, checking(Course(remaining_schedule, itinerary), whole=whole)

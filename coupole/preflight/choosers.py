@@ -30,6 +30,8 @@ def chooser_of(job: Job) -> Chooser | None:
     if isinstance(plan.exposure, AutoExposure):
         return AutoExposureChooser(plan.exposure, leds, base_from_support, emission=rig.dome.emission)
     if plan.chooses_lights:
-        lights = {pose.name: view.lights or plan.lights for view in plan.views for pose in expand_view(view)}
+        lights = {
+            pose.name: view.lights or plan.lights for view in plan.view_entries for pose in expand_view(view)
+        }
         return AdaptiveLightsChooser(lights, leds, base_from_support, emission=rig.dome.emission)
     return None

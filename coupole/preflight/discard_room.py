@@ -117,7 +117,7 @@ def refusals_of_discarding(job: Job) -> list[str]:
             "expected LEDs that are known beforehand: which of them are kept for the check is known after the "
             "last view alone with `lights: {kind: adaptive}`, so no frame could be discarded"
         )
-    elif isinstance(job.plan.exposure, AutoExposure) and any(view.lights for view in job.plan.views):
+    elif isinstance(job.plan.exposure, AutoExposure) and any(view.lights for view in job.plan.view_entries):
         messages.append(
             "expected the same lights in all views with `exposure: {kind: auto}`: otherwise it is not known "
             "beforehand which LEDs are kept for the check"

@@ -125,7 +125,7 @@ def metering_plan(plan: Plan, leds: LedTable, rows: NDArray[np.int64]) -> Plan:
     if len(rows):
         metering_rows = rows[spread_rows(leds.positions_mm[rows], METERING_LIGHTS)]
         changes["lights"] = LightIds(kind="ids", ids=tuple(int(led) for led in leds.ids[metering_rows]))
-        changes["views"] = tuple(view.model_copy(update={"lights": None}) for view in plan.views)
+        changes["views"] = tuple(view.model_copy(update={"lights": None}) for view in plan.view_entries)
     return plan.model_copy(update=changes)
 
 

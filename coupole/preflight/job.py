@@ -24,6 +24,7 @@ from coupole.plan.plan import Plan
 from coupole.plan.reading import read_plan
 from coupole.plan.rig_devices import described_arm, device_times, runs_tables
 from coupole.plan.schedule import Schedule, build_schedule
+from coupole.plan.view_choices import ChosenView, has_enough_views, problem_of_views
 from coupole.plan.yamlfile import Document
 from coupole.preflight.object_shape import ObjectShape, read_object
 from coupole.storage.run_inputs import Inputs
@@ -51,6 +52,8 @@ class Job:
     choices: Mapping[str, Sequence[Choice]] = field(default_factory=dict)
     """Choices that a run has made for its views so far, by name of view. Only a run that chooses its bursts has
     them."""
+    chosen_views: Sequence[ChosenView] = ()
+    """Views that a run has chosen so far, in their order. Only a run that chooses its views has them."""
 
     @property
     def inputs(self) -> Inputs:
@@ -81,7 +84,7 @@ def read_job(plan_path: Path, rig_path: Path | None = None, *, text: str | None 
 def motion_of(plan: Plan, cell: Cell, shape: ObjectShape, schedule: Schedule) -> CellMotion:
     """Return the arm's motion in this cell."""
     targets = [view.target_mm for view in schedule.views if view.target_mm is not None]
-    return CellMotion(cell, shape.corners_mm, targets, plan.order)
+    return CellMotion(cell, shape.corners_mm, targets, plan.order, is_order_open=plan.chooses_views)
 
 
 def schedule_of(plan: Plan, cell: Cell, pace: Pace = FASTEST) -> Schedule:
@@ -101,20 +104,27 @@ def at_pace(job: Job, pace: Pace) -> Job:
     if pace == job.pace:
         return job
     schedule = schedule_of(job.plan, job.cell, pace).without(job.hidden_leds)
-    return with_choices(replace(job, schedule=schedule, pace=pace), job.choices)
+    return with_choices(replace(job, schedule=schedule, pace=pace), job.choices, job.chosen_views)
 
 
-def with_choices(job: Job, choices: Mapping[str, Sequence[Choice]]) -> Job:
-    """Return the same job for a run that has made these choices. Raises StorageError for a choice that the plan
-    does not allow, because the journal was then changed."""
-    if not job.schedule.is_open:
-        return job
+def with_choices(
+    job: Job, choices: Mapping[str, Sequence[Choice]], chosen_views: Sequence[ChosenView] = ()
+) -> Job:
+    """Return the same job for a run that has made these choices of bursts and views. If it needs no more views,
+    the others are left out. Raises StorageError for a choice that the plan does not allow, because the journal was
+    then changed."""
     try:
-        return replace(job, schedule=job.schedule.with_choices(choices), choices=choices)
+        if job.schedule.is_open:
+            job = replace(job, schedule=job.schedule.with_choices(choices), choices=choices)
+        if problem := problem_of_views(job.schedule, chosen_views):
+            raise KeyError(problem)
     except KeyError as error:
         raise StorageError(
             f"the run's journal has a choice that its plan does not allow: {error.args[0]}"
         ) from None
+    names = [choice.view for choice in chosen_views]
+    schedule = job.schedule.only_views(names) if has_enough_views(chosen_views) else job.schedule
+    return replace(job, schedule=schedule, chosen_views=tuple(chosen_views))
 
 
 def without_hidden(job: Job, known_leds: Mapping[str, Sequence[int]] | None = None) -> Job:
@@ -132,7 +142,7 @@ def without_hidden(job: Job, known_leds: Mapping[str, Sequence[int]] | None = No
 
 
 def _hidden_from_home(job: Job) -> dict[str, list[int]]:
-    itinerary = job.motion.itinerary(job.schedule.views, job.cell.rig.motion.home_joints_deg)
+    itinerary = job.motion.planned_itinerary(job.schedule.views)
     hidden_leds: dict[str, list[int]] = {}
     for view, visit, bursts in zip(
         job.schedule.views, itinerary.visits, job.schedule.planned_bursts(), strict=True

@@ -55,7 +55,7 @@ def read_object(files: PlanFiles) -> ObjectShape:
             raise InputError([files.document.problem(("object", "mesh_unit"), problem)])
         if size_mm < _DOUBTFUL_MM and (better := _other_unit(size_mm, unit, diameter_mm)):
             remarks.append(f"object {files.plan.object.id}: it is {size_mm:.3g} mm large. {better}")
-    targets = [view.target_mm for view in files.plan.views if hasattr(view, "target_mm")]
+    targets = [view.target_mm for view in files.plan.view_entries if hasattr(view, "target_mm")]
     return ObjectShape(files.mesh_path, corners, _dose_points(corners, targets), tuple(remarks))
 
 

@@ -19,7 +19,7 @@ from coupole.motion.itinerary import Itinerary
 from coupole.plan.bursts import BurstTiming
 from coupole.plan.choices import MOST_CHOICES, OpenView
 from coupole.plan.led_table import LedTable
-from coupole.plan.plan import Plan
+from coupole.plan.plan import AdaptiveViews, EnoughViews, Plan
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import upload_s
 from coupole.plan.schedule import Schedule
@@ -86,7 +86,11 @@ class Report:
     """The expected course of a plan or of the rest of a run, and the refusals."""
 
     is_bound: bool = False
-    """True if the figures are upper bounds, because bursts are chosen in the run."""
+    """True if the figures are upper bounds, because bursts or views are chosen in the run."""
+    candidates: int | None = None
+    """Number of views from which the run chooses; None if the plan itself gives the views."""
+    view_count: int = 0
+    """Number of views that are taken; the greatest one if views are chosen."""
     whole: Whole | None = None
     """Figures of the whole run, if it is resumed; None otherwise."""
     views: list[ViewReport] = field(default_factory=list)
@@ -167,7 +171,14 @@ def check(
 ) -> Report:
     """Check the course of a whole plan, or that of the rest of the run `whole`."""
     schedule, itinerary = course.schedule, course.itinerary
-    report = Report(schedule.is_open, whole, shots=schedule.shots, frames=schedule.frames)
+    report = Report(
+        is_bound=schedule.is_open or plan.chooses_views,
+        candidates=None if schedule.most_views is None else len(schedule.views),
+        view_count=schedule.view_count,
+        whole=whole,
+        shots=schedule.shots,
+        frames=schedule.frames,
+    )
     report.timings = tuple(dict.fromkeys(burst.timing for bursts in schedule.bursts for burst in bursts))
     report.dose_before_lux_h = object_light.dose_before_lux_h
     budgets = [object_light.dose_budget_lux_h, plan.object.dose_budget_lux_h if plan.object else None]
@@ -180,7 +191,12 @@ def check(
     report.refusals += refuse_on_times(schedule.bursts, rig.led_limits)
     _time_and_dose(report, plan, rig, schedule, itinerary, leds, object_light.points_support_mm)
     bursts = [schedule.bursts[index] for index in _order(itinerary)]
-    heat = heat_of(bursts, [view.move_s for view in report.views], rig.led_limits, leds)
+    moves_s = [view.move_s for view in report.views]
+    if itinerary.is_from_home:  # the views with most light, each a moment after the other
+        bursts = sorted(bursts, key=lambda of_view: -sum(int(b.is_light().sum()) for b in of_view))
+        bursts = bursts[: schedule.view_count]
+        moves_s = [rig.motion.settle_dwell_s] * len(bursts)
+    heat = heat_of(bursts, moves_s, rig.led_limits, leds)
     report.peak_board_c, report.too_hot = heat.peak_c, heat.too_hot
     report.refusals += heat.refusals
     _storage(report, rig, schedule, storage, keeps_all=plan.discard is None)
@@ -218,43 +234,35 @@ def _time_and_dose(
     leds: LedTable,
     points_support_mm: NDArray[np.float64],
 ) -> None:
-    points_base = apply(rig.support.base_from_support.matrix(), points_support_mm)
-    lux = leds.illuminance_lux(points_base, emission=rig.dome.emission)
-    row_of_id = {int(led): row for row, led in enumerate(leds.ids)}
-    dose_of_table: dict[int, NDArray[np.float64]] = {}
-    total = np.zeros(len(points_support_mm))
-    for index in _order(itinerary):
+    costs = CostOfViews(plan, rig, schedule, leds, points_support_mm)
+    doses = np.zeros((len(schedule.views), len(points_support_mm)))
+    durations_s, ideals_s = np.zeros((2, len(schedule.views)))
+    for number, index in enumerate(_order(itinerary)):
         view, visit, bursts = schedule.views[index], itinerary.visits[index], schedule.bursts[index]
-        move_s = (visit.leg.duration_s if visit and visit.leg.waypoints else 0.0) + rig.motion.settle_dwell_s
+        leg_s = visit.leg.duration_s if visit and visit.leg.waypoints else 0.0
+        move_s = (2.0 if itinerary.is_from_home else 1.0) * leg_s + rig.motion.settle_dwell_s
         burst_s = sum(b.duration_s for b in bursts)
-        dose = np.zeros(len(total))
-        if plan.chooses_lights:
-            dose = _most_dose(schedule.open_view(index), lux, row_of_id)
-        for burst in () if plan.chooses_lights else bursts:
-            if id(burst.table) not in dose_of_table:
-                lit = burst.table[burst.table["led"] != NO_LED]
-                rows = [row_of_id[int(led)] for led in lit["led"]]
-                dose_of_table[id(burst.table)] = lux[:, rows] @ lit["on_us"] / 3.6e9
-            dose += dose_of_table[id(burst.table)]
-            if burst.panel:
-                dose += rig.dome.panel_lux * (burst.duration_s + BURST_OVERHEAD_S) / 3600.0
-        total += dose
-        waiting_s = max(0.0, upload_s(rig, len(bursts[0].table)) - move_s) if not report.views else 0.0
-        if schedule.is_open:  # a table is uploaded when it has been chosen
-            choices = len(bursts) if plan.chooses_lights else MOST_CHOICES
-            waiting_s += choices * (CHOICE_S + upload_s(rig, max(len(burst.table) for burst in bursts)))
-        report.ideal_s += move_s + burst_s
-        report.duration_s += move_s + SETTLE_CHECK_S + waiting_s + burst_s + BURST_OVERHEAD_S * len(bursts)
+        doses[number] = costs.dose_lux_h(index)
+        waiting_s = max(0.0, upload_s(rig, len(bursts[0].table)) - move_s) if number == 0 else 0.0
+        ideals_s[number] = move_s + burst_s
+        durations_s[number] = move_s + waiting_s + costs.standing_s(index)
         report.views.append(
             ViewReport(
                 view.name,
                 None if visit is None else tuple(visit.joints_deg.tolist()),
                 move_s,
                 burst_s,
-                float(dose.max()),
+                float(doses[number].max()),
             )
         )
-    report.dose_lux_h = float(total.max())
+    report.ideal_s, report.duration_s = _most(ideals_s, schedule), _most(durations_s, schedule)
+    report.dose_lux_h = float(np.sort(doses, axis=0)[::-1][: schedule.view_count].sum(axis=0).max())
+    if isinstance(plan.views, AdaptiveViews):
+        least_s = durations_s - ideals_s + [view.move_s / 2.0 + view.burst_s for view in report.views]
+        frames = [sum(len(burst.labels) for burst in bursts) for bursts in schedule.bursts]
+        least = {"frames": min(frames, default=0), "seconds": least_s.min(initial=np.inf)}
+        report.refusals += _too_strict(plan.views.until, least | {"lux_h": doses.max(axis=1).min(initial=np.inf)})
+        _limit(report, plan.views.until)
     budget = report.dose_budget_lux_h
     if budget is not None and report.dose_lux_h + report.dose_before_lux_h > budget:
         assert plan.object is not None
@@ -263,6 +271,75 @@ def _time_and_dose(
             f"{report.dose_lux_h:.2f} lux.h after "
             f"{report.dose_before_lux_h:.2f} lux.h before; its budget is {budget:g} lux.h"
         )
+
+
+def _most(figure_of_views: NDArray[np.float64], schedule: Schedule) -> float:
+    """Return the sum of a figure [views] of the views, the greatest possible one if views are chosen."""
+    return float(np.sort(figure_of_views)[::-1][: schedule.view_count].sum())
+
+
+def _too_strict(until: EnoughViews, least: Mapping[str, float]) -> list[str]:
+    """Return refusals of limits that allow not a single view. `least` has the least figures of a view."""
+    return [
+        f"views: `{key}` of `until` allows no view: expected at least {least[key]:.4g}, found {limit:g}"
+        for key, limit in (("frames", until.frames), ("seconds", until.seconds), ("lux_h", until.lux_h))
+        if limit is not None and np.isfinite(least[key]) and least[key] > limit
+    ]
+
+
+def _limit(report: Report, until: EnoughViews) -> None:
+    """Limit the figures to those that the plan asks for: no view is begun that would exceed them."""
+    if until.frames is not None:
+        report.frames = min(report.frames, until.frames)
+        report.shots = min(report.shots, report.frames)
+    if until.seconds is not None:
+        report.duration_s = min(report.duration_s, until.seconds)
+        report.ideal_s = min(report.ideal_s, report.duration_s)
+    if until.lux_h is not None:
+        report.dose_lux_h = min(report.dose_lux_h, until.lux_h)
+
+
+class CostOfViews:
+    """Greatest time and light of each view of a schedule, without the way to it."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        rig: Rig,
+        schedule: Schedule,
+        leds: LedTable,
+        points_support_mm: NDArray[np.float64],
+    ) -> None:
+        """The light is computed at `points_support_mm` [n, 3]."""
+        points_base = apply(rig.support.base_from_support.matrix(), points_support_mm)
+        self._lux = leds.illuminance_lux(points_base, emission=rig.dome.emission)
+        self._row_of_id = {int(led): row for row, led in enumerate(leds.ids)}
+        self._plan, self._rig, self._schedule = plan, rig, schedule
+        self._dose_of_table: dict[int, NDArray[np.float64]] = {}
+
+    def standing_s(self, number: int) -> float:
+        """Return the longest time of a view after the motion to it: settling, bursts and choices of bursts."""
+        bursts = self._schedule.bursts[number]
+        standing_s = SETTLE_CHECK_S + sum(b.duration_s for b in bursts) + BURST_OVERHEAD_S * len(bursts)
+        if self._schedule.is_open:  # a table is uploaded when it has been chosen
+            choices = len(bursts) if self._plan.chooses_lights else MOST_CHOICES
+            standing_s += choices * (CHOICE_S + upload_s(self._rig, max(len(burst.table) for burst in bursts)))
+        return standing_s
+
+    def dose_lux_h(self, number: int) -> NDArray[np.float64]:
+        """[n] most light of a view at each point."""
+        if self._plan.chooses_lights:
+            return _most_dose(self._schedule.open_view(number), self._lux, self._row_of_id)
+        dose = np.zeros(len(self._lux))
+        for burst in self._schedule.bursts[number]:
+            if id(burst.table) not in self._dose_of_table:
+                lit = burst.table[burst.table["led"] != NO_LED]
+                rows = [self._row_of_id[int(led)] for led in lit["led"]]
+                self._dose_of_table[id(burst.table)] = self._lux[:, rows] @ lit["on_us"] / 3.6e9
+            dose += self._dose_of_table[id(burst.table)]
+            if burst.panel:
+                dose += self._rig.dome.panel_lux * (burst.duration_s + BURST_OVERHEAD_S) / 3600.0
+        return dose
 
 
 def _most_dose(view: OpenView, lux: NDArray[np.float64], row_of_id: Mapping[int, int]) -> NDArray[np.float64]:

@@ -119,7 +119,7 @@ def discard_complete(run: Run, out: Path, say: Callable[[str, int, int], object]
         return
     with _hold_when_free(run):
         finish(run)
-        views = [view for view in run.about["views"] if view not in discarded_views(run)]
+        views = [view for view in run.views if view not in discarded_views(run)]
         for count, view in enumerate(views, start=1):
             if reason_to_keep(run, view) or not samples_path(out, view).exists():
                 continue
@@ -175,7 +175,7 @@ def _forget(run: Run, view: str) -> None:
 
 def _enter_finished(run: Run) -> None:
     """Add files to the manifest, if they will not change any more and are not too large."""
-    paths = [run.journal_path, *map(run.view_path, run.about["views"])]
+    paths = [run.journal_path, *map(run.view_path, run.views)]
     listed_names = manifest.read_checksums(run.folder)
     names = {str(path.relative_to(run.folder)): path.stat().st_size for path in paths if path.is_file()}
     manifest.enter(

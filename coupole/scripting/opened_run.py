@@ -123,7 +123,7 @@ class Run(Mapping[str, RunView]):
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._run = RunFolder(Path(path))
         self._closed = False
-        by_view: dict[str, dict[str, FrameProven]] = {name: {} for name in self._run.about["views"]}
+        by_view: dict[str, dict[str, FrameProven]] = {name: {} for name in self._run.views}
         for shot, event in self._run.proven().items():
             by_view.setdefault(shot.view, {})[str(shot.label)] = event
         self._views = {name: RunView(name, events, self) for name, events in by_view.items()}
@@ -161,7 +161,8 @@ class Run(Mapping[str, RunView]):
 
     @property
     def views(self) -> tuple[str, ...]:
-        """Names of the views, in the order of the plan."""
+        """Names of the views, in the order of the plan; where views are chosen in the run, in that of the
+        choices."""
         return tuple(self._views)
 
     @property
@@ -190,6 +191,11 @@ class Run(Mapping[str, RunView]):
     def open_views(self) -> tuple[str, ...]:
         """Views for which more frames may still be chosen; none if the plan names all frames."""
         return tuple(self._run.open_views())
+
+    @property
+    def wants_views(self) -> bool:
+        """True if more views may yet be chosen; False where the plan names all views."""
+        return self._run.wants_views
 
     def dataset(self, view: str) -> xr.Dataset:
         """All proven frames of a view as an xarray Dataset on dask. `pixels` is [shot, y, x] uint16 DN, with a

@@ -80,15 +80,16 @@ def archive_run(
                 "or archive its complete views with --partial."
             )
         open_views = run.open_views()
-        if open_views and not partial:
+        if (open_views or run.wants_views) and not partial:
+            of_what = f"the shots of {open_views[0]}" if open_views else "its views"
             raise UnprovenError(
-                f"{run.folder}: the shots of {open_views[0]} are not all chosen yet. Resume the run first, or "
-                "archive its complete views with --partial."
+                f"{run.folder}: {of_what} are not all chosen yet. Resume the run first, or archive its complete "
+                "views with --partial."
             )
         finish(run)  # what a crash has left
         event_of_view = discarded_views(run)
         result = Archived(incomplete=sorted({shot.view for shot in missing} | set(open_views)))
-        for view in run.about["views"]:
+        for view in run.views:
             path = run.view_path(view)
             if view in result.incomplete:
                 continue

@@ -29,6 +29,7 @@ from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import device_times
 from coupole.plan.schedule import Schedule, build_schedule
 from coupole.plan.shot_id import ShotId, ShotLabel
+from coupole.plan.view_choices import problem_of_views
 from coupole.storage.run import Run
 from coupole.storage.step_fields import STORED_NO_LED
 
@@ -50,9 +51,11 @@ class AsPlanned:
 
     def problems_of_the_list(self, run: Run) -> Iterator[str]:
         """Find shots under a light that are in `run.json` but not in the plan, and the reverse."""
+        chosen_views = set(run.views)
         planned_shots = {
             ShotId(view.name, label)
             for view, labels in zip(self.schedule.views, self.schedule.labels, strict=True)
+            if run.most_views is None or view.name in chosen_views
             for label in labels
             if label.is_shot and getattr(label.light, "id", None) not in run.hidden_leds.get(view.name, ())
         }
@@ -70,6 +73,8 @@ class AsPlanned:
     def problems_of_choices(self, run: Run) -> Iterator[str]:
         """Find choices of the journal that the plan does not allow, or whose exposure time differs from the
         plan's."""
+        if problem := problem_of_views(self.schedule, run.chosen_views()):
+            yield f"the journal has a choice that the run's plan does not allow: {problem}"
         choices = run.choices()
         for number, view in enumerate(self.schedule.views if self.schedule.is_open else ()):
             open_view, view_choices = self.schedule.open_view(number), choices.get(view.name, ())

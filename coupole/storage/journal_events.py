@@ -157,6 +157,19 @@ class BurstsChosen(JournalEvent):
     """Numbers behind the reason, and the alternatives that were weighed."""
 
 
+class ViewChosen(JournalEvent):
+    """The next view was chosen. The line is synced before the arm moves to it. A resumed run repeats the
+    choice."""
+
+    event: Literal["chosen_view"] = "chosen_view"
+    view: str
+    """Name of the view; empty if no more views are taken."""
+    reason: str
+    """The reason for this view, or for no more views."""
+    figures: dict[str, Any] = Field(default_factory=dict)
+    """Numbers behind the reason, and the best alternatives with theirs."""
+
+
 class BurstBegun(JournalEvent):
     """A burst is about to give light. The line is synced before the light."""
 
@@ -353,6 +366,7 @@ Event: TypeAlias = (
     | ArmSettled
     | FrameProven
     | BurstsChosen
+    | ViewChosen
     | BurstBegun
     | BurstEnded
     | GapFound

@@ -33,6 +33,7 @@ import coupole
 from coupole.errors import InputError, StorageError
 from coupole.plan.choices import Choice, has_enough
 from coupole.plan.shot_id import Led, ShotId, ShotLabel
+from coupole.plan.view_choices import ChosenView, has_enough_views
 from coupole.storage import journal, manifest
 from coupole.storage.durable import make_folder, sync_folder, write_synced
 from coupole.storage.journal_events import (
@@ -41,6 +42,7 @@ from coupole.storage.journal_events import (
     FrameProven,
     FramesDiscarded,
     ProcessingAsked,
+    ViewChosen,
 )
 from coupole.storage.line_file import utc_now
 from coupole.storage.run_inputs import Inputs, changes_since, keep
@@ -129,6 +131,40 @@ class Run:
         return {path.stem: _settled_bytes(path) for path in (self.folder / "views").glob("*.h5")}
 
     @property
+    def most_views(self) -> int | None:
+        """Greatest number of its views, if they are chosen while it runs; None if the plan gives them."""
+        most_views: int | None = self.about.get("most_views")
+        return most_views
+
+    def chosen_views(self) -> list[ChosenView]:
+        """The choices of views that were made, from the journal; empty if the plan itself gives the views."""
+        if self.most_views is None:
+            return []
+        return [
+            ChosenView(view=event.view, reason=event.reason, figures=event.figures)
+            for event in journal.read_events(self.journal_path)
+            if isinstance(event, ViewChosen)
+        ]
+
+    @property
+    def views(self) -> list[str]:
+        """Names of its views, in the plan's order. If they are chosen while it runs, these are the views chosen so
+        far, in the order of the choices."""
+        if self.most_views is None:
+            return list(self.about["views"])
+        return [choice.view for choice in self.chosen_views() if choice.view]
+
+    @property
+    def wants_views(self) -> bool:
+        """True if more views may be chosen."""
+        return self.most_views is not None and not has_enough_views(self.chosen_views())
+
+    @property
+    def expected_views(self) -> int:
+        """Number of its views; while more may be chosen, the greatest number."""
+        return self.most_views if self.most_views is not None and self.wants_views else len(self.views)
+
+    @property
     def is_open(self) -> bool:
         """True if its bursts are chosen while it runs."""
         return bool(self.about.get("chosen_in_the_run", False))
@@ -148,19 +184,19 @@ class Run:
         if not self.is_open:
             return []
         choices = self.choices()
-        return [view for view in self.about["views"] if not has_enough(choices.get(view, ()))]
+        return [view for view in self.views if not has_enough(choices.get(view, ()))]
 
     def expected_shots(self) -> Iterable[ShotId]:
         """All shots and dark frames of the plan, without those whose LEDs are occluded in their view. If bursts
-        are chosen while the run goes on, these are all shots that were chosen so far."""
+        or views are chosen while the run goes on, these are all shots that were chosen so far."""
         if self.is_open:
             choices = self.choices()
-            for view in self.about["views"]:
+            for view in self.views:
                 bursts = (burst for choice in choices.get(view, ()) for burst in choice.bursts)
                 yield from (ShotId(view, label) for burst in bursts for label in burst.labels())
             return
         labels: list[str] | dict[str, list[str]] = self.about["labels"]
-        for view in self.about["views"]:
+        for view in self.views:
             hidden_lights = set(map(Led, self.hidden_leds.get(view, ())))
             for text in labels[view] if isinstance(labels, dict) else labels:
                 if (label := ShotLabel.parse(text)).light not in hidden_lights:
@@ -201,7 +237,7 @@ class Run:
         incomplete_views = {shot.view for shot in self.expected_shots() if shot not in proven}
         incomplete_views |= set(self.open_views())
         begun_views = {shot.view for shot in proven}
-        return [v for v in self.about["views"] if v not in incomplete_views and v in begun_views]
+        return [v for v in self.views if v not in incomplete_views and v in begun_views]
 
     @property
     def asked_result(self) -> Path | None:

@@ -75,6 +75,8 @@ class _Description(_Part):
     """One list for all views, or one for each."""
     chosen_in_the_run: bool = False
     """True: the frames are listed in the journal, not in `labels`."""
+    most_views: int | None = None
+    """Greatest number of views, if they are chosen in the run. Then `views` lists the candidates."""
     hidden_leds: dict[str, list[int]] = Field(default_factory=dict)
     plan: _File
     rig: _File

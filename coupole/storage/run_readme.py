@@ -62,7 +62,7 @@ with the folder of the samples, which is not this one.
 
 def readme(folder_name: str, about: dict[str, Any]) -> str:
     """Return the text, from the content of run.json."""
-    views = about.get("views") or ["NAME"]
+    views = ["NAME"] if "most_views" in about else about.get("views") or ["NAME"]
     return _TEXT.format(
         name=folder_name,
         line="=" * len(folder_name),

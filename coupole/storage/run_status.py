@@ -37,6 +37,7 @@ from coupole.storage.journal_events import (
     SessionStopped,
     TextUnread,
     ViewBegun,
+    ViewChosen,
     ViewSealed,
 )
 from coupole.storage.processing import Processing, processing_of
@@ -98,6 +99,12 @@ class Status:
     so far."""
     open_views: list[str] = field(default_factory=list)
     """Views for which more frames may still be chosen, if frames are chosen in the run."""
+    most_views: int | None = None
+    """Greatest number of views, if views are chosen in the run; None if the plan gives them."""
+    wants_views: bool = False
+    """True if more views may still be chosen."""
+    why_enough_views: str = ""
+    """Reason why no more views are chosen; empty if more may be chosen, or if the plan gives the views."""
     last_event: str = ""
     dose_lux_h: float = 0.0
     """Light on the object in all sessions."""
@@ -126,9 +133,27 @@ class Status:
 
     @property
     def left_in_words(self) -> str:
-        """Return in words how much is left to take. If bursts are chosen in the run, the rest is not known."""
+        """Return in words how much is left to take. If bursts or views are chosen in the run, the rest is not
+        known."""
         frames = "1 frame" if self.frames_left == 1 else f"{self.frames_left} frames"
+        if self.wants_views:
+            return f"{frames} and views that are not chosen yet"
         return f"{frames} and frames that are not chosen yet" if self.open_views else frames
+
+    @property
+    def has_left(self) -> bool:
+        """True if frames are left to take, or may be left because the choice has not ended."""
+        return bool(self.frames_left or self.open_views or self.wants_views)
+
+    @property
+    def views_in_words(self) -> str:
+        """Return in words how many views were chosen, and why no more are. It is empty if the plan gives the
+        views."""
+        if self.most_views is None:
+            return ""
+        return f"{len(self.views)} of at most {self.most_views} views" + (
+            f"; {self.why_enough_views}" if self.why_enough_views else " so far"
+        )
 
     def figures(self) -> dict[str, Any]:
         """Content of `--json`."""
@@ -162,6 +187,7 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
     status.darks_proven = sum(not shot.is_shot and not isinstance(shot.light, Sentinel) for shot in proven)
     proven_per_view = Counter(shot.view for shot in proven)
     status.open_views = run.open_views()
+    status.most_views, status.wants_views = run.most_views, run.wants_views
     status.views = {
         view: (proven_per_view[view], count)
         for view, count in (dict.fromkeys(status.open_views, 0) | per_view).items()
@@ -172,12 +198,12 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
         status.state, status.reason = "interrupted", KILLED
     holder = run.holder if in_use else None
     status.stopped_pid = holder if holder and is_stopped(holder) else None
-    if (status.frames_left or status.open_views) and not in_use:
+    if status.has_left and not in_use:
         status.go_on = run.go_on_command
         if status.faults or status.holds:
             status.before_that = _confirmation(run)
     if result:
-        frames_left = bool(status.frames_left or status.open_views)
+        frames_left = status.has_left
         discards = [event for event in events if isinstance(event, FramesDiscarded)]
         place = _place_of_samples(run, discards) or Path(result)
         processing = processing_of(run.folder, place, frames_left=frames_left, in_use=in_use)
@@ -244,6 +270,8 @@ def _note_event(found: Status, event: Event) -> None:
             found.findings.append(f"{event.view}: {event.kind}: {event.message}{picture}")
         case BurstEnded():
             session.light_s += event.on_s
+        case ViewChosen():
+            found.why_enough_views = "" if event.view else event.reason
         case (
             JournalBegun() | ProcessingAsked() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven()
             | BurstsChosen() | BurstBegun() | GapFound() | ViewSealed() | InputsChanged() | TextUnread()
@@ -285,4 +313,4 @@ def newest_run(parent: Path, name: str, plan: Path, say: Callable[[str], object]
 def is_complete(folder: Path) -> bool:
     """Tell whether all frames of a run are proven, and no more are to be chosen."""
     found = status(Run(folder))
-    return not found.missing and not found.open_views
+    return not found.missing and not found.open_views and not found.wants_views

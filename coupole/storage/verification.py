@@ -13,7 +13,7 @@ from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file, journal, manifest
 from coupole.storage.as_planned import AsPlanned, as_planned
 from coupole.storage.discarding import discarded_views, place_of_result
-from coupole.storage.journal_events import BurstsChosen, FrameProven
+from coupole.storage.journal_events import BurstsChosen, FrameProven, ViewChosen
 from coupole.storage.run import Run
 from coupole.storage.sample_proofs import problem_of
 
@@ -53,6 +53,7 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
     proven = run.proven()
     result.missing = [str(shot) for shot in run.expected_shots() if shot not in proven]
     result.missing += [f"{view}: its other frames are not chosen yet" for view in run.open_views()]
+    result.missing += ["its other views are not chosen yet"] * run.wants_views
     result.bad += _unchosen(run)
     by_file: dict[str, list[FrameProven]] = {}
     for frame in proven.values():
@@ -115,14 +116,22 @@ def _check_discarded(run: Run, result: Verification, proven: Mapping[ShotId, Fra
 
 
 def _unchosen(run: Run) -> list[str]:
-    """Find frames that come before their choice in the journal, if frames are chosen."""
+    """Find frames that come before their choice, or before that of their view, in the journal, if these are
+    chosen."""
     chosen_shots: set[ShotId] = set()
+    chosen_views: set[str] = set()
     problems = []
-    for event in journal.read_events(run.journal_path) if run.is_open else ():
+    chooses_views = run.most_views is not None
+    for event in journal.read_events(run.journal_path) if run.is_open or chooses_views else ():
         if isinstance(event, BurstsChosen):
             chosen_shots |= {ShotId(event.view, label) for burst in event.bursts for label in burst.labels()}
-        elif isinstance(event, FrameProven) and event.shot not in chosen_shots:
-            problems.append(f"{event.shot}: was not chosen before it was proven")
+        elif isinstance(event, ViewChosen):
+            chosen_views.add(event.view)
+        elif isinstance(event, FrameProven):
+            if run.is_open and event.shot not in chosen_shots:
+                problems.append(f"{event.shot}: was not chosen before it was proven")
+            elif chooses_views and event.shot.view not in chosen_views:
+                problems.append(f"{event.shot}: its view was not chosen before it was proven")
     return problems
 
 

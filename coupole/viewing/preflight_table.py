@@ -24,7 +24,7 @@ def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> 
     """
     whole = report.whole
     table = Table(title=f"{name} on {rig}", title_justify="left", box=None, show_header=False)
-    counts = f"{len(report.views)}, {report.shots}, {report.frames}"
+    counts = f"{report.view_count}, {report.shots}, {report.frames}"
     size, duration = bytes_text(report.bytes), duration_text(report.duration_s)
     if whole is not None:
         counts += f" left of {whole.views}, {whole.shots}, {whole.frames}"
@@ -32,6 +32,8 @@ def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> 
         duration += f" left of {duration_text(whole.duration_s)}"
     at_most = ", at most" if report.is_bound else ""
     table.add_row(f"views, shots, frames{at_most}", counts)
+    if report.candidates is not None:
+        table.add_row("views are chosen from", f"{report.candidates} candidates; the arm has a way to each")
     size_name = "on disk" if report.peak_bytes is None else "all frames, added up"
     table.add_row(f"{size_name}{at_most}", size + (_speeds(report) if report.frames else ""))
     if report.peak_bytes is not None and report.staying_bytes is not None:
@@ -78,7 +80,8 @@ def document_of(report: Report) -> dict[str, Any]:
         "ok": not report.refusals,
         "refusals": report.refusals,
         "warnings": report.warnings,
-        "views": len(report.views),
+        "views": report.view_count,
+        **({} if report.candidates is None else {"candidates": report.candidates}),
         "shots": report.shots,
         "frames": report.frames,
         "bytes": report.bytes,

@@ -15,7 +15,7 @@ from coupole.pages.page_rendering import write_page
 from coupole.plan import yamlfile
 from coupole.plan.plan import Plan
 from coupole.storage import journal
-from coupole.storage.journal_events import BurstsChosen, Event, FrameProven, ViewBegun
+from coupole.storage.journal_events import BurstsChosen, Event, FrameProven, ViewBegun, ViewChosen
 from coupole.storage.run import Run, name_without_time
 from coupole.storage.run_status import Status, status
 from coupole.viewing import report_facts as run_facts
@@ -93,6 +93,7 @@ def _quality(
     if isinstance(object_coverage, Coverage):
         parts.append(coverage_in_words(object_coverage))
     ends = dict.fromkeys(e.reason for e in events if isinstance(e, BurstsChosen) and not e.bursts)
+    parts += [e.reason for e in events if isinstance(e, ViewChosen) and not e.view]
     parts += list(ends)[:_MOST_ENDS]
     parts.append(f"{_things(lines)} went wrong" if lines else "nothing went wrong")
     sentence = "; ".join(parts)

@@ -20,6 +20,7 @@ from coupole.storage.journal_events import (
     FindingNoted,
     GapFound,
     SessionStopped,
+    ViewChosen,
 )
 from coupole.storage.run import Run
 from coupole.storage.run_status import KILLED, Session, Status
@@ -66,7 +67,7 @@ def light(events: Sequence[Event], views: Iterable[SampledView], run_status: Sta
     )
 
 
-def choices(events: Iterable[Event]) -> list[Section]:
+def choices(events: Sequence[Event]) -> list[Section]:
     """Return the choices that were made in the run, with their reasons; none if the plan gives all bursts."""
     rows: list[Sequence[Inline]] = []
     for event in events:
@@ -74,7 +75,22 @@ def choices(events: Iterable[Event]) -> list[Section]:
             frames = sum(len(burst.leds) for burst in event.bursts)
             rows.append((event.view, event.reason, str(frames)))
     table = Table("Choices, in the order in which they were made", ("view", "choice", "frames"), rows)
-    return [Section("choices", "Chosen in the run", tables=[table])] if rows else []
+    tables = [table] if rows else []
+    if of_views := _choices_of_views(events):
+        tables.insert(0, of_views)
+    return [Section("choices", "Chosen in the run", tables=tables)] if tables else []
+
+
+def _choices_of_views(events: Iterable[Event]) -> Table | None:
+    """Return the views that were chosen, with the best alternatives; None if the plan gives the views."""
+    rows: list[Sequence[Inline]] = []
+    for event in events:
+        if isinstance(event, ViewChosen):
+            next_best = event.figures.get("next_best", ())
+            texts = [f"{candidate['view']} ({candidate['score']:.3g})" for candidate in next_best]
+            rows.append((event.view or "no more", event.reason, ", ".join(texts)))
+    head = ("view", "choice", "next best, with their scores")
+    return Table("Views, in the order in which they were chosen", head, rows) if rows else None
 
 
 def duration_in_words(run_status: Status) -> str:
@@ -250,7 +266,7 @@ def _files(run: Run) -> Table:
     names = ("README.txt", "run.json", "journal.jsonl", "manifest.sha256")
     paths = [run.folder / name for name in names]
     paths += [run.folder / entry["stored"] for entry in _stored_files(run)]
-    paths += [run.view_path(view) for view in run.about["views"]]
+    paths += [run.view_path(view) for view in run.views]
     rows = [
         (Link(str(path.relative_to(run.folder))), bytes_text(path.stat().st_size))
         for path in paths

@@ -88,7 +88,7 @@ class SampledView:
 
 def sampled_views(run: Run, proven: Iterable[FrameProven]) -> list[SampledView]:
     """All views of a run, in the plan's order. If a file cannot be read, `trouble` of its view says why."""
-    frames: dict[str, list[FrameProven]] = {name: [] for name in run.about["views"]}
+    frames: dict[str, list[FrameProven]] = {name: [] for name in run.views}
     shot_counts = dict.fromkeys(frames, 0)
     for event in proven:
         frames.setdefault(event.shot.view, []).append(event)

@@ -255,6 +255,8 @@ def show_status(console: Console, status: Status) -> None:
         console.print(f"  {status.reason}", markup=False)
     console.print(f"  proof: {status.proof}")
     console.print(f"  light on the object: {status.dose_lux_h:.3f} lux.h")
+    if status.most_views is not None:
+        console.print(f"  chosen in the run: {status.views_in_words}", markup=False)
     for view, (proven, total) in status.views.items():
         console.print(f"  {view}: {proven} of {total} frames")
     if status.frames_discarded:

@@ -10,7 +10,6 @@ from pathlib import Path
 from rich.console import Console
 
 from coupole.errors import InputError, reason
-from coupole.motion.itinerary import plan_itinerary
 from coupole.preflight.checking import check_job
 from coupole.preflight.job import Job, without_hidden
 from coupole.preflight.preflight import StorageFacts
@@ -44,15 +43,11 @@ def look_at_plan(job: Job, folder: Path, console: Console, *, paths: bool) -> tu
 
 def look(job: Job, console: Console, *, paths: bool) -> Scene:
     """Return the scene, and the refusals that `check` would give, except those that concern the disk."""
-    rig, views = job.cell.rig, job.schedule.views
+    views = job.schedule.views
     with _doing(console, f"planning paths to {len(views)} views" if paths else "finding postures"):
         job = without_hidden(job) if paths else job
         job, report = check_job(job, StorageFacts(free_bytes=sys.maxsize), paths=paths)
-        home_deg = rig.motion.home_joints_deg
-        if paths:
-            itinerary = job.motion.itinerary(views, home_deg)
-        else:
-            itinerary = plan_itinerary(views, rig, None, home_deg, job.plan.order)
+        itinerary = job.motion.planned_itinerary(views, paths=paths)
     with _doing(console, "finding shadows"):
         return scene_of(job, itinerary, job.motion.bodies if paths else None, report.refusals)
 

@@ -72,6 +72,7 @@ RUNS = (
     Run("full_proofs.py --list", r"python tools/prove_clusters\.py --triangles"),
     Run("mutants.py --check", r"\d+ mutants fit the code"),
     Run("prove_adaptive_lights.py --smallest", r"adaptive: \d\.\d\d of the spread LEDs' error", full=True),
+    Run("prove_adaptive_views.py --smallest", r"worst: \d\.\d+ of the spread views' error", full=True),
     Run("prove_artefacts.py --smallest", r"wrong tile, 2%: found in 1 of 1", full=True),
     Run("prove_auto_exposure.py --smallest", r"duration: auto \d.* ratio \d", full=True),
     Run("prove_brackets.py --smallest", r"steps of 8: \d.* within 1\.96 u", full=True),

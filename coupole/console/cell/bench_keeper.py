@@ -157,7 +157,7 @@ class Bench:
         if not self.plan:
             return []
         plan = read_plan(self._plans.path(self.plan), self._cell.document.path).plan
-        return [pose.name for view in plan.views for pose in expand_view(view)]
+        return [pose.name for view in plan.view_entries for pose in expand_view(view)]
 
     def plan_path(self) -> str:
         """Return the plan's file. Raises InputError if the bench was begun without a plan."""

@@ -49,7 +49,7 @@ def name_of_retake(run: Run, view: str, taken_names: set[str]) -> str:
 
 def _single_views(plan: Plan) -> list[View]:
     views: list[View] = []
-    for view in plan.views:
+    for view in plan.view_entries:
         views += views_of_grid(view) if isinstance(view, Grid) else [view]
     return views
 

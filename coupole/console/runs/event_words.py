@@ -27,6 +27,7 @@ from coupole.storage.journal_events import (
     SessionStopped,
     TextUnread,
     ViewBegun,
+    ViewChosen,
     ViewSealed,
 )
 
@@ -49,6 +50,8 @@ def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
             return f"the arm moves to {event.view}"
         case BurstsChosen():
             return f"{event.view}: {event.reason}"
+        case ViewChosen():
+            return f"next view {event.view}: {event.reason}" if event.view else f"no more views: {event.reason}"
         case BurstBegun():
             return f"{event.view}: a burst begins, at most {max(event.planned_lux_h, default=0.0):.3f} lux h"
         case BurstEnded():

@@ -228,7 +228,7 @@ class RunFiles:
             proven = sum(count for count, _ in run_status.views.values())
             thumbnail = _typical(run) if proven else ""
             is_archived = bool(proven) and all(
-                frame_file.read_layout(run.view_path(view)).is_archived for view in run.about["views"]
+                frame_file.read_layout(run.view_path(view)).is_archived for view in run.views
             )
         except (CoupoleError, KeyError, OSError) as error:
             return RunRow(name, "damaged", "", "", str(error), False, 0, 0, 0, False, "", "")

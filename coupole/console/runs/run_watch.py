@@ -12,7 +12,14 @@ from coupole.console.runs.event_words import words_of
 from coupole.console.runs.run_files import RunFiles
 from coupole.plan.shot_id import Led
 from coupole.storage.journal import Follower
-from coupole.storage.journal_events import BurstEnded, BurstsChosen, FrameProven, ProcessingAsked, ReshootBegun
+from coupole.storage.journal_events import (
+    BurstEnded,
+    BurstsChosen,
+    FrameProven,
+    ProcessingAsked,
+    ReshootBegun,
+    ViewChosen,
+)
 from coupole.storage.processing import Processing, processing_of
 from coupole.storage.run import Run
 
@@ -63,6 +70,9 @@ class _Followed:
                     self.result = event.result
                 case BurstsChosen():
                     self.expected_counts[event.view] += sum(len(list(burst.labels())) for burst in event.bursts)
+                case ViewChosen() if event.view and not self.run.is_open:
+                    shots = self.run.expected_shots()
+                    self.expected_counts[event.view] = sum(shot.view == event.view for shot in shots)
                 case BurstEnded():
                     self.hottest_board_c = event.hottest_board_c
                 case _:
@@ -86,7 +96,7 @@ class RunWatch:
             followed_run = self._followed
             if followed_run is None or followed_run.run.folder.name != name:
                 run = self._runs.run(name)
-                shots_of_view = Counter(dict.fromkeys(run.about["views"], 0) if run.is_open else {})
+                shots_of_view = Counter(dict.fromkeys(run.views, 0) if run.is_open else {})
                 if not run.is_open:  # otherwise frames are chosen in the run, and only its journal names them
                     shots_of_view.update(shot.view for shot in run.expected_shots())
                 followed_run = self._followed = _Followed(run, Follower(run.journal_path), shots_of_view)

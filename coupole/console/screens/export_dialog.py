@@ -22,7 +22,7 @@ class ExportDialog:
             heading(f"Export {run.folder.name}")
             formats = {name: FORMATS[name].gives for name in formats_of(Source.RUN)}
             self._form = Choice("format", formats, self._tell, name="format")
-            views = {"": "all views"} | {view: view for view in run.about["views"]}
+            views = {"": "all views"} | {view: view for view in run.views}
             self._view = Choice("views", views, name="views")
             self._licence = ui.input("licence, such as CC-BY-4.0").props("outlined dense").style("width:100%")
             self._again = ui.checkbox("overwrite earlier files")

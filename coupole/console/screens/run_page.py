@@ -114,9 +114,7 @@ class _Page:
             self._facts = ui.html(facts_html(self._run_facts(row)), sanitize=False).classes("two-columns")
             self._facts.style("width:100%")
             ui.timer(_LOOK_EVERY_S, self._renew)
-            RunActions(
-                self._visit, row.name, can_resume=bool(status.frames_left or status.open_views), frames=row.proven
-            )
+            RunActions(self._visit, row.name, can_resume=status.has_left, frames=row.proven)
             TaskList(self._visit, lambda task: task.words.endswith(f" {self._name}"), empty="", most=4)
 
     async def _renew(self) -> None:
@@ -135,6 +133,7 @@ class _Page:
             "took": f"{duration_text(duration_s)} in {count(len(status.sessions), 'session')}",
             "frames": f"{row.proven} of {row.frames} proven"
             + (f", {missing_count} are missing" if missing_count else ""),
+            **({"views": status.views_in_words} if status.most_views is not None else {}),
             "taken again": f"{status.reshot} shots",
             "light on the object": f"{status.dose_lux_h:.3f} lux h",
             "size": bytes_text(row.bytes) + (", archived" if row.archived else ""),
@@ -144,7 +143,7 @@ class _Page:
         }
 
     def _choosers(self) -> None:
-        views = list(self._known.run.about["views"])
+        views = list(self._known.run.views)
         with ui.row().classes("bar"):
             self._view = Choice("view", {view: view for view in views}, self.choose, name="view")
             self._exposure = Choice("exposure", {"0": "-"}, self._choose_exposure, name="exposure")

@@ -104,7 +104,7 @@ class _Follower:
 
     def to_the_end(self) -> None:
         """Follow the run until its result is made. Raises as `reflectance_of`."""
-        self._teller.step("waiting", views=len(self._run.about["views"]))
+        self._teller.step("waiting", views=self._run.expected_views)
         while True:
             self._read_news()
             if self._looks:
@@ -116,7 +116,7 @@ class _Follower:
             elif not (self._look_ahead() or self._grow()):
                 time.sleep(_LOOK_EVERY_S)
         samples_s = self._seconds_since_last_frame()
-        self._teller.step("fitting")
+        self._teller.step("fitting", views=self._run.expected_views)
         ahead = self._ahead if self._tried_views else NOTHING_AHEAD  # nothing else would use what is kept
         reflectance_of(self._request, self._result, say=self._teller.part, ahead=ahead)
         run_reflectance_page.write(self._result)
@@ -153,7 +153,7 @@ class _Follower:
         if not self._is_done:
             with contextlib.suppress(OSError):  # a picture alone
                 write_normals(self._result, view, self._result / PICTURE)
-        self._teller.step("waiting", views_done=len(self._taken))
+        self._teller.step("waiting", views_done=len(self._taken), views=self._run.expected_views)
         return True
 
     def _remaining_views(self) -> list[str]:
@@ -176,8 +176,8 @@ class _Follower:
         made."""
         if self._run.is_open:
             return False
-        of = len(self._run.about["views"])
-        views = tuple(view for view in self._run.about["views"] if self._has_samples(view))
+        of = self._run.expected_views
+        views = tuple(view for view in self._run.views if self._has_samples(view))
         if not 0 < len(views) < of or views == self._tried_views:
             return False
         self._tried_views = views

@@ -46,7 +46,7 @@ def rehearse(
     count, channels = len(surface.points_mm), surface.signal_per_f.shape[2]
     step = -(-count * len(views) * len(led_rows) * channels // _MOST_VALUES)
     rows = np.arange(0, count, step)
-    samples = _drawn_samples(surface, views, material, exposures_us, led_rows, rows, np.random.default_rng(seed))
+    samples = drawn_samples(surface, views, material, exposures_us, led_rows, rows, np.random.default_rng(seed))
     mask = np.ones(len(samples.led_mm), np.bool_)
     materials = fit_triangles(samples, mask, noise_um)
     uncertainty = covariances(
@@ -60,7 +60,7 @@ def rehearse(
     return {NORMAL_DEG: np.degrees(np.hypot(deviations[:, 0], deviations[:, 1])), **percents}
 
 
-def _drawn_samples(
+def drawn_samples(
     surface: Surface,
     views: Sequence[SeenParts],
     material: SupposedMaterial,

@@ -22,7 +22,7 @@ from coupole.geometry import apply, inverse
 from coupole.kernels import kernel
 from coupole.motion.occlusion import REACHED, Occlusion, Occlusions, Sight, sight_of
 from coupole.motion.patches import Patches
-from coupole.plan.rig import Sensor
+from coupole.plan.rig import Rig, Sensor
 from coupole.preflight.framing import depth_of_field_mm
 from coupole.preflight.job import Job
 from coupole.reflectance.extraction.measured_run import Powers, emission_of, read_powers, u_signal_of
@@ -145,7 +145,7 @@ class SupposedCell:
                 for point, normal in zip(patches.points_mm, patches.normals, strict=True)
             ]
         )
-        triangles, areas_mm2 = _triangles_of_parts(patches, self._job.shape.corners_mm)
+        triangles, areas_mm2 = triangles_of_parts(patches, self._job.shape.corners_mm)
         return Surface(
             patches.points_mm,
             patches.normals,
@@ -161,25 +161,34 @@ class SupposedCell:
 
     def seen_by(self, joints_deg: Floats, support_from_camera: Floats) -> SeenParts:
         """Return the parts that a view sees with the arm in this posture."""
-        occlusion: Occlusion = self.occlusions.at(joints_deg)
-        sight = sight_of(self.rig, support_from_camera)
-        pixels = np.where(occlusion.is_seen, self._pixels(sight), 0.0)
-        return SeenParts(support_from_camera[:3, 3], pixels, occlusion.codes == REACHED)
-
-    def _pixels(self, sight: Sight) -> Floats:
-        """[n] pixels that a triangle of each part covers; 0 if it is out of focus, or seen too obliquely."""
-        ways = sight.support_from_camera[:3, 3] - self.surface.points_mm
-        distance_mm = np.linalg.norm(ways, axis=1)
-        depth_mm = -ways @ sight.support_from_camera[:3, 2]
-        cosine = np.sum(ways * self.surface.normals, axis=1) / distance_mm
-        near_mm, far_mm = depth_of_field_mm(self.rig.lens, self.rig.sensor.pixel_pitch_um)
-        is_used = (cosine > LEAST_COSINE) & (depth_mm >= near_mm) & (depth_mm <= far_mm)
-        scale = sight.focal_px**2 * distance_mm / np.maximum(depth_mm, 1.0) ** 3
-        pixels: Floats = np.where(is_used, self.surface.triangle_areas_mm2 * cosine * scale, 0.0)
-        return pixels
+        return seen_by(self.occlusions, self.surface, joints_deg, support_from_camera)
 
 
-def _triangles_of_parts(patches: Patches, corners_mm: Floats) -> tuple[Floats, Floats]:
+def seen_by(
+    occlusions: Occlusions, surface: Surface, joints_deg: Floats, support_from_camera: Floats
+) -> SeenParts:
+    """Return the parts of a surface that a view sees with the arm in this posture."""
+    occlusion: Occlusion = occlusions.at(joints_deg)
+    pixels = _pixels(surface, occlusions.rig, sight_of(occlusions.rig, support_from_camera))
+    return SeenParts(
+        support_from_camera[:3, 3], np.where(occlusion.is_seen, pixels, 0.0), occlusion.codes == REACHED
+    )
+
+
+def _pixels(surface: Surface, rig: Rig, sight: Sight) -> Floats:
+    """[n] pixels that a triangle of each part covers; 0 if it is out of focus, or seen too obliquely."""
+    ways = sight.support_from_camera[:3, 3] - surface.points_mm
+    distance_mm = np.linalg.norm(ways, axis=1)
+    depth_mm = -ways @ sight.support_from_camera[:3, 2]
+    cosine = np.sum(ways * surface.normals, axis=1) / distance_mm
+    near_mm, far_mm = depth_of_field_mm(rig.lens, rig.sensor.pixel_pitch_um)
+    is_used = (cosine > LEAST_COSINE) & (depth_mm >= near_mm) & (depth_mm <= far_mm)
+    scale = sight.focal_px**2 * distance_mm / np.maximum(depth_mm, 1.0) ** 3
+    pixels: Floats = np.where(is_used, surface.triangle_areas_mm2 * cosine * scale, 0.0)
+    return pixels
+
+
+def triangles_of_parts(patches: Patches, corners_mm: Floats) -> tuple[Floats, Floats]:
     """[n] number of triangles of each part, and their mean area, mm^2. A triangle that lies in several parts
     counts in each by its share."""
     across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])

@@ -1,0 +1,1 @@
+"""Views that are chosen in a run (`views: {kind: adaptive}`)."""

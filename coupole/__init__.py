@@ -25,8 +25,8 @@ def _is_writable(folder: Path) -> bool:
 def _keep_kernels_somewhere() -> None:
     """Give numba a folder for its compiled code, which is usually beside the package or in the user's cache. If
     neither can be written (another user's installation, no home), it is a folder of this user among the temporary
-    files. A folder that somebody else has made there is not used, because code is loaded from it. Call this before
-    numba is imported.
+    files. A folder there that belongs to another user is not used, because code is loaded from it. Call this
+    before numba is imported.
     """
     places = (Path(__file__).parent, Path("~/.cache").expanduser())
     if "NUMBA_CACHE_DIR" in os.environ or any(map(_is_writable, places)):

@@ -137,8 +137,8 @@ def shifts_px(
 def judge(
     modes: Sequence[Mode], coefficients: Floats, covariance: Floats, degrees: float
 ) -> tuple[SuspectedShift, ...]:
-    """Judge the suspects by the free estimates [c] of all modes and their covariance [c, c], whose noise is known
-    to so many degrees of freedom."""
+    """Judge the suspects by the free estimates [c] of all modes and their covariance [c, c], whose noise has the
+    given degrees of freedom."""
     suspects = []
     for name in dict.fromkeys(mode.suspect for mode in modes):
         own_modes = [number for number, mode in enumerate(modes) if mode.suspect == name]

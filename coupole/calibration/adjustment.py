@@ -58,7 +58,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Block:
-    """Some observations: residuals [m] (observed minus computed, over the stated noise), derivatives of the
+    """Some observations: residuals [m] (observed minus computed, divided by the stated noise), derivatives of the
     computed values [m, k], columns of the k parameters, and the group's number."""
 
     residuals: Floats
@@ -73,11 +73,11 @@ class Component:
 
     name: str
     factor: float
-    """Estimated over stated noise; 1 if the noise was not to be estimated."""
+    """Estimated noise, divided by the stated noise; 1 if the noise was not to be estimated."""
     rejected_count: int
     redundancy: float
     chi2: float
-    """Sum of squared residuals over the stated noise."""
+    """Sum of the squares of the residuals, each divided by the stated noise."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Adjusted(Generic[S]):
     degrees: Floats
     """Effective degrees of freedom [p]."""
     residuals: tuple[Floats, ...]
-    """Residuals of each block, over the stated noise."""
+    """Residuals of each block, divided by the stated noise."""
     accepted_masks: tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], ...]
     """Masks of each block: True for residuals that were not rejected."""
     steps: int
@@ -261,7 +261,7 @@ def _seen_factors(
     parameters: int,
     calibration_name: str,
 ) -> Floats:
-    """Return the noise of each group from its squared residuals over its redundancy."""
+    """Return the noise of each group from its squared residuals divided by its redundancy."""
     matrices, _ = _normals(blocks, weights, len(groups), parameters)
     covariance = _covariance(matrices, factors, calibration_name)
     new_factors = factors.copy()

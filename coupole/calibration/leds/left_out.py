@@ -44,7 +44,7 @@ class LeftOutViews:
     """Predictions of the views by each other, and the LEDs' covariance that follows."""
 
     ratios: Floats
-    """[v] root mean square of the prediction error of each view over its standard uncertainty; about 1."""
+    """[v] root mean square of the prediction error of each view divided by its standard uncertainty; about 1."""
     centre_covariance: Floats
     """[n, 3, 3] of the LEDs' centres by the jackknife over views, mm^2."""
 

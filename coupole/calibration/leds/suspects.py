@@ -77,7 +77,8 @@ class SuspectedShift:
 
     @property
     def away(self) -> float:
-        """Shift of the images away from the camera over its standard uncertainty; 0 for a shift towards it."""
+        """Shift of the images away from the camera, divided by its standard uncertainty; 0 for a shift towards
+        it."""
         return max(0.0, -float(self.coefficients[0] / self.u[0])) if self.name == PRIMARY else 0.0
 
     @property

@@ -213,7 +213,7 @@ class _Problem:
         return float(np.mean((self._mixture_reflectance(subset, shares) - self.target) ** 2))
 
     def refined_shares(self, subset: tuple[int, ...]) -> tuple[float, tuple[int, ...], Array]:
-        """Squared residuals over their variances, and shares that are not negative."""
+        """Squared residuals divided by their variances, and shares that are not negative."""
         from scipy.optimize import least_squares
 
         if len(subset) == 1:

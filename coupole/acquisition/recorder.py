@@ -39,7 +39,8 @@ _SLOWEST_SYNC_BYTES_S, _SLOWEST_ALLOCATION_BYTES_S = 5e6, 50e6
 
 
 class Recorder(Protocol):
-    """The recorder that the sequencer needs. Several threads may call `store`, only one all else."""
+    """The recorder that the sequencer needs. Several threads may call `store`; all other methods are called by
+    only one thread."""
 
     name: str
     """Purpose of the light, in the object's dose ledger: the run's name, or `meter`."""

@@ -58,7 +58,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Block:
-    """Some observations: residuals [m] (observed minus computed, over the stated noise), derivatives of the
+    """Some observations: residuals [m] (observed minus computed, divided by the stated noise), derivatives of the
     computed values [m, k], columns of the k parameters, and the group's number."""
 
     residuals: Floats
@@ -85,11 +85,11 @@ class Component:
 
     name: str
     factor: float
-    """Estimated over stated noise; 1 if the noise was not to be estimated."""
+    """Estimated noise, divided by the stated noise; 1 if the noise was not to be estimated."""
     rejected_count: int
     redundancy: float
     chi2: float
-    """Sum of squared residuals over the stated noise."""
+    """Sum of the squares of the residuals, each divided by the stated noise."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Adjusted(Generic[S]):
     degrees: Floats
     """Effective degrees of freedom [p]."""
     residuals: tuple[Floats, ...]
-    """Residuals of each block, over the stated noise."""
+    """Residuals of each block, divided by the stated noise."""
     accepted_masks: tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], ...]
     """Masks of each block: True for residuals that were not rejected."""
     steps: int
@@ -262,7 +262,7 @@ def _seen_factors(
     weights: Sequence[Floats],
     factors: Floats,
 ) -> Floats:
-    """Return the noise of each group from its squared residuals over its redundancy."""
+    """Return the noise of each group from its squared residuals divided by its redundancy."""
     matrices, _ = _normals(blocks, weights, len(problem.groups), problem.parameters)
     covariance = _covariance(matrices, factors, problem.calibration_name)
     new_factors = factors.copy()

@@ -25,9 +25,9 @@ class LeftOut:
     """Predictions of the views."""
 
     ratios: Floats
-    """[views] root mean square of the prediction error over its standard uncertainty; about 1."""
+    """[views] root mean square of the prediction error divided by its standard uncertainty; about 1."""
     off: Floats
-    """[views] root mean square of the group's prediction errors, over the stated noise."""
+    """[views] root mean square of the group's prediction errors, divided by the stated noise."""
 
     @property
     def ratio(self) -> float:

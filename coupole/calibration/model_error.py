@@ -30,8 +30,8 @@ _ROUNDS, _SETTLED = 4, 0.01
 
 @dataclass(frozen=True)
 class Suspect:
-    """A cause for which the model has no term: derivatives [observations, modes] of the computed values over their
-    stated noise, in the order of the blocks of the group."""
+    """A cause for which the model has no term: derivatives [observations, modes] of the computed values, divided
+    by the stated noise, in the order of the blocks of the group."""
 
     name: str
     modes: Floats
@@ -50,8 +50,8 @@ class Suspected:
     """[modes] most probable coefficients."""
     coefficient_covariance: Floats
     pattern: float
-    """Root mean square of its pattern in the residuals, over the stated noise. The part that the model absorbs is
-    left out."""
+    """Root mean square of its pattern in the residuals, divided by the stated noise. The part that the model
+    absorbs is left out."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class ModelError:
     covariance: Floats
     """[p, p]."""
     noise: float
-    """Noise of the group without the patterns, over the stated noise."""
+    """Noise of the group without the patterns, divided by the stated noise."""
     suspects: tuple[Suspected, ...]
 
     def of(self, name: str) -> Suspected:
@@ -81,8 +81,8 @@ def with_suspects(
 ) -> ModelError:
     """Judge the suspects by the residuals of `group`, at the solution of an adjustment.
 
-    `weights` are 1 for a residual that was kept, otherwise 0. `factors` [groups] are the estimated noises over the
-    stated ones. `redundancy` is that of the group.
+    `weights` are 1 for a residual that was kept, otherwise 0. `factors` [groups] are the estimated noises, divided
+    by the stated ones. `redundancy` is that of the group.
     """
     noise = float(factors[group])
     for _ in range(_ROUNDS):

@@ -26,7 +26,7 @@ LEAST_MATCHED, LEAST_SHARE = 4, 0.4
 _TRIES = 20_000
 _AMBIGUOUS_SHARE = 0.8
 _THINNEST = 0.1
-"""Least height of a triangle over its longest side. Thinner triangles determine the motion too poorly."""
+"""Least height of a triangle, relative to its longest side. Thinner triangles determine the motion too poorly."""
 
 
 Indices = np.ndarray[tuple[int], np.dtype[np.intp]]

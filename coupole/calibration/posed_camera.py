@@ -17,7 +17,7 @@ from coupole.geometry import transform
 
 HAND_EYE = "flange_from_camera"
 MOST_APART = 5.0
-"""Largest difference of two records of one lens, over its standard uncertainty."""
+"""Largest difference of two records of one lens, divided by its standard uncertainty."""
 
 
 @dataclass(frozen=True)

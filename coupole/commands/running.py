@@ -123,8 +123,8 @@ def _beside(
     *,
     is_asked: bool,
 ) -> Iterator[ProcessingBeside | None]:
-    """The processing beside an acquisition, if it is asked for, or the run that is resumed has asked for it; what
-    became of it is in `summary` afterwards."""
+    """The processing during an acquisition, if the command or the resumed run asks for it. Its outcome is in
+    `summary` afterwards."""
     from coupole.storage.run import Run
 
     if resume is not None:

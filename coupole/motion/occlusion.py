@@ -90,8 +90,9 @@ class Occlusion:
     def arrays(self, patches: Patches) -> dict[str, NDArray[np.generic]]:
         """Return arrays by name, which are stored with a view's frames and can be read without this module.
 
-        `codes` uint8 [patches, leds] and `seen` [patches] as above; for the patches, in the support frame,
-        `points_mm` and outward `normals` float32 [patches, 3] and `areas_mm2` float32 [patches].
+        `codes` is uint8 [patches, leds], and `seen` is [patches], with the meanings above. The patches themselves
+        are given in the support frame: `points_mm` and outward `normals`, float32 [patches, 3], and `areas_mm2`,
+        float32 [patches].
         """
         return {
             "codes": self.codes,

@@ -195,9 +195,9 @@ def fit_from(roots, used_samples, lights, half, views, view_of, unknowns, prior,
     rms.
 
     `roots` are square roots of the samples `used_samples`; `lights` and half vectors `half` are [samples, 3].
-    `view_of` [samples] gives each sample's row of `views` [v, 3]. The normal is held to `prior` by `stiffness`, 1
-    over its variance in rad^2. Roughness and ks are held to usual values by `usual`, so that no highlight is
-    invented where no sample could show it.
+    `view_of` [samples] gives each sample's row of `views` [v, 3]. The normal is held to `prior` by `stiffness`,
+    the inverse of its variance in rad^2. Roughness and ks are held to usual values by `usual`, so that no
+    highlight is invented where no sample could show it.
     """
     scale = CAUCHY * math.exp(0.5 * unknowns[3])
     matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)

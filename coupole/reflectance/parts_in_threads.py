@@ -35,7 +35,7 @@ def first_alone(work: Callable[..., Done]) -> Callable[..., Done]:
 
 
 def in_threads(work: Callable[[int], object], count: int, *, part: int = 1, threads: int | None = None) -> None:
-    """Call `work(first)` for the first number of each `part` of `count`, in so many threads, or in one thread for
-    each core. The first call of a kind in this process runs alone."""
+    """Call `work(first)` for the first number of each `part` of `count`, in the given number of threads; by
+    default, one thread for each core. The first call of a kind in this process runs alone."""
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         list(pool.map(first_alone(work), range(0, count, part)))

@@ -20,7 +20,7 @@ from coupole.reflectance.picture_set import PictureSet
 Floats = NDArray[np.float64]
 
 _SITES = 4096
-"""Approximate number of pixels by which lights are rated."""
+"""Approximate number of pixels that are used to rate lights."""
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ Floats = NDArray[np.float32]
 SCHEMA = "coupole-reflectance-pictures/1"
 SAMPLES, MATERIALS, INTERPOLATION = "samples/pictures.h5", "fits/materials.h5", "fits/interpolation.h5"
 INTERVALS = "fits/intervals.h5"
-"""File of the coefficients and factors by which intervals of relit pictures are predicted; missing under too few
-lights."""
+"""File of the coefficients and factors by which intervals of relit pictures are predicted; missing if there were
+too few lights."""
 CONES = "normals_95_deg.npy"
 NORMALS, ABOUT, REPORT = "normals.npy", "result.json", "report.html"
 AXES = "x to the right of the picture, y up, z to the camera"

@@ -165,8 +165,8 @@ def _mae(
 ) -> dict[str, dict[str, float | None]]:
     """Return the errors of pictures by blocks of pixels, and of means of triangles. Triangles with a material of
     their own have errors of three predictions: by this material, by their cluster's material, and by the cluster's
-    harmonics, where all three have a value. Triangles that borrowed a material have errors by the borrowed
-    material."""
+    harmonics, where all three have a value. For triangles with a borrowed material, the prediction is by the
+    borrowed material."""
     clusters = result.clusters
     pictures, triangles = ({name: [0.0, 0] for name in _WAYS} for _ in range(2))
     for view in views:

@@ -64,7 +64,7 @@ class RunRequest:
     mesh: Path | None = None
     calibrations: tuple[Path, ...] = ()
     left_out: tuple[int, ...] = ()
-    """LEDs kept for the check; empty for every twelfth."""
+    """LEDs kept for the check; if it is empty, every twelfth LED."""
     scan_noise_um: float = 30.0
     memory_bytes: int = 2_000_000_000
     support_reflectance: float = 0.0

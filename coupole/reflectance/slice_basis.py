@@ -41,7 +41,7 @@ class Basis:
     """Functions of a direction, and the penalty that keeps their coefficients small."""
 
     harmonic: bool
-    """True for spherical harmonics; else radial functions with a linear tail."""
+    """True for spherical harmonics, False for radial functions with a linear tail."""
     penalty: Floats
     """[COUNT]"""
 

@@ -129,8 +129,8 @@ def _refuse_others(path: Path, text: str) -> None:
 
 
 def frames_of_leds(folder: Path, frames: LightFrames, view: str | None) -> dict[int, LightFrame]:
-    """Return, for each LED, the frame of the longest exposure that is hardly clipped, else of the shortest
-    exposure."""
+    """Return, for each LED, the frame of the longest exposure that is hardly clipped, otherwise that of the
+    shortest exposure."""
     frame_of_led: dict[int, LightFrame] = {}
     for led, exposures in _exposures_of_leds(folder, frames, view).items():
         frame_of_led[led] = exposures[0]

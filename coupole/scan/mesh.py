@@ -13,9 +13,9 @@ from coupole.kernels import kernel
 from coupole.scan.mesh_text import OK, TOO_FEW
 
 CHUNK = 4_000_000
-"""Number of records that are converted at a time."""
+"""Number of records that are converted together."""
 MOST_VERTICES = 2**31
-"""An edge is stored as one 64-bit number (`coupole.scan.mesh_defects`)."""
+"""Greatest number of vertices: an edge is stored as one 64-bit number (`coupole.scan.mesh_defects`)."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,8 @@ def expect_records(
 
 
 def expect_room(path: Path, record_name: str, count: int, least_bytes: int, size_bytes: int) -> None:
-    """Raise InputError if a file of this size cannot hold as many records as it says, before they get memory."""
+    """Raise InputError if a file of this size cannot hold the stated number of records. This is checked before
+    memory is allocated."""
     if count * least_bytes > size_bytes:
         raise InputError(
             f"{path}: expected {count} of {record_name}, as its header says, of {least_bytes} bytes or more "

@@ -1,4 +1,4 @@
-"""A mesh's file as its readers need it: on the disk, or as bytes that were read before."""
+"""The file of a mesh as input of its readers: on the disk, or as bytes that were read before."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class MeshFile:
-    """`path` is its name in messages; with `data` nothing is read from the disk."""
+    """A file of a mesh. `path` is its name in messages; with `data` nothing is read from the disk."""
 
     path: Path
     data: bytes | None = None
@@ -27,7 +27,7 @@ class MeshFile:
         return self.path.open("rb") if self.data is None else io.BytesIO(self.data)
 
     def mapped_bytes(self) -> NDArray[np.uint8]:
-        """Its bytes; a file's are mapped into memory, not loaded."""
+        """Bytes of the file; a file on the disk is mapped into memory, not loaded."""
         if self.data is not None or self.size_bytes == 0:
             return np.frombuffer(self.data or b"", np.uint8)
         with self.path.open("rb") as file:
@@ -35,7 +35,7 @@ class MeshFile:
 
 
 def read_records(file: BinaryIO, record: np.dtype[np.void], count: int) -> NDArray[Any]:
-    """The next `count` records, or as many as are there."""
+    """Return the next `count` records, or all remaining ones if there are fewer."""
     if isinstance(file, io.BytesIO):
         data = file.read(count * record.itemsize)
         return np.frombuffer(data, record, len(data) // record.itemsize)

@@ -11,7 +11,8 @@ from coupole.kernels import kernel
 from coupole.scan.mesh import Mesh
 
 OUT_OF_PROPORTION = 200.0
-"""An edge longer or shorter than the median by this factor has another scale: mm and m differ by 1000."""
+"""An edge that is longer or shorter than the median edge by this factor has another scale (mm and m differ by
+1000)."""
 _ODD_SHARE = 1e-3
 _SAMPLE = 1_000_000
 
@@ -25,18 +26,19 @@ class Defects:
     """Edges with three triangles or more."""
     flipped_edges: int
     first_flipped: int
-    """Edges whose two triangles have opposite orientations: one shows its inside."""
+    """Edges whose two triangles have opposite orientations, so that one of them shows its inside."""
     open_edges: int
-    """Edges with one triangle: rims of holes."""
+    """Edges with only one triangle: rims of holes."""
     degenerate: int
     first_degenerate: int
     """Triangles without area."""
     odd_scale: int
-    """A triangle of another scale than the others if there are more than a few of these; else -1."""
+    """Number of a triangle with another scale than the others, if there are more than a few such triangles;
+    otherwise -1."""
 
 
 def find_defects(mesh: Mesh) -> Defects:
-    """Check all edges and triangles. Needs 24 bytes per triangle beside the mesh."""
+    """Check all edges and triangles. This needs 24 bytes per triangle in addition to the mesh."""
     degenerate, first_degenerate = _degenerate(mesh.vertices, mesh.triangles)
     keys = np.empty(3 * len(mesh.triangles), np.uint64)
     _fill_edge_keys(mesh.triangles, keys)
@@ -55,7 +57,7 @@ def find_defects(mesh: Mesh) -> Defects:
 
 
 def longest_edges(mesh: Mesh, triangles: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """[n] longest edge of each of these triangles [n, 3], in the mesh's unit."""
+    """[n] longest edge of each of the triangles [n, 3], in the mesh's unit."""
     corners = mesh.vertices[triangles].astype(np.float64)
     edges: NDArray[np.float64] = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     return edges
@@ -88,7 +90,7 @@ def _degenerate(vertices, triangles):  # type: ignore[no-untyped-def]
 
 @kernel
 def _fill_edge_keys(triangles, keys):  # type: ignore[no-untyped-def]
-    """Keys of lower vertex, higher vertex and, in the last bit, the orientation of the triangle."""
+    """Fill keys with the lower vertex, the higher vertex and, in the last bit, the orientation of the triangle."""
     for t in range(len(triangles)):
         for k in range(3):
             a, b = np.uint64(triangles[t, k]), np.uint64(triangles[t, (k + 1) % 3])
@@ -100,8 +102,8 @@ def _fill_edge_keys(triangles, keys):  # type: ignore[no-untyped-def]
 
 @kernel
 def _count_edges(keys):  # type: ignore[no-untyped-def]
-    """Number of open edges; number and first key of edges with more than two triangles; the same for flipped
-    edges."""
+    """Return the number of open edges; number and first key of edges with more than two triangles; and number and
+    first key of flipped edges."""
     none = np.uint64(0)
     open_edges, crowded_count, turned_count, first_crowded, first_turned = 0, 0, 0, none, none
     at = 0
@@ -123,7 +125,7 @@ def _count_edges(keys):  # type: ignore[no-untyped-def]
 
 @kernel
 def _triangle_with(triangles, key):  # type: ignore[no-untyped-def]
-    """The first triangle that has an edge."""
+    """Return the first triangle that has this edge."""
     low, high = key >> np.uint64(33), (key >> np.uint64(1)) & np.uint64(0xFFFFFFFF)
     for t in range(len(triangles)):
         for k in range(3):

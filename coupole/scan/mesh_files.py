@@ -1,8 +1,8 @@
 """Triangle meshes of up to tens of millions of triangles: PLY, STL and OBJ, read at the speed of the disk.
 
 Invalid files are refused with the place of the error: a file that ends too early, coordinates that are not finite,
-corners that do not exist, faces that are not triangles, no faces. Memory stays within about three times that of
-vertices and triangles.
+corners that do not exist, faces that are not triangles, no faces. The readers need at most about three times the
+memory of vertices and triangles.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from coupole.scan.mesh_stl import read_stl
 
 
 def read_mesh(path: Path, data: bytes | None = None) -> Mesh:
-    """Read a mesh, its format by the suffix: .ply, .stl or .obj. Raises InputError with the place of the error.
+    """Read a mesh in the format of its suffix: .ply, .stl or .obj. Raises InputError with the place of the error.
 
-    `data` are the file's bytes, if they were read already; the file is then left alone. An STL repeats vertices
-    for each triangle; those with bitwise equal coordinates become one.
+    `data` are the file's bytes if they have been read already; the file is then not read again. An STL repeats
+    vertices for each triangle; vertices with bitwise equal coordinates become one.
     """
     readers: dict[str, Callable[[MeshFile], Mesh]] = {".ply": read_ply, ".stl": read_stl, ".obj": read_obj}
     if path.suffix.lower() not in readers:

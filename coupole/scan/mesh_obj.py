@@ -29,7 +29,8 @@ def read_obj(source: MeshFile) -> Mesh:
 
 @kernel
 def _obj_line(data, at, end):  # type: ignore[no-untyped-def]
-    """1 for a vertex, 2 for a face, 0 for anything else; and the offset of its first value."""
+    """Return the kind of line (1 for a vertex, 2 for a face, 0 for any other), and the offset of its first
+    value."""
     at = mesh_text.skip_blanks(data, at, end)
     if at + 1 < end and (data[at + 1] == 32 or data[at + 1] == 9):
         if data[at] == 118:
@@ -62,8 +63,8 @@ def _count_obj(data):  # type: ignore[no-untyped-def]
 
 @kernel
 def _fill_obj(data, vertices, triangles):  # type: ignore[no-untyped-def]
-    """Faces with more than three corners become triangle fans; negative corners count back from the last
-    vertex."""
+    """Fill vertices and triangles. Faces with more than three corners become triangle fans; negative corners count
+    back from the last vertex."""
     at, line, v, t = 0, 1, 0, 0
     while at < len(data):
         end = mesh_text.line_end(data, at)

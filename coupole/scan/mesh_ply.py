@@ -60,19 +60,19 @@ def read_ply(source: MeshFile) -> Mesh:
 
 
 def _expect_possible(source: MeshFile, element: _Element, *, ascii_text: bool) -> None:
-    """Raise InputError if the file is too short for an element, or a property stands twice."""
+    """Raise InputError if the file is too short for an element, or if a property occurs twice."""
     path, names = source.path, [field[0] for field in element.properties]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(
             f"{path}: element `{element.name}` has property `{twice[0]}` twice; expected each name once"
         )
-    kinds = [_PLY_TYPES.get(field[1], "u1") for field in element.properties]  # of a list, its count
+    kinds = [_PLY_TYPES.get(field[1], "u1") for field in element.properties]  # for a list, its count
     least_bytes = 2 * len(kinds) if ascii_text else sum(np.dtype(kind).itemsize for kind in kinds)
     expect_room(path, f"`{element.name}`", element.count, max(1, least_bytes), source.size_bytes + 1)
 
 
 def _ply_header(source: MeshFile) -> tuple[str, list[_Element], int, int]:
-    """Format, elements, and the byte and line at which the data begin."""
+    """Return format, elements, and the byte and line at which the data begin."""
     elements: list[_Element] = []
     path, file_format = source.path, ""
     with source.open_file() as file:
@@ -104,7 +104,7 @@ def _with(element: _Element, property_words: tuple[str, ...]) -> _Element:
 
 
 def _plain_record(path: Path, element: _Element, order: str) -> np.dtype[np.void]:
-    """Layout of an element without lists."""
+    """Return the layout of an element without lists."""
     if any(len(field) == 3 for field in element.properties):
         raise InputError(f"{path}: element `{element.name}` holds lists; only faces may")
     return np.dtype([(name, order + _PLY_TYPES[kind]) for name, kind in element.properties])
@@ -125,7 +125,8 @@ def _binary_vertices(path: Path, file, element: _Element, order: str) -> NDArray
                 path, "vertex", element.count, first + len(part), min(CHUNK, element.count - first) + first
             )
             for k, axis in enumerate("xyz"):
-                with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused below
+                # numbers that float32 cannot hold become infinite, and are refused below
+                with np.errstate(over="ignore"):
                     vertices[first : first + len(part), k] = part[axis]
     expect_finite(path, vertices, "vertex {}")
     return vertices

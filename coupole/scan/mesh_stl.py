@@ -19,7 +19,8 @@ _STL_HEADER_BYTES = 80
 
 
 def read_stl(source: MeshFile) -> Mesh:
-    """Read an STL: as binary if its size agrees with its count of triangles, whatever its header; else as text."""
+    """Read an STL: as binary if its size agrees with its count of triangles, whatever its header says; otherwise
+    as text."""
     path, size = source.path, source.size_bytes
     with source.open_file() as file:
         header = file.read(_STL_HEADER_BYTES)
@@ -110,7 +111,8 @@ class _Welder:
         out = self._triangles.reshape(-1)[3 * self._filled :]
         while welded_count < len(points):
             welded_count, self._known = _weld(points, welded_count, self._slots, self._vertices, self._known, out)
-            if welded_count < len(points):  # not enough room: more vertices than a closed surface has
+            # there is not enough room: the mesh has more vertices than a closed surface
+            if welded_count < len(points):
                 self._vertices = np.concatenate([self._vertices, np.empty_like(self._vertices)])
                 self._slots = np.full(2 * len(self._slots), -1, np.int64)
                 _fill_slots(self._slots, self._vertices, self._known)
@@ -122,7 +124,7 @@ class _Welder:
 
 @kernel
 def _slot(slots, vertices, x, y, z):  # type: ignore[no-untyped-def]
-    """Slot of a point in the hash table (open addressing), or the free slot for it."""
+    """Return the slot of a point in the hash table (open addressing), or the free slot for it."""
     key = np.empty(3, np.float32)
     key[0], key[1], key[2] = x + np.float32(0.0), y + np.float32(0.0), z + np.float32(0.0)  # -0 becomes 0
     bits = key.view(np.uint32)

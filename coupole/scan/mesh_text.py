@@ -1,6 +1,6 @@
 """Numbers in text files of gigabytes: lines, tokens and decimal numbers of a byte array, in compiled code.
 
-They are read once to count and once to fill arrays of the right size.
+The numbers are read twice: first to count them, then to fill arrays of the right size.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from coupole.kernels import kernel
 OK, NOT_A_NUMBER, TOO_FEW, BAD_CORNER = 0, 1, 2, 3
 _NEWLINE, _SPACE, _TAB, _RETURN = 10, 32, 9, 13
 _DIGITS = 18
-"""More do not fit into a 64-bit integer; further digits are below the resolution of float64."""
+"""Greatest number of digits: more do not fit into a 64-bit integer, and further digits are below the resolution of
+float64."""
 
 
 @kernel
 def line_end(data, at):  # type: ignore[no-untyped-def]
-    """Offset of the newline that ends the line at `at`, or the end of the data."""
+    """Return the offset of the newline that ends the line at `at`, or the end of the data."""
     while at < len(data) and data[at] != _NEWLINE:
         at += 1
     return at
@@ -39,7 +40,7 @@ def token_end(data, at, end):  # type: ignore[no-untyped-def]
 
 @kernel
 def whole(data, at, end):  # type: ignore[no-untyped-def]
-    """The integer at `at`, the offset after it, and whether there was one."""
+    """Return the integer at `at`, the offset after it, and True if there was one."""
     negative = at < end and data[at] == 45
     if at < end and (data[at] == 45 or data[at] == 43):
         at += 1
@@ -52,12 +53,13 @@ def whole(data, at, end):  # type: ignore[no-untyped-def]
 
 @kernel
 def decimal(data, at, end):  # type: ignore[no-untyped-def]
-    """The decimal number at `at` (also nan and inf, as NaN), the offset after it, and whether there was one."""
+    """Return the decimal number at `at` (also nan and inf, as NaN), the offset after it, and True if there was
+    one."""
     stop = token_end(data, at, end)
     negative = at < stop and data[at] == 45
     if at < stop and (data[at] == 45 or data[at] == 43):
         at += 1
-    if at < stop and (data[at] | 32) in (110, 105):  # n of nan, i of inf
+    if at < stop and (data[at] | 32) in (110, 105):  # the n of nan, or the i of inf
         return np.nan, stop, True
     mantissa, digits, exponent, any_digit, after_point = np.int64(0), 0, 0, False, False
     while at < stop:

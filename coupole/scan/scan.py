@@ -31,9 +31,9 @@ _SAMPLE = 1_000_000
 
 @contextmanager
 def new_scan_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder to write into, which is renamed to `folder` on success and removed otherwise.
+    """Make a temporary folder, which is renamed to `folder` on success and removed otherwise.
 
-    Raises InputError if `folder` is there already, StorageError if nothing can be written.
+    Raises InputError if `folder` exists, StorageError if nothing can be written.
     """
     if folder.exists():
         raise InputError(f"--out {folder}: exists already; name a new folder")
@@ -52,9 +52,9 @@ def new_scan_folder(folder: Path) -> Iterator[Path]:
 
 
 def write_scan(scan: Scan, sources: Sequence[Path], unit: str, folder: Path) -> dict[str, Any]:
-    """Write `mesh.ply`, `targets.csv` and `scan.json` into a folder; returns the content of `scan.json`.
+    """Write `mesh.ply`, `targets.csv` and `scan.json` into a folder; return the content of `scan.json`.
 
-    `sources` are the scanner's files, `unit` is the mesh's unit in them. Raises OSError.
+    `sources` are the scanner's files; `unit` is the unit of the mesh in them. Raises OSError.
     """
     summary = {
         "schema_version": 1,
@@ -102,7 +102,7 @@ def _figures(scan: Scan) -> dict[str, Any]:
 
 
 def edges_mm(mesh: Mesh) -> NDArray[np.float64]:
-    """Lengths of the edges of at most a million triangles."""
+    """Return the lengths of the edges of at most a million triangles."""
     some = mesh.triangles[:: max(1, len(mesh.triangles) // _SAMPLE)]
     corners = mesh.vertices[some].astype(np.float64)
     lengths: NDArray[np.float64] = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).reshape(-1)

@@ -21,9 +21,9 @@ from coupole.scan.targets import Targets
 
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "in": 25.4}
 PLAUSIBLE_MM = (2.0, 3000.0)
-"""Diagonal of an object's bounding box: the support is 1.48 m wide."""
+"""Smallest and largest diagonal of an object's bounding box; the support is 1.48 m wide."""
 _TARGETS_BEYOND = 3.0
-"""Targets are on the object or around it, within this many sizes of it."""
+"""Greatest distance of targets from the object, relative to its size."""
 
 Progress = Callable[[str], None]
 
@@ -51,9 +51,9 @@ def read_scan(
 ) -> Scan:
     """Read mesh and targets and check them.
 
-    `unit` is the mesh's (mm, cm, m, um, in), `targets_unit` the table's; without it, the unit in the table, else
-    the mesh's. With `accept_defects` a mesh is accepted although edges have more than two triangles or opposite
-    orientations; these are counted, not repaired. Raises InputError.
+    `unit` is the unit of the mesh (mm, cm, m, um, in). `targets_unit` is that of the table; by default it is the
+    unit named in the table, or that of the mesh. With `accept_defects`, a mesh is accepted although some edges
+    have more than two triangles or opposite orientations; these are counted, not repaired. Raises InputError.
     """
     progress("reading the mesh")
     raw = mesh_files.read_mesh(mesh_path)

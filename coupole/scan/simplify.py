@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 def simplified_mesh(
     vertices_mm: NDArray[np.float64], faces: NDArray[np.int64], faces_at_most: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices [n, 3] and faces [m, 3] of about the same shape with fewer faces: the vertices in each cell of a
-    grid are merged, with cells as large as needed."""
+    """Return vertices [n, 3] and faces [m, 3] of about the same shape with fewer faces: the vertices in each cell
+    of a grid are merged. The cells are as large as necessary."""
     size_mm = float(np.ptp(vertices_mm, axis=0).max(initial=0.0))
     cells, surface = 512, (vertices_mm, faces)
     while len(surface[1]) > faces_at_most:

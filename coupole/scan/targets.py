@@ -19,14 +19,14 @@ from coupole.errors import InputError
 _REMARK = re.compile(r"^\s*(#|//|;|%)")
 _NUMBER = re.compile(r"^[+-]?(\d+([.]\d*)?|[.]\d+)([eE][+-]?\d+)?$")
 _UNIT = re.compile(r"[\[(](?:mm|cm|m|um|µm|in)[\])]|\b(?:mm|cm|um|µm|inch|inches)\b|\bunits?\W+(?:m|in)\b", re.I)
-"""`m` and `in` are words too: they count in brackets, or after `unit`."""
+"""Units in a heading. `m` and `in` are also words, so they count only in brackets or after `unit`."""
 _COLUMNS = {3: "x y z", 4: "name x y z", 6: "x y z nx ny nz", 7: "name x y z nx ny nz"}
 _UNIT_NORMAL_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True)
 class Targets:
-    """Centres [n, 3] in the file's unit; `normals` [n, 3] of length 1 where the file has them."""
+    """Centres [n, 3] in the file's unit, and `normals` [n, 3] of length 1 if the file has them."""
 
     names: tuple[str, ...]
     centers: NDArray[np.float64]
@@ -67,7 +67,7 @@ def _unit(written_unit: str) -> str:
 
 
 def _words(line: str, path: Path, number: int) -> list[str]:
-    """A line's columns. A comma is a decimal comma if another separator is between the columns."""
+    """Return a line's columns. A comma is a decimal comma if another separator is between the columns."""
     text = line.strip()
     if ";" in text or "\t" in text:
         words = [word.strip().replace(",", ".") for word in re.split(r"[;\t]+", text.rstrip(";\t"))]

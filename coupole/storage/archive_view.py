@@ -141,7 +141,8 @@ def _check_records(path: Path, table: NDArray[np.void], frames: list[FrameProven
 
 
 def _write(path: Path, partial: Path, frames: list[FrameProven], codec: Codec, progress: Progress) -> int:
-    """Compress the frames of `path` into a new synced file `partial`; return the bytes that they need there."""
+    """Compress the frames of `path` into a new synced file `partial`; return the number of bytes that they need
+    there."""
     layout, workers = (
         frame_file.read_layout(path),
         (os.cpu_count() or 1) + 1,

@@ -29,8 +29,8 @@ class TextQueue:
     next text that is taken says how many lines were lost. Any thread may use it."""
 
     def __init__(self, most_bytes: int = MOST_BYTES, *, tells: bool = True) -> None:
-        """Make an empty queue. With `tells`, it reports dropped text in its place; a document has `tells`
-        false."""
+        """Make an empty queue. With `tells`, a message takes the place of dropped text. For a document, `tells` is
+        False."""
         self._most_bytes, self._tells = most_bytes, tells
         self._pieces: deque[bytes] = deque()
         self._waiting_bytes = self._taken_bytes = 0  # taken: handed out, not yet with the reader

@@ -25,7 +25,7 @@ INK: Colour = (0.13, 0.15, 0.18)
 
 
 def of_share(share: ArrayLike) -> NDArray[np.float64]:
-    """Return colours [..., 3] of shares [...] from 0 to 1, the same as those of amounts on all pages."""
+    """Return colours [..., 3] of shares [...] from 0 to 1, which are the colours of amounts on all pages."""
     return colours_of(share)
 
 

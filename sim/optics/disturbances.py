@@ -31,7 +31,7 @@ class Spot:
     y: float
     radius: float
     share: float
-    """Transmission of a smudge in its middle, or brightness of a thing over the mean of the picture."""
+    """Transmission of a smudge in its middle, or brightness of a thing relative to the mean of the picture."""
 
     def radius_share(self, shape: tuple[int, int]) -> Electrons:
         """[h, w] distance of each pixel from the middle over the radius."""
@@ -130,7 +130,7 @@ class Disturber:
         return replace(self._lasting, things=tuple(things)) if things else self._lasting
 
     def flux(self, led: int, now_ns: int) -> float:
-        """Return the flux of an LED over its flux without disturbances."""
+        """Return the flux of an LED relative to its flux without disturbances."""
         factor = self._dim.get(led, 1.0)
         for since_ns, warming in self._warming:
             factor *= max(0.0, 1.0 + warming.per_s * max(0.0, (now_ns - since_ns) * 1e-9))

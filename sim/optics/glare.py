@@ -37,11 +37,11 @@ class Glare(BaseModel):
     ghost: Part = 0.05
     """Share of the glare that is a turned picture. The rest is the lobe."""
     core: Annotated[float, Field(gt=0, le=1)] = 0.05
-    """Radius of the lobe's middle, over the picture's width."""
+    """Radius of the lobe's middle, as a share of the picture's width."""
     falls_by: Annotated[float, Field(ge=2, le=5)] = 3.0
     """Power of the distance by which the lobe falls."""
     ghost_blur: Annotated[float, Field(gt=0, le=0.5)] = 0.12
-    """Standard deviation of the ghost's blur, over the picture's width."""
+    """Standard deviation of the ghost's blur, as a share of the picture's width."""
 
     @model_validator(mode="after")
     def _whole(self) -> Glare:

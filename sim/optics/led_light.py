@@ -53,7 +53,7 @@ STEADY = LedModel(flux_spread=0.0, pump_spread_nm=0.0, flux_per_k=0.0, flicker=0
 
 
 def own_flux_factor(model: LedModel, led: int) -> float:
-    """Flux of a new LED at the reference temperature over its tabulated flux; 0 if it is dead."""
+    """Flux of a new LED at the reference temperature, relative to its tabulated flux; 0 if it is dead."""
     if led in model.dead:
         return 0.0
     return float(np.exp(model.flux_spread * _normal(model.seed, _OWN_FLUX, led)))
@@ -81,7 +81,7 @@ class Flashes:
         model's."""
 
     def flux(self, led: int, temperature_c: float) -> float:
-        """Flux of the LED's next flash over its tabulated flux."""
+        """Flux of the LED's next flash, relative to its tabulated flux."""
         self._count += 1
         loose = self.unsteady.get(led, 0.0) * _normal(self._model.seed, _LOOSE, led, self._count)
         flux = led_flux_factor(self._model, led, self._count, temperature_c, hours=self._model.hours_shone)

@@ -62,7 +62,7 @@ class SensorModel:
         return self.full_scale_e / (self.white_dn - self.black_dn)
 
     def dark_factor(self, temperature_c: float) -> float:
-        """Dark current at a temperature over that at `dark_reference_c`."""
+        """Dark current at a temperature, relative to that at `dark_reference_c`."""
         return float(2.0 ** ((temperature_c - self.dark_reference_c) / self.dark_doubling_k))
 
     def channels(self) -> NDArray[np.int64]:

@@ -55,7 +55,7 @@ class LightStranger(BaseModel):
         return np.asarray(tilted_normals / np.linalg.norm(tilted_normals, axis=1, keepdims=True))
 
     def over_cosine(self, emitter: Emitter, points_mm: NDArray[np.float32]) -> NDArray[np.float32]:
-        """[n] factor of the light at points [n, 3] over that of the same flux by the cosine."""
+        """[n] factor of the light at points [n, 3] relative to the light of the same flux by the cosine law."""
         away = points_mm - emitter.centre_mm
         cosine = np.clip(away @ emitter.normal / np.linalg.norm(away, axis=1), _LEAST_COSINE, 1.0)
         return np.asarray(self.intensity(np.degrees(np.arccos(cosine))) / cosine, np.float32)

@@ -167,7 +167,7 @@ class Hand(When):
     at: tuple[Place, Place] = (0.3, 0.4)
     radius: Annotated[float, Field(gt=0, le=1)] = 0.15
     brightness: Annotated[float, Field(ge=0, le=100)] = 0.8
-    """Its brightness over the mean of the picture behind it."""
+    """Its brightness relative to the mean of the picture behind it."""
     sway: Annotated[float, Field(ge=0, le=1)] = 0.03
 
 

@@ -14,8 +14,8 @@ from coupole.plan.registry import settings_class
 from coupole.plan.rig_devices import device_for
 
 CYCLES = {"cycle_ms": "packets", "status_ms": "statuses", "frequency_hz": "samples"}
-"""Settings of drivers that say how often the controller reports. Each has the figure of `Robot.statistics` that
-counts the reports."""
+"""Settings of drivers that state how often the controller reports. The value is the name of the figure of
+`Robot.statistics` that counts these reports."""
 _CYCLE_S = 3.0
 _CYCLE_DEVIATION = 0.05
 """Greatest deviation of the period of the controller's reports, as a share. A larger deviation shows another

@@ -63,7 +63,8 @@ def deviations_deg(
 
 class Normals:
     """Normals times reflectance [3, pixels]. For each pixel it is the least-squares solution of `lights . b =
-    picture` over the `good` lights that reach the pixel. Pixels that fewer than four reach count as black."""
+    picture` over the `good` lights that reach the pixel. Pixels that fewer than four lights reach count as
+    black."""
 
     def __init__(self, pictures: Floats, lights: Floats, lit: NDArray[np.bool_], good: NDArray[np.bool_]) -> None:
         self._pictures, self._lights, self._used = pictures, lights, lit & good[:, None]

@@ -59,7 +59,7 @@ class MeasuredTile:
     u_certified: Floats
     """[places, channels]."""
     residual_ratio: float
-    """Residuals over their stated noise, root mean square."""
+    """Root mean square of the residuals, divided by their stated noise."""
 
 
 def reflectance_of(

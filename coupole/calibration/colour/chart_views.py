@@ -159,7 +159,7 @@ class ChartReader:
         return bool((towards @ normal).min() > _LEAST_COSINE and off_deg.min() > _GLOSS_DEG)
 
     def _light(self, frame: LightFrame) -> Floats:
-        """Return [patches], the irradiance of the frame's LED over its flux; 1 under a panel."""
+        """Return [patches], the irradiance of the frame's LED divided by its flux; 1 under a panel."""
         points, normal = self._points()
         if frame.led is None:
             return np.ones(len(points))

@@ -59,7 +59,7 @@ class Balanced:
         return Balanced(self.signal[keep], self.u[keep], self.xyz[keep], self.u_lab, grey, self.white, light_u)
 
     def white_signal(self) -> Floats:
-        """Signal [3] of the perfect white: the signal of the greys over their Y, weighted by Y."""
+        """Signal [3] of the perfect white: the signal of the greys divided by their Y, weighted by Y."""
         if self.white is not None:
             return self.white
         luminance = self.xyz[list(self.neutral), 1]

@@ -54,7 +54,8 @@ class FoundLight:
 
 def light_basis(centres: Floats) -> Floats:
     """Return [patches, n] for patches at [patches, 2]: two slopes, and three curvatures if there are enough
-    patches. Each has a mean of 0 over the patches. A chart of one row has no slope across it."""
+    patches. Each has a mean of 0 over the patches. For a chart of one row, the slope across the row is not
+    determined."""
     middle, half = (centres.max(axis=0) + centres.min(axis=0)) / 2.0, np.ptp(centres, axis=0) / 2.0
     x, y = ((centres - middle) / np.where(half > 0.0, half, 1.0)).T
     shapes = [x, y] if len(centres) < _LEAST_FOR_CURVES else [x, y, x * x, x * y, y * y]

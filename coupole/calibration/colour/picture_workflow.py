@@ -32,8 +32,8 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 _GAMMA = (0.8, 1.25)
-"""Slopes of the greys' logarithmic signals over their logarithmic luminance that count as linear. They leave room
-for uneven light and stray light; sRGB's slope is 0.45."""
+"""Slopes of the greys' logarithmic signals against their logarithmic luminance that count as linear. They leave
+room for uneven light and stray light; sRGB's slope is 0.45."""
 _LEAST_GREYS, _LEAST_RANGE = 3, 3.0
 """Least number of greys, and least ratio of their luminances, for a test of linearity."""
 _ROUGH = 0.15

@@ -74,8 +74,8 @@ class LedGeometry:
     accepted_mask: NDArray[np.bool_]
     """[k] False for spots left out as gross errors."""
     prior_step: Floats
-    """[free + 6 + k] change of lens, hand-eye and axes, over the standard uncertainties of their record; with
-    the growth of the picture, if it is named."""
+    """[free + 6 + k] changes of lens, hand-eye and axes, divided by the standard uncertainties of their record. If
+    the growth of the picture is a named suspect, its change is included."""
     steps: int
     suspects: tuple[SuspectedShift, ...]
     views: LeftOutViews

@@ -1,4 +1,5 @@
-"""Equations of the LEDs' adjustment: its unknowns, its residuals over the stated noise, and their derivatives."""
+"""Equations of the LEDs' adjustment: its unknowns, its residuals divided by the stated noise, and their
+derivatives."""
 
 from __future__ import annotations
 
@@ -175,7 +176,7 @@ def points_seen(problem: Problem, state: LedState) -> tuple[Floats, Floats, Floa
 
 
 def whitened_residuals(problem: Problem, state: LedState) -> Floats:
-    """Residuals [k, 2] over the stated noise."""
+    """Residuals [k, 2] divided by the stated noise."""
     in_camera = points_seen(problem, state)[2]
     projection = optics.project(in_camera, state.lens)
     computed_px = projection.pixels + _by_modes(problem, state, in_camera, projection) @ state.coefficients

@@ -1,4 +1,5 @@
-"""Views of LEDs left out in turn, without adjusting anew: how each moves the LEDs, and how others predict it.
+"""Views of LEDs left out in turn, without a new adjustment: how each view moves the LEDs, and how well the others
+predict it.
 
 With H the part of the hat matrix that belongs to a view, its residuals would be (I - H)^-1 r if it had been left
 out (as in `cross_validation`), and the LEDs would move by -C J^T (I - H)^-1 r. The sum of the squares of these
@@ -43,7 +44,7 @@ class LeftOutViews:
     """Predictions of the views by each other, and the LEDs' covariance that follows."""
 
     ratios: Floats
-    """[v] root mean square of the prediction error of each view over its standard uncertainty; about 1."""
+    """[v] root mean square of the prediction error of each view divided by its standard uncertainty; about 1."""
     centre_covariance: Floats
     """[n, 3, 3] of the LEDs' centres by the jackknife over views, mm^2."""
 

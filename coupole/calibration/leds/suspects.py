@@ -77,7 +77,8 @@ class SuspectedShift:
 
     @property
     def away(self) -> float:
-        """Shift of the images away from the camera over its standard uncertainty; 0 for a shift towards it."""
+        """Shift of the images away from the camera, divided by its standard uncertainty; 0 for a shift towards
+        it."""
         return max(0.0, -float(self.coefficients[0] / self.u[0])) if self.name == PRIMARY else 0.0
 
     @property
@@ -137,8 +138,8 @@ def shifts_px(
 def judge(
     modes: Sequence[Mode], coefficients: Floats, covariance: Floats, degrees: float
 ) -> tuple[SuspectedShift, ...]:
-    """Judge the suspects by the free estimates [c] of all modes and their covariance [c, c], whose noise is known
-    to so many degrees of freedom."""
+    """Judge the suspects by the free estimates [c] of all modes and their covariance [c, c], whose noise has the
+    given degrees of freedom."""
     suspects = []
     for name in dict.fromkeys(mode.suspect for mode in modes):
         own_modes = [number for number, mode in enumerate(modes) if mode.suspect == name]

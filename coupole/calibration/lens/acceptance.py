@@ -16,8 +16,8 @@ DOUBTS = (
     Allowed("pattern", "lens: error of the model's form, over its uncertainty", 1.0),
     Allowed("predicted", "views left out: prediction error over uncertainty", 1.5),
 )
-"""`pattern` is the root mean square over the field of the change that a richer lens would make, over the standard
-uncertainty of a direction's image. `predicted` is for all views, each of which is left out in turn."""
+"""`pattern` is the root mean square over the field of the change that a richer lens would make, divided by the
+standard uncertainty of a direction's image. `predicted` is for all views, each of which is left out in turn."""
 CAMERA = (*IMAGES, *DOUBTS, Allowed("ray_px", "uncertainty at the field's corners", 0.5, "px"))
 """`ray_px` is the standard uncertainty of the image of a direction at the field's corners."""
 HAND_EYE = (

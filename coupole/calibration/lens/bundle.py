@@ -80,7 +80,7 @@ class HandEyeCalibration:
     components: tuple[Component, ...]
     """[groups]."""
     board_scale: float
-    """Relative excess of the board's size over its description."""
+    """Relative excess of the board's size, compared with its description."""
     axis_zeros_deg: Floats
     """[axes] true minus reported angles; empty if axes were not known."""
     pose_errors: Floats

@@ -36,7 +36,8 @@ _ROUNDS = 3
 _LEAST_CORNERS = (12, 30, 60)
 """Least number of corners for an asymmetry that is constant, linear, or quadratic over the image."""
 _CLEAR = 3.0
-"""Least decrease of the squared residuals for an asymmetry, over their variance and the number of coefficients."""
+"""Least decrease of the squared residuals for an asymmetry, divided by their variance and the number of
+coefficients."""
 _FLOOR_PX = 3e-4
 """Error of the fit without noise if the blur is symmetric: rms, from `tools/prove_corners.py`."""
 _SKEW_LEFT = 0.17

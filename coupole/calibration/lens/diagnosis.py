@@ -44,7 +44,7 @@ class Disagreement:
     distance_mm: float
     angle_deg: float
     sigmas: float
-    """Largest difference of the six components, over its uncertainty."""
+    """Largest difference of the six components, divided by its uncertainty."""
     beyond_noise: bool
     """True if they differ by more than the noise of the poses explains."""
 

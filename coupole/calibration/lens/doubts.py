@@ -48,8 +48,8 @@ class Doubts:
     field: Field
     predictions: LeftOut
     pattern: float
-    """Root mean square over the field of the part of the true lens that the lens's form cannot follow, over the
-    standard uncertainty of a direction's image by the record's lens."""
+    """Root mean square over the field of the part of the true lens that the lens's form cannot follow, divided by
+    the standard uncertainty of a direction's image by the record's lens."""
 
     @property
     def sigma_px(self) -> float:

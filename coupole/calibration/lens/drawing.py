@@ -100,7 +100,7 @@ def _draw_images(ax: Axes, lens_report: Shown) -> None:
 
 
 def _draw_distribution(ax: Axes, lens_report: Shown) -> None:
-    """Draw the residuals over their noise, beside the normal distribution."""
+    """Draw the residuals divided by their noise, beside the normal distribution."""
     normal = np.concatenate(lens_report.residuals_px).ravel() / max(lens_report.pixel_px, 1e-12)
     grid = np.linspace(-4.5, 4.5, 181)
     ax.hist(np.clip(normal, -4.5, 4.5), bins=60, density=True, color=GREY, range=(-4.5, 4.5))

@@ -245,5 +245,6 @@ def _robust_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float,
 
 
 def warmth_of(temperature_c: float, reference_c: float | None, doubling_k: float) -> float:
-    """Return the dark current at a temperature over that at the reference; 1 if this is not known."""
+    """Return the dark current at a temperature, relative to that at the reference temperature; 1 if this is not
+    known."""
     return 1.0 if reference_c is None else float(2.0 ** ((temperature_c - reference_c) / doubling_k))

@@ -41,7 +41,7 @@ class Reading:
     """Temperature of the LED's board minus its temperature when the power was calibrated; NaN if one of them is
     not known."""
     ratio: float
-    """Measured signal over that expected from the LED's calibrated power."""
+    """Measured signal, relative to that expected from the LED's calibrated power."""
     u_ratio: float
     """Standard uncertainty of the ratio, from noise and from the LED's own calibration."""
     by_shared: tuple[float, ...] = ()
@@ -177,8 +177,8 @@ def _refuse_few(readings: Sequence[Reading]) -> None:
 
 
 def _excess(residuals: Floats, noise: Floats) -> float:
-    """Return the estimated over the stated noise, from the median of neighbours' differences. A single step hardly
-    changes it."""
+    """Return the ratio of the estimated to the stated noise, from the median of neighbours' differences. A single
+    step hardly changes it."""
     differences = np.abs(np.diff(residuals)) / np.hypot(noise[1:], noise[:-1])
     return max(1.0, float(np.median(differences) * 1.4826))
 
@@ -196,7 +196,7 @@ def _odd(residuals: Floats, noise: Floats) -> NDArray[np.bool_]:
 
 def _refuse_sudden(names: Sequence[str], residuals: Floats, noise: Floats) -> None:
     """Raise InputError if the level of the readings has a step. The test uses the largest difference of the means
-    before and after, over its noise."""
+    before and after, divided by its noise."""
     weight = (_excess(residuals, noise) * noise) ** -2.0
     before, sums = np.cumsum(weight)[:-1], np.cumsum(weight * residuals)[:-1]
     after, rest = weight.sum() - before, (weight * residuals).sum() - sums

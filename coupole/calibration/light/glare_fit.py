@@ -40,8 +40,8 @@ U_NEAR = 0.15
 than the rims of the traps, where blur hides it. For a lobe with half of its core there, the result was 13 % too
 small."""
 _LEAST_SPREAD = 0.35
-"""Least extent of the traps' positions, over the picture's width. Traps in one place do not show the glare in
-other places."""
+"""Least extent of the traps' positions, as a share of the picture's width. Traps in one place do not show the
+glare in other places."""
 _LEAST_VEIL = 1e-6
 """Least veil, as a share of white, for a relative error. A fit without a view may predict no veil, and a relative
 error of nothing does not exist."""

@@ -74,8 +74,8 @@ class LedPower:
         return total
 
     def u_against_mean(self) -> Floats:
-        """Relative standard uncertainty [n] of an LED's power over the mean of all LEDs. The common scale does not
-        count."""
+        """Relative standard uncertainty [n] of an LED's power relative to the mean of all LEDs. The common scale
+        does not count."""
         off = self.common - np.nanmean(self.common[self.power > 0], axis=0)
         together = np.einsum("ni,ij,nj->n", off, self.common_covariance, off)
         total: Floats = np.sqrt(self.u_own**2 + together)

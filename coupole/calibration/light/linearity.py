@@ -112,14 +112,14 @@ class _Fit:
     covariance: Floats
     """[3, 3] of c2, c3 and the time offset in ms."""
     residuals: Floats
-    """Residuals of the unsaturated signals over their uncertainties."""
+    """Residuals of the unsaturated signals, divided by their uncertainties."""
     deviations: Floats
     """[groups, exposures] relative deviations of the uncorrected signals from a line."""
 
 
 def _fit(signals: Floats, u_signals: Floats, exposures: Floats, range_dn: float, flicker: float) -> _Fit:
-    """Fit the curve, the time offset (ms), the logarithm of each group's rate over its start, and the relative
-    light of each exposure."""
+    """Fit the curve, the time offset (ms), the logarithm of each group's rate relative to its start, and the
+    relative light of each exposure."""
     is_known = np.isfinite(signals)
     start = np.nanmedian(signals / exposures, axis=1)
     scatter = max(flicker / np.sqrt(2.0), 1e-6)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 WIDTHS: dict[str, float] = {"even": np.inf, "turned": 0.1, "wide": 0.2, "middle": 0.08, "near": 0.03}
-"""Standard deviation of each part over the picture's width. Infinite means the same everywhere."""
+"""Standard deviation of each part, as a share of the picture's width. Infinite means the same everywhere."""
 TURNED = "turned"
 """The part of the picture that is turned about its middle: light that goes from the sensor to a face of the lens
 and back."""

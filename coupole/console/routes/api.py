@@ -111,8 +111,8 @@ def _add_cell(app: FastAPI, service: Service) -> None:
 
     @app.post("/api/v1/queue", responses=REFUSALS)
     async def add(new_entry: NewEntry, person: Who, request: Request) -> Entry:
-        """Enter a plan, a run to be resumed, or a hold. The answer comes after the preflight. An entry that cannot
-        be run, or not with all running and waiting entries before it, is refused with all its problems."""
+        """Enter a plan, a run to be resumed, or a hold. The answer comes after the preflight. An entry is refused
+        with all its problems if it cannot be run, or if it cannot be run after the entries before it."""
         allow(service, person, Role.OPERATOR, "queue", acts=True)
         request.state.about = new_entry.plan or new_entry.resume or new_entry.hold
         here = is_command_line(request)

@@ -1,5 +1,5 @@
-"""Planes of coefficients of each pixel, computed from its values under lights, and the viewers' pictures from
-them.
+"""Planes of coefficients: computed for each pixel from its values under lights; and the pictures that viewers
+compute from them.
 
 Viewers show the sums unchanged; therefore values are encoded for displays (sRGB) before the fit.
 """

@@ -63,10 +63,10 @@ class Coefficients:
     covariance: Array
     """[n, 2, 2] covariance of K and S."""
     chi2: Array
-    """[n], squared residuals over their variances. The expected value is the number of spectra minus 2."""
+    """[n], squared residuals divided by their variances. The expected value is the number of spectra minus 2."""
     unlike: Array
-    """[n], squared differences of the spectra from their mean, or from their grounds if that is less, over the
-    noise's variance. They are near 0 for films that hide their ground, and for nearly invisible films."""
+    """[n], squared differences of the spectra from their mean, or from their grounds if that is less, divided by
+    the noise's variance. They are near 0 for films that hide their ground, and for nearly invisible films."""
     spectra: int
 
     @property

@@ -39,7 +39,7 @@ class Deserved:
 
 @dataclass(frozen=True)
 class GrainRatio:
-    """Mean grain size of one grinding over that of another."""
+    """Mean grain size of one grinding, relative to that of another."""
 
     ratio: float
     u_ratio: float

@@ -1,10 +1,10 @@
 """The recipe of a colour: shares of paints with an opaque mixture that matches a target (Duncan 1949).
 
-K and S of a mixture are sums by share. Subsets of the palette are compared by the linear problem sum c_i (K_i - Q
-S_i) = 0, where Q is the target's K/S; it is weighted so that its residuals are those of measured reflectance. The
-best few subsets are refined by least squares on the measured reflectance itself, with shares that are not
-negative. If there are at most `_EXHAUSTIVE` subsets of a size, all are tried. Otherwise the best subset grows
-paint by paint, with exchanges.
+K and S of a mixture are the sums of those of its paints, weighted by the shares. Subsets of the palette are
+compared by the linear problem sum c_i (K_i - Q S_i) = 0, where Q is the target's K/S; it is weighted so that its
+residuals are those of measured reflectance. The best few subsets are refined by least squares on the measured
+reflectance itself, with shares that are not negative. If there are at most `_EXHAUSTIVE` subsets of a size, all
+are tried. Otherwise the best subset grows paint by paint, with exchanges.
 """
 
 from __future__ import annotations
@@ -213,7 +213,7 @@ class _Problem:
         return float(np.mean((self._mixture_reflectance(subset, shares) - self.target) ** 2))
 
     def refined_shares(self, subset: tuple[int, ...]) -> tuple[float, tuple[int, ...], Array]:
-        """Squared residuals over their variances, and shares that are not negative."""
+        """Squared residuals divided by their variances, and shares that are not negative."""
         from scipy.optimize import least_squares
 
         if len(subset) == 1:

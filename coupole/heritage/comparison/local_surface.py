@@ -22,8 +22,8 @@ FREEDOM = 3 * _FREEDOM_ALONE
 """Degrees of freedom of a scatter. Neighbouring fits share most of their points, which limits this number."""
 _BATCH = 50_000
 _MOST_BESIDE = 0.6
-"""Largest distance of the neighbours' middle from the place, over their extent. If it is larger, the place is at a
-rim, where the surface ends."""
+"""Largest distance of the neighbours' middle from the place, relative to their extent. If it is larger, the place
+is at a rim, where the surface ends."""
 _LEAST_COSINE, _BESIDE_LINE, _NEXT_TO_LINE = 0.5, 2.0, 6
 """Least cosine between normals, largest distance in spacings, and number of points. A surface is seen at a place
 if a point with a similar normal lies near the line along the place's normal, and if the points next to this line

@@ -104,8 +104,8 @@ class Powers:
 
 @dataclass(frozen=True)
 class Drift:
-    """Power of the LEDs over their calibrated power: its logarithm is level + rate_per_h (t - start_s) / 3600 +
-    per_k dT."""
+    """Power of the LEDs, relative to their calibrated power: its logarithm is level + rate_per_h (t - start_s) /
+    3600 + per_k dT."""
 
     level: float = 0.0
     rate_per_h: float = 0.0

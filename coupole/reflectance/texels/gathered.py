@@ -28,7 +28,7 @@ from coupole.reflectance.triangle_fit import TriangleMaterials
 Floats = NDArray[np.float64]
 
 _REACH = 3.0
-"""Largest distance of a place from the place that a neighbouring pixel sees, over the median distance of
+"""Largest distance of a place from the place that a neighbouring pixel sees, relative to the median distance of
 neighbouring pixels. Beyond it, the pixel sees something in front of the place."""
 _BLOCK, _PART = 1 << 20, 1 << 15
 """Number of places that are looked up together, and number in one part for a thread."""

@@ -143,9 +143,9 @@ def _pixels_of(
 def colours_of(
     values: Singles, places_mm: Singles, lights: Lights, fit: PixelMaterials, shine: Floats, threads: int | None
 ) -> tuple[Floats, Floats]:
-    """[n, channels] logarithms of kd over the mean of the channels, for texels with fits, and their standard
-    uncertainty [n], mean of channels. `values` are [n, channels, leds of the view]; `shine` [n, channels] is ks
-    over the channels' mean. NaN without a fit."""
+    """[n, channels] logarithms of kd relative to the mean of the channels, for texels with fits, and their
+    standard uncertainty [n], mean of channels. `values` are [n, channels, leds of the view]; `shine` [n, channels]
+    is ks over the channels' mean. NaN without a fit."""
     count, channels = values.shape[:2]
     kd, u_kd = np.full((count, channels), np.nan), np.full((count, channels), np.nan)
     grey = np.exp(fit.logs)

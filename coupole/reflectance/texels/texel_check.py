@@ -83,8 +83,8 @@ def _psnr_db(parts: list[NDArray[np.float64]], peak: float) -> float | None:
 
 
 def texel_widening(result: RunResult, say: Said = silent) -> dict[str, Any] | None:
-    """Return quantiles of the errors of pictures over their stated uncertainty, in the form of `result.json` for
-    fits. They come from every second left-out LED; None from too few pixels."""
+    """Return quantiles of the errors of pictures, divided by their stated uncertainty, in the form of
+    `result.json` for fits. They come from every second left-out LED; None from too few pixels."""
     samples = WideningSamples()
     for number, view in enumerate(result.views, start=1):
         _add_errors(samples, result, view)

@@ -1,1 +1,1 @@
-"""Many scans of one object with unknown poses: matched, checked, adjusted together, merged."""
+"""Registration of many scans of one object with unknown poses: matching, checks, joint adjustment, merging."""

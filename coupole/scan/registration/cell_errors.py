@@ -1,9 +1,10 @@
-"""Errors of overlaps, by cells of space: what the points of a cell have in common does not average out.
+"""Errors of overlaps, summed over cells of space, because errors that the points of a cell share do not average
+out.
 
-The covariance of a fit is that of sums over cells (a sandwich, clustered: Liang, Zeger, Biometrika 73(1), 1986).
-Where there are about as many parameters as cells, the fit absorbs much of their errors; each sum is taken as it
-would be if the fit had not seen its cell (CR3, the jackknife by clusters: Bell, McCaffrey, Survey Methodology
-28(2), 2002).
+The covariance of a fit is that of sums over cells (a sandwich estimator, clustered: Liang, Zeger, Biometrika
+73(1), 1986). If there are about as many parameters as cells, the fit absorbs much of their errors. Therefore each
+sum is computed as if the fit had not seen its cell (CR3, the jackknife by clusters: Bell, McCaffrey, Survey
+Methodology 28(2), 2002).
 """
 
 from __future__ import annotations
@@ -24,17 +25,17 @@ class Overlap:
     first: int
     second: int
     derivatives: Floats
-    """[n, 12] of the distances, by steps of the first and of the second scan."""
+    """[n, 12] derivatives of the distances with respect to steps of the first and of the second scan."""
     off_mm: Floats
-    """[n] distances along the normals of the first."""
+    """[n] distances along the normals of the first scan."""
     points_mm: Floats
     """[n, 3]"""
     nearest_mm: Floats
-    """[n] from point to point."""
+    """[n] distances to the nearest point of the first scan."""
 
     @property
     def columns(self) -> NDArray[np.intp]:
-        """[12] columns of both scans' steps among the steps of all scans."""
+        """[12] columns of both scans' steps in the steps of all scans."""
         return np.concatenate([6 * scan + np.arange(6) for scan in (self.first, self.second)])
 
 
@@ -52,10 +53,10 @@ class _CellPart:
 def gradient_covariance(
     overlaps: Sequence[Overlap], weights: Sequence[Floats], inverse_normal: Floats, cell_mm: float
 ) -> Floats:
-    """Covariance [6 n, 6 n] of the gradient of all overlaps, by its sums over cells of `cell_mm`.
+    """Return the covariance [6 n, 6 n] of the gradient of all overlaps, from its sums over cells of `cell_mm`.
 
-    `weights`: [points] of each overlap, by which its squared distances count. `inverse_normal`: [6 n, 6 n], zero
-    for a scan that stands still.
+    `weights` are the weights [points] of the squared distances of each overlap. `inverse_normal` is [6 n, 6 n],
+    with zeros for a fixed scan.
     """
     covariance = np.zeros_like(inverse_normal)
     if not overlaps:

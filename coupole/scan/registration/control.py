@@ -1,8 +1,8 @@
-"""Targets in scans (spheres, stickers, a station of a traverse) and control points: read, matched, weighed.
+"""Targets in scans (spheres, stickers, a station of a traverse) and control points: read, matched, weighted.
 
-A table of targets has a line for each sighting: the scan, the target's name, x, y and z in that scan's frame,
-and the standard uncertainty of each in mm. A table of control points has name, x, y, z and uncertainty in the
-site's frame. A station of a traverse is a target at the place of the scanner in its own scan, mostly 0, 0, 0.
+A table of targets has a line for each sighting: the scan, the target's name, x, y and z in that scan's frame, and
+the standard uncertainty of each in mm. A table of control points has name, x, y, z and uncertainty in the site's
+frame. A station of a traverse is a target at the position of the scanner in its own scan, usually 0, 0, 0.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ _TARGET_COLUMNS = ("scan", "name", "x", "y", "z", "u_mm")
 _CONTROL_COLUMNS = ("name", "x", "y", "z", "u_mm")
 LEAST_TARGETS = 3
 _THINNEST = 0.02
-"""Least extent of targets across their line, over that along it: they must not lie on a line."""
+"""Least extent of targets across a line through them, relative to the extent along it; targets must not lie on a
+line."""
 _SIGMAS = 6.0
-"""Beyond so many standard uncertainties two sightings are not of the same target."""
+"""Greatest difference, in standard uncertainties, between two sightings of the same target."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class ControlPoint:
-    """A target whose place in the site's frame is known."""
+    """A target with a known position in the site's frame."""
 
     point_mm: Floats
     u_mm: float
@@ -62,11 +63,11 @@ class Sightings:
 
     @property
     def is_anchored(self) -> bool:
-        """True if control points determine where the scans are."""
+        """True if control points determine the positions of the scans."""
         return self.control is not None
 
     def of_scans(self, scans: Sequence[int]) -> Sightings:
-        """Return the sightings of some scans, which are numbered anew in this order."""
+        """Return the sightings of some scans, renumbered in this order."""
         place = {scan: k for k, scan in enumerate(scans)}
         sightings = tuple(
             replace(sighting, scan=place[sighting.scan]) for sighting in self.sightings if sighting.scan in place
@@ -82,7 +83,7 @@ class Sightings:
         return sightings_of
 
     def site_from_common(self, poses: Sequence[Floats]) -> Floats:
-        """4x4 that brings sightings of control points onto these, by least squares."""
+        """Return the 4x4 transform that maps sightings of control points to these points, by least squares."""
         assert self.control is not None
         control_sightings = [sighting for sighting in self.sightings if sighting.name in self.control]
         return motion_of_points(
@@ -93,8 +94,8 @@ class Sightings:
         )
 
     def normal_equations(self, poses: Sequence[Floats], pivots: Floats) -> tuple[Floats, Floats]:
-        """Return the targets' part of the equations: [6 n, 6 n] and [6 n] of steps about pivots; the targets' own
-        places are eliminated."""
+        """Return the targets' part of the equations: [6 n, 6 n] and [6 n] for steps about pivots. The targets' own
+        positions are eliminated."""
         normal, gradient = np.zeros((6 * len(poses),) * 2), np.zeros(6 * len(poses))
         for name, several in self.by_name().items():
             control = (self.control or {}).get(name)
@@ -118,7 +119,7 @@ class Sightings:
         return normal, gradient
 
     def with_distances(self, poses: Sequence[Floats]) -> tuple[Sighting, ...]:
-        """All sightings with their distances from the targets' adjusted places."""
+        """Return all sightings with their distances from the targets' adjusted positions."""
         sightings = []
         for name, several in self.by_name().items():
             control = (self.control or {}).get(name)
@@ -131,14 +132,14 @@ class Sightings:
 
 
 def _rows(arm_mm: Floats) -> Floats:
-    """[3, 6] derivative of a place by a step about a pivot that is `arm_mm` away."""
+    """[3, 6] derivative of a position with respect to a step about a pivot that is `arm_mm` away."""
     x, y, z = arm_mm
     return np.array([[1, 0, 0, 0, z, -y], [0, 1, 0, -z, 0, x], [0, 0, 1, y, -x, 0]], dtype=np.float64)
 
 
 def motions_by_targets(sightings: Sightings) -> list[PairMotion]:
-    """Motions between scans that share three targets or more that are not on a line. Raises InputError if names
-    that two scans share cannot be of the same targets."""
+    """Return motions between scans that share at least three targets not on a line. Raises InputError if targets
+    with the same name in two scans cannot be the same target."""
     of_scan: dict[int, dict[str, Sighting]] = defaultdict(dict)
     for sighting in sightings.sightings:
         of_scan[sighting.scan][sighting.name] = sighting
@@ -187,7 +188,7 @@ NO_TARGETS = TargetTables()
 
 
 def read_sightings(tables: TargetTables, names: Sequence[str], unit: str) -> Sightings:
-    """Read both tables; `names` are the scans', in order. Raises InputError with the line."""
+    """Read both tables; `names` are the names of the scans, in order. Raises InputError with the line."""
     targets, control = tables.targets, tables.control
     if control is not None and targets is None:
         raise InputError(

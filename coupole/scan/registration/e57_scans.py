@@ -1,4 +1,4 @@
-"""Scans of an E57 (ASTM E2807), in metres as the standard has it, by pye57 (libE57Format)."""
+"""Scans of an E57 (ASTM E2807), in the standard's unit (metres), by pye57 (libE57Format)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _INVALID = ("cartesianInvalidState", "sphericalInvalidState")
 
 
 def e57_sources(path: Path) -> list[ScanSource]:
-    """The scans of a file. Raises InputError, ExtraMissing."""
+    """Return the scans of a file. Raises InputError, ExtraMissing."""
     with _open_e57(path) as file:
         count = file.scan_count
     if count == 0:
@@ -32,7 +32,7 @@ def e57_sources(path: Path) -> list[ScanSource]:
 
 
 def read_e57(source: ScanSource, *, colours: bool) -> ScanContent:
-    """One scan, without the points that it marks as invalid. Raises InputError, ExtraMissing."""
+    """Read one scan, without the points that it marks as invalid. Raises InputError, ExtraMissing."""
     with _open_e57(source.path) as file:
         header = file.get_header(source.number)
         fields = header.point_fields
@@ -78,7 +78,7 @@ def _columns(file: Any, header: Any, names: list[str]) -> dict[str, NDArray[np.f
 
 
 def _srgba(header: Any, columns: dict[str, NDArray[np.float64]]) -> NDArray[np.uint8]:
-    """[n, 4] by the limits that the file states, else of 0 to 255."""
+    """[n, 4] colours, scaled by the limits that the file states; by default, the limits are 0 and 255."""
     levels = []
     for name in _COLOURS:
         low, high = 0.0, 255.0
@@ -103,7 +103,7 @@ def _pose(source: ScanSource, header: Any) -> NDArray[np.float64]:
 
 
 def _cartesian(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[n, 3] of range, azimuth and elevation."""
+    """[n, 3] coordinates from range, azimuth and elevation."""
     away, azimuth, elevation = places.T
     flat = away * np.cos(elevation)
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), away * np.sin(elevation)], axis=1)

@@ -8,7 +8,7 @@ from coupole.errors import ExtraMissing
 
 
 def registration_libraries() -> tuple[Any, Any]:
-    """`small_gicp` and `kiss_matcher`. Raises ExtraMissing."""
+    """Return `small_gicp` and `kiss_matcher`. Raises ExtraMissing."""
     try:
         import kiss_matcher
         import small_gicp

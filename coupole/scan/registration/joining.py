@@ -1,8 +1,8 @@
-"""Scans joined to groups by the motions between pairs; a motion that others contradict is rejected.
+"""Joins scans to groups by the motions between pairs, and rejects a motion that others contradict.
 
-As Kruskal's spanning tree, the strongest motion first, but with a vote: all motions between two groups are
-compared, those that agree stand together, and the best supported place of one group in the other counts. It is
-taken only if no scan of one group then lies in the space that a scanner of the other saw through.
+As in Kruskal's spanning tree, the strongest motion comes first, but there is a vote: all motions between two
+groups are compared, and the position of one group in the other with the most support is used. It is accepted only
+if no scan of one group then lies in the space that a scanner of the other saw through.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from coupole.scan.registration.small_motions import displacement_mm, inverse_of,
 from coupole.scan.registration.viewpoint import Floats
 
 AGREEMENT_PITCHES = 3.0
-"""Two motions agree if they bring a scan's points to places within so many cells of the coarse grid."""
+"""Two motions agree if their positions of a scan's points differ by at most this number of cells of the coarse
+grid."""
 _MOST_CROSS_CHECKS, _FEW_CHECKS, _EVERY = 300, 30, 5
-"""Greatest number of pairs of scans of two groups that are checked; number of pairs from which on not each point
-is
-checked; step in points then."""
+"""Greatest number of pairs of scans of two groups that are checked; number of pairs above which only some points
+are checked; step between these points."""
 
 
 @dataclass
 class Groups:
-    """Groups of scans with known places in each other, and which motions they rest on."""
+    """Groups of scans with known poses relative to each other, and the motions on which the poses rest."""
 
     group_from_scan: list[Floats]
-    """Transform of each scan, 4x4 mm, into the frame of its group's first scan."""
+    """Transform of each scan, 4x4 mm, to the frame of its group's first scan."""
     members: dict[int, list[int]]
     group_of: list[int]
     accepted_motions: list[PairMotion] = field(default_factory=list)
@@ -43,13 +43,13 @@ class Groups:
         return np.asarray(inverse_of(self.group_from_scan[first]) @ self.group_from_scan[second])
 
     def agrees(self, scans: Sequence[PreparedScan], motion: PairMotion) -> bool:
-        """Tell whether a motion between two scans of one group agrees with the places that they have already."""
+        """Tell whether a motion between two scans of one group agrees with the present poses of these scans."""
         predicted_motion = self.predicted_motion(motion.first, motion.second)
         return predicted_motion is not None and _agree(scans, motion, predicted_motion)
 
 
 def join(scans: Sequence[PreparedScan], motions: Sequence[PairMotion]) -> Groups:
-    """Groups by motions in any order."""
+    """Return the groups that the motions, in any order, give."""
     count = len(scans)
     groups = Groups([np.eye(4) for _ in scans], {k: [k] for k in range(count)}, list(range(count)))
     waiting = sorted(motions, key=lambda motion: -motion.fit.places * motion.fit.overlap)
@@ -80,7 +80,7 @@ def _agree(scans: Sequence[PreparedScan], motion: PairMotion, predicted_motion: 
 def _merge(
     scans: Sequence[PreparedScan], groups: Groups, group: int, other_group: int, motions: Sequence[PairMotion]
 ) -> None:
-    """Place a group in another as most of the motions between them say, or reject these."""
+    """Place a group in another by the majority of the motions between them, or reject these motions."""
     places = [_place(groups, group, motion) for motion in motions]
     supporters = [
         [m for m in motions if _agree(scans, m, _between(groups, group, m, one_from_other))]
@@ -103,7 +103,7 @@ def _merge(
 
 
 def _place(groups: Groups, group: int, motion: PairMotion) -> Floats:
-    """The place of the other group in group `group` by a motion between scans of both."""
+    """Return the pose of the other group in group `group` by a motion between scans of both."""
     first, second, first_from_second = motion.first, motion.second, motion.first_from_second
     if groups.group_of[first] != group:
         first, second, first_from_second = second, first, inverse_of(first_from_second)
@@ -112,7 +112,7 @@ def _place(groups: Groups, group: int, motion: PairMotion) -> Floats:
 
 
 def _between(groups: Groups, group: int, motion: PairMotion, one_from_other: Floats) -> Floats:
-    """`first_from_second` of a motion's scans, if the other group is placed so in group `group`."""
+    """Return `first_from_second` of a motion's scans if the other group has this pose in group `group`."""
     whole = one_from_other if groups.group_of[motion.first] == group else inverse_of(one_from_other)
     first, second = groups.group_from_scan[motion.first], groups.group_from_scan[motion.second]
     return np.asarray(inverse_of(first) @ whole @ second)
@@ -121,13 +121,13 @@ def _between(groups: Groups, group: int, motion: PairMotion, one_from_other: Flo
 def _contradict(
     scans: Sequence[PreparedScan], groups: Groups, group: int, other_group: int, one_from_other: Floats
 ) -> bool:
-    """True if a scan of one group lies in the space that a scan of the other saw through."""
+    """True if a scan of one group lies in the space that a scanner of the other saw through."""
     pairs = [(a, b) for a in groups.members[group] for b in groups.members[other_group]]
     if len(pairs) > _MOST_CROSS_CHECKS:
         picks = np.random.default_rng(0).choice(len(pairs), _MOST_CROSS_CHECKS, replace=False)
         pairs = [pairs[k] for k in picks]
     every = 1 if len(pairs) < _FEW_CHECKS else _EVERY
-    slack = 1.0 + len(pairs) ** 0.25  # poses of groups that were not adjusted yet have drifted
+    slack = 1.0 + len(pairs) ** 0.25  # poses of groups that are not adjusted yet have accumulated errors
     for a, b in pairs:
         first_from_second = inverse_of(groups.group_from_scan[a]) @ one_from_other @ groups.group_from_scan[b]
         near_mm = 0.7 * scans[a].coarse.pitch_mm * slack
@@ -139,7 +139,7 @@ def _contradict(
 
 
 def spheres_meet(first_scan: PreparedScan, second_scan: PreparedScan, one_from_other: Floats) -> bool:
-    """Tell whether two scans' bounding spheres meet: only then they may overlap."""
+    """Tell whether the bounding spheres of two scans meet; only then the scans may overlap."""
     (middle_one, radius_one), (middle_other, radius_other) = first_scan.coarse.sphere, second_scan.coarse.sphere
     apart = np.linalg.norm(moved_points(one_from_other, middle_other[None])[0] - middle_one)
     return bool(apart < radius_one + radius_other)

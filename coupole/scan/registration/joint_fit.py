@@ -1,9 +1,10 @@
-"""All scans adjusted together: every overlap, targets and control points in one least squares, with covariances.
+"""Adjustment of all scans together: one least-squares fit of all overlaps, targets and control points, with
+covariances.
 
-Points of one scan are compared with the surface of another along its normals (Chen, Medioni, 1992), for all
-pairs that overlap at once, so that errors do not add up along chains (Bergevin et al., PAMI 18(5), 1996).
-Neighbouring points have errors in common, and a point counts in every pair of its scan; so the covariance is
-that of sums over cells of space, not over points (`cell_errors`).
+Points of one scan are compared with the surface of another along its normals (Chen, Medioni, 1992). This is done
+for all overlapping pairs at once, so that errors do not accumulate along chains (Bergevin et al., PAMI 18(5),
+1996). Neighbouring points have errors in common, and a point counts in every pair of its scan. Therefore the
+covariance is computed from sums over cells of space, not over points (`cell_errors`).
 """
 
 from __future__ import annotations
@@ -29,12 +30,13 @@ _MOST_ROUNDS, _LEAST_ROUNDS = 20, 2
 _SETTLED_PITCHES = 3e-3
 _SAME_SIDE = 0.7
 _BESIDE_PITCHES = 0.7
-"""Greatest distance beside the nearest point, over the pitch: farther away is a rim, where no surface is."""
+"""Greatest lateral distance from the nearest point, relative to the pitch. A point farther away lies beyond a rim,
+where there is no surface."""
 _STEEP = 0.5
-"""Least cosine of incidence: beyond 60 degrees from a surface's normal, a scanner's errors grow."""
+"""Least cosine of incidence, because a scanner's errors grow beyond 60 degrees from a surface's normal."""
 _HUBER = 2.0
 _CELLS_ACROSS = 12
-"""Cells of space along the size of a scan, over each of which errors may have something in common."""
+"""Number of cells of space along the size of a scan; errors within a cell may be correlated."""
 _LEAST_PAIRS = 30
 
 
@@ -47,19 +49,20 @@ class JointFit:
     covariance: Floats
     """[6 n, 6 n] of steps (mm, rad) about the pivots, in the common frame; zero for the fixed scan."""
     overlap_covariance: Floats
-    """[6 n, 6 n] part of it by errors of overlaps; the rest is by targets, control points, sizes of scans."""
+    """[6 n, 6 n] part of the covariance from errors of overlaps; the rest is from targets, control points and
+    sizes of scans."""
     pivots_mm: Floats
     """[n, 3] middle of each scan in the common frame."""
     noise_mm: float
-    """Noise of one distance between two surfaces: robust standard deviation."""
+    """Noise of one distance between two surfaces, as robust standard deviation."""
     rms_mm: float
     """Root mean square of the distances along normals, over all overlaps."""
     median_nearest_mm: float
-    """Median distance from points to the nearest ones of other scans, over all overlaps."""
+    """Median distance from points to the nearest points of other scans, over all overlaps."""
     inflation: float
-    """Standard uncertainties over those that independent errors of all points would give."""
+    """Standard uncertainties, relative to those that independent errors of all points would give."""
     sightings: tuple[Sighting, ...]
-    """Targets, with what is left of them."""
+    """Targets, with their residuals."""
 
 
 def adjust(
@@ -70,15 +73,17 @@ def adjust(
     sightings: Sightings,
     say: Say,
 ) -> JointFit:
-    """Poses of scans from poses that are about right; `pairs` are numbers of scans that overlap. The scan
-    `fixed_scan` stays where it is, unless there are control points. Raises InputError if nothing overlaps."""
+    """Adjust the poses of scans, which must be approximately right; `pairs` are numbers of scans that overlap.
+
+    The scan `fixed_scan` stays fixed, unless there are control points. Raises InputError if nothing overlaps.
+    """
     poses = [np.array(pose) for pose in common_from_scan]
     if sightings.is_anchored:
         onto = sightings.site_from_common(poses)
         poses = [onto @ pose for pose in poses]
     inflation = 1.0
     poses, state = _settled_poses(scans, pairs, poses, fixed_scan, sightings, inflation, say)
-    if sightings.sightings and state.overlaps:  # what a point weighs against a target is known only now
+    if sightings.sightings and state.overlaps:  # the weight of a point relative to a target is known only now
         inflation = state.inflation()
         poses, state = _settled_poses(scans, pairs, poses, fixed_scan, sightings, inflation, say)
     every = np.concatenate([o.off_mm for o in state.overlaps] or [np.zeros(1)])
@@ -107,7 +112,7 @@ class _State:
     noise_mm: float
     targets_normal: Floats
     normal: Floats
-    """Normal matrix with targets, and with what is known before: no scan is farther off than its own size."""
+    """Normal matrix with targets and prior knowledge: the error of a scan's position is smaller than its size."""
     gradient: Floats
     prior: Floats
     """[6 n]"""
@@ -122,7 +127,8 @@ class _State:
         return step
 
     def inflation(self) -> float:
-        """Root mean ratio of variances of the poses, of sums over cells to those of independent points."""
+        """Root mean ratio of the variances of the poses: from sums over cells, divided by those from independent
+        points."""
         if not self.overlaps:
             return 1.0
         points = self.normal - self.targets_normal
@@ -131,19 +137,19 @@ class _State:
         return max(1.0, float(np.sqrt(np.median(np.diag(honest)[self.free] / np.diag(bread)[self.free]))))
 
     def covariances(self) -> tuple[Floats, Floats]:
-        """[6 n, 6 n] by errors of overlaps, and by those of targets and of what is known before."""
+        """[6 n, 6 n] covariances from errors of overlaps, and from those of targets and prior knowledge."""
         bread = self._inverse(self.normal)
         meat = self._meat(bread, self.inflation_used)
         return bread @ meat @ bread, bread @ (self.targets_normal + np.diag(self.prior)) @ bread
 
     def _inverse(self, normal: Floats) -> Floats:
-        """The inverse of a normal matrix [6 n, 6 n], with zeros for the fixed scan."""
+        """Return the inverse of a normal matrix [6 n, 6 n], with zeros for the fixed scan."""
         inverse = np.zeros_like(normal)
         inverse[np.ix_(self.free, self.free)] = np.linalg.inv(normal[np.ix_(self.free, self.free)])
         return inverse
 
     def _meat(self, bread: Floats, inflation: float) -> Floats:
-        """[6 n, 6 n] covariance of the gradient, by cells of space."""
+        """[6 n, 6 n] covariance of the gradient, from sums over cells of space."""
         size_mm = float(np.median([scan.survey.size_mm for scan in self.scans])) / _CELLS_ACROSS
         weights = [_weights(overlap.off_mm, self.noise_mm) / inflation**2 for overlap in self.overlaps]
         return gradient_covariance(self.overlaps, weights, bread, size_mm)
@@ -226,7 +232,7 @@ def _overlaps(
     other_number: int,
     reach_mm: float,
 ) -> list[Overlap]:
-    """The points of each of two scans on the surface of the other."""
+    """Return the points of each of two scans that lie on the surface of the other."""
     signless = "none" in (scans[scan_number].viewpoint.stand, scans[other_number].viewpoint.stand)
     overlaps = []
     for first, second in ((scan_number, other_number), (other_number, scan_number)):

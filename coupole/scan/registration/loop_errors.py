@@ -1,4 +1,4 @@
-"""Loops of pairs: how far the motions of pairs, each by itself, miss closing, and what that says of all poses."""
+"""Loops of pairs: how well the separate motions of pairs close, and what this shows about all poses."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ _CHANCE = 1e-6
 
 @dataclass(frozen=True)
 class PairAlone:
-    """The motion between two scans by their own overlap alone."""
+    """The motion between two scans from their own overlap only."""
 
     first: int
     second: int
     first_from_second: Floats
     surprise: float
-    """Squared difference from the joint fit over its covariance; where loops are many, chi-squared with 6 degrees
-    of freedom if noise explains it."""
+    """Squared difference from the joint fit, divided by its covariance. With many loops it is chi-squared with 6
+    degrees of freedom, if noise explains it."""
 
 
 @dataclass(frozen=True)
 class Loop:
-    """Scans in a ring, and how far its motions of pairs miss closing."""
+    """Scans in a ring, and the closure error of the motions of its pairs."""
 
     scans: tuple[int, ...]
     error_mm: float
-    """Root mean square displacement of the first scan's points after once around."""
+    """Root mean square displacement of the first scan's points after one turn around the ring."""
     error_deg: float
 
 
 def pairs_alone(
     scans: Sequence[PreparedScan], pairs: Sequence[tuple[int, int]], fit: JointFit, say: Say
 ) -> list[PairAlone]:
-    """Each pair adjusted by itself, from where the joint fit has it."""
+    """Return each pair, adjusted separately from its pose in the joint fit."""
     adjusted_pairs = []
     for number, (first, second) in enumerate(pairs):
         say("closing loops", number + 1, len(pairs))
@@ -60,11 +60,13 @@ def pairs_alone(
 
 
 def with_loops(fit: JointFit, pairs: Sequence[PairAlone], count: int) -> tuple[JointFit, float]:
-    """The fit with a covariance that is not smaller than the loops say, and the factor for uncertainties by
-    overlaps.
+    """Return the fit with a covariance that is not smaller than the loops show, and the factor for uncertainties
+    from overlaps.
 
-    The factor is of the median pair: a pair whose overlap does not hold it, so that by itself it slides away, says
-    nothing of the joint fit, which other pairs hold."""
+    The factor is that of the median pair. Some pairs have an overlap that does not determine their motion, so that
+    they slide when adjusted separately. Such a pair shows nothing about the joint fit, in which other pairs hold
+    it.
+    """
     loops = len(pairs) - (count - 1)
     if loops < 1:
         return fit, 1.0
@@ -75,12 +77,13 @@ def with_loops(fit: JointFit, pairs: Sequence[PairAlone], count: int) -> tuple[J
 
 
 def sliding_pairs(pairs: Sequence[PairAlone], factor: float) -> list[PairAlone]:
-    """Pairs that by themselves end elsewhere than all together: farther than one in a million would by chance."""
+    """Return the pairs whose separate motion differs from the joint fit by more than chance explains once in a
+    million."""
     return [pair for pair in pairs if pair.surprise > factor**2 * chdtri(6, _CHANCE)]
 
 
 def find_loops(scans: Sequence[PreparedScan], pairs: Sequence[PairAlone]) -> list[Loop]:
-    """A ring for each pair beyond a spanning tree, the worst first."""
+    """Return a ring for each pair beyond a spanning tree, the worst first."""
     count = len(scans)
     costs = np.array([1.0 + pair.surprise for pair in pairs])
     rows, columns = np.array([[p.first, p.second] for p in pairs]).reshape(-1, 2).T

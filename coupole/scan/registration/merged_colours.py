@@ -1,4 +1,4 @@
-"""Colours of points carried into the merged surface: averaged in linear light, where means of light are right."""
+"""Colours of points for the merged surface, averaged in linear light, where averaging is correct."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from scipy.spatial import cKDTree
 from coupole.scan.registration.viewpoint import Floats
 
 NO_COLOUR = (0, 0, 0)
-"""Colour of vertices near which no point has a colour, as PTX has it."""
+"""Colour of vertices without a coloured point nearby, as in PTX."""
 _NEIGHBOURS = 8
 
 
 def linear_light(srgba: NDArray[np.uint8]) -> Floats:
-    """[n, 4] red, green and blue of 0 to 1 in linear light times the weight, and the weight: 0 where a point has
-    no colour (IEC 61966-2-1)."""
+    """[n, 4] red, green and blue of 0 to 1 in linear light, multiplied by the weight; and the weight, which is 0
+    for a point without a colour (IEC 61966-2-1)."""
     srgb = srgba[:, :3] / 255.0
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     weight = (srgba[:, 3:] > 0).astype(np.float64)
@@ -23,7 +23,7 @@ def linear_light(srgba: NDArray[np.uint8]) -> Floats:
 
 
 def encode_srgb(weighted_sums: Floats) -> NDArray[np.uint8]:
-    """[n, 3] sRGB, 8 bit, of sums of weighted linear light [n, 4]."""
+    """[n, 3] sRGB, 8 bits, from sums of weighted linear light [n, 4]."""
     weight = weighted_sums[:, 3:]
     linear = np.clip(weighted_sums[:, :3] / np.where(weight > 0, weight, 1.0), 0.0, 1.0)
     srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
@@ -31,7 +31,8 @@ def encode_srgb(weighted_sums: Floats) -> NDArray[np.uint8]:
 
 
 def around(points: Floats, linear: Floats, places: Floats, reach: float, width: float) -> Floats:
-    """[m, 4] sums at places [m, 3] of linear light [n, 4] of the nearest points [n, 3], by a Gaussian `width`."""
+    """[m, 4] sums of the linear light [n, 4] of the nearest points [n, 3] at places [m, 3], weighted by a Gaussian
+    of `width`."""
     away, nearest = cKDTree(points).query(places, min(_NEIGHBOURS, len(points)), distance_upper_bound=reach)
     away, nearest = away.reshape(len(places), -1), nearest.reshape(len(places), -1)
     there = np.isfinite(away)

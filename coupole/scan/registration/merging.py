@@ -1,10 +1,10 @@
-"""Merges registered scans to one mesh and to thinner clouds, in blocks of space, with memory for one block at a
-time.
+"""Merges registered scans into one mesh and into thinner clouds, block by block of space, with memory for only one
+block.
 
-Each scan is read once, thinned to the mesh's cells and written to the blocks that it touches. The surface is
-where the signed distance, the weighted mean over the points around (implicit moving least squares: Kolluri, ACM
-Trans. Algorithms 4(2), 2008), passes through zero; marching cubes (scikit-image) draw it. Blocks share their
-outer corners, so that meshes of neighbours meet in the same vertices.
+Each scan is read once, thinned to the mesh's cells and written to the blocks that it touches. The surface is where
+the signed distance passes through zero. This distance is the weighted mean over the points around (implicit moving
+least squares: Kolluri, ACM Trans. Algorithms 4(2), 2008); marching cubes (scikit-image) find the surface. Blocks
+share their outer corners, so that meshes of neighbouring blocks meet in the same vertices.
 """
 
 from __future__ import annotations
@@ -31,15 +31,16 @@ from coupole.scan.registration.viewpoint import Floats
 Say = Callable[[str, int, int], None]
 BLOCK_CELLS = 64
 _REACH_CELLS = 3.0
-"""Points farther from a corner say nothing of it."""
+"""Greatest distance, in cells, at which a point affects a corner."""
 _KERNEL_CELLS = 1.0
 _NEAR_CELLS, _COVERED_CELLS = 2.5, 1.3
-"""A corner has a distance only if a point is as near; a triangle is kept only if one is."""
+"""Greatest distances, in cells, from the nearest point: of a corner with a distance, and of a triangle that is
+kept."""
 _MOST_NEIGHBOURS = 32
 _STEEPEST = 0.2
-"""Cosine of incidence below which points are left out: they are smeared over rims."""
+"""Cosine of incidence below which points are left out, because the scanner smears them over rims."""
 _RECORD = np.dtype([("point", "<f4", 3), ("normal", "<f4", 3), ("weight", "<f4"), ("light", "<f4", 4)])
-"""`light`: as `linear_light` has it."""
+"""Record of a point; `light` is that of `linear_light`."""
 _COLOURS_HEAD = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
 _FACE = np.dtype([("corners", "u1"), ("indices", "<u4", 3)])
 _CHUNK = 2_000_000
@@ -47,21 +48,21 @@ _CHUNK = 2_000_000
 
 @dataclass
 class Merged:
-    """Counts and sizes of what was written."""
+    """Counts and sizes of the written files."""
 
     vertices: int = 0
     triangles: int = 0
     points: int = 0
-    """Points that were read, of all scans."""
+    """Number of points that were read from all scans."""
     cell_mm: float = 0.0
     has_colours: bool = False
-    """True if a scan had colours, and mesh and clouds have them."""
+    """True if a scan had colours; mesh and clouds then have them too."""
     levels: dict[str, int] = field(default_factory=dict)
-    """Points of each thinner cloud, by the name of its file."""
+    """Number of points of each thinner cloud, by the name of its file."""
 
 
 def default_cell_mm(scans: Sequence[PreparedScan]) -> float:
-    """1.5 times the spacing of the scans' points."""
+    """Return 1.5 times the spacing of the scans' points."""
     return 1.5 * float(np.median([scan.survey.spacing_mm for scan in scans]))
 
 
@@ -114,7 +115,7 @@ def merge(
 
 
 def _records(scan: PreparedScan, pose: Floats, unit: str, cell_mm: float) -> NDArray[np.void]:
-    """A scan's points, one for each cell, in the common frame."""
+    """Yield a scan's points, one for each cell, in the common frame."""
     small_gicp, _ = registration_libraries()
     content = read_scan(scan.source, unit, colours=True)
     whole = content.mesh
@@ -153,7 +154,7 @@ def _block_of(points: NDArray[np.float32], cell_mm: float) -> NDArray[np.int64]:
 
 
 def _distribute(records: NDArray[np.void], cell_mm: float, folder: Path) -> None:
-    """Append records to the files of the blocks that they touch, or nearly touch."""
+    """Append records to the files of all blocks that they touch or nearly touch."""
     margin = _REACH_CELLS * cell_mm
     points = records["point"].astype(np.float64)
     low, high = (np.floor((points + d) / (cell_mm * BLOCK_CELLS)).astype(np.int64) for d in (-margin, margin))
@@ -177,7 +178,7 @@ def _distribute(records: NDArray[np.void], cell_mm: float, folder: Path) -> None
 def _surface(
     records: NDArray[np.void], block: NDArray[np.int64], cell_mm: float
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Vertices [n, 3], in cells from the block's first corner, and triangles [m, 3]."""
+    """Return vertices [n, 3], in cells from the block's first corner, and triangles [m, 3]."""
     try:
         from skimage import measure
     except ImportError as error:
@@ -218,7 +219,7 @@ def _surface(
 def _shades(
     records: NDArray[np.void], vertices: NDArray[np.float32], block: NDArray[np.int64], cell_mm: float
 ) -> NDArray[np.uint8]:
-    """[n, 3] sRGB colours of vertices in cells from a block's first corner."""
+    """[n, 3] sRGB colours of vertices, which are in cells from a block's first corner."""
     if not len(vertices) or not records["light"][:, 3].any():
         return np.zeros((len(vertices), 3), np.uint8)
     lit = records[records["light"][:, 3] > 0]
@@ -267,7 +268,7 @@ class _MeshFile:
         block: NDArray[np.int64],
         shades: NDArray[np.uint8],
     ) -> None:
-        """Vertices in cells from the first corner of a block, triangles of them, and colours [n, 3]."""
+        """Add vertices in cells from the first corner of a block, triangles of them, and colours [n, 3]."""
         if not len(triangles):
             return
         whole = np.round(vertices)
@@ -282,7 +283,7 @@ class _MeshFile:
         self._triangles += len(triangles)
 
     def write(self, path: Path, cell_mm: float) -> tuple[int, int]:
-        """Write the mesh; returns the numbers of its vertices and triangles."""
+        """Write the mesh; return the numbers of its vertices and triangles."""
         self._vertices.flush()
         self._faces.flush()
         stands_for = np.arange(self._count, dtype=np.int64)
@@ -327,7 +328,8 @@ def _write_points(file: BinaryIO, points: Floats, shades: NDArray[np.uint8] | No
 
 
 def _edge_keys(vertices: NDArray[np.float32], block: NDArray[np.int64]) -> NDArray[np.int64]:
-    """[n, 4] of vertices, each on an edge of the grid: the edge's first corner, and its direction."""
+    """[n, 4] keys of vertices, each of which lies on an edge of the grid: the edge's first corner, and its
+    direction."""
     off = np.abs(vertices - np.round(vertices))
     along = np.argmax(off, axis=1)
     corner = np.round(vertices).astype(np.int64)
@@ -338,7 +340,7 @@ def _edge_keys(vertices: NDArray[np.float32], block: NDArray[np.int64]) -> NDArr
 
 
 class _Level:
-    """A cloud with one point, the mean, for each cell of a grid."""
+    """A cloud with one point for each cell of a grid: the mean of the cell's points."""
 
     def __init__(self, pitch_mm: float, *, has_colours: bool) -> None:
         self._coloured = has_colours

@@ -1,9 +1,9 @@
-"""Motion of one scan to another: found by features without a first guess, refined, and verified.
+"""Motion of one scan to another: found by features without an initial pose, refined, and verified.
 
-Motions come from KISS-Matcher (Lim, Kim, Shin, Sattler, Myung, ICRA 2025: Faster-PFH features, pruning by a
-graph of consistent pairs, a solver by graduated non-convexity) and are refined by generalized ICP (Koide,
-small_gicp, JOSS 2024). A motion counts only if enough of the surfaces lie on each other, with normals on the
-same side, and if next to no point of one scan lies in the space that the other's scanner saw through.
+Motions come from KISS-Matcher (Lim, Kim, Shin, Sattler, Myung, ICRA 2025: Faster-PFH features, pruning by a graph
+of consistent pairs, a solver by graduated non-convexity) and are refined by generalized ICP (Koide, small_gicp,
+JOSS 2024). A motion is accepted on two conditions. Enough of the surfaces must lie on each other, with normals on
+the same side. And almost no point of one scan may lie in the space that the other's scanner saw through.
 """
 
 from __future__ import annotations
@@ -18,32 +18,31 @@ from coupole.scan.registration.prepared_scan import Cloud, PreparedScan
 from coupole.scan.registration.viewpoint import Floats
 
 LEAST_OVERLAP = 0.12
-"""Share of the smaller scan that must lie on the other one."""
+"""Least share of the smaller scan that must lie on the other one."""
 MOST_CONTRADICTED = 0.02
-"""Share of the points in rays of the other scanner that may lie before its surface: edges of noise, not of
-pose."""
+"""Greatest share of the points in rays of the other scanner that may lie before its surface. Such points come from
+noise at edges, not from a wrong pose."""
 _LEAST_AGREED = 5
-"""Pairs of features that agree on a motion, below which it is not even refined."""
+"""Least number of feature pairs that must agree on a motion before it is refined."""
 _ROUGH_OVERLAP, _ROUGH_CONTRADICTED = 0.06, 0.15
-"""Least overlap and largest contradicted share of a motion that is worth refining on the fine clouds."""
+"""Least overlap and greatest contradicted share of a motion that is refined on the fine clouds."""
 _SAME_SIDE = 0.7
-"""Cosine between normals of points that lie on each other."""
+"""Least cosine between the normals of points that lie on each other."""
 _COARSE_ITERATIONS, _FINE_ITERATIONS = 40, 12
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Measures of how well two scans lie on each other."""
+    """Measures of the agreement of two scans."""
 
     overlap: float
-    """Share of the smaller scan's places that lie on the other scan."""
+    """Share of the smaller scan's cells that lie on the other scan."""
     contradicted_share: float
-    """Share of points, seen by the other scanner, that lie where it saw nothing; 0 where neither viewpoint is
-    known."""
+    """Share of points, seen by the other scanner, that lie where it saw nothing; 0 if no viewpoint is known."""
     rms_mm: float
     """Root mean square distance along the normals, over the overlap."""
     places: int
-    """Number of places of the overlap, on the coarse grid."""
+    """Number of cells of the overlap, on the coarse grid."""
 
     @property
     def holds(self) -> bool:
@@ -59,13 +58,13 @@ class PairMotion:
     first_from_second: Floats
     fit: Fit
     found_by: str
-    """`features`, or `prediction` by poses that were known already."""
+    """`features`, or `prediction` from poses that were known already."""
 
 
 def match_by_features(first: Cloud, second: Cloud) -> tuple[Floats, int]:
-    """`first_from_second` without a first guess, and the number of pairs of features that agree on it."""
+    """Return `first_from_second` without an initial pose, and the number of feature pairs that agree on it."""
     _, kiss_matcher = registration_libraries()
-    scale = 1.0 / first.pitch_mm  # its noise bounds are made for cells of one unit
+    scale = 1.0 / first.pitch_mm  # the library's noise bounds assume cells of one unit
     matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(voxel_size=1.0, use_voxel_sampling=False))
     estimate = matcher.estimate(
         list((second.points_mm * scale).astype(np.float32)), list((first.points_mm * scale).astype(np.float32))
@@ -78,7 +77,7 @@ def match_by_features(first: Cloud, second: Cloud) -> tuple[Floats, int]:
 def refined_motion(
     first: Cloud, second: Cloud, first_from_second: Floats, reach_mm: float, iterations: int
 ) -> Floats:
-    """The motion by generalized ICP, with points as far apart as `reach_mm` at first."""
+    """Return the motion after generalized ICP, in which points may at first be `reach_mm` apart."""
     small_gicp, _ = registration_libraries()
     alignment = small_gicp.align(
         _gicp_cloud(first),
@@ -94,7 +93,7 @@ def refined_motion(
 
 
 def _gicp_cloud(cloud: Cloud) -> Any:
-    """The cloud as the library's own, kept beside it."""
+    """Return the cloud in the form of the library; it is stored with the cloud."""
     small_gicp, _ = registration_libraries()
     if "_library_cloud" not in cloud.__dict__:
         library_cloud = small_gicp.PointCloud(cloud.points_mm)
@@ -110,7 +109,7 @@ def _tree(cloud: Cloud) -> Any:
 
 
 def fit_of(first: PreparedScan, second: PreparedScan, first_from_second: Floats, near_mm: float) -> Fit:
-    """Measure how well two scans lie on each other: points within `near_mm` along the normals count."""
+    """Measure the agreement of two scans: points within `near_mm` along the normals count."""
     moved_mm = second.coarse.points_mm @ first_from_second[:3, :3].T + first_from_second[:3, 3]
     turned_normals = second.coarse.normals @ first_from_second[:3, :3].T
     reach_mm = 1.5 * first.coarse.pitch_mm
@@ -132,8 +131,8 @@ def fit_of(first: PreparedScan, second: PreparedScan, first_from_second: Floats,
 def contradiction(
     first: PreparedScan, second: PreparedScan, first_from_second: Floats, near_mm: float, every: int = 1
 ) -> float:
-    """Share of points that the other scanner sees by its rays, and that lie before the surface where these ended:
-    the larger of both scans'. Only each `every`-th point is looked at."""
+    """Return the share of points that lie in the other scanner's rays, but before the surface where these ended:
+    the larger share of both scans. Only every `every`-th point is tested."""
     there = second.coarse.points_mm[::every] @ first_from_second[:3, :3].T + first_from_second[:3, 3]
     back = (first.coarse.points_mm[::every] - first_from_second[:3, 3]) @ first_from_second[:3, :3]
     return max(_contradicted_share(first, there, near_mm), _contradicted_share(second, back, near_mm))
@@ -147,7 +146,7 @@ def _contradicted_share(seer: PreparedScan, points_mm: Floats, near_mm: float) -
 
 
 def match(number_first: int, number_second: int, first: PreparedScan, second: PreparedScan) -> PairMotion | None:
-    """The motion between two scans of which nothing is known, if one is found that holds."""
+    """Find the motion between two scans without prior knowledge; None if no accepted motion is found."""
     guess, agreeing_count = match_by_features(first.coarse, second.coarse)
     if agreeing_count < _LEAST_AGREED:
         return None
@@ -162,7 +161,7 @@ def improve(
     guess: Floats,
     found_by: str,
 ) -> PairMotion | None:
-    """The motion between two scans from one that is about right, if it holds."""
+    """Refine an approximate motion between two scans; None if the result is not accepted."""
     pitch_mm = first.coarse.pitch_mm
     motion = refined_motion(first.coarse, second.coarse, guess, 2.5 * pitch_mm, _COARSE_ITERATIONS)
     fit = fit_of(first, second, motion, 0.7 * pitch_mm)

@@ -1,4 +1,4 @@
-"""Pairs of scans, matched by several processes."""
+"""Matching of pairs of scans in several processes."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from coupole.scan.registration.prepared_scan import PreparedScan
 from coupole.scan.registration.viewpoint import Floats
 
 Task = tuple[int, int, Floats | None]
-"""Numbers of two scans, and `first_from_second` if it is known about."""
+"""Numbers of two scans, and `first_from_second` if it is approximately known."""
 Say = Callable[[str, int, int], None]
 _WORTH_PROCESSES = 30
-"""Number of tasks above which more processes save more time than their start takes."""
+"""Number of tasks above which several processes save more time than their start takes."""
 _TOGETHER = 8
 
 _scans_there: list[PreparedScan] = []
-"""Scans of a process that matches."""
+"""Scans of a matching process."""
 
 
 class Search:
-    """Matches pairs of some scans."""
+    """Matches pairs of the given scans."""
 
     def __init__(self, scans: Sequence[PreparedScan], processes: int) -> None:
         self._scans, self._processes = scans, processes
         self._pool: ProcessPoolExecutor | None = None
 
     def run(self, task_name: str, tasks: Sequence[Task], say: Say) -> list[PairMotion]:
-        """The motions that hold, in the order of the tasks."""
+        """Return the accepted motions, in the order of the tasks."""
         motions = []
         for number, motion in enumerate(self._motions(tasks)):
             say(task_name, number + 1, len(tasks))
@@ -54,7 +54,7 @@ class Search:
 
 @contextmanager
 def search_of(scans: Sequence[PreparedScan], processes: int | None = None) -> Iterator[Search]:
-    """A search with as many processes as the machine has processors, or as stated."""
+    """Return a search with the given number of processes; by default, one for each processor."""
     search = Search(scans, processes or len(os.sched_getaffinity(0)))
     try:
         yield search

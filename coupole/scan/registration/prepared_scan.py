@@ -1,5 +1,5 @@
-"""A scan made ready to be matched: thinned clouds with normals that face the scanner, its trees and its
-picture."""
+"""A scan prepared for matching: thinned clouds with normals that face the scanner, their search trees, and the
+scanner's picture."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from coupole.scan.registration.scan_files import read_scan
 from coupole.scan.registration.viewpoint import DepthPicture, Floats, Stand, Viewpoint, folds
 
 NEIGHBOURS = 12
-"""Number of a point's neighbours by which its normal is found."""
+"""Number of neighbours from which a point's normal is computed."""
 PLACE_SPACINGS = 2.0
 _SAMPLE, _MOST_PICTURED = 100_000, 120_000
 _COARSEST_STEP = 0.05
-"""Largest step of 32-bit coordinates, over the points' spacing."""
+"""Largest step of 32-bit coordinates, relative to the points' spacing."""
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points [n, 3] in mm in their scan's frame, one for each cell of a grid, with normals out of the surface."""
+    """Points [n, 3] in mm in their scan's frame, one for each cell of a grid, with outward normals."""
 
     points_mm: Floats
     normals: Floats
     incidence: Floats
-    """[n] cosine between normal and the way to the scanner; 1 where that is not known."""
+    """[n] cosine between normal and direction to the scanner; 1 if the viewpoint is not known."""
     pitch_mm: float
     """Pitch of the grid."""
 
@@ -48,13 +48,13 @@ class Cloud:
         return middle, float(np.linalg.norm(self.points_mm - middle, axis=1).max())
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without trees and the libraries' own clouds, which every process makes for itself."""
+        """Return the state without trees and the libraries' own clouds, which each process makes again."""
         return {name: self.__dict__[name] for name in ("points_mm", "normals", "incidence", "pitch_mm")}
 
 
 @dataclass(frozen=True)
 class Survey:
-    """Facts about a scan before pitches and viewpoints are chosen for all scans."""
+    """Facts about a scan that are needed before pitches and viewpoints are chosen for all scans."""
 
     count: int
     spacing_mm: float
@@ -62,18 +62,18 @@ class Survey:
     size_mm: float
     """Diagonal of the bounding box."""
     places: int
-    """Cells of a grid of `PLACE_SPACINGS` spacings that hold points."""
+    """Number of occupied cells of a grid of `PLACE_SPACINGS` spacings."""
     folded_shares: dict[Stand, float]
-    """Share of rays along which two surfaces lie, for each viewpoint that the scan could have."""
+    """Share of rays along which two surfaces lie, for each possible viewpoint of the scan."""
 
 
 @dataclass(frozen=True)
 class PreparedScan:
-    """Parts of a scan that are kept in memory; the whole is read again when scans are merged."""
+    """The parts of a scan that stay in memory; the whole scan is read again for merging."""
 
     source: ScanSource
     stated_pose: Floats | None
-    """4x4 mm that the scan's file states."""
+    """Pose that the scan's file states, 4x4 mm."""
     survey: Survey
     viewpoint: Viewpoint
     fine: Cloud
@@ -103,7 +103,7 @@ def survey(source: ScanSource, unit: str) -> Survey:
 
 
 def _expect_fine_steps(source: ScanSource, mesh: Mesh, spacing_mm: float) -> None:
-    """Raise InputError if coordinates are too far from their origin for 32-bit numbers."""
+    """Raise InputError if coordinates are too far from the origin for 32-bit numbers."""
     farthest_mm = np.abs(mesh.vertices).max()
     step_mm = float(np.spacing(farthest_mm))
     if step_mm > _COARSEST_STEP * spacing_mm:
@@ -115,7 +115,8 @@ def _expect_fine_steps(source: ScanSource, mesh: Mesh, spacing_mm: float) -> Non
 
 
 def _sample(count: int) -> NDArray[np.intp]:
-    """Numbers of points to draw a scan's picture from: drawn at random, as those in a row make stripes."""
+    """Numbers of the points from which a scan's picture is drawn. They are random, because consecutive points make
+    stripes."""
     if count <= _MOST_PICTURED:
         return np.arange(count)
     return np.random.default_rng(0).choice(count, _MOST_PICTURED, replace=False)
@@ -140,7 +141,8 @@ def prepare(
 
 
 def thinned_cloud(points_mm: Floats, pitch_mm: float, viewpoint: Viewpoint, known_normals: Floats | None) -> Cloud:
-    """The mean point of each cell, with normals that face the scanner, or the side of the `known_normals` ones."""
+    """Return the mean point of each cell, with normals that face the scanner, or that are on the side of
+    `known_normals`."""
     small_gicp, _ = registration_libraries()
     middle = points_mm.mean(axis=0)
     thin = small_gicp.voxelgrid_sampling(points_mm - middle, pitch_mm)
@@ -160,7 +162,7 @@ def thinned_cloud(points_mm: Floats, pitch_mm: float, viewpoint: Viewpoint, know
 
 
 def spacing(points_mm: NDArray[np.float32]) -> float:
-    """Median distance to the nearest other point, mm, by a compact part of the scan."""
+    """Return the median distance to the nearest other point, mm, from a compact part of the scan."""
     part = points_mm
     if len(points_mm) > _SAMPLE:
         at = points_mm[len(points_mm) // 2]
@@ -172,7 +174,7 @@ def spacing(points_mm: NDArray[np.float32]) -> float:
 
 
 def vertex_normals(mesh: Mesh) -> Floats | None:
-    """[n, 3] normals from the triangles, of length 1 or 0; None for a cloud without triangles."""
+    """[n, 3] normals from the triangles, with length 1 or 0; None for a cloud without triangles."""
     vertices, triangles = mesh.vertices, mesh.triangles
     if not len(triangles):
         return None

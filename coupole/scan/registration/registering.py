@@ -1,5 +1,5 @@
-"""Registers scans with unknown poses, in any order: found pair by pair, joined, adjusted together, proven by
-loops."""
+"""Registers scans with unknown poses, in any order: finds motions of pairs, joins them, adjusts all poses
+together, and tests them by loops."""
 
 from __future__ import annotations
 
@@ -31,41 +31,41 @@ from coupole.scan.registration.viewpoint import Floats, Stand, Viewpoint, choose
 
 Say = Callable[[str, int, int], None]
 ALL_PAIRS = 20
-"""Greatest number of scans of which all pairs are tried. With more scans, pairs are tried until all are
+"""Greatest number of scans for which all pairs are tried. With more scans, pairs are tried until all scans are
 connected."""
 _FINE_PLACES, _COARSE_PLACES = (20_000, 2_500), (8_000, 1_600)
-"""Points of a scan's fine and coarse cloud: of few scans, and of many."""
+"""Number of points of a scan's fine and coarse cloud: for few scans, and for many."""
 _PARTNERS = 6
-"""Largest number of pairs of each scan in a round, of more scans than `ALL_PAIRS`."""
+"""Greatest number of pairs of each scan in a round, if there are more than `ALL_PAIRS` scans."""
 _ODD_SIZE = 200.0
-"""A scan larger or smaller than most by this factor has another unit."""
+"""A scan that is larger or smaller than most by this factor has another unit."""
 _ROUNDED_CELLS = 0.01
-"""Largest rounding of a coordinate of the merged mesh, in its cells."""
+"""Largest rounding error of a coordinate of the merged mesh, in its cells."""
 _LEAST_JOINT_OVERLAP = 0.04
 """Least share of the smaller scan that must overlap for a pair to count in the joint fit."""
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Scans with their poses; numbers count them in the order in which they were named."""
+    """Scans with their poses. Numbers of scans count them in the given order."""
 
     names: tuple[str, ...]
     """Names of the scans."""
     scans: tuple[PreparedScan, ...]
     """Points and normals of each scan in its own frame, mm."""
     placed_numbers: tuple[int, ...]
-    """Numbers of the scans that are connected; the first is the one whose frame is the common one."""
+    """Numbers of the connected scans; the frame of the first one is the common frame."""
     first_from_scan: dict[int, Floats]
-    """4x4 mm, to the first placed scan's frame."""
+    """Transforms to the first placed scan's frame, 4x4 mm."""
     covariance: dict[int, Floats]
-    """[6, 6] of each pose: a step (mm, rad) about the scan's middle, in the common frame; in the control points'
-    frame if there are any."""
+    """[6, 6] covariance of each pose: a step (mm, rad) about the scan's middle, in the common frame; in the
+    control points' frame if there are control points."""
     site_from_first: Floats | None
     """Transform of the first placed scan's frame into the control points' frame."""
     unplaced_numbers: tuple[int, ...]
-    """Numbers of the scans that no other overlaps enough."""
+    """Numbers of the scans that overlap no other scan enough."""
     motions: tuple[PairMotion, ...]
-    """Motions between pairs that the poses rest on."""
+    """Motions between pairs on which the poses rest."""
     rejected_motions: tuple[PairMotion, ...]
     """Motions between pairs that contradict the others."""
     pairs: int
@@ -73,15 +73,15 @@ class Registration:
     loops: tuple[Loop, ...]
     """Closed chains of pairs, with the error of each."""
     loop_factor: float
-    """Factor by which the loops enlarged the uncertainties by overlaps."""
+    """Factor by which the loops enlarged the uncertainties from overlaps."""
     sliding_pairs: tuple[tuple[int, int], ...]
-    """Pairs of scans that by themselves, without the others, would lie elsewhere."""
+    """Pairs of scans whose motion would differ if they were adjusted separately."""
     fit: JointFit
     """The joint adjustment of all poses."""
 
     def is_merged_on_site(self, cell_mm: float) -> bool:
-        """True if mesh and clouds are in the control points' frame: there is one, and 32 bits keep a hundredth of
-        a cell there."""
+        """True if mesh and clouds are in the control points' frame. This needs such a frame, and coordinates in it
+        that 32 bits resolve to a hundredth of a cell."""
         if self.site_from_first is None:
             return False
         farthest_mm = max(
@@ -91,7 +91,7 @@ class Registration:
         return farthest_mm * float(np.finfo(np.float32).eps) < _ROUNDED_CELLS * cell_mm
 
     def merged_from_scan(self, cell_mm: float) -> list[Floats]:
-        """4x4 mm of each placed scan to the frame of mesh and clouds."""
+        """Transform of each placed scan to the frame of mesh and clouds, 4x4 mm."""
         poses = [self.first_from_scan[k] for k in self.placed_numbers]
         if self.site_from_first is None or not self.is_merged_on_site(cell_mm):
             return poses
@@ -108,7 +108,8 @@ def register(
     processes: int | None = None,
     say: Say,
 ) -> Registration:
-    """Poses of scans in files; with `trust_poses` those that PTX and E57 state are first guesses.
+    """Find the poses of scans in files. With `trust_poses`, the search starts from the poses that PTX and E57
+    state.
 
     Raises InputError for invalid files, and if no two scans overlap; ExtraMissing.
     """
@@ -186,7 +187,7 @@ def pitches(surveys: Sequence[Survey]) -> tuple[float, float]:
 
 
 def _stated_tasks(scans: Sequence[PreparedScan]) -> Iterator[Task]:
-    """Pairs that overlap by the poses of their files, with their motions."""
+    """Return the pairs that overlap by the poses of their files, with their motions."""
     for first, second in combinations(range(len(scans)), 2):
         first_pose, second_pose = scans[first].stated_pose, scans[second].stated_pose
         if first_pose is not None and second_pose is not None:
@@ -198,7 +199,8 @@ def _stated_tasks(scans: Sequence[PreparedScan]) -> Iterator[Task]:
 def _groups_by_search(
     scans: Sequence[PreparedScan], search: Search, by_targets: Sequence[PairMotion], say: Say, *, every: bool
 ) -> Groups:
-    """Groups by features, and by motions that are known; `every` pair is tried, else those of different groups."""
+    """Return groups from motions by features and from known motions. With `every`, all pairs are tried; otherwise
+    only pairs of different groups."""
     known_pairs = {(m.first, m.second) for m in by_targets}
     untried_pairs = [pair for pair in combinations(range(len(scans)), 2) if pair not in known_pairs]
     motions = list(by_targets)
@@ -222,7 +224,8 @@ def _groups_by_search(
 def _some(
     untried_pairs: Sequence[tuple[int, int]], groups: Groups, round_number: int
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Pairs for a round, a few of each scan, drawn from those of different groups; and the others."""
+    """Return pairs for a round, a few for each scan, drawn from those of different groups; and the remaining
+    pairs."""
     order = np.random.default_rng(round_number).permutation(len(untried_pairs))
     partner_counts: dict[int, int] = {}
     batch, later = [], []
@@ -240,7 +243,7 @@ def _some(
 def _grow(
     scans: Sequence[PreparedScan], search: Search, groups: Groups, placed_numbers: Sequence[int], say: Say
 ) -> None:
-    """Motions of the pairs that overlap by the poses found, and were not matched yet."""
+    """Return motions of the pairs that overlap by the found poses and were not matched yet."""
     matched_pairs = {(m.first, m.second) for m in groups.accepted_motions}
     tasks = []
     every = list(combinations(placed_numbers, 2))
@@ -264,7 +267,7 @@ def _may_overlap(scans: Sequence[PreparedScan], pair: tuple[int, int], predicted
 def _overlapping(
     scans: Sequence[PreparedScan], placed_numbers: Sequence[int], poses: Sequence[Floats]
 ) -> Iterator[tuple[int, int, float]]:
-    """Pairs of the placed scans, by their places in `placed_numbers`, with the share that overlaps."""
+    """Return pairs of the placed scans, by their places in `placed_numbers`, with the overlapping share."""
     for first_place, second_place in combinations(range(len(placed_numbers)), 2):
         first, second = scans[placed_numbers[first_place]], scans[placed_numbers[second_place]]
         first_from_second = inverse_of(poses[first_place]) @ poses[second_place]

@@ -1,4 +1,4 @@
-"""A scan in a file that may hold several, and what is read of it."""
+"""A scan in a file that may contain several scans, and its content."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from coupole.scan.mesh import Mesh
 
 @dataclass(frozen=True)
 class ScanSource:
-    """Place where a scan is stored."""
+    """File and place where a scan is stored."""
 
     path: Path
     name: str
-    """Name of the file, with `#2` and so on for the second scan of a file and the next ones."""
+    """Name of the file; from the second scan of a file on, with `#2` and so on."""
     number: int = 0
     """Number of the scan in its file."""
     at_byte: int = 0
     at_line: int = 1
-    """Line where the scan's own header begins, in files of text."""
+    """Line where the scan's own header begins, for text files."""
 
     def __str__(self) -> str:
         return str(self.path) if self.number == 0 else f"{self.path}, scan {self.number + 1}"
@@ -35,6 +35,7 @@ class ScanContent:
     mesh: Mesh
     """Mesh of the scan; without triangles if it is a cloud."""
     srgba: NDArray[np.uint8] | None = None
-    """[n, 4] sRGB colours, 8 bit, and 255 where a point has one, else 0; None where no point has."""
+    """[n, 4] sRGB colours, 8 bits, and 255 for a point with a colour, 0 for one without; None if no point has a
+    colour."""
     stated_pose: NDArray[np.float64] | None = None
-    """4x4 that brings the scan into the frame that its file states; it proves nothing."""
+    """4x4 transform of the scan to the frame that its file states; it is not proven."""

@@ -29,15 +29,15 @@ from coupole.scan.scanner_export import MM_PER_UNIT
 
 SUFFIXES = (".ply", ".stl", ".obj", ".e57", *HEADED_SUFFIXES, *TEXT_SUFFIXES)
 LEAST_POINTS = 200
-"""Least number of points of a scan: with fewer no shape can be recognized."""
+"""Least number of points of a scan; a shape cannot be recognized from fewer."""
 _HEADER_BYTES = 65536
 PLAUSIBLE_SIZE_MM = (2.0, 1e6)
-"""Diagonal of a scan's bounding box: from a coin to a cathedral."""
+"""Smallest and largest diagonal of a scan's bounding box: from a coin to a cathedral."""
 
 
 def sources_of(paths: Sequence[Path]) -> list[ScanSource]:
-    """The scans of files, of which a PTX, PTS or E57 may hold several; their names are paths where two files have
-    the same name. Raises InputError with the place of the error, ExtraMissing."""
+    """Return the scans of files. A PTX, PTS or E57 may contain several. If two files have the same name, their
+    scans are named by paths. Raises InputError with the place of the error, ExtraMissing."""
     sources: list[ScanSource] = []
     for path in paths:
         suffix = path.suffix.lower()
@@ -62,8 +62,8 @@ def sources_of(paths: Sequence[Path]) -> list[ScanSource]:
 
 
 def read_scan(source: ScanSource, unit: str, *, colours: bool = False) -> ScanContent:
-    """A scan in mm; an E57 is in metres, whatever the `unit`. Raises InputError with the place of the error,
-    ExtraMissing."""
+    """Read a scan in mm; an E57 is always in metres, whatever the `unit`. Raises InputError with the place of the
+    error, ExtraMissing."""
     suffix = source.path.suffix.lower()
     if suffix == ".e57":
         content, unit = e57_scans.read_e57(source, colours=colours), e57_scans.UNIT
@@ -88,7 +88,7 @@ def read_scan(source: ScanSource, unit: str, *, colours: bool = False) -> ScanCo
 
 
 def _ply_colours(path: Path, count: int) -> NDArray[np.uint8] | None:
-    """[n, 4] of `red`, `green` and `blue` of a PLY's vertices, 8 bit; None without them."""
+    """[n, 4] colours from `red`, `green` and `blue` of a PLY's vertices, 8 bits; None without them."""
     with path.open("rb") as file:
         head = file.read(_HEADER_BYTES).split(b"end_header")[0]
     if b" red" not in head or b" blue" not in head:
@@ -119,7 +119,7 @@ def _expect_plausible(source: ScanSource, mesh: Mesh, unit: str) -> None:
 
 
 def expect_different(paths: Sequence[Path]) -> None:
-    """Raise InputError if two files hold the same bytes, or one is named twice."""
+    """Raise InputError if two files have the same bytes, or if a file is named twice."""
     path_of: dict[str, Path] = {}
     for path in paths:
         try:

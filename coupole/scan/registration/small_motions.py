@@ -1,5 +1,5 @@
-"""Rigid motions [..., 4, 4] in mm and their small steps [..., 6]: translation in mm, then rotation in rad, both
-in the frame that a motion leads to (from the left)."""
+"""Rigid motions [..., 4, 4] in mm and their small steps [..., 6]: translation in mm, then rotation in rad, both in
+the target frame of a motion (from the left)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def moved_points(motion: Floats, points_mm: Floats) -> Floats:
 
 
 def stepped_motion(motion: Floats, step: Floats, pivot_mm: Floats) -> Floats:
-    """A motion [4, 4] after a step [6] that turns about a point of the frame it leads to."""
+    """Return a motion [4, 4] after a step [6] about a point of its target frame."""
     turn = Rotation.from_rotvec(step[3:]).as_matrix()
     new_motion = np.eye(4)
     new_motion[:3, :3] = turn @ motion[:3, :3]
@@ -32,20 +32,20 @@ def stepped_motion(motion: Floats, step: Floats, pivot_mm: Floats) -> Floats:
 
 
 def step_between(before: Floats, after: Floats, pivot_mm: Floats) -> Floats:
-    """The step [6] that leads from one motion to another, about a point."""
+    """Return the step [6] about a point from one motion to another."""
     turn = after[:3, :3] @ before[:3, :3].T
     rest = after[:3, 3] - pivot_mm - turn @ (before[:3, 3] - pivot_mm)
     return np.concatenate([rest, Rotation.from_matrix(turn).as_rotvec()])
 
 
 def displacement_mm(first_motion: Floats, second_motion: Floats, points_mm: Floats) -> float:
-    """Root mean square distance between places of points [n, 3] by two motions."""
+    """Return the root mean square distance between the positions of points [n, 3] after two motions."""
     apart = points_mm @ (first_motion - second_motion)[:3, :3].T + (first_motion - second_motion)[:3, 3]
     return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
 
 
 def motion_of_points(from_mm: Floats, to_mm: Floats) -> Floats:
-    """4x4 that brings points [n, 3] onto others by least squares."""
+    """Return the 4x4 transform that maps points [n, 3] to others by least squares."""
     middle_from, middle_to = from_mm.mean(axis=0), to_mm.mean(axis=0)
     motion = np.eye(4)
     motion[:3, :3] = Rotation.align_vectors(to_mm - middle_to, from_mm - middle_from)[0].as_matrix()

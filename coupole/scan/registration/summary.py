@@ -12,7 +12,7 @@ from coupole.scan.registration.registering import Registration
 from coupole.scan.registration.small_motions import displacement_mm, inverse_of
 
 _CONSPICUOUS = 3.0
-"""Times their uncertainty that targets may be off before a sentence says so."""
+"""Ratio of a target's error to its uncertainty above which a sentence reports it."""
 
 
 def about(registration: Registration, merged_mesh: Merged | None) -> dict[str, Any]:
@@ -75,7 +75,7 @@ def about(registration: Registration, merged_mesh: Merged | None) -> dict[str, A
 
 
 def frame_of_mesh(registration: Registration, merged_mesh: Merged) -> str:
-    """`site` for that of the control points, else the first placed scan's name."""
+    """Return `site` for the frame of the control points, otherwise the first placed scan's name."""
     is_on_site = registration.is_merged_on_site(merged_mesh.cell_mm)
     return "site" if is_on_site else registration.names[registration.placed_numbers[0]]
 
@@ -92,7 +92,7 @@ def _uncertainty(registration: Registration, number: int) -> dict[str, Any]:
 
 
 def point_uncertainty_mm(registration: Registration, number: int) -> float:
-    """Root mean square displacement of a scan's points by the uncertainty of its pose (68 %)."""
+    """Return the root mean square displacement of a scan's points from the uncertainty of its pose (68 %)."""
     covariance, points = registration.covariance[number], registration.scans[number].coarse.points_mm
     arms = points - points.mean(axis=0)
     turn = registration.fit.common_from_scan[registration.placed_numbers.index(number)][:3, :3]
@@ -102,8 +102,8 @@ def point_uncertainty_mm(registration: Registration, number: int) -> float:
 
 
 def stated_poses_off_mm(registration: Registration) -> dict[str, float]:
-    """Root mean square displacement of each scan's points from where the pose that its file states puts them, seen
-    from the first placed scan that states one."""
+    """Return the root mean square displacement of each scan's points from the pose that its file states, relative
+    to the first placed scan with a stated pose."""
     stated_poses = {
         k: pose for k in registration.placed_numbers if (pose := registration.scans[k].stated_pose) is not None
     }
@@ -119,7 +119,7 @@ def stated_poses_off_mm(registration: Registration) -> dict[str, float]:
 
 
 def worst_loop_mm(registration: Registration) -> float:
-    """0 where there is no loop."""
+    """Return the worst closure error of a loop, mm; 0 without loops."""
     return registration.loops[0].error_mm if registration.loops else 0.0
 
 
@@ -132,7 +132,7 @@ def _sliding(registration: Registration) -> str:
 
 
 def remarks(registration: Registration) -> Iterator[str]:
-    """Yield remarks that the reader must know, one sentence each."""
+    """Yield important remarks, one sentence each."""
     names = registration.names
     yield (
         f"{len(registration.placed_numbers)} of {len(names)} scans placed by {registration.pairs} overlapping "

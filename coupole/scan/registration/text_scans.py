@@ -1,9 +1,10 @@
 """Scans as text: PTX and PTS of Leica and others, and plain lines with x, y and z.
 
-A PTX has one or more scans, each with the numbers of its columns and rows, the scanner's place and axes (4 lines),
-a matrix of 4 lines that is multiplied from the right to points as rows, and a line for each ray: x, y, z,
-intensity, and red, green and blue if there are colours. Rays that did not come back are `0 0 0`. A PTS has the
-number of points before these. A colour of 0, 0, 0 is none (SpatialAnalyzer user's manual, "PTX", "PTS").
+A PTX has one or more scans. Each has the numbers of its columns and rows, the scanner's position and axes (4
+lines), a matrix of 4 lines, and a line for each ray. Points are rows, and the matrix is multiplied from their
+right. The line of a ray has x, y, z, intensity and, if there are colours, red, green and blue. Rays that did not
+return are `0 0 0`. A PTS has the number of points, then the same lines of points. A colour of 0, 0, 0 means no
+colour (SpatialAnalyzer user's manual, "PTX", "PTS").
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ HEADED_SUFFIXES = (".ptx", ".pts")
 _LEAST_BYTES_OF_A_LINE = 6
 _PTX_LINES = 10
 _RIGID = 1e-3
-"""Largest departure of a stated rotation from an orthogonal matrix."""
+"""Largest deviation of a stated rotation from an orthogonal matrix."""
 
 Floats = NDArray[np.float64]
 
 
 def headed_sources(path: Path) -> Iterator[ScanSource]:
-    """The scans of a PTX or PTS. Raises InputError with the line."""
+    """Return the scans of a PTX or PTS. Raises InputError with the line."""
     number, line = 0, 1
     with path.open("rb") as file:
         while True:
@@ -54,7 +55,7 @@ def headed_sources(path: Path) -> Iterator[ScanSource]:
 
 
 def read_headed(source: ScanSource) -> ScanContent:
-    """One scan of a PTX or PTS. Raises InputError with the line."""
+    """Read one scan of a PTX or PTS. Raises InputError with the line."""
     with source.path.open("rb") as file:
         file.seek(source.at_byte)
         count, lines, pose = _header(file, source)
@@ -65,13 +66,14 @@ def read_headed(source: ScanSource) -> ScanContent:
 
 
 def read_plain(path: Path) -> ScanContent:
-    """Lines with x, y and z, and perhaps others; with six columns or seven the last three may be colours."""
+    """Read lines with x, y, z and possibly more columns. With six or seven columns, the last three may be
+    colours."""
     with path.open("rb") as file:
         return _content(path, _table(path, file, 1), None, none_is_black=False)
 
 
 def _content(path: Path, table: Floats, pose: Floats | None, *, none_is_black: bool) -> ScanContent:
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused
+    with np.errstate(over="ignore"):  # numbers that float32 cannot hold become infinite, and are refused
         points = table[:, :3].astype(np.float32)
     expect_finite(path, points, "point {}")
     colours = _colours(table, none_is_black=none_is_black)
@@ -79,7 +81,7 @@ def _content(path: Path, table: Floats, pose: Floats | None, *, none_is_black: b
 
 
 def _colours(table: Floats, *, none_is_black: bool) -> NDArray[np.uint8] | None:
-    """The last three of six columns or seven, if all are whole numbers of 0 to 255 and not all 0 or 1."""
+    """Return the last three of six or seven columns if they are whole numbers of 0 to 255 and not all 0 or 1."""
     if table.shape[1] not in (6, 7) or not len(table):
         return None
     last = table[:, -3:]
@@ -90,7 +92,7 @@ def _colours(table: Floats, *, none_is_black: bool) -> NDArray[np.uint8] | None:
 
 
 def _header(file: BinaryIO, source: ScanSource) -> tuple[int, int, Floats | None]:
-    """Number of points, lines of the header, and the pose that a PTX states."""
+    """Return the number of points, the lines of the header, and the pose that a PTX states."""
     lines = _PTX_LINES if source.path.suffix.lower() == ".ptx" else 1
     rows = []
     for k in range(lines):
@@ -136,11 +138,11 @@ def _pose(source: ScanSource, matrix: Floats) -> Floats:
 
 
 def _table(path: Path, lines: Iterator[bytes] | BinaryIO, first_line: int) -> Floats:
-    """[n, columns] of lines with the same count of numbers each. Raises InputError with the line."""
+    """[n, columns] numbers of lines with equal numbers of columns. Raises InputError with the line."""
     reader = _Decoded(lines)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # without lines: counted by who asked
+            warnings.simplefilter("ignore", UserWarning)  # no warning about missing lines: the caller counts them
             table = np.loadtxt(reader, dtype=np.float64, comments=("#", "//"), ndmin=2)
     except ValueError as error:
         line = first_line + reader.count - 1
@@ -154,7 +156,7 @@ def _table(path: Path, lines: Iterator[bytes] | BinaryIO, first_line: int) -> Fl
 
 
 class _Decoded:
-    """Lines as text, of which the last one handed out is known."""
+    """Decoded lines; it knows which line was returned last."""
 
     def __init__(self, lines: Iterator[bytes] | BinaryIO) -> None:
         self._lines = iter(lines)

@@ -1,8 +1,8 @@
 """Viewpoint of a scanner, and the space that it saw through.
 
-A scan is what one scanner saw from one side: each of its rays ends at the first surface. So no point of another
-scan may lie between the scanner and its surface; where one does, the two scans are placed wrongly (free-space
-violation; Huber, Automatic Three-dimensional Modeling from Reality, 2002, section 4.2).
+A scan is the view of a scanner from one side: each ray ends at the first surface. So no point of another scan may
+lie between the scanner and its surface. If one does, the two scans are placed wrongly (free-space violation;
+Huber, Automatic Three-dimensional Modeling from Reality, 2002, section 4.2).
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ Stand = Literal["origin", "+x", "-x", "+y", "-y", "+z", "-z", "none"]
 STANDS: tuple[Stand, ...] = ("origin", "+x", "-x", "+y", "-y", "+z", "-z", "none")
 
 _MOST_FOLDED = 0.05
-"""Share of the picture's cells with two surfaces in them, of a scan that was seen from there."""
+"""Greatest share of the picture's cells with two surfaces, for a possible viewpoint."""
 _AS_GOOD = 0.005
 _LEAST_FORWARD = 0.1
-"""Length of the mean of all directions below which a scan looks all around."""
+"""Length of the mean of all directions below which a scan covers all directions."""
 _MOST_CELLS = 4_000_000
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A scanner in the frame of its own scan: at the origin, or far away along an axis (its rays parallel)."""
+    """A scanner in the frame of its own scan: at the origin, or far away along an axis, with parallel rays."""
 
     stand: Stand
 
@@ -58,7 +58,7 @@ def _axis(stand: Stand) -> Floats:
 
 
 class DepthPicture:
-    """Picture of what a scanner saw, in cells: the nearest and farthest depth in and around each."""
+    """Picture of the scanner's view, in cells: the nearest and farthest depth in and around each."""
 
     def __init__(self, viewpoint: Viewpoint, points_mm: Floats, spacing_mm: float) -> None:
         self._viewpoint = viewpoint
@@ -90,7 +90,7 @@ class DepthPicture:
 
     def in_front(self, points_mm: Floats, least_mm: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Tell which points [n, 3] in this scan's frame lie in rays that ended at a surface, and which of these
-        lie by `least_mm` or more before it, in space that the scanner saw through."""
+        lie at least `least_mm` before it, in space that the scanner saw through."""
         places, depths = self._viewpoint.places_and_depths(points_mm @ self._level)
         flat, inside = self._cells(self._turned_places(places))
         nearest = np.where(inside, self._nearest[flat], -np.inf)
@@ -110,8 +110,8 @@ class DepthPicture:
 
 
 def _level(points_mm: Floats) -> Floats:
-    """[3, 3] axes in which the middle of what was seen lies on the horizon: near the poles a picture by azimuth
-    and elevation is distorted."""
+    """[3, 3] axes in which the middle of the view lies on the horizon, because a picture by azimuth and elevation
+    is distorted near the poles."""
     ways = points_mm / np.maximum(np.linalg.norm(points_mm, axis=1, keepdims=True), 1e-12)
     forward = ways.mean(axis=0)
     if np.linalg.norm(forward) < _LEAST_FORWARD:
@@ -121,16 +121,16 @@ def _level(points_mm: Floats) -> Floats:
 
 
 def _gap(azimuths: Floats) -> float:
-    """An azimuth at which nothing was seen, or the least: there a turn begins."""
+    """Return an azimuth at which the scanner saw nothing, or least; the picture begins there."""
     counts, borders = np.histogram(np.mod(azimuths, 2 * np.pi), 360, (0, 2 * np.pi))
     return float(borders[int(np.argmin(counts))])
 
 
 def folds(points_mm: Floats, normals: Floats | None, spacing_mm: float) -> dict[Stand, float]:
-    """Return for each viewpoint that a scan [n, 3] could have: share of the rays along which two surfaces lie.
+    """Return, for each possible viewpoint of a scan [n, 3], the share of the rays along which two surfaces lie.
 
-    Where normals [n, 3] say which side is out, they choose between the two ends of an axis, else it is the
-    positive end, as range images have it.
+    If normals [n, 3] show which side is out, they choose between the two ends of an axis. Otherwise it is the
+    positive end, as in range images.
     """
     step_mm = 8 * spacing_mm
     fold_shares: dict[Stand, float] = {}
@@ -145,8 +145,9 @@ def folds(points_mm: Floats, normals: Floats | None, spacing_mm: float) -> dict[
 
 
 def choose_viewpoints(folded_shares: Sequence[dict[Stand, float]]) -> list[Viewpoint]:
-    """One viewpoint for each scan: of all that they could have the one that folds them least, as all come from one
-    scanner; the origin if it is as good. `none` for a scan that it does not fit: one that was merged, or moved."""
+    """Return one viewpoint for each scan. All scans come from one scanner; so the viewpoint is the one with the
+    smallest share of folded rays over all scans, or the origin if it is as good. A scan that does not fit it,
+    because it was merged or moved, gets `none`."""
     common_stands = set.intersection(*(set(of_scan) for of_scan in folded_shares))
     total = {stand: float(np.median([of_scan[stand] for of_scan in folded_shares])) for stand in common_stands}
     best: Stand = min(total, key=lambda stand: (total[stand], stand)) if total else "none"

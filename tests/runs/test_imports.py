@@ -81,6 +81,16 @@ def test_wrong_options_are_refused_before_what_takes_seconds_to_import(
     assert heavy(modules(tmp_path / "seen", "end")) <= libraries
 
 
+def test_a_result_of_runs_imports_nothing_of_comparisons_and_registration(tmp_path: Path) -> None:
+    """They want scipy.stats: half a second."""
+    ended = cells.finish(watched(tmp_path / "seen", "reflectance", "nosuch", "--out", tmp_path / "out"))
+    assert ended.code == 2, ended.err
+    names = modules(tmp_path / "seen", "end")
+    assert "coupole.reflectance.run_fits" in names
+    unwanted = ("scipy.stats", "coupole.heritage", "coupole.scan.registration")
+    assert [name for name in names if name.startswith(unwanted)] == []
+
+
 def test_each_command_is_found_where_the_table_has_it() -> None:
     for command in cli.COMMANDS:
         found = cells.here(command, "--help")

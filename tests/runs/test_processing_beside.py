@@ -18,6 +18,8 @@ from beside_runs import begun, cell_of_three_views, files, is_beside, result_of,
 from cells import CellFolder
 from PIL import Image
 
+from coupole.reflectance.beside.beforehand import reasons_against
+
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("hurried")]
 
 
@@ -144,36 +146,37 @@ def test_a_resumed_run_goes_on_with_what_was_asked(tmp_path: Path) -> None:
     assert whole.document["reflectance"]["is_whole"], whole.err
 
 
+def test_what_cannot_be_made_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path)
+    cell.write(calibrations="none")
+    ended = cell.acquire("--reflectance", "--result", tmp_path / "plan.yaml/result")
+    assert ended.code == 3, ended.err
+    assert "expected calibration records of the kinds hand-eye, leds, led-power" in ended.err
+    assert "expected a folder that can be made" in ended.err
+    assert not (tmp_path / "storage").exists() or not list((tmp_path / "storage").glob("2*"))
+
+
 @pytest.mark.parametrize(
     ("plan", "words"),
     [
-        ({"calibrations": "none"}, "expected calibration records of the kinds hand-eye, leds, led-power"),
         ({"object": {"id": "nobody"}}, "expected the object's mesh"),
         ({"gain_db": 6.0}, "holds for a gain of"),
         ({"lights": {"kind": "panels", "panels": [1]}}, "expected single LEDs"),
     ],
 )
-def test_what_cannot_be_made_is_refused_before_anything_moves(
-    tmp_path: Path, plan: dict[str, Any], words: str
-) -> None:
+def test_what_is_lacking_is_told(tmp_path: Path, plan: dict[str, Any], words: str) -> None:
     cell = cell_of_three_views(tmp_path)
+    assert reasons_against(cell.plan, None, None, None) == []
     cell.write(**plan)
-    ended = cell.acquire("--reflectance")
-    assert ended.code == 3, ended.err
-    assert words in ended.err
-    assert not (tmp_path / "storage").exists() or not list((tmp_path / "storage").glob("2*"))
+    (reason,) = reasons_against(cell.plan, None, None, None)
+    assert words in reason
 
 
 @pytest.mark.parametrize(("result", "words"), [("/proc/no/result", "/proc: "), ("plan.yaml/result", "is a file")])
-def test_a_result_folder_that_cannot_be_made_is_refused_before_anything_moves(
-    tmp_path: Path, result: str, words: str
-) -> None:
-    cell = cell_of_three_views(tmp_path)
-    ended = cell.acquire("--reflectance", "--result", tmp_path / result)
-    assert ended.code == 3, ended.err
-    assert "expected a folder that can be made" in ended.err
-    assert words in ended.err
-    assert not (tmp_path / "storage").exists() or not list((tmp_path / "storage").glob("2*"))
+def test_a_result_folder_that_cannot_be_made_is_told(tmp_path: Path, result: str, words: str) -> None:
+    (reason,) = reasons_against(cell_of_three_views(tmp_path).plan, None, tmp_path / result, None)
+    assert "expected a folder that can be made" in reason
+    assert words in reason
 
 
 def test_the_result_of_another_run_is_neither_touched_nor_taken_for_this_ones(tmp_path: Path) -> None:

@@ -221,7 +221,7 @@ def test_runs_of_one_object_are_fitted_together(made: Made, tmp_path: Path) -> N
     np.testing.assert_allclose(np.nanmedian(fitted.kd, axis=0) * np.pi, DIFFUSE, rtol=0.05)
     np.testing.assert_allclose(np.nanmedian(fitted.alpha), ROUGHNESS, rtol=0.15)
     second.plan_data["object"]["support_from_object"] = {"translation_mm": [1.0, 0, 0]}
-    second.write()
+    second.write(lights={"kind": "ids", "ids": [0]})
     moved = second.acquire()
     assert moved.code == 0
     ended = cells.here(

@@ -22,6 +22,8 @@ from sim.world.client import World
 
 MANY_LIGHTS = {"kind": "every", "every": 4}
 """270 LEDs: a burst of 2.8 s."""
+OTHER_SIDE = {**SIDE, "lights": cells.SOME_LIGHTS}
+"""The view after that burst: it is only completed."""
 SPEED = 2.0
 
 
@@ -48,7 +50,7 @@ def _self_contained_cell(folder: Path, *, write: bool = True) -> CellFolder:
     if write:
         shutil.copy(cells.REPO / "configs/domes/coupole.csv", folder)
         shutil.copy(cells.COARSE_RELIEF, folder)
-        cell.write(views=[TOP, SIDE], lights=MANY_LIGHTS)
+        cell.write(views=[TOP, OTHER_SIDE], lights=MANY_LIGHTS, order="as_written")
     return cell
 
 
@@ -65,6 +67,12 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Killed:
     return Killed(folder, run, worlds)
 
 
+def _labels(run: Path) -> dict[str, list[str]]:
+    """Of each view's frames."""
+    found: dict[str, list[str]] = cells.about(run)["labels"]
+    return found
+
+
 def _proven(run: Path) -> dict[str, dict[str, Any]]:
     return {event["shot"]: event for event in cells.events(run, "frame")}
 
@@ -78,13 +86,13 @@ def _pixels_of(run: Path, shots: Any) -> dict[str, bytes]:
 
 
 def test_a_killed_run_has_kept_part_of_a_burst(killed: Killed) -> None:
-    assert 20 < len(_proven(killed.run)) < len(cells.labels(killed.run))
+    assert 20 < len(_proven(killed.run)) < len(_labels(killed.run)["top"])
     assert cells.events(killed.run, "stop") == []
     found = cells.here("status", killed.run, "--json").document
     assert (found["state"], found["faults"]) == ("interrupted", [])
     assert "it was killed, or the power failed" in found["reason"]
     assert found["go_on"] == f"coupole acquire --resume {killed.run}"
-    assert found["frames_left"] == 2 * len(cells.labels(killed.run)) - len(_proven(killed.run))
+    assert found["frames_left"] == sum(map(len, _labels(killed.run).values())) - len(_proven(killed.run))
 
 
 def test_verify_says_five_of_a_run_that_is_not_complete(killed: Killed) -> None:
@@ -121,7 +129,7 @@ def resumed(killed: Killed, tmp_path_factory: pytest.TempPathFactory) -> Resumed
 def test_a_killed_run_is_resumed_to_completeness(resumed: Resumed) -> None:
     assert resumed.ended.code == 0, resumed.ended.err
     found = resumed.ended.document
-    assert (found["run"], found["proven"], found["missing"]) == (str(resumed.run), 540, 0)
+    assert (found["run"], found["proven"], found["missing"]) == (str(resumed.run), 270 + 54, 0)
     cells.assert_each_shot_proven_once(resumed.run)
 
 
@@ -130,7 +138,7 @@ def test_what_was_proven_before_a_kill_is_not_taken_again(resumed: Resumed) -> N
     assert {shot: after[shot] for shot in resumed.proven_before} == resumed.proven_before
     resumed_burst = cells.events(resumed.run, "burst")[0]
     marks = 10  # they are fired with every burst
-    assert resumed_burst["steps"] <= len(cells.labels(resumed.run)) - len(resumed.proven_before) + marks
+    assert resumed_burst["steps"] <= len(_labels(resumed.run)["top"]) - len(resumed.proven_before) + marks
 
 
 def test_bytes_that_were_proven_before_a_kill_stay_as_they_were(resumed: Resumed) -> None:

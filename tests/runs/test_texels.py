@@ -164,7 +164,7 @@ def test_a_job_that_was_stopped_goes_on_and_ends_alike(made: Made, tmp_path: Pat
     assert not list(copy.rglob("*.part"))
     assert (copy / "texels/top.h5").read_bytes() == (out / "texels/top.h5").read_bytes()
     shutil.rmtree(copy / "texels")
-    with cluster(tmp_path, 2) as (address, _):
+    with cluster(tmp_path, 1) as (address, _):
         add_texels(request_of(made), copy, scheduler=address)
     for name in ("top.h5", "side.h5", "texels.json"):
         assert (copy / "texels" / name).read_bytes() == (out / "texels" / name).read_bytes()

@@ -31,7 +31,8 @@ from coupole.storage.run import Occupied
 BURST_OVERHEAD_S = 0.14
 """Time to arm the camera, read the table's CRC back, start, wait for the last frame, and sync (simulated cell)."""
 CHOICE_S = 2.0
-"""Time of a choice of bursts in the run, for 1080 LEDs on a busy machine (`tools/prove_auto_exposure.py`)."""
+"""Time of a choice in the run: of bursts for 1080 LEDs on a busy machine (`tools/prove_auto_exposure.py`), or of a
+view."""
 SETTLE_CHECK_S = 0.1
 """Time from the end of a motion to 'settled', without the dwell (measured on the simulated cell)."""
 DISK_SHARE = 0.9
@@ -288,13 +289,15 @@ def _too_strict(until: EnoughViews, least: Mapping[str, float]) -> list[str]:
 
 
 def _limit(report: Report, until: EnoughViews) -> None:
-    """Limit the figures to those that the plan asks for: no view is begun that would exceed them."""
+    """Limit the figures to those that the plan asks for: no view is begun that would exceed them. The time of the
+    choices comes on top."""
     if until.frames is not None:
         report.frames = min(report.frames, until.frames)
         report.shots = min(report.shots, report.frames)
     if until.seconds is not None:
         report.duration_s = min(report.duration_s, until.seconds)
         report.ideal_s = min(report.ideal_s, report.duration_s)
+    report.duration_s += CHOICE_S * report.view_count
     if until.lux_h is not None:
         report.dose_lux_h = min(report.dose_lux_h, until.lux_h)
 

@@ -22,8 +22,8 @@ from coupole.calibration.adjustment import Block
 from coupole.calibration.rotations import Floats
 
 _NULL = 1e-7
-"""Least share of the information of a direction of the modes. With less, the direction belongs to the model
-itself."""
+"""Least share of the information in one direction of the space of the modes. With less, the direction belongs to
+the model itself."""
 _LEAST_LOG = -60.0
 _ROUNDS, _SETTLED = 4, 0.01
 

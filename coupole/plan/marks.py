@@ -1,8 +1,8 @@
 """Dark marks at both ends of a burst, for the proof of its frames.
 
 *Coded* marks enclose a burst that the box runs: their periods identify the burst's beginning and end
-(`coupole.acquisition.frame_matching`). *Plain* marks enclose a burst that the host fires with a box without a log.
-They must be dark; otherwise a lamp is on that should be off.
+(`coupole.acquisition.frame_matching`). *Plain* marks enclose a burst that the host fires, because the box has no
+log. They must be dark; otherwise a lamp is on that should be off.
 """
 
 from __future__ import annotations

@@ -88,7 +88,8 @@ class TextQueue:
             return Unread(self._lost_lines, self._lost_bytes, waiting, stalled_s)
 
     def wait_until_drained(self, patience_s: float, at_most_s: float) -> bool:
-        """Wait until the reader has everything, takes nothing for `patience_s`, or `at_most_s` have passed."""
+        """Wait until the reader has all bytes. Give up if the reader takes none for `patience_s`, or after
+        `at_most_s`."""
         begun_s = time.monotonic()
         with self._changed:
             while self._waiting_bytes or self._taken_bytes:

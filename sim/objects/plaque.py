@@ -134,8 +134,8 @@ def _in_roundel(x: Array, y: Array) -> NDArray[np.int64]:
 
 
 def _grains(x: Array, y: Array) -> Array:
-    """Return even random values [n], 0 to 1, equal within a grain of powder. A place has gold if its value is
-    below the share of gold."""
+    """Return uniform random values [n], 0 to 1; all places in a grain of powder have the same value. A place has
+    gold if its value is below the share of gold."""
     from scipy.special import ndtr
 
     return np.asarray(ndtr(noise(x, y, _GRAIN_MM, _POWDER_SEED) / NOISE_SPREAD))

@@ -174,7 +174,8 @@ def _copy(image, top, left_px, source):  # type: ignore[no-untyped-def]
 
 @kernel
 def _mirrored_index(place, count):  # type: ignore[no-untyped-def]
-    """Return the index in an axis of `count` that is continued by reflection, with doubled edges."""
+    """Return the index of a place on an axis of `count` pixels that is continued by reflection; the edge pixels
+    are repeated."""
     if 0 <= place < count:
         return place
     place %= 2 * count

@@ -20,8 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _BLOCK = struct.Struct("<QqqdqqQQ")
-"""Sequence (odd while being written), machine ns and world ns at the anchor, speed, hurry-until ns, horizon ns,
-1 while the world runs, its process. The client's request, hurry-until ns, follows it."""
+"""Fields of the block. The world writes a sequence number (odd while it writes), machine ns and world ns at the
+anchor, the speed, the hurry-until ns, the horizon ns, 1 while the world runs, and its process. The client writes
+its request, a hurry-until ns, after them."""
 _SEQUENCE, _WISH = struct.Struct("<Q"), struct.Struct("<q")
 BLOCK_BYTES = _BLOCK.size + _WISH.size
 _NAP_S = 0.02

@@ -83,8 +83,8 @@ def _step_target_deg(arm: Arm, here_deg: Joints, axis: int, direction: int) -> J
 
 
 def _along(arm: Arm, flange_from_camera: Transform, here_deg: Joints, axis: str, direction: int) -> Joints:
-    """Return joint angles farther along the camera's line or turn, as far as a straight motion in joint space
-    keeps to the line."""
+    """Return joint angles farther along the camera's line or turn. The step is as long as a straight motion in
+    joint space stays close to the line."""
     start = forward(arm, here_deg) @ flange_from_camera
     part = 1.0
     while part * _STEP_MM >= _LEAST_MM:

@@ -23,8 +23,9 @@ _ROUNDS = 12
 _MOST_TURN = math.cos(math.radians(40.0))
 _LEAST_FACING = math.cos(math.radians(70.0))
 _LEAST_FACING_MERGED = math.cos(math.radians(86.0))
-"""Cosines of greatest angles: of mean directions within a chart; of single triangles to a chart's plane while the
-chart grows; and the same when small charts are merged into their neighbours."""
+"""Cosines of three greatest angles. First: between mean directions within a chart. Second: between a single
+triangle and the plane of its chart, while the chart grows. Third: the same, when small charts are merged into
+their neighbours."""
 _LEAST_TRIANGLES = 64
 """Fewest triangles of a chart; smaller ones are merged into their neighbours."""
 _MOST_SHARE = 1 / 100

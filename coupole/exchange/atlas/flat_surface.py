@@ -117,8 +117,8 @@ def flatten(surface: MeasuredSurface) -> FlatSurface:
 def _lay_out(
     surface: MeasuredSurface, rows: NDArray[np.int64], views: list[TexelView], textured_mesh: TexturedMesh | None
 ) -> tuple[NDArray[np.int64], Atlas]:
-    """Places of the triangles `rows`; if there is a mesh with texture coordinates, of the triangles that both
-    have."""
+    """Places of the triangles `rows`. With a mesh that has texture coordinates, only the triangles that both have
+    are placed."""
     options = surface.options
     corners_mm = surface.vertices_mm[surface.triangles[rows]]
     texel_mm = options.texel_mm or _finest_mm(views, corners_mm)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from coupole.acquisition.arm_supervisor import ArmSupervisor
 from coupole.acquisition.bursts_of_views import BurstsOfViews
@@ -13,8 +14,10 @@ from coupole.plan.bursts import Burst
 from coupole.plan.plan import AdaptiveViews
 from coupole.plan.view_choices import has_enough_views
 from coupole.preflight.job import Job
-from coupole.reflectance.next_views.next_views import NextViews
 from coupole.storage.journal_events import ViewChosen
+
+if TYPE_CHECKING:
+    from coupole.reflectance.next_views.next_views import NextViews
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,8 @@ def chosen_visits(job: Job, arm: ArmSupervisor, bursts: BurstsOfViews, recorder:
     """Return the views that the run has chosen and not completed, then further ones, each chosen when the one
     before is complete. A choice is on the disk when its view is returned. Raises PreflightRefused if the arm has
     no way from where it is."""
+    from coupole.reflectance.next_views.next_views import NextViews
+
     assert isinstance(job.plan.views, AdaptiveViews)
     next_views = None if has_enough_views(job.chosen_views) else NextViews(job, job.plan.views.until)
     return _chosen_visits(job, arm, bursts, recorder, next_views)

@@ -10,21 +10,16 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from coupole.console.plans.plan_queue import Entry
 
 
-def _without_control_characters(text: str) -> str:
-    """Refuse what would move a terminal's cursor or colour its text where it is printed."""
-    if any(unicodedata.category(character) == "Cc" and character != "\n" for character in text):
-        raise ValueError("expected text without control characters")
+def _printable(text: str) -> str:
+    """Refuse what would move a terminal's cursor, colour its text or begin a line where the text is printed."""
+    if any(unicodedata.category(character) == "Cc" for character in text):
+        raise ValueError("expected one line without control characters")
     return text
 
 
-def _one_line(text: str) -> str:
-    if "\n" in text:
-        raise ValueError("expected one line")
-    return text
-
-
-Text = Annotated[str, Field(max_length=2000), AfterValidator(_without_control_characters)]
-Line = Annotated[Text, AfterValidator(_one_line)]
+Text = Annotated[str, Field(max_length=2000)]
+Line = Annotated[Text, AfterValidator(_printable)]
+"""Words that are shown to others, also at terminals."""
 
 
 MOST_LUX_H = 1e9
@@ -96,7 +91,7 @@ class Light(Asked):
 
     dose_lux_h: Annotated[float, Field(ge=0, le=MOST_LUX_H, allow_inf_nan=False, strict=True)]
     """Light dose in lux hours."""
-    note: Annotated[str, Field(min_length=1, max_length=2000)]
+    note: Annotated[Line, Field(min_length=1)]
     """Description of that light."""
 
 
@@ -105,9 +100,9 @@ class Budget(Asked):
 
     dose_lux_h: Annotated[float, Field(ge=0, le=MOST_LUX_H, allow_inf_nan=False, strict=True)]
     """Light dose in lux hours."""
-    name: Annotated[str, Field(max_length=200)] = ""
+    name: Annotated[Line, Field(max_length=200)] = ""
     """Name of the person who is responsible; empty for the sender."""
-    reason: Annotated[str, Field(max_length=2000)] = ""
+    reason: Line = ""
     """Reason for this budget."""
 
 

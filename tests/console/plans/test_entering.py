@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from cells import CellFolder
+from pydantic import ValidationError
 
 from coupole.console.cell.acquisitions import Acquisitions
 from coupole.console.cell.lending import begun_here
@@ -126,6 +127,12 @@ def test_what_preflight_refuses_or_cannot_say_is_not_entered(desk: Desk) -> None
             with pytest.raises(InputError):
                 desk.enter(**asked)
     assert desk.names == []
+
+
+@pytest.mark.parametrize("hold", ["turn\x1b[2Jit", "turn it\nand go", "bell\a"])
+def test_words_for_others_cannot_steer_their_terminal(desk: Desk, hold: str) -> None:
+    with pytest.raises(ValidationError, match="one line without control characters"):
+        desk.enter(hold=hold)
 
 
 def test_only_what_waits_is_moved_and_only_before_what_waits(desk: Desk) -> None:

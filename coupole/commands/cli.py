@@ -22,7 +22,6 @@ from coupole.bounded import leave
 from coupole.commands.common import fail
 from coupole.commands.examples import add_examples
 from coupole.commands.extras import lacking_extras, missing_extra
-from coupole.commands.shortages import place_of, shortage_behind
 from coupole.errors import CoupoleError, Interrupted, StorageError
 from coupole.viewing import text_outlet
 
@@ -258,6 +257,8 @@ def _code_of_missing(error: ImportError) -> int:
 
 
 def _code_of_defect(error: Exception) -> int:
+    from coupole.commands.shortages import place_of, shortage_behind
+
     shortage = shortage_behind(error)
     if shortage is not None:
         fail(shortage, as_json="--json" in sys.argv)

@@ -6,6 +6,7 @@ import os
 import select
 import tty
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ LONG_FLASH = table(1, led=900, on_us=2_000_000, period_us=2_000_000)
 def dark_after_s(world: LedBoxAlone, lights_off: Callable[[], None]) -> float:
     """World time from the call to the moment at which the light and the panel are off."""
     dark_ns: list[int] = []
-    world.box._on_panel = lambda panel, on, t_ns: dark_ns.append(t_ns)
+    world.box._cables = replace(world.box._cables, on_panel=lambda panel, on, t_ns: dark_ns.append(t_ns))
     called_ns = world.clock.now_ns()
     lights_off()
     assert len(dark_ns) == len(world.darkened_ns) == 1

@@ -101,7 +101,7 @@ def test_each_choice_has_its_reason_and_the_next_best(whole: CellFolder) -> None
     assert coverages == sorted(coverages)
     assert coverages[-1] > 0.5
     gains = [chosen.figures["chosen"]["gain"] for chosen in chosen_views]
-    assert gains == sorted(gains, reverse=True)
+    assert min(gains) > 0  # they may grow: a part with few samples counts by its share
 
 
 def test_a_run_costs_no_more_than_preflight_and_the_choices_say(whole: CellFolder) -> None:

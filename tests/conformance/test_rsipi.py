@@ -155,6 +155,12 @@ def echo_server(config: Path, cycle_ms: int) -> Iterator[subprocess.Popen[str]]:
             server.kill()
 
 
+def _ipoc(data: bytes) -> bytes:
+    found = re.search(rb"<IPOC>(\d+)</IPOC>", data)
+    assert found is not None, data
+    return found[1]
+
+
 @contextmanager
 def bad_network(port: int, driver_port: int) -> Iterator[None]:
     """Between the controller, which sends to `port` of 127.0.0.1, and the driver: packets are doubled, held back
@@ -164,19 +170,29 @@ def bad_network(port: int, driver_port: int) -> Iterator[None]:
 
     def relay(near: socket.socket, far: socket.socket, over: threading.Event) -> None:
         passed: list[bytes] = []
+        controller: tuple[str, int] | None = None
+        unanswered, until_s = b"", 0.0
         while not over.is_set():
-            if not select.select([near], [], [], 0.05)[0]:
-                continue
-            data, controller = near.recvfrom(65535)
-            passed.append(data)
-            if len(passed) % 100 == 50:
-                time.sleep(0.03)
-            for repeated in (data, *[data] * (len(passed) % 7 == 0), *passed[-30:-29] * (len(passed) % 40 == 39)):
-                far.sendto(repeated, ("127.0.0.2", driver_port))
-            wait_s = _ANSWER_S
-            while select.select([far], [], [], wait_s)[0]:
-                near.sendto(far.recv(65535), controller)
-                wait_s = 0.0
+            waits = bool(unanswered) and time.monotonic() < until_s
+            for ready in select.select([far] if waits else [far, near], [], [], 0.05)[0]:
+                data, sender = ready.recvfrom(65535)
+                if ready is far:
+                    assert controller is not None
+                    near.sendto(data, controller)
+                    if _ipoc(data) == unanswered:  # not the second answer to what came twice
+                        unanswered = b""
+                    continue
+                controller = sender
+                passed.append(data)
+                if len(passed) % 100 == 50:
+                    time.sleep(0.03)
+                for repeated in (
+                    data,
+                    *[data] * (len(passed) % 7 == 0),
+                    *passed[-30:-29] * (len(passed) % 40 == 39),
+                ):
+                    far.sendto(repeated, ("127.0.0.2", driver_port))
+                unanswered, until_s = _ipoc(data), time.monotonic() + _ANSWER_S
 
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as near,

@@ -186,12 +186,9 @@ def bad_network(port: int, driver_port: int) -> Iterator[None]:
                 passed.append(data)
                 if len(passed) % 100 == 50:
                     time.sleep(0.03)
-                for repeated in (
-                    data,
-                    *[data] * (len(passed) % 7 == 0),
-                    *passed[-30:-29] * (len(passed) % 40 == 39),
-                ):
-                    far.sendto(repeated, ("127.0.0.2", driver_port))
+                repeats = [data] * (len(passed) % 7 == 0) + passed[-30:-29] * (len(passed) % 40 == 39)
+                for packet in (data, *repeats):
+                    far.sendto(packet, ("127.0.0.2", driver_port))
                 unanswered, until_s = _ipoc(data), time.monotonic() + _ANSWER_S
 
     with (

@@ -53,6 +53,13 @@ def test_no_link_of_the_pages_is_broken(staged: site_source.Source) -> None:
     assert staged.broken_links == []
 
 
+def test_no_text_has_the_marks_of_a_merge_that_was_not_finished() -> None:
+    marks = re.compile(r"^(<{7} |={7}$|>{7} )", re.MULTILINE)
+    texts = [*REPO.glob("*.md"), *DOCS.rglob("*.md")]
+    assert REPO / "CHANGELOG.md" in texts
+    assert [path.name for path in texts if marks.search(path.read_text(encoding="utf-8"))] == []
+
+
 def test_places_that_links_name_are_on_their_pages() -> None:
     missing = []
     for path in [REPO / "README.md", *sorted(DOCS.rglob("*.md"))]:

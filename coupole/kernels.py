@@ -27,7 +27,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
@@ -38,6 +38,8 @@ LIBRARIES = ("llvmlite", "numba", "numpy", "scipy")
 """Libraries that compile kernels, or compute constants that are compiled into them."""
 UNUSED_S = 30 * 86400.0
 """Code that nobody used for this time is removed when other code of the same module is kept."""
+_LOCKED_S = 2.0
+"""Longest wait for another process that keeps code in the same folder. It may have been stopped meanwhile."""
 _DAY_S = 86400.0
 _ROOT = Path(__file__).parent.parent
 _IMPORT = re.compile(r"^(?:from ([\w.]+) import (\([^)]*\)|[^\n]*)|import ([^\n]+))", re.MULTILINE)
@@ -172,6 +174,18 @@ def _remove_unused(module: str) -> None:
                 shutil.rmtree(folder)
 
 
+def _lock(lock: IO[str]) -> None:
+    """Take the lock of a folder of code. Raises TimeoutError if another process holds it for too long."""
+    give_up_s = time.monotonic() + _LOCKED_S
+    while True:
+        try:
+            return fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > give_up_s:
+                raise TimeoutError(f"another process holds {lock.name}") from None
+            time.sleep(0.01)
+
+
 # -- numba's side -----------------------------------------------------------------------------------------
 
 
@@ -224,7 +238,7 @@ class _KernelCache(FunctionCache):
                 _remove_unused(folder.name.rpartition("-")[0])
             folder.mkdir(parents=True, exist_ok=True)
             with (folder / "lock").open("w") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
+                _lock(lock)
                 super()._save_overload(signature, code)  # type: ignore[no-untyped-call]
         except OSError as error:
             warnings.warn(f"compiled code is not kept: {error}", RuntimeWarning, stacklevel=2)

@@ -38,7 +38,7 @@ def test_too_few_open_files_are_told_with_the_limit(tmp_path: Path) -> None:
     assert "may not open more files at once (the limit is 20). Raise the limit (`ulimit -n 1024`)." in err
     assert "defect" not in err
     assert "Traceback" not in err
-    document = json.loads(out.splitlines()[-1])
+    document = json.loads(out)
     assert document["kind"] == "ResourceShortage"
     assert document["exit_code"] == 1
 
@@ -90,6 +90,18 @@ def test_a_defect_stays_one() -> None:
     assert shortage_behind(RuntimeError("another")) is None
     assert shortage_behind(BlockingIOError(errno.EAGAIN, "a socket is not ready")) is None
     assert shortage_behind(OSError(errno.EIO, "input/output error")) is None
+
+
+def test_what_was_dealt_with_is_not_blamed() -> None:
+    def read() -> None:
+        try:
+            raise OSError(errno.EMFILE, "Too many open files")
+        except OSError:
+            raise ValueError("a defect") from None
+
+    with pytest.raises(ValueError, match="a defect") as caught:
+        read()
+    assert shortage_behind(caught.value) is None
 
 
 def test_a_run_without_free_file_numbers_does_not_blame_the_disk() -> None:

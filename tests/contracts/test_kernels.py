@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import fcntl
 import os
 import re
 import subprocess
@@ -10,6 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -61,13 +63,17 @@ def surroundings(**more: str) -> dict[str, str]:
     return {**kept, "PYTHONPATH": str(REPO), "PYTHONDONTWRITEBYTECODE": "1", **more}
 
 
+def started(checkout: Path, timeout: float | None = None) -> subprocess.CompletedProcess[str]:
+    place = surroundings(NUMBA_CACHE_DIR=str(checkout.parent / "cache"))
+    command = [sys.executable, "script.py"]
+    return subprocess.run(
+        command, cwd=checkout, env=place, capture_output=True, text=True, check=True, timeout=timeout
+    )
+
+
 def run(checkout: Path) -> str:
     """What the kernel computes, and how often its code was there already."""
-    cache = str(checkout.parent / "cache")
-    command = [sys.executable, "script.py"]
-    ended = subprocess.run(
-        command, cwd=checkout, env=surroundings(NUMBA_CACHE_DIR=cache), capture_output=True, text=True, check=True
-    )
+    ended = started(checkout)
     assert ended.stderr == ""
     return ended.stdout.strip()
 
@@ -107,6 +113,21 @@ def test_code_that_is_torn_is_compiled_anew(checkout: Path) -> None:
     assert run(checkout) == "21.0 0"
     for file in (checkout.parent / "cache").rglob("*.nbi"):
         file.write_bytes(b"")
+    assert run(checkout) == "21.0 0"
+    assert run(checkout) == "21.0 1"
+
+
+def test_who_keeps_code_and_is_stopped_meanwhile_holds_up_nobody(checkout: Path) -> None:
+    run(checkout)
+    for file in (checkout.parent / "cache").rglob("*.nb?"):
+        file.unlink()
+    with ExitStack() as locks:
+        for folder in folders_of_code(checkout).values():
+            lock = locks.enter_context((folder / "lock").open("w"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        ended = started(checkout, timeout=60)
+    assert ended.stdout == "21.0 0\n"
+    assert "compiled code is not kept: another process holds" in ended.stderr
     assert run(checkout) == "21.0 0"
     assert run(checkout) == "21.0 1"
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import socket
 import threading
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -30,32 +31,34 @@ def test_clients_that_send_or_read_nothing_hold_up_no_other_and_not_the_end(tmp_
         assert not path.exists()  # while all of them are still there
 
 
-def test_a_process_that_accepts_nobody_is_told_as_such(tmp_path: Path) -> None:
-    """As one that is stopped, and that many have asked already."""
-    path = tmp_path / "socket"
+@contextmanager
+def full_queue(path: Path) -> Iterator[socket.socket]:
+    """A socket whose process accepts nobody, and for which as many wait as may."""
     with ExitStack() as waiting:
         stopped = waiting.enter_context(socket.socket(socket.AF_UNIX))
         stopped.bind(str(path))
         stopped.listen(1)
         for _ in range(2):
             waiting.enter_context(socket.socket(socket.AF_UNIX)).connect(str(path))
-        with pytest.raises(TimeoutError, match=r"accepts no connection.*`kill -CONT PID` lets one run again"):
-            exchange(path, {"ask": "state"}, patience_s=0.2)
+        yield stopped
+
+
+def test_a_process_that_accepts_nobody_is_told_as_such(tmp_path: Path) -> None:
+    """As one that is stopped, and that many have asked already."""
+    path = tmp_path / "socket"
+    message = r"accepts no connection.*`kill -CONT PID` lets one run again"
+    with full_queue(path), pytest.raises(TimeoutError, match=message):
+        exchange(path, {"ask": "state"}, patience_s=0.2)
 
 
 def test_a_place_that_becomes_free_is_taken(tmp_path: Path) -> None:
     path = tmp_path / "socket"
-    with ExitStack() as waiting:
-        stopped = waiting.enter_context(socket.socket(socket.AF_UNIX))
-        stopped.bind(str(path))
-        stopped.listen(1)
-        for _ in range(2):
-            waiting.enter_context(socket.socket(socket.AF_UNIX)).connect(str(path))
+    with full_queue(path) as stopped, ExitStack() as taken:
 
         def go_on() -> None:
             for _ in range(3):
                 connection, _ = stopped.accept()
-                waiting.enter_context(connection)
+                taken.enter_context(connection)
             connection.makefile().readline()
             connection.sendall(b'{"state": "running"}\n')
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cells
 import pytest
+from imperfect_cells import imperfect_rig
 from ruamel.yaml import YAML
 
 from coupole.calibration.record import read_record
@@ -21,7 +22,7 @@ def rig(tmp_path: Path) -> Path:
     """The imperfect cell with small frames, faster than life."""
     path = tmp_path / "rig.yaml"
     with path.open("w") as file:
-        YAML().dump(cells.imperfect_rig(256, speed=5.0), file)
+        YAML().dump(imperfect_rig(256, speed=5.0), file)
     return path
 
 

@@ -11,6 +11,7 @@ import cells
 import numpy as np
 import pytest
 from cells import Ended
+from imperfect_cells import imperfect_rig
 from numpy.typing import NDArray
 
 from coupole.calibration.light.frames import LightFrame, open_light_frames
@@ -33,7 +34,7 @@ def rig(
 ) -> Path:
     """The imperfect cell with small frames, faster than life; slower where boards cool while a session begins, of
     which a busy machine makes several seconds."""
-    content = cells.imperfect_rig(256, speed=5.0 if warm_k else 20.0)
+    content = imperfect_rig(256, speed=5.0 if warm_k else 20.0)
     content["storage"]["folder"] = str(folder / "runs")
     boards = {"ambient_c": ambient_c, "warm_k": warm_k, "thermal_time_constant_s": COOLING_S}
     settings = content["world"]["settings"]

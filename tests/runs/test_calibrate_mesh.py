@@ -10,6 +10,7 @@ from typing import Any
 import cells
 import numpy as np
 import pytest
+from imperfect_cells import imperfect_rig
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
@@ -32,7 +33,7 @@ def make_rig(scale: Callable[[int, int], int]) -> Callable[..., Path]:
 
     def make(folder: Path, *things: Mapping[str, Any]) -> Path:
         width_px = scale(512, 2048)
-        content = cells.imperfect_rig(width_px, speed=20.0)
+        content = imperfect_rig(width_px, speed=20.0)
         content["storage"]["folder"] = str(folder / "runs")
         content["world"]["settings"]["things"] = [dict(thing) for thing in things]
         content["world"]["settings"]["camera"]["samples_per_side"] = scale(2, 3)

@@ -15,11 +15,13 @@ import pytest
 from cells import SIDE, TOP, CellFolder
 from view_files import FORMAT, METADATA, SLOTS, frame
 
-from coupole.errors import DiskFull
+from coupole.errors import DiskFull, StorageError
 from coupole.storage import journal
 from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FaultNoted, SessionStarted, SessionStopped
+from coupole.storage.run import Run
+from coupole.storage.run_inputs import Inputs
 from coupole.storage.view_writer import ViewWriter
 
 
@@ -56,6 +58,16 @@ def test_a_view_for_which_there_is_no_room_is_refused_and_leaves_no_file(small_d
     with pytest.raises(DiskFull, match="the disk is full"):
         create(small_disk / "top.h5", 200, FORMAT, METADATA)
     assert list(small_disk.iterdir()) == []
+
+
+def test_a_run_that_cannot_be_made_leaves_no_folder(small_disk: Path, tmp_path: Path) -> None:
+    fill(small_disk, 16384)
+    for name in ("plan.yaml", "rig.yaml"):
+        (tmp_path / name).write_text("#" * 100_000)
+    inputs = Inputs(tmp_path / "plan.yaml", tmp_path / "rig.yaml", ())
+    with pytest.raises(StorageError, match="cannot make a run folder: No space left"):
+        Run.create(small_disk / "runs", "small", inputs, {})
+    assert list((small_disk / "runs").iterdir()) == []
 
 
 def test_the_space_of_a_view_is_its_own_though_the_disk_fills_up(small_disk: Path) -> None:

@@ -5,102 +5,27 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import cells
 import numpy as np
 import pytest
-from at_the_console import NARROW, WIDE, Visitor
+from at_the_console import WIDE, Visitor, assert_usable
+from bench_room import PASSWORD, Room, kill_browser
 from browser import Browser as Window
 from browser import needs_chromium
 from cells import CellFolder
 from ruamel.yaml import YAML
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
-from served import Browser, Served, served
+from served import served
 
-from sim.world.client import World
-
-PASSWORD = "a long password"
 HOME_DEG = [0.0, -170.0, 150.0, 0.0, -70.0, 0.0]
 PARK_DEG = [60.0, -170.0, 150.0, 0.0, -70.0, 0.0]
 BUDGET_LUX_H = 0.2
 EXPOSURE_MS = 8.0
 pytestmark = needs_chromium
-
-
-@dataclass
-class Room:
-    """A world, the console of its cell with the devices open, and somebody before it."""
-
-    cell: CellFolder
-    world: World
-    served: Served
-    engineer: Browser
-    ada: Visitor
-
-    def joints_deg(self) -> np.ndarray:
-        return np.array(self.world.ask("state")["joints_deg"])
-
-    def at_rest(self) -> dict[str, Any]:
-        found: dict[str, Any] = cells.wait_until(
-            lambda: not (state := self.world.ask("state"))["arm_moving"] and state, "the arm at rest"
-        )
-        return found
-
-    def lit_s(self, led: int) -> float:
-        return float(self.world.ask("light")["leds_s"].get(str(led), 0.0))
-
-    def bench(self) -> dict[str, Any]:
-        found: dict[str, Any] = self.engineer.get("/api/v1/bench").document
-        return found
-
-    def logged(self) -> list[str]:
-        """What people have done, by the audit log."""
-        log = next(self.cell.folder.rglob("audit.jsonl")).read_text().splitlines()
-        return [line["asked"] for line in map(json.loads, log)]
-
-    def chooses(self, name: str, value: str) -> None:
-        self.ada.at(f"[data-name={name}] option[value='{value}']")
-        self.ada.driver.execute_script(
-            "const one = document.querySelector(`[data-name=${arguments[0]}]`); one.value = arguments[1];"
-            "one.dispatchEvent(new Event('change', {bubbles: true}))",
-            name,
-            value,
-        )
-
-    def holds(self, axis: str) -> None:
-        """Press the pointer on a button and keep it there, until the arm is under way."""
-        button = self.ada.at(f"[data-axis={axis}][data-direction='1']")
-        self.ada.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
-        self.keeps(
-            lambda: ActionChains(self.ada.driver, duration=20).click_and_hold(button).perform(),
-            lambda: ActionChains(self.ada.driver, duration=20).release().perform(),
-        )
-
-    def keeps(self, press: Callable[[], None], release: Callable[[], None]) -> None:
-        """Press until the arm is under way; anew where a hold has ended because a busy machine renewed it late."""
-        before = self.joints_deg()
-
-        def under_way() -> bool:
-            if np.abs(self.joints_deg() - before).max() > 1.0:
-                return True
-            if self.ada.at("[data-name=hand-said]").text.startswith(("stopped", "released")):
-                release()
-                press()
-            return False
-
-        press()
-        cells.wait_until(under_way, "the arm under way")
-
-    def opened(self) -> None:
-        self.ada.sees("[data-name=bench]", "closed")
-        self.chooses("object-plan", "plan.yaml")
-        self.ada.clicks("[data-name=open]")
-        self.ada.sees("[data-name=bench]", "The devices are open; the object of plan.yaml lies on the support.")
 
 
 @pytest.fixture(scope="module")
@@ -124,16 +49,6 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Room]:
             yield found
         finally:
             found.ada.driver.quit()
-
-
-def assert_usable(visitor: Visitor) -> None:
-    """Whatever is on the screen now, at both sizes, in light and dark."""
-    for size, scheme in ((NARROW, "dark"), (WIDE, "light")):
-        visitor.resizes(size)
-        visitor.prefers(scheme)
-        assert visitor.fits(), (size, visitor.too_wide())
-        assert visitor.barriers() == [], (size, scheme)
-    assert visitor.browser.troubles() == []
 
 
 # -- devices --------------------------------------------------------------------------------------------------
@@ -380,7 +295,7 @@ def test_a_browser_that_is_killed_while_it_holds_stops_the_arm(room: Room) -> No
     room.ada.sees("[data-name=joints]")
     room.holds("A1")
     before = room.world.ask("state")
-    kill(room.ada)
+    kill_browser(room.ada)
     rested = room.at_rest()
     assert rested["t_s"] - before["t_s"] < 2.0, "its death, 0.3 s, and the braking"
     assert abs(rested["joints_deg"][0] - before["joints_deg"][0]) < 30.0
@@ -398,12 +313,3 @@ def test_the_devices_are_closed_before_the_queue_begins_a_plan(room: Room) -> No
     assert cells.safe(room.world)
     assert room.engineer.state()["lent_to"] == ""
     assert not Path(str(room.engineer.state()["run"])).exists()
-
-
-def kill(visitor: Visitor) -> None:
-    """As a crash of the machine before which somebody sits: nothing can be said any more."""
-    import psutil
-
-    driver = psutil.Process(visitor.driver.service.process.pid)
-    for process in driver.children(recursive=True):
-        process.kill()

@@ -21,7 +21,7 @@ Codes = NDArray[np.uint8]
 Singles = NDArray[np.float32]
 
 _BLOCK = 512
-"""Rows that are value_of_code together."""
+"""Number of rows that are averaged together."""
 _CODES = np.arange(256) / 255.0
 
 

@@ -32,6 +32,7 @@ _NAMES = {
     "open_cell": "scripting.cell_devices",
     "fit_reflectance": "scripting.analyses",
     "calibrate_camera": "scripting.analyses",
+    "calibrate_colour": "scripting.colour_profiles",
     "CalibrationRecord": "scripting.analyses",
     "identify": "scripting.analyses",
     "PigmentFinding": "heritage.analysis.identification",

@@ -15,6 +15,7 @@ from coupole.scripting.analyses import fit_reflectance as fit_reflectance
 from coupole.scripting.analyses import identify as identify
 from coupole.scripting.analyses import register as register
 from coupole.scripting.cell_devices import open_cell as open_cell
+from coupole.scripting.colour_profiles import calibrate_colour as calibrate_colour
 from coupole.scripting.opened_result import Materials as Materials
 from coupole.scripting.opened_result import PicturesResult as PicturesResult
 from coupole.scripting.opened_result import Result as Result
@@ -30,8 +31,8 @@ from coupole.storage import journal_events as events
 __all__ = [
     "Acquisition", "CalibrationRecord", "Comparison", "Frame", "FreeCamera", "Materials", "PicturesResult",
     "PigmentFinding", "Plan", "Registration", "Report", "Result", "Rig", "Run", "RunView", "acquire",
-    "calibrate_camera", "compare", "errors", "events", "fit_reflectance", "identify", "lights", "open_cell",
-    "open_result", "open_run", "register", "testing",
+    "calibrate_camera", "calibrate_colour", "compare", "errors", "events", "fit_reflectance", "identify", "lights",
+    "open_cell", "open_result", "open_run", "register", "testing",
 ]  # fmt: skip
 
 __version__: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,6 +21,7 @@ from coupole.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from coupole.calibration.light.records import Progress
     from coupole.calibration.report import Outcome
     from coupole.calibration.request import Request
     from coupole.calibration.rotations import Floats
@@ -165,32 +167,28 @@ def _by_runs(runs: list[Path], options: _GivenOptions) -> Work:
 
 
 def _by_pictures(paths: list[Path], options: _GivenOptions, *, srgb: bool) -> Work:
-    from coupole.calibration.colour.chart import chart_of_values, is_values_file, read_chart
-    from coupole.calibration.colour.colour_workflow import Origin, colour_outcome
-    from coupole.calibration.colour.picture_workflow import see_in_pictures
-    from coupole.calibration.light.frames import PlainSources
-    from coupole.calibration.light.records import record_input
-    from coupole.calibration.sources import About
-    from coupole.exchange.chart_photographs import pictures_at, read_chart_photograph
+    from coupole.scripting.colour_profiles import ChartInputs, profile_of
 
     def work(console: Console, request: Request) -> Outcome:
         _refuse_options_of_runs(options)
-        read_known = chart_of_values if is_values_file(options.chart) else read_chart
-        whole_chart = read_known(options.chart, options.names_without)
-        files = pictures_at(paths, options.white)
-        with console.status("reading pictures"):
-            pictures = [read_chart_photograph(path, srgb=srgb) for path in files]
-            white = None if options.white is None else read_chart_photograph(options.white, srgb=srgb)
-        with bar(console, "looking for the chart") as progress:
-            in_pictures = see_in_pictures(pictures, whole_chart, corners_of(options.corners), white, progress)
-        inputs = tuple(pair for path in (*files, options.white) for pair in record_input(path))
-        chart_inputs = tuple(pair for path in whole_chart.files for pair in record_input(path))
-        size_px = pictures[0].size_px
-        origin = Origin(PlainSources(About(is_simulated=False), inputs), size_px, chart_inputs)
-        with bar(console, "patches left out") as progress:
-            return colour_outcome(in_pictures.sighting, in_pictures.known_chart, origin, request, progress)
+        corners_px = corners_of(options.corners)
+        inputs = ChartInputs(paths, options.chart, options.white, corners_px, options.names_without, srgb)
+        return profile_of(inputs, request, _At(console))
 
     return work
+
+
+@dataclass(frozen=True)
+class _At:
+    """Tells at the terminal how far the work is."""
+
+    console: Console
+
+    def status(self, words: str) -> AbstractContextManager[object]:
+        return self.console.status(words)
+
+    def bar(self, words: str) -> AbstractContextManager[Progress]:
+        return bar(self.console, words)
 
 
 def _refuse_options_of_runs(options: _GivenOptions) -> None:

@@ -60,9 +60,9 @@ def fit_reflectance(
     from coupole.scripting.opened_result import open_result
 
     request = RunRequest(
-        tuple(_paths(runs, "runs")),
+        tuple(path_list(runs, "runs")),
         None if mesh is None else Path(mesh),
-        records_named(_paths(calibrations)),
+        records_named(path_list(calibrations)),
         tuple(map(int, left_out)),
         memory_bytes=memory_bytes,
     )
@@ -99,7 +99,7 @@ def calibrate_camera(
         raise InputError("square_mm: only for a plain board of columns and rows")
     path = Path(board) if board is not None and not isinstance(board, tuple) else None
     sources, _, sightings = sight_board(
-        _paths(images, "runs, or one folder of pictures"),
+        path_list(images, "runs, or one folder of pictures"),
         path,
         None,
         plain_board,
@@ -127,7 +127,7 @@ def identify(
     if unit not in ("auto", "percent", "fraction"):
         raise InputError(f"unit {unit!r}: expected auto, percent or fraction")
     measured_spectra = [
-        spectrum for path in _paths(spectra, "spectra") for spectrum in read_library(path, unit=unit)
+        spectrum for path in path_list(spectra, "spectra") for spectrum in read_library(path, unit=unit)
     ]
     return identify_spectra(
         measured_spectra,
@@ -163,7 +163,7 @@ def register(
     if seen_from is not None and stand is None:
         raise InputError(f"--seen-from {seen_from}: expected one of {', '.join(STANDS)}")
     return registering.register(
-        _paths(scans),
+        path_list(scans),
         unit,
         stand=stand,
         tables=TargetTables(
@@ -286,7 +286,7 @@ def _silent(step: str, count: int, total: int) -> None:
     """Report no progress."""
 
 
-def _paths(paths: AnyPath | Sequence[AnyPath], what: str = "") -> list[Path]:
+def path_list(paths: AnyPath | Sequence[AnyPath], what: str = "") -> list[Path]:
     """Return the paths as a list. Raises InputError if there is none, although `what` is expected."""
     if isinstance(paths, str | os.PathLike):
         return [Path(paths)]

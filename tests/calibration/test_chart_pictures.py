@@ -18,6 +18,7 @@ from judged_charts import judge
 from places import SHARED_DATA
 from typer.testing import CliRunner, Result
 
+import coupole
 from coupole.calibration.colour.chart import read_chart
 from coupole.calibration.colour.chart_pictures import PlainPicture, read_plain_patches
 from coupole.calibration.colour.picture_workflow import see_in_pictures
@@ -138,6 +139,30 @@ def test_intervals_and_the_bound_for_new_colours_hold(with_white: bool, scale: A
     assert np.mean(np.abs(errors) <= charts[0].factor) > 0.8
     assert 0.4 < np.sqrt(np.mean(errors**2)) < 1.6
     assert np.mean([chart.within_bound for chart in charts]) > 0.85
+
+
+def test_python_gives_the_record_and_the_files_of_the_command(uneven: Path, tmp_path: Path) -> None:
+    chart, white = uneven / "chart.yaml", uneven / "white.tif"
+    options = ("--chart", chart, "--white", white, "--without", "A1", "--corners", corner_words(uneven_chart()))
+    by_command = made(tmp_path / "command", uneven / "chart.tif", *options)
+    corners_px = [tuple(map(float, pair.split(","))) for pair in corner_words(uneven_chart()).split()]
+    record = coupole.calibrate_colour(
+        uneven / "chart.tif",
+        chart=chart,
+        white=white,
+        corners_px=corners_px,
+        without=["A1"],
+        out=tmp_path / "python",
+    )
+    assert record.parameters == by_command.parameters
+    assert (record.inputs, record.is_accepted) == (by_command.inputs, by_command.is_accepted)
+    name = record.name
+    written = {path.name for path in (tmp_path / "python").iterdir()}
+    assert written == {f"{name}{suffix}" for suffix in (".yaml", ".icc", ".csv", ".html", ".png")}
+    with pytest.raises(InputError, match="exists already"):
+        coupole.calibrate_colour(uneven / "chart.tif", chart=chart, out=tmp_path / "python")
+    with pytest.raises(InputError, match=r"corners_px: expected \[4, 2\] pixels"):
+        coupole.calibrate_colour(uneven / "chart.tif", chart=chart, corners_px=[1, 2])
 
 
 def test_a_turned_chart_is_found_by_its_colours_and_told(tmp_path: Path) -> None:

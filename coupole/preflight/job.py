@@ -26,6 +26,7 @@ from coupole.plan.rig_devices import described_arm, device_times, runs_tables
 from coupole.plan.schedule import Schedule, build_schedule
 from coupole.plan.view_choices import ChosenView, has_enough_views, problem_of_views
 from coupole.plan.yamlfile import Document
+from coupole.preflight.machine import refuse_little_address_space
 from coupole.preflight.object_shape import ObjectShape, read_object
 from coupole.storage.run_inputs import Inputs
 
@@ -68,7 +69,8 @@ class Job:
 
 def read_job(plan_path: Path, rig_path: Path | None = None, *, text: str | None = None) -> Job:
     """Read a plan and all files that it names. With `text`, the text is read instead of the plan's file. Raises
-    InputError with all problems of all files."""
+    InputError with all problems of all files; ResourceShortage if this process may have too little memory."""
+    refuse_little_address_space()
     files = read_plan(plan_path, rig_path, text=text)
     shape = read_object(files)
     calibrations = None

@@ -3,15 +3,33 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 from pathlib import Path
 
 from coupole.devices import HostNeed
+from coupole.errors import ResourceShortage
 from coupole.plan.cell import Cell
 from coupole.plan.rig_devices import host_needs
 
 ROOM_BYTES = 20_400_000_000
 """Size of one view under 1080 LEDs: frames of 12 megapixels, 12 bits packed."""
+
+
+LEAST_ADDRESS_SPACE_BYTES = 2_500_000_000
+"""Least address space that a plan may be read with. The demo's run took 2.0 GB of it, most of it compiled code and
+libraries. Embree ends the process with a segmentation fault where it gets none."""
+
+
+def refuse_little_address_space() -> None:
+    """Raises ResourceShortage if this process is limited to less than LEAST_ADDRESS_SPACE_BYTES (`ulimit -v`)."""
+    limit_bytes, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit_bytes != resource.RLIM_INFINITY and limit_bytes < LEAST_ADDRESS_SPACE_BYTES:
+        raise ResourceShortage(
+            f"this process may have {limit_bytes / 1e9:.2f} GB of address space; a plan needs "
+            f"{LEAST_ADDRESS_SPACE_BYTES / 1e9:.1f} GB, and large frames need more. Raise the limit (`ulimit -v "
+            "unlimited`)."
+        )
 
 
 def machine_needs(cell: Cell) -> list[tuple[str, HostNeed]]:

@@ -43,6 +43,15 @@ def test_too_few_open_files_are_told_with_the_limit(tmp_path: Path) -> None:
     assert document["exit_code"] == 1
 
 
+@pytest.mark.parametrize("command", ["check", "acquire"])
+def test_a_limit_of_memory_at_which_libraries_crash_is_refused(tmp_path: Path, command: str) -> None:
+    CellFolder(tmp_path)
+    code, _, err = _limited("RLIMIT_AS", 1_500_000_000, command, tmp_path / "plan.yaml")
+    assert code == 1, err
+    assert "this process may have 1.50 GB of address space; a plan needs 2.5 GB" in " ".join(err.split())
+    assert "(`ulimit -v unlimited`)" in " ".join(err.split())
+
+
 def test_too_little_memory_is_told_though_another_error_hides_it() -> None:
     def frame_without_memory() -> None:
         try:

@@ -7,7 +7,8 @@ folder PIGMENTS, by leaving out. `--test` applies the rule to `GamblinConservati
 
 `--paints FOLDER` applies the rule to paints of 11 other makers, whose tables are in the folder (`cmt` of the
 repository painting_tools of Ruben Wiersma), with Kremer as the library: by default paints of the six makers on
-which the rule was developed, with `--test` those of the other five.
+which the rule was developed, with `--test` those of the other five. `--both FOLDER` adds those of the six makers
+that have a class of Kremer's to the library.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from coupole.appearance.matter import kubelka_munk
 from coupole.appearance.spectra.measured import Measured
 from coupole.appearance.spectra.spectra_library import LibrarySpectrum, read_library
 from coupole.heritage.analysis.identification import identify
-from coupole.heritage.analysis.pigment_classes import shipped_classes
+from coupole.heritage.analysis.pigment_classes import PigmentClass, shipped_classes
 from coupole.heritage.analysis.references import Rate, References, make_references, trimmed_spectrum
 from coupole.heritage.analysis.spectral_features import BANDS_NM
-from coupole.heritage.analysis.unmixing import unmix
+from coupole.heritage.analysis.unmixing import unmix, weights_of_bands
 from smallest import add_smallest
 
 DEVELOPED_ON = "KremerHistorical.rs"
@@ -79,6 +80,7 @@ def _mixtures(references: References, mixtures: int) -> None:
     values, classes, nm = of_bands.reflectance, of_bands.classes, BANDS_NM[of_bands.bands]
     ratio = kubelka_munk.k_over_s(values)
     verdicts: Counter[str] = Counter()
+    holds: list[bool] = []
     count = 0
     while count < mixtures:
         pair = random.choice(len(values), 2, replace=False)
@@ -90,9 +92,16 @@ def _mixtures(references: References, mixtures: int) -> None:
         identification = identify(Measured("mixture", nm, noisy, ()), references)
         true = {of_bands.model.class_names[classes[row]] for row in pair}
         names = {part.class_name for part in identification.parts} or {identification.class_name}
+        if identification.parts and names == true:
+            measured_share = weights_of_bands(noisy) ** 2 / (weights @ ratio[pair])
+            of_parts = dict(zip(classes[pair], weights * (ratio[pair] @ measured_share), strict=True))
+            low, high = identification.parts[0].interval
+            first = of_bands.model.class_names.index(identification.parts[0].class_name)
+            holds.append(low <= of_parts[first] / sum(of_parts.values()) <= high)
         verdicts[f"{identification.verdict}, {'right' if names == true or (names < true) else 'wrong'}"] += 1
         count += 1
     print("mixtures of two, both in the library:", ", ".join(f"{k} {v}" for k, v in sorted(verdicts.items())))
+    print(f"intervals of their shares hold: {Rate(sum(holds), len(holds))}")
     rows = np.arange(len(values))
     for omission, groups in (("it", rows), ("its class", classes)):
         rest_of_library = [groups != groups[row] for row in rows]
@@ -133,6 +142,17 @@ def paints_of(folder: Path, makers: Sequence[str], kremer: Sequence[LibrarySpect
                 sample = Measured(f"{path.stem} {' '.join(name.split())}", nm, reflectance, ())
                 queries.append((sample, classes.get(f"P{index[1]}{index[2]}".upper(), "")))
     return queries
+
+
+def with_paints(kremer: Sequence[LibrarySpectrum], folder: Path) -> References:
+    """Return Kremer's library with the paints of the developing makers that have one of its classes."""
+    paints = [
+        (LibrarySpectrum(sample.name, str(folder), line, sample.wavelengths_nm, sample.values), name)
+        for line, (sample, name) in enumerate(paints_of(folder, DEVELOPING_MAKERS, kremer), start=1)
+        if name
+    ]
+    table = shipped_classes(kremer) | {paint.name: PigmentClass(name, "") for paint, name in paints}
+    return make_references([*kremer, *(paint for paint, _ in paints)], table)
 
 
 def test(references: References, queries: Sequence[Query]) -> None:
@@ -176,11 +196,14 @@ def main() -> None:
     parser.add_argument("pigments", type=Path)
     parser.add_argument("--test", action="store_true")
     parser.add_argument("--paints", type=Path, metavar="FOLDER", help="tables of paints of other makers")
+    parser.add_argument("--both", type=Path, metavar="FOLDER", help="tables of paints for the library")
     parser.add_argument("--mixtures", type=int, default=100, help="of two spectra")
     add_smallest(parser, mixtures=2)
     options = parser.parse_args()
     spectra = read_library(options.pigments / DEVELOPED_ON)
     references = make_references(spectra, shipped_classes(spectra))
+    if options.both:
+        references = with_paints(spectra, options.both)
     if options.paints:
         makers = TESTING_MAKERS if options.test else DEVELOPING_MAKERS
         test(references, paints_of(options.paints, makers, spectra))

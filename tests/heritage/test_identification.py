@@ -88,7 +88,7 @@ def test_an_opaque_mixture_is_unmixed_into_its_two_pigments() -> None:
 
 def test_intervals_of_shares_hold_the_truth_in_93_to_97_percent() -> None:
     # Two batches of different pigments, with noise of the instrument, and an error of additivity of 0.3 %, which
-    # neighbouring bands share. `tools/prove_identification.py` does the same with Kremer's spectra.
+    # neighbouring bands share. `tools/prove_identification.py` does it with Kremer's spectra.
     random = np.random.default_rng(11)
     nm = WAVELENGTHS_NM[::2]
     pairs = [(a, b) for a in SHAPES for b in SHAPES if a < b]
@@ -138,12 +138,14 @@ def test_the_violet_of_an_ultramarine_is_kept_at_every_concentration(concentrati
     assert not identified(dark, library()).remarks
 
 
-def test_a_thin_layer_on_white_is_recognised() -> None:
-    rho, tau = kubelka_munk.layer(kubelka_munk.k_over_s(grains("vermilion", 99)), 1.0, 0.4)
+@pytest.mark.parametrize("shape", ["vermilion", "red lead"])
+def test_a_thin_layer_on_white_is_recognised(shape: str) -> None:
+    # Three times the K/S of the powder, as in oil. Without thin layers among the appearances both are unknown.
+    rho, tau = kubelka_munk.layer(3.0 * kubelka_munk.k_over_s(grains(shape, 99)), 1.0, 0.4)
 
     found = identified(kubelka_munk.over(rho, tau, 0.8), library())
 
-    assert (found.verdict, found.class_name) == ("match", "vermilion")
+    assert (found.verdict, found.class_name) == ("match", shape)
 
 
 def test_evidence_is_where_the_classes_differ() -> None:

@@ -75,19 +75,21 @@ def appearances(reflectance: Array, wavelengths_nm: Array) -> Array:
     """
     ratio = kubelka_munk.k_over_s(np.clip(reflectance, _DARKEST, _LIGHTEST))
     looks = [reflectance]
-    for one in _APPEARANCES[1:]:
-        absorption = ratio * one.ratio * (wavelengths_nm / _MEDIUM_NM) ** one.exponent
-        if np.isinf(one.scattering):
+    for appearance in _APPEARANCES[1:]:
+        absorption = ratio * appearance.ratio * (wavelengths_nm / _MEDIUM_NM) ** appearance.exponent
+        if np.isinf(appearance.scattering):
             look = kubelka_munk.opaque(absorption)
         else:
-            rho, tau = kubelka_munk.layer(absorption, 1.0, one.scattering)
+            rho, tau = kubelka_munk.layer(absorption, 1.0, appearance.scattering)
             look = kubelka_munk.over(rho, tau, _OF_WHITE_GROUND)
-        if one.from_within:
+        if appearance.from_within:
             face = Face(
-                np.array((1.0 - _SURFACE) * (1.0 - one.from_within)), np.array(one.from_within), np.zeros(())
+                np.array((1.0 - _SURFACE) * (1.0 - appearance.from_within)),
+                np.array(appearance.from_within),
+                np.zeros(()),
             )
             look = face.reflectance_in_air(InternalReflectance(look)).values
-        looks.append(one.gloss + (1.0 - one.gloss) * look)
+        looks.append(appearance.gloss + (1.0 - appearance.gloss) * look)
     return np.stack(looks)
 
 

@@ -102,8 +102,8 @@ def unmix(reflectance: Array, references: Array, classes: NDArray[np.intp]) -> U
     larger = float(max(share[best], 1.0 - share[best]))
     # All pairs of the same two classes, with the class of the larger share first.
     kin = np.column_stack([first, second])[~is_rival]
-    swapped = classes[kin[:, 0]] != classes[order[0]]
-    kin[swapped] = kin[swapped, ::-1]
+    is_swapped = classes[kin[:, 0]] != classes[order[0]]
+    kin[is_swapped] = kin[is_swapped, ::-1]
     return Unmixed(
         (int(order[0]), int(order[1])),
         (larger, 1.0 - larger),
@@ -152,8 +152,8 @@ def _share_interval(relative: Array, weight: Array, pairs: NDArray[np.intp]) -> 
     probability = np.exp(likelihood - likelihood.max())
     probability /= probability.sum()
     mean = float(probability @ share)
-    spread = float(np.sqrt(probability @ (variance + (share - mean) ** 2)))
-    half_width = float(t.ppf(0.975, bands - 2.0)) * spread
+    standard_uncertainty = float(np.sqrt(probability @ (variance + (share - mean) ** 2)))
+    half_width = float(t.ppf(0.975, bands - 2.0)) * standard_uncertainty
     return max(mean - half_width, 0.0), min(mean + half_width, 1.0)
 
 

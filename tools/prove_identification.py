@@ -4,29 +4,46 @@
 folder PIGMENTS, by leaving out. `--test` applies the rule to `GamblinConservationColors.rs` and
 `oilpaint/oilpaint.rs` with Kremer as the library. Its output must not be used to choose anything
 (docs/decisions/0042-identification.md).
+
+`--paints FOLDER` applies the rule to paints of 11 other makers, whose tables are in the folder (`cmt` of the
+repository painting_tools of Ruben Wiersma), with Kremer as the library: by default paints of the six makers on
+which the rule was developed, with `--test` those of the other five. `--both FOLDER` adds those of the six makers
+that have a class of Kremer's to the library.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from coupole.appearance.matter import kubelka_munk
 from coupole.appearance.spectra.measured import Measured
-from coupole.appearance.spectra.spectra_library import read_library
+from coupole.appearance.spectra.spectra_library import LibrarySpectrum, read_library
 from coupole.heritage.analysis.identification import identify
-from coupole.heritage.analysis.pigment_classes import shipped_classes
+from coupole.heritage.analysis.pigment_classes import PigmentClass, shipped_classes
 from coupole.heritage.analysis.references import Rate, References, make_references, trimmed_spectrum
 from coupole.heritage.analysis.spectral_features import BANDS_NM
-from coupole.heritage.analysis.unmixing import unmix
+from coupole.heritage.analysis.unmixing import unmix, weights_of_bands
 from smallest import add_smallest
 
 DEVELOPED_ON = "KremerHistorical.rs"
 TESTED_ON = ("GamblinConservationColors.rs", "oilpaint/oilpaint.rs")
+DEVELOPING_MAKERS = ("DalerRowney", "Holbein", "Maimeri", "Talens", "WinsorNewton", "apaFerrario")
+TESTING_MAKERS = ("Chroma", "Golden", "Liquitex", "Schmincke", "Vallejo")
+"""Every second maker by the alphabet, settled before a spectrum was looked at."""
+_LAMP_BLACK = {"PBK6": "carbon black"}
+_INDEX = re.compile(r"\(P\.?\s?(Y|O|R|V|B|G|Br|Bk|W)\.?\s?(\d+)(?:[:.]\d)?\)", re.IGNORECASE)
+"""The only Colour Index name of a paint; paints of several pigments are not counted."""
+_SAME = 1e-4
 _SEED = 7
+
+Query = tuple[Measured, str]
+"""A spectrum with its class; the class is empty if Kremer's table does not have the Colour Index name."""
 
 
 def develop(references: References, mixtures: int) -> None:
@@ -63,6 +80,7 @@ def _mixtures(references: References, mixtures: int) -> None:
     values, classes, nm = of_bands.reflectance, of_bands.classes, BANDS_NM[of_bands.bands]
     ratio = kubelka_munk.k_over_s(values)
     verdicts: Counter[str] = Counter()
+    holds: list[bool] = []
     count = 0
     while count < mixtures:
         pair = random.choice(len(values), 2, replace=False)
@@ -74,9 +92,16 @@ def _mixtures(references: References, mixtures: int) -> None:
         identification = identify(Measured("mixture", nm, noisy, ()), references)
         true = {of_bands.model.class_names[classes[row]] for row in pair}
         names = {part.class_name for part in identification.parts} or {identification.class_name}
+        if identification.parts and names == true:
+            measured_share = weights_of_bands(noisy) ** 2 / (weights @ ratio[pair])
+            of_parts = dict(zip(classes[pair], weights * (ratio[pair] @ measured_share), strict=True))
+            low, high = identification.parts[0].interval
+            first = of_bands.model.class_names.index(identification.parts[0].class_name)
+            holds.append(low <= of_parts[first] / sum(of_parts.values()) <= high)
         verdicts[f"{identification.verdict}, {'right' if names == true or (names < true) else 'wrong'}"] += 1
         count += 1
     print("mixtures of two, both in the library:", ", ".join(f"{k} {v}" for k, v in sorted(verdicts.items())))
+    print(f"intervals of their shares hold: {Rate(sum(holds), len(holds))}")
     rows = np.arange(len(values))
     for omission, groups in (("it", rows), ("its class", classes)):
         rest_of_library = [groups != groups[row] for row in rows]
@@ -89,20 +114,55 @@ def _mixtures(references: References, mixtures: int) -> None:
         print(f"mixture seen in a single pigment, {omission} left out: {Rate(false_mixtures, len(rows))}")
 
 
-def test(references: References, folder: Path) -> None:
-    """Print the four rates of the test set, and each wrong verdict."""
-    classes = set(references.class_of)
-    inside: list[tuple[Measured, str]] = []
-    outside: list[tuple[Measured, str]] = []
+def published_queries(folder: Path) -> list[Query]:
+    """Return the spectra of the test set with their classes, by the tables that come with Coupole."""
+    queries = []
     for name in TESTED_ON:
         spectra = read_library(folder / name)
         table = shipped_classes(spectra)
-        for spectrum in spectra:
-            class_name = table[spectrum.name].class_name
-            if class_name:
-                (inside if class_name in classes else outside).append((trimmed_spectrum(spectrum), class_name))
+        queries += [(trimmed_spectrum(s), table[s.name].class_name) for s in spectra if table[s.name].class_name]
+    return queries
+
+
+def paints_of(folder: Path, makers: Sequence[str], kremer: Sequence[LibrarySpectrum]) -> list[Query]:
+    """Return the paints of one pigment of certain makers, each spectrum once, with the class of its Colour Index
+    name in Kremer's table."""
+    classes = {entry.colour_index.upper(): entry.class_name for entry in shipped_classes(kremer).values()}
+    classes = {index: name for index, name in classes.items() if index} | _LAMP_BLACK
+    nm = np.array((folder / "spectra.txt").read_text().split(), dtype=float)
+    queries: list[Query] = []
+    for path in sorted(path for maker in makers for path in folder.glob(f"{maker}_*.rs")):
+        for row in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            name, values = row.strip().strip('"').rpartition('"')[::2]
+            index = _INDEX.search(name)
+            if index is None or len(values.split()) != len(nm):
+                continue
+            reflectance = np.array(values.split(), dtype=float)
+            if all(np.abs(reflectance - before.values).max() >= _SAME for before, _ in queries):
+                sample = Measured(f"{path.stem} {' '.join(name.split())}", nm, reflectance, ())
+                queries.append((sample, classes.get(f"P{index[1]}{index[2]}".upper(), "")))
+    return queries
+
+
+def with_paints(kremer: Sequence[LibrarySpectrum], folder: Path) -> References:
+    """Return Kremer's library with the paints of the developing makers that have one of its classes."""
+    paints = [
+        (LibrarySpectrum(sample.name, str(folder), line, sample.wavelengths_nm, sample.values), name)
+        for line, (sample, name) in enumerate(paints_of(folder, DEVELOPING_MAKERS, kremer), start=1)
+        if name
+    ]
+    table = shipped_classes(kremer) | {paint.name: PigmentClass(name, "") for paint, name in paints}
+    return make_references([*kremer, *(paint for paint, _ in paints)], table)
+
+
+def test(references: References, queries: Sequence[Query]) -> None:
+    """Print the four rates of queries, and each verdict."""
+    classes = set(references.class_of)
+    inside = [(sample, true) for sample, true in queries if true in classes]
+    outside = [(sample, true) for sample, true in queries if true not in classes]
+    rest_of_library = {true: references.without_class(true) for _, true in inside}
     with_class = [(true, identify(sample, references)) for sample, true in inside]
-    without_class = [(true, identify(sample, references.without_class(true))) for sample, true in inside]
+    without_class = [(true, identify(sample, rest_of_library[true])) for sample, true in inside]
     never = [(true, identify(sample, references)) for sample, true in outside]
     for title, results in (
         ("class in the library", with_class),
@@ -117,10 +177,13 @@ def test(references: References, folder: Path) -> None:
                 f"{first.probability:.2f}"
             )
     right = sum(answer.candidates[0].class_name == true for true, answer in with_class)
-    match_is_right = [answer.class_name == true for true, answer in with_class if answer.verdict == "match"]
+    stated = [answer.verdict == "match" and answer.class_name == true for true, answer in with_class]
+    confident = sum(answer.verdict in ("match", "mixture") for _, answer in with_class)
     print(f"\n(1) first candidate right: {Rate(right, len(with_class))}")
-    wrong = Rate(len(match_is_right) - sum(match_is_right), len(with_class))
-    print(f"(2) match, right: {Rate(sum(match_is_right), len(with_class))}; wrong: {wrong}")
+    print(
+        f"(2) match, right: {Rate(sum(stated), len(with_class))}; match or mixture, wrong: "
+        f"{Rate(confident - sum(stated), len(with_class))}"
+    )
     for number, results in ((3, without_class), (4, never)):
         print(
             f"({number}) unknown: {Rate(sum(answer.verdict == 'unknown' for _, answer in results), len(results))}"
@@ -132,13 +195,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pigments", type=Path)
     parser.add_argument("--test", action="store_true")
+    parser.add_argument("--paints", type=Path, metavar="FOLDER", help="tables of paints of other makers")
+    parser.add_argument("--both", type=Path, metavar="FOLDER", help="tables of paints for the library")
     parser.add_argument("--mixtures", type=int, default=100, help="of two spectra")
     add_smallest(parser, mixtures=2)
     options = parser.parse_args()
     spectra = read_library(options.pigments / DEVELOPED_ON)
     references = make_references(spectra, shipped_classes(spectra))
-    if options.test:
-        test(references, options.pigments)
+    if options.both:
+        references = with_paints(spectra, options.both)
+    if options.paints:
+        makers = TESTING_MAKERS if options.test else DEVELOPING_MAKERS
+        test(references, paints_of(options.paints, makers, spectra))
+    elif options.test:
+        test(references, published_queries(options.pigments))
     else:
         develop(references, options.mixtures)
 

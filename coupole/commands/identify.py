@@ -152,7 +152,10 @@ def _show(console: Console, findings: list[PigmentFinding]) -> None:
             (candidate.class_name, f"{candidate.probability:.0%}") for candidate in finding.candidates[:_SHOWN]
         ]
         if finding.parts:
-            rows = [(part.class_name, f"{part.share:.0%} of K/S") for part in finding.parts]
+            rows = [
+                (part.class_name, f"{part.share:.0%} of K/S ({part.interval[0]:.1%} to {part.interval[1]:.1%})")
+                for part in finding.parts
+            ]
         for number, (class_name, probability) in enumerate(rows):
             first = number == 0
             table.add_row(
@@ -187,8 +190,8 @@ def _document_of(spectrum: LibrarySpectrum, finding: PigmentFinding, page: Path 
         ],
         "not_in_library": finding.not_in_library,
         "mixture": [
-            {"name": candidate.name, "class": candidate.class_name, "share": candidate.share}
-            for candidate in finding.parts
+            {"name": part.name, "class": part.class_name, "share": part.share, "interval": list(part.interval)}
+            for part in finding.parts
         ],
         "reason": finding.reason,
         "remarks": list(finding.remarks),

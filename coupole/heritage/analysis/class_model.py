@@ -40,11 +40,17 @@ class HeldOut:
 
 
 class ClassModel:
-    """Classes of the references `reflectance` [n, bands], which have no gaps; `classes` [n] are the numbers of
-    their classes."""
+    """Classes of the references `reflectance` [n, bands], which have no gaps, at `wavelengths_nm` [bands];
+    `classes` [n] are the numbers of their classes."""
 
-    def __init__(self, reflectance: Array, classes: NDArray[np.intp], class_names: tuple[str, ...]) -> None:
-        looks = appearances(reflectance)
+    def __init__(
+        self,
+        reflectance: Array,
+        wavelengths_nm: Array,
+        classes: NDArray[np.intp],
+        class_names: tuple[str, ...],
+    ) -> None:
+        looks = appearances(reflectance, wavelengths_nm)
         self.class_names = class_names
         self._classes, self._count = classes, len(looks)
         self._rows = features(looks.reshape(-1, looks.shape[-1]))

@@ -49,6 +49,8 @@ class Part:
     class_name: str
     share: float
     """Share of the mixture's K/S."""
+    interval: tuple[float, float]
+    """Interval of 95 % of the share, if the library has these two pigments themselves."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,7 @@ def _judge(
 ) -> tuple[Verdict, str]:
     model, best = of_bands.model, candidates[0]
     flat = "; the spectrum has no bands, so its level decides" if log_k_over_s(reflectance).std() < _FLAT else ""
-    if mixture is not None and mixture.is_settled:
+    if mixture is not None and mixture.is_settled and not _lacks_siblings(of_bands, mixture):
         return "mixture", (
             f"two references leave {mixture.residual:.1%} of K/S; one alone is worse by {mixture.gain:.0f} and "
             f"two of "
@@ -173,10 +175,20 @@ def _judge(
     return "ambiguous", f"{choices}{flat}"
 
 
+def _lacks_siblings(of_bands: OfBands, mixture: Unmixed) -> bool:
+    """Tell whether a part may be another class of its family, which the library lacks."""
+    names = of_bands.model.class_names
+    return any(lacking(names[of_bands.classes[row]], names) for row in mixture.references)
+
+
 def _parts(references: References, of_bands: OfBands, mixture: Unmixed) -> tuple[Part, ...]:
+    low, high = mixture.share_interval
+    intervals = ((low, high), (1.0 - high, 1.0 - low))
     return tuple(
-        Part(references.names[row], references.class_of[row], share)
-        for row, share in zip(of_bands.rows[list(mixture.references)], mixture.shares, strict=True)
+        Part(references.names[row], references.class_of[row], share, interval)
+        for row, share, interval in zip(
+            of_bands.rows[list(mixture.references)], mixture.shares, intervals, strict=True
+        )
     )
 
 

@@ -25,8 +25,8 @@ _SAME = 1e-4
 _WIDEST_GAP_NM = 20.0
 _VIOLET_NM = 460.0
 _RISE_BEYOND, _RISE_BY = 0.1, 0.005
-"""Limits of the rise over 20 nm. The first is for the logarithm of reflectance, beyond the rise of the references;
-the second is for reflectance."""
+"""Limits of the change over 20 nm. The first is for the fall of log(K/S) beyond that of the references: other than
+the rise of reflectance, it does not depend on the concentration. The second is for reflectance."""
 
 
 @dataclass(frozen=True)
@@ -158,20 +158,23 @@ class References:
                 )
             classes = np.array([names.index(self.class_of[row]) for row in rows])
             values = self.reflectance[np.ix_(rows, bands)]
-            self._of_bands_cache[key] = OfBands(bands, rows, values, classes, ClassModel(values, classes, names))
+            self._of_bands_cache[key] = OfBands(
+                bands, rows, values, classes, ClassModel(values, BANDS_NM[bands], classes, names)
+            )
         return self._of_bands_cache[key]
 
     def without_stray_light(self, reflectance: Array) -> tuple[Array, str]:
-        """Return a spectrum [221] without a violet end that rises more than any reference, and a remark about the
-        omitted part, if any.
+        """Return a spectrum [221] without a violet end where K/S falls more than in any reference, and a remark
+        about the omitted part, if any.
 
         Pigments absorb more towards the ultraviolet. Instruments have least light there, so stray light becomes
         visible.
         """
         violet = np.flatnonzero(BANDS_NM < _VIOLET_NM)
         with np.errstate(invalid="ignore"):
-            of_all = np.log(np.maximum(np.vstack([reflectance, self.reflectance]), 0.005))
-            rise = of_all[:, violet] - of_all[:, violet + 2]
+            of_all = np.vstack([reflectance, self.reflectance])
+            log_ratio = np.where(np.isfinite(of_all), log_k_over_s(np.nan_to_num(of_all)), np.nan)
+            rise = log_ratio[:, violet + 2] - log_ratio[:, violet]
             step = reflectance[violet] - reflectance[violet + 2]
             most = np.nanmax(rise[1:], initial=0.0) + _RISE_BEYOND
             wrong = np.flatnonzero((rise[0] > most) & (step > _RISE_BY))

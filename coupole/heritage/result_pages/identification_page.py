@@ -83,7 +83,10 @@ def _overview(findings: Sequence[PigmentFinding]) -> Table:
 def _section(number: int, finding: PigmentFinding) -> Section:
     nm = finding.evidence.wavelengths_nm
     extent = f"{nm[0]:g} to {nm[-1]:g} nm{', near infrared too' if finding.near_infrared else ''}"
-    parts = [(part.class_name, part.name, f"{part.share:.0%}") for part in finding.parts]
+    parts = [
+        (part.class_name, part.name, f"{part.share:.0%}", f"{part.interval[0]:.1%} to {part.interval[1]:.1%}")
+        for part in finding.parts
+    ]
     candidates = [
         (candidate.class_name, f"{candidate.probability:.1%}", candidate.name)
         for candidate in finding.candidates[:_CANDIDATES]
@@ -100,7 +103,7 @@ def _section(number: int, finding: PigmentFinding) -> Section:
             "not in the library": f"{finding.not_in_library:.0%}",
         },
         tables=[
-            Table("Parts of the mixture", ("class", "reference", "share of K/S"), parts),
+            Table("Parts of the mixture", ("class", "reference", "share of K/S", "95 % interval"), parts),
             Table("Most probable classes", ("class", "probability", "nearest reference"), candidates),
         ],
         notes=[] if number else ["Its spectrum is the picture at the top."],

@@ -13,7 +13,7 @@ from typing import Any
 from coupole.errors import CoupoleError, reason
 from coupole.reflectance.beside.first_look import write_normals
 from coupole.reflectance.beside.growing import Growth, fit_so_far
-from coupole.reflectance.light_paths import NOTHING_AHEAD, Ahead
+from coupole.reflectance.light_paths import Ahead
 from coupole.reflectance.result_pages import run_reflectance_page
 from coupole.reflectance.run_job import RunRequest, extract_beside, look_ahead, reflectance_of
 from coupole.storage.discarding import NOT_YET, reason_to_keep, to_discard
@@ -117,8 +117,7 @@ class _Follower:
                 time.sleep(_LOOK_EVERY_S)
         samples_s = self._seconds_since_last_frame()
         self._teller.step("fitting", views=self._run.expected_views)
-        ahead = self._ahead if self._tried_views else NOTHING_AHEAD  # nothing else would use what is kept
-        reflectance_of(self._request, self._result, say=self._teller.part, ahead=ahead)
+        reflectance_of(self._request, self._result, say=self._teller.part, ahead=self._ahead)
         run_reflectance_page.write(self._result)
         result_s = self._seconds_since_last_frame()
         self._teller.say(
@@ -160,14 +159,20 @@ class _Follower:
         return [view for view in self._run.complete_views() if view not in self._taken]
 
     def _look_ahead(self) -> bool:
-        """Find the surface that the present view sees, once, while its frames arrive; False if there is nothing to
-        do."""
+        """Compute what the samples of the present view need besides its frames, once, while they arrive; False if
+        there is nothing to do. It ends when a view is complete."""
         if not self._begun_view or self._begun_view in self._taken:
             return False
         view, self._begun_view = self._begun_view, ""
         with contextlib.suppress(CoupoleError, OSError):  # found, and told, when its samples are taken
-            look_ahead(self._run.folder, view)
+            look_ahead(self._run.folder, view, self._ahead, self._may_look_ahead)
+        if not self._may_look_ahead():  # the rest of it waits for the samples of complete views
+            self._begun_view = self._begun_view or view
         return True
+
+    def _may_look_ahead(self) -> bool:
+        self._read_news()
+        return not self._looks or not (self._is_done or self._remaining_views())
 
     def _grow(self) -> bool:
         """Make a result of the views so far, if it has more views than the newest one; False if there is nothing

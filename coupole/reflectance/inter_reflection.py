@@ -95,7 +95,7 @@ def subtract(
     form_factors = paths.form_factors()
     say("inter-reflection", 2, 2 + len(missing))
     for number, view in enumerate(missing):
-        _subtract_view(view, paths, form_factors, patch_reflectance, diffuse[view.path.stem])
+        _subtract_view(view, paths, form_factors, patch_reflectance, diffuse[view.path.stem], say)
         say("inter-reflection", 3 + number, 2 + len(missing))
 
 
@@ -186,6 +186,7 @@ def _subtract_view(
     form_factors: csr_array,
     apparent_reflectance: Floats,
     diffuse: Floats,
+    say: Said,
 ) -> None:
     exitance = radiosity(form_factors, paths.direct(view.led_mm, view.led_normals), apparent_reflectance)
     gathers = paths.gathers(view.triangles)
@@ -212,6 +213,7 @@ def _subtract_view(
                     file[name][rows] = of_rows
                 share_dataset[rows] = share.astype(np.float16)
                 sample_count += int(np.count_nonzero(np.isfinite(share)))
+                say(f"inter-reflection of {view.view}", rows.stop, len(view.triangles))
             every = np.concatenate(shares)
             file.attrs[SAMPLES] = sample_count
             file.attrs[INTER_REFLECTION] = np.quantile(every, [0.5, 0.95]) if len(every) else [0.0, 0.0]

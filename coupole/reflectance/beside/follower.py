@@ -25,15 +25,19 @@ from coupole.storage.run import Run
 _LOOK_EVERY_S = 0.2
 _TELL_EVERY_S = 1.0
 Say = Callable[[dict[str, Any]], object]
+AtTheEnd = Callable[[Callable[[], None]], None]
 
 
-def process_run(folder: Path, result: Path, say: Say) -> bool:
+def process_run(folder: Path, result: Path, say: Say, at_the_end: AtTheEnd) -> bool:
     """Process a run into its result, during its acquisition and after it; True if the result is complete. `say`
-    receives the progress, and `times` at the end. Failures are reported, and existing results stay."""
+    receives the progress, and `times` at the end. `at_the_end` calls what is to be done when all frames are there.
+    Failures are reported, and existing results stay."""
     teller = _Teller(result, say)
     try:
         with hold_result(result):
-            _Follower(Run(folder), result, teller).to_the_end()
+            follower = _Follower(Run(folder), result, teller)
+            follower.until_all_frames_are_there()
+            at_the_end(follower.make_result)
     except (CoupoleError, OSError, MemoryError) as error:
         teller.fail(str(error) if isinstance(error, CoupoleError) else reason(error))
         return False
@@ -102,19 +106,24 @@ class _Follower:
         self._may_give_up = True
         """True if the newest result of the views so far was not given up, so that the next one may be."""
 
-    def to_the_end(self) -> None:
-        """Follow the run until its result is made. Raises as `reflectance_of`."""
+    def until_all_frames_are_there(self) -> None:
+        """Take samples, look ahead and make results so far while the run goes on. Raises as `reflectance_of`."""
         self._teller.step("waiting", views=self._run.expected_views)
-        while True:
-            self._read_news()
+        self._read_news()
+        while not self._is_done:
             if self._looks:
                 self._offer_safe()
                 if not self._take_samples():
-                    if self._is_done:
-                        break
                     self._looks = False
             elif not (self._look_ahead() or self._grow()):
                 time.sleep(_LOOK_EVERY_S)
+            self._read_news()
+
+    def make_result(self) -> None:
+        """Take the samples that remain, and make the result. Raises as `reflectance_of`."""
+        self._offer_safe()
+        while self._take_samples():
+            self._offer_safe()
         samples_s = self._seconds_since_last_frame()
         self._teller.step("fitting", views=self._run.expected_views)
         reflectance_of(self._request, self._result, say=self._teller.part, ahead=self._ahead)

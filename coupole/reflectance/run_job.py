@@ -7,16 +7,13 @@ first missing file.
 from __future__ import annotations
 
 import json
-import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
-
-import numpy as np
 
 from coupole.errors import InputError
 from coupole.intake.plain_data import read_json
@@ -34,13 +31,7 @@ from coupole.reflectance.discarded_frames import (
     read_back_or_drop,
     refuse_without_frames,
 )
-from coupole.reflectance.extraction.extraction import (
-    Geometry,
-    extract_view,
-    find_codes_ahead,
-    geometry_of,
-    surface_of,
-)
+from coupole.reflectance.extraction.extraction import Geometry, extract_view, geometry_of
 from coupole.reflectance.extraction.frames_for_check import write_frames
 from coupole.reflectance.extraction.measured_run import (
     MeasuredRun,
@@ -50,7 +41,7 @@ from coupole.reflectance.extraction.measured_run import (
 )
 from coupole.reflectance.extraction.radiance import Radiometry
 from coupole.reflectance.inter_reflection import subtract
-from coupole.reflectance.light_paths import NOTHING_AHEAD, Ahead, paths_of
+from coupole.reflectance.light_paths import NOTHING_AHEAD, Ahead
 from coupole.reflectance.result_folder import SETTINGS, begin, complete, read_settings
 from coupole.reflectance.run_check import check_result
 from coupole.reflectance.run_fits import fit_result
@@ -216,44 +207,6 @@ def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> 
         raise disk_error(out, error) from error
     else:
         return digest if gives_frames else ""
-    finally:
-        forget()
-
-
-def look_ahead(
-    run: Path, view_name: str, ahead: Ahead = NOTHING_AHEAD, is_wanted: Callable[[], bool] = lambda: True
-) -> None:
-    """Compute what the samples of a view need besides its frames, while these still arrive, if it has a frame
-    already: the surface that it sees, where the object hides LEDs from it, and the paths of light to it, which
-    `ahead` keeps. It ends early if `is_wanted` says so. Raises as `reflectance_of`."""
-    request = RunRequest((run,))
-    try:
-        measured_run, geometry, _ = prepare_run(uuid4().hex, run.resolve(), request.sources)
-        view = next((view for view in measured_run.views if view.name == view_name), None)
-        if view is None:
-            return
-        surface = surface_of(measured_run, geometry, view, len(os.sched_getaffinity(0)))
-        shots = measured_run.run.expected_shots()
-        lit = {shot.light.id for shot in shots if shot.view == view_name and isinstance(shot.light, Led)}
-        leds = np.intersect1d(np.array(sorted(lit), np.int64), measured_run.leds.ids)
-        find_codes_ahead(measured_run, geometry, view, leds, is_wanted)
-        if measured_run.direct_light_alone or not is_wanted():
-            return
-        paths = paths_of(
-            measured_run.corners_mm.astype(np.float32),
-            measured_run.base_from_support,
-            support_reflects=request.support_reflectance > 0,
-            paper=measured_run.emission == "paper",
-            triangles_of_views=len(surface.triangles) * measured_run.run.expected_views,
-            ahead=ahead,
-        )
-        for compute in (
-            paths.form_factors,
-            lambda: paths.direct(*measured_run.leds.of(leds)),
-            lambda: paths.gathers(surface.triangles),
-        ):
-            if is_wanted():
-                compute()
     finally:
         forget()
 

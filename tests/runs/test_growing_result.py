@@ -15,9 +15,10 @@ from cells import CellFolder
 
 from coupole.reflectance import light_paths
 from coupole.reflectance.beside.growing import Growth, fit_so_far
+from coupole.reflectance.beside.looking_ahead import look_ahead
 from coupole.reflectance.extraction import extraction
 from coupole.reflectance.light_paths import Ahead
-from coupole.reflectance.run_job import RunRequest, extract_beside, look_ahead, reflectance_of
+from coupole.reflectance.run_job import RunRequest, extract_beside, reflectance_of
 from coupole.reflectance.run_result import RunResult
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("hurried")]

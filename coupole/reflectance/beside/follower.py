@@ -13,9 +13,10 @@ from typing import Any
 from coupole.errors import CoupoleError, reason
 from coupole.reflectance.beside.first_look import write_normals
 from coupole.reflectance.beside.growing import Growth, fit_so_far
+from coupole.reflectance.beside.looking_ahead import look_ahead
 from coupole.reflectance.light_paths import Ahead
 from coupole.reflectance.result_pages import run_reflectance_page
-from coupole.reflectance.run_job import RunRequest, extract_beside, look_ahead, reflectance_of
+from coupole.reflectance.run_job import RunRequest, extract_beside, reflectance_of
 from coupole.storage.discarding import NOT_YET, reason_to_keep, to_discard
 from coupole.storage.journal import Follower
 from coupole.storage.journal_events import FrameProven, SessionStopped, ViewBegun, ViewSealed

@@ -1,4 +1,4 @@
-"""What the samples of a view need besides its frames, computed while these still arrive."""
+"""Computes what the samples of a view need besides its frames, while these still arrive."""
 
 from __future__ import annotations
 

@@ -91,6 +91,7 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
             "peer": "longest_move",
             "ratio": move_s / value_s,
             "peer_value": round(move_s, 2),
+            "over_a_move_s": round(value_s - move_s, 2),
         }
 
 
@@ -147,7 +148,7 @@ def _write_cell(root: Path, folder: Path, size: Size) -> None:
     }
     rig["dome"]["leds"] = str(root / "configs/domes/coupole.csv")
     rig["led_limits"] |= {"cooldown_ratio": 0.0}
-    rig["world"]["settings"] |= {"camera": {"render_once": True}}
+    rig["world"]["settings"] |= {"camera": {"render_once": True}, "interreflection": True}  # it is subtracted
     rig["robot"]["settings"] = {"link_timeout_s": 30.0, "attention_s": 0.5}
     rig["ledbox"]["settings"]["watchdog_s"] = 30.0
     rig |= {"storage": {"folder": "runs", "reserve_bytes": 0}, "ledger": "ledger", "controllers": "controllers"}

@@ -10,9 +10,10 @@ diffuse.
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
@@ -23,7 +24,8 @@ from scipy.sparse import csr_array
 from coupole.reflectance.discarded_frames import rewrite
 from coupole.reflectance.extraction.frame_veils import GLARE
 from coupole.reflectance.extraction.lamp_sight import lit_on
-from coupole.reflectance.light_paths import NOTHING_AHEAD, Ahead, PathsOfLight, Scene, cosines_on, scene_of
+from coupole.reflectance.light_paths import NOTHING_AHEAD, Ahead, PathsOfLight, Scene, cosines_on, paths_of
+from coupole.reflectance.parts_in_threads import in_threads
 from coupole.reflectance.result_folder import complete
 from coupole.reflectance.run_result import AS_MEASURED, INTER_REFLECTION, SAMPLES, RunResult, ViewSamples
 from coupole.reflectance.triangle_fit import TriangleSamples
@@ -38,6 +40,9 @@ _LEAST_COSINE = 0.2
 _MOST_REFLECTED = 0.95
 MOST_SHARE = 0.5
 """Largest share of a sample that may be inter-reflection; samples with a larger share are left out."""
+_ROWS, _MEDIAN_ROWS, _PART = 4096, 8192, 256
+"""Number of triangles that are read together, for the subtraction and for medians; number of triangles that a
+thread works on at a time."""
 
 
 def radiosity(
@@ -45,8 +50,8 @@ def radiosity(
 ) -> NDArray[np.float32]:
     """[channels, patches, leds] exitance of patches for a power of 1. `apparent_reflectance` [patches, channels]
     is the reflectance if all light counts as direct; patches that no LED reaches keep it."""
-    exitances = []
-    for channel_reflectance in apparent_reflectance.T:
+
+    def of_channel(channel_reflectance: Floats) -> NDArray[np.float32]:
         reflectance = channel_reflectance.copy()
         for _ in range(passes):
             exitance = reflectance[:, None].astype(np.float32) * direct
@@ -57,8 +62,10 @@ def radiosity(
             beside = np.where(direct > 0, indirect, 0.0).sum(axis=1)  # of the LEDs that samples are of
             share = np.where(direct_power > 0, direct_power / np.maximum(direct_power + beside, 1e-30), 1.0)
             reflectance = channel_reflectance * share
-        exitances.append(exitance)
-    return np.stack(exitances)
+        return exitance
+
+    with ThreadPoolExecutor() as pool:
+        return np.stack(list(pool.map(of_channel, apparent_reflectance.T)))
 
 
 def subtract(
@@ -75,19 +82,20 @@ def subtract(
     missing = [view for view in result.views if view.inter_reflection is None]
     if not missing:
         return
-    corners = result.corners_mm.astype(np.float64)
-    pose = result.base_from_support
-    support = (pose[:3, 3], pose[:3, 2]) if support_reflectance > 0 else None
-    count = len(corners) + sum(len(view.triangles) for view in result.views)
-    key = (hashlib.sha256(corners.tobytes()).hexdigest(), support_reflectance > 0)
-    scene: Scene = ahead.result(count, ("scene", *key), lambda: scene_of(corners, support_z=support))
-    paths = PathsOfLight(scene, key, count, paper, ahead)
-    patch_reflectance, diffuse = _as_measured(result, paths, len(corners), support_reflectance)
+    paths = paths_of(
+        result.corners_mm,
+        result.base_from_support,
+        support_reflects=support_reflectance > 0,
+        paper=paper,
+        triangles_of_views=sum(len(view.triangles) for view in result.views),
+        ahead=ahead,
+    )
+    patch_reflectance, diffuse = _as_measured(result, paths, len(result.corners_mm), support_reflectance)
     say("inter-reflection", 1, 2 + len(missing))
     form_factors = paths.form_factors()
     say("inter-reflection", 2, 2 + len(missing))
     for number, view in enumerate(missing):
-        _subtract_view(view, paths, form_factors, patch_reflectance, diffuse[view.path.stem])
+        _subtract_view(view, paths, form_factors, patch_reflectance, diffuse[view.path.stem], say)
         say("inter-reflection", 3 + number, 2 + len(missing))
 
 
@@ -150,8 +158,8 @@ def _diffuse(result: RunResult, view: ViewSamples, most: int = 64) -> Floats:
     some_leds = np.zeros(len(view.leds), np.bool_)
     some_leds[:: max(1, len(view.leds) // most)] = True
     medians = np.full((len(view.triangles), result.channels), np.nan)
-    for first in range(0, len(medians), 8192):
-        rows = slice(first, min(first + 8192, len(medians)))
+    for first in range(0, len(medians), _MEDIAN_ROWS):
+        rows = slice(first, min(first + _MEDIAN_ROWS, len(medians)))
         for columns in (some_leds, ~some_leds):
             if np.isnan(medians[rows]).any():
                 _fill_medians(medians[rows], result.view_samples(view, rows, columns))
@@ -160,11 +168,16 @@ def _diffuse(result: RunResult, view: ViewSamples, most: int = 64) -> Floats:
 
 def _fill_medians(reflectances: Floats, samples: TriangleSamples) -> None:
     """Fill the rows of `reflectances` [n, channels] that have NaN with medians of the samples."""
-    cosine = cosines_on(samples.centres_mm, samples.normals, samples.led_mm)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        values = np.where(cosine[..., None] > _LEAST_COSINE, samples.values / cosine[..., None], np.nan)
-    missing = np.isnan(reflectances).any(axis=1) & np.all(np.isfinite(values).any(axis=1), axis=1)
-    reflectances[missing] = np.nanmedian(values[missing], axis=1)
+
+    def fill(first: int) -> None:
+        part = slice(first, first + _PART)
+        cosine = cosines_on(samples.centres_mm[part], samples.normals[part], samples.led_mm)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            values = np.where(cosine[..., None] > _LEAST_COSINE, samples.values[part] / cosine[..., None], np.nan)
+        missing = np.isnan(reflectances[part]).any(axis=1) & np.all(np.isfinite(values).any(axis=1), axis=1)
+        reflectances[part][missing] = np.nanmedian(values[missing], axis=1)
+
+    in_threads(fill, len(reflectances), part=_PART)
 
 
 def _subtract_view(
@@ -173,11 +186,13 @@ def _subtract_view(
     form_factors: csr_array,
     apparent_reflectance: Floats,
     diffuse: Floats,
+    say: Said,
 ) -> None:
-    scene = paths.scene
-    exitance = radiosity(form_factors, paths.direct(view), apparent_reflectance)
-    gathers = paths.gathers(view)
-    diffuse = np.where(np.isfinite(diffuse), diffuse, apparent_reflectance[scene.patch[view.triangles]] / np.pi)
+    exitance = radiosity(form_factors, paths.direct(view.led_mm, view.led_normals), apparent_reflectance)
+    gathers = paths.gathers(view.triangles)
+    of_patches = apparent_reflectance[paths.scene.patch[view.triangles]] / np.pi
+    diffuse = np.where(np.isfinite(diffuse), diffuse, of_patches)
+    indirect = _Indirect(view, paths.scene, gathers, exitance, diffuse, paths.paper)
 
     def write(part: Path) -> None:
         shutil.copyfile(view.path, part)
@@ -188,19 +203,17 @@ def _subtract_view(
                 INTER_REFLECTION, file["f"].shape, np.float16, chunks=file["f"].chunks, fillvalue=np.nan
             )
             share_dataset.attrs["told"] = description
-            for first in range(0, len(view.triangles), 4096):
-                rows = slice(first, min(first + 4096, len(view.triangles)))
-                f = file["f"][rows]
-                off = _off(view, scene, gathers[rows], exitance, diffuse[rows], rows, paths.paper)
-                share = off / f
-                share[~(share < MOST_SHARE)] = np.nan
-                some = share[:: 1 + len(f) // 512]
+            for first in range(0, len(view.triangles), _ROWS):
+                rows = slice(first, min(first + _ROWS, len(view.triangles)))
+                values = {name: file[name][rows] for name in ("f", "u_own", GLARE) if name in file}
+                share, new_values = _lowered(indirect, rows, values)
+                some = share[:: 1 + len(share) // 512]
                 shares.append(some[np.isfinite(some)])
-                file["f"][rows], file["u_own"][rows] = f * (1 - share), file["u_own"][rows] / (1 - share)
-                if GLARE in file:
-                    file[GLARE][rows] = file[GLARE][rows] / (1 - share)
+                for name, of_rows in new_values.items():
+                    file[name][rows] = of_rows
                 share_dataset[rows] = share.astype(np.float16)
                 sample_count += int(np.count_nonzero(np.isfinite(share)))
+                say(f"inter-reflection of {view.view}", rows.stop, len(view.triangles))
             every = np.concatenate(shares)
             file.attrs[SAMPLES] = sample_count
             file.attrs[INTER_REFLECTION] = np.quantile(every, [0.5, 0.95]) if len(every) else [0.0, 0.0]
@@ -208,24 +221,52 @@ def _subtract_view(
     rewrite(view.path, write)
 
 
-def _off(
-    view: ViewSamples,
-    scene: Scene,
-    gathers: csr_array,
-    exitance: NDArray[np.float32],
-    diffuse: Floats,
-    rows: slice,
-    paper: bool,
-) -> NDArray[np.float32]:
-    """[n, leds, channels] amount to subtract from f of triangles: their diffuse reflectance times the ratio of
-    indirect to direct light."""
-    triangles = view.triangles[rows]
-    centres, normals = scene.centres_mm[triangles], scene.normals[triangles]
-    arriving = lit_on(centres, view.led_mm, view.led_normals, paper) * cosines_on(centres, normals, view.led_mm)
-    indirect = np.stack([gathers @ channel_exitance for channel_exitance in exitance], axis=-1)
-    is_lit = arriving > 0
-    total = np.where(is_lit, arriving, 0.0).sum(axis=1)[:, None]
-    of_direct = total / np.maximum(total + np.where(is_lit[..., None], indirect, 0.0).sum(axis=1), 1e-30)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        off = (np.nan_to_num(diffuse) * of_direct)[:, None] * indirect / arriving[..., None]
-    return np.where(is_lit[..., None], off, 0.0).astype(np.float32)
+@dataclass(frozen=True)
+class _Indirect:
+    """Light that reaches the triangles of a view from other parts of the object."""
+
+    view: ViewSamples
+    scene: Scene
+    gathers: csr_array
+    """[n, patches], by `PathsOfLight.gathers`."""
+    exitance: NDArray[np.float32]
+    """[channels, patches, leds], by `radiosity`."""
+    diffuse: Floats
+    """[n, channels] diffuse reflectance of the triangles."""
+    paper: bool
+
+    def off(self, rows: slice) -> NDArray[np.float32]:
+        """[rows, leds, channels] amount to subtract from f of triangles: their diffuse reflectance times the ratio
+        of indirect to direct light."""
+        view, triangles, gathers = self.view, self.view.triangles[rows], self.gathers[rows]
+        centres, normals = self.scene.centres_mm[triangles], self.scene.normals[triangles]
+        lit = lit_on(centres, view.led_mm, view.led_normals, self.paper)
+        arriving = lit * cosines_on(centres, normals, view.led_mm)
+        indirect = np.stack([gathers @ channel_exitance for channel_exitance in self.exitance], axis=-1)
+        is_lit = arriving > 0
+        total = np.where(is_lit, arriving, 0.0).sum(axis=1)[:, None]
+        of_direct = total / np.maximum(total + np.where(is_lit[..., None], indirect, 0.0).sum(axis=1), 1e-30)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off = (np.nan_to_num(self.diffuse[rows]) * of_direct)[:, None] * indirect / arriving[..., None]
+        return np.where(is_lit[..., None], off, 0.0).astype(np.float32)
+
+
+def _lowered(
+    indirect: _Indirect, rows: slice, values: dict[str, NDArray[np.float16]]
+) -> tuple[NDArray[np.float32], dict[str, NDArray[np.float32]]]:
+    """Return the share [rows, leds, channels] of f that is subtracted from rows of a view, NaN where no sample
+    remains; and the new `values`. Those of uncertainty are relative, so they grow. Small parts of the rows are
+    worked on in threads: this takes less memory, and no value depends on other rows."""
+    share = np.empty(values["f"].shape, np.float32)
+    new_values = {name: np.empty_like(share) for name in values}
+
+    def lower(first: int) -> None:
+        part = slice(first, min(first + _PART, len(share)))
+        part_share = indirect.off(slice(rows.start + part.start, rows.start + part.stop)) / values["f"][part]
+        part_share[~(part_share < MOST_SHARE)] = np.nan
+        share[part], kept = part_share, 1 - part_share
+        for name, new in new_values.items():
+            new[part] = values[name][part] * kept if name == "f" else values[name][part] / kept
+
+    in_threads(lower, len(share), part=_PART)
+    return share, new_values

@@ -7,6 +7,7 @@ space that other patches fill, and the light that comes directly from LEDs.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 from collections.abc import Callable
@@ -21,7 +22,6 @@ from scipy.sparse import csr_array, vstack
 from coupole.motion.occlusion import RAY_START_MM, blocked_segments, ray_mesh
 from coupole.motion.remembered import Remembered
 from coupole.reflectance.extraction.lamp_sight import lit_on
-from coupole.reflectance.run_result import ViewSamples
 
 Floats = NDArray[np.float64]
 
@@ -221,20 +221,39 @@ class PathsOfLight:
         form_factors: csr_array = self.ahead.result(self.count, ("form factors", *self.key), compute)
         return form_factors
 
-    def direct(self, view: ViewSamples) -> NDArray[np.float32]:
+    def direct(self, led_mm: Floats, led_normals: Floats) -> NDArray[np.float32]:
         """[patches, leds] `direct_irradiance` of the LEDs of a view."""
         direct: NDArray[np.float32] = self.ahead.result(
             self.count,
-            ("direct", *self.key, view.led_mm, view.led_normals, self.paper),
-            lambda: direct_irradiance(self.scene, view.led_mm, view.led_normals, paper=self.paper),
+            ("direct", *self.key, led_mm, led_normals, self.paper),
+            lambda: direct_irradiance(self.scene, led_mm, led_normals, paper=self.paper),
         )
         return direct
 
-    def gathers(self, view: ViewSamples) -> csr_array:
-        """[triangles of the view, patches] share of the half space that each patch fills, by `seen_from`."""
+    def gathers(self, triangles: NDArray[np.int64]) -> csr_array:
+        """[n, patches] share of the half space over the triangles of a view that each patch fills, by
+        `seen_from`."""
         gathers: csr_array = self.ahead.result(
-            self.count,
-            ("gathers", *self.key, view.triangles),
-            lambda: seen_from(self.scene, view.triangles, _POINTS),
+            self.count, ("gathers", *self.key, triangles), lambda: seen_from(self.scene, triangles, _POINTS)
         )
         return gathers
+
+
+def paths_of(
+    corners_mm: NDArray[np.float32],
+    base_from_support: Floats,
+    *,
+    support_reflects: bool,
+    paper: bool,
+    triangles_of_views: int,
+    ahead: Ahead = NOTHING_AHEAD,
+) -> PathsOfLight:
+    """Return the paths of light in the scene of an object, by its triangles [m, 3, 3] as a result's file has them.
+    The support belongs to the scene if it reflects. `triangles_of_views` is the number of triangles of all
+    views."""
+    corners = corners_mm.astype(np.float64)
+    support = (base_from_support[:3, 3], base_from_support[:3, 2]) if support_reflects else None
+    count = len(corners) + triangles_of_views
+    key = (hashlib.sha256(corners.tobytes()).hexdigest(), support_reflects)
+    scene: Scene = ahead.result(count, ("scene", *key), lambda: scene_of(corners, support_z=support))
+    return PathsOfLight(scene, key, count, paper, ahead)

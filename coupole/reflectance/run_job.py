@@ -7,7 +7,6 @@ first missing file.
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,7 +31,7 @@ from coupole.reflectance.discarded_frames import (
     read_back_or_drop,
     refuse_without_frames,
 )
-from coupole.reflectance.extraction.extraction import Geometry, extract_view, geometry_of, surface_of
+from coupole.reflectance.extraction.extraction import Geometry, extract_view, geometry_of
 from coupole.reflectance.extraction.frames_for_check import write_frames
 from coupole.reflectance.extraction.measured_run import (
     MeasuredRun,
@@ -208,18 +207,6 @@ def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> 
         raise disk_error(out, error) from error
     else:
         return digest if gives_frames else ""
-    finally:
-        forget()
-
-
-def look_ahead(run: Path, view_name: str) -> None:
-    """Find the surface that a view sees, while its frames still arrive, if it has a frame already. Raises as
-    `reflectance_of`."""
-    try:
-        measured_run, geometry, _ = prepare_run(uuid4().hex, run.resolve(), RunRequest((run,)).sources)
-        for view in measured_run.views:
-            if view.name == view_name:
-                surface_of(measured_run, geometry, view, len(os.sched_getaffinity(0)))
     finally:
         forget()
 

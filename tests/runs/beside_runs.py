@@ -29,9 +29,11 @@ def cell_of_three_views(folder: Path, relief: Path = cells.COARSE_RELIEF, **plan
     return cell
 
 
-def acquired_run(folder: Path) -> CellFolder:
+def acquired_run(folder: Path, **world: Any) -> CellFolder:
     """The cell, with a run that nothing has processed."""
     cell = cell_of_three_views(folder)
+    cell.world_settings.update(world)
+    cell.write()
     assert cell.acquire().code == 0
     return cell
 

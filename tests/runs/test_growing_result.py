@@ -13,9 +13,12 @@ import pytest
 from beside_runs import acquired_run, begun, cell_of_three_views, files, result_of, same_result
 from cells import CellFolder
 
+from coupole.reflectance import light_paths
 from coupole.reflectance.beside.growing import Growth, fit_so_far
+from coupole.reflectance.beside.looking_ahead import look_ahead
+from coupole.reflectance.extraction import extraction
 from coupole.reflectance.light_paths import Ahead
-from coupole.reflectance.run_job import RunRequest, extract_beside, look_ahead, reflectance_of
+from coupole.reflectance.run_job import RunRequest, extract_beside, reflectance_of
 from coupole.reflectance.run_result import RunResult
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("hurried")]
@@ -24,8 +27,8 @@ MEMORY_BYTES = 2_000_000_000
 
 @pytest.fixture(scope="module")
 def acquired(tmp_path_factory: pytest.TempPathFactory) -> CellFolder:
-    """A run that is only read."""
-    return acquired_run(tmp_path_factory.mktemp("acquired"))
+    """A run that is only read; as of real objects, inter-reflection is subtracted from its samples."""
+    return acquired_run(tmp_path_factory.mktemp("acquired"), interreflection=True)
 
 
 def said_by(*arguments: str | Path) -> dict[str, Any]:
@@ -107,13 +110,36 @@ def test_a_run_that_goes_on_has_a_result_of_its_views_so_far(tmp_path: Path) -> 
     same_result(result, afterwards)
 
 
+def test_no_ray_is_left_for_the_time_after_the_last_frame(
+    acquired: CellFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While its frames arrive: what each view sees, what hides LEDs from it, and all paths of light."""
+    run, result, ahead = acquired.run_folder, tmp_path / "result", Ahead()
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError
+
+    for view in ("top", "side", "low"):
+        look_ahead(run, view, ahead)
+        with monkeypatch.context() as since:
+            for name in ("seen_surface", "lamp_codes"):
+                since.setattr(extraction, name, refuse)
+            extract_beside(run, view, result)
+    with monkeypatch.context() as since:
+        for name in ("scene_of", "seen_from", "direct_irradiance"):
+            since.setattr(light_paths, name, refuse)
+        assert reflectance_of(RunRequest((run,)), result, ahead=ahead)["subtracted"]
+    reflectance_of(RunRequest((run,)), tmp_path / "afterwards")
+    same_result(result, tmp_path / "afterwards")
+
+
 def test_what_is_known_ahead_and_given_up_changes_no_bit_of_the_result(
     acquired: CellFolder, tmp_path: Path
 ) -> None:
     run, result = acquired.run_folder, tmp_path / "result"
     ahead, views = Ahead(), ("top", "side")
-    for view in views:
-        look_ahead(run, view)
+    for view, is_wanted in zip(views, (lambda: False, iter([True, False, False]).__next__), strict=True):
+        look_ahead(run, view, ahead, is_wanted)
         extract_beside(run, view, result)
     before = {name: path.read_bytes() for name, path in files(result).items()}
     growth = Growth.of_views(run, result, views, 3)

@@ -3,6 +3,7 @@ process that makes it, and never at the cost of the run."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -21,6 +22,7 @@ from PIL import Image
 from coupole.reflectance.beside.beforehand import reasons_against
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("hurried")]
+NICE_OF_THE_END = 10
 
 
 def has_samples(cell: CellFolder) -> bool:
@@ -39,6 +41,14 @@ def status(run: Path) -> dict[str, Any]:
     assert ended.code == 0, ended.err
     document: dict[str, Any] = ended.document["processing"] or {}  # none before the session's first line
     return document
+
+
+def nice_of_threads(pid: int) -> list[int]:
+    nice = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(OSError):  # the thread has just ended
+            nice.append(os.getpriority(os.PRIO_PROCESS, int(task.name)))
+    return nice
 
 
 def frames_alone_count(ended: cells.Ended) -> dict[str, Any]:
@@ -66,6 +76,7 @@ def test_the_result_is_the_one_that_is_made_afterwards(tmp_path: Path) -> None:
         if is_beside(worker):  # it has not ended meanwhile
             assert refused.code == 2
             assert f"process {worker}" in refused.err
+    cells.wait_until(lambda: NICE_OF_THE_END in nice_of_threads(worker), "the work after the last frame")
     said = frames_alone_count(cells.finish(process))
     assert said["is_whole"]
     assert said["views"] == 3

@@ -13,9 +13,10 @@ from typing import Any
 from coupole.errors import CoupoleError, reason
 from coupole.reflectance.beside.first_look import write_normals
 from coupole.reflectance.beside.growing import Growth, fit_so_far
-from coupole.reflectance.light_paths import NOTHING_AHEAD, Ahead
+from coupole.reflectance.beside.looking_ahead import look_ahead
+from coupole.reflectance.light_paths import Ahead
 from coupole.reflectance.result_pages import run_reflectance_page
-from coupole.reflectance.run_job import RunRequest, extract_beside, look_ahead, reflectance_of
+from coupole.reflectance.run_job import RunRequest, extract_beside, reflectance_of
 from coupole.storage.discarding import NOT_YET, reason_to_keep, to_discard
 from coupole.storage.journal import Follower
 from coupole.storage.journal_events import FrameProven, SessionStopped, ViewBegun, ViewSealed
@@ -25,15 +26,19 @@ from coupole.storage.run import Run
 _LOOK_EVERY_S = 0.2
 _TELL_EVERY_S = 1.0
 Say = Callable[[dict[str, Any]], object]
+AtTheEnd = Callable[[Callable[[], None]], None]
 
 
-def process_run(folder: Path, result: Path, say: Say) -> bool:
+def process_run(folder: Path, result: Path, say: Say, at_the_end: AtTheEnd) -> bool:
     """Process a run into its result, during its acquisition and after it; True if the result is complete. `say`
-    receives the progress, and `times` at the end. Failures are reported, and existing results stay."""
+    receives the progress, and `times` at the end. `at_the_end` calls what is to be done when all frames are there.
+    Failures are reported, and existing results stay."""
     teller = _Teller(result, say)
     try:
         with hold_result(result):
-            _Follower(Run(folder), result, teller).to_the_end()
+            follower = _Follower(Run(folder), result, teller)
+            follower.until_all_frames_are_there()
+            at_the_end(follower.make_result)
     except (CoupoleError, OSError, MemoryError) as error:
         teller.fail(str(error) if isinstance(error, CoupoleError) else reason(error))
         return False
@@ -102,23 +107,27 @@ class _Follower:
         self._may_give_up = True
         """True if the newest result of the views so far was not given up, so that the next one may be."""
 
-    def to_the_end(self) -> None:
-        """Follow the run until its result is made. Raises as `reflectance_of`."""
+    def until_all_frames_are_there(self) -> None:
+        """Take samples, look ahead and make results so far while the run goes on. Raises as `reflectance_of`."""
         self._teller.step("waiting", views=self._run.expected_views)
-        while True:
-            self._read_news()
+        self._read_news()
+        while not self._is_done:
             if self._looks:
                 self._offer_safe()
                 if not self._take_samples():
-                    if self._is_done:
-                        break
                     self._looks = False
             elif not (self._look_ahead() or self._grow()):
                 time.sleep(_LOOK_EVERY_S)
+            self._read_news()
+
+    def make_result(self) -> None:
+        """Take the samples that remain, and make the result. Raises as `reflectance_of`."""
+        self._offer_safe()
+        while self._take_samples():
+            self._offer_safe()
         samples_s = self._seconds_since_last_frame()
         self._teller.step("fitting", views=self._run.expected_views)
-        ahead = self._ahead if self._tried_views else NOTHING_AHEAD  # nothing else would use what is kept
-        reflectance_of(self._request, self._result, say=self._teller.part, ahead=ahead)
+        reflectance_of(self._request, self._result, say=self._teller.part, ahead=self._ahead)
         run_reflectance_page.write(self._result)
         result_s = self._seconds_since_last_frame()
         self._teller.say(
@@ -160,14 +169,20 @@ class _Follower:
         return [view for view in self._run.complete_views() if view not in self._taken]
 
     def _look_ahead(self) -> bool:
-        """Find the surface that the present view sees, once, while its frames arrive; False if there is nothing to
-        do."""
+        """Compute what the samples of the present view need besides its frames, once, while they arrive; False if
+        there is nothing to do. It ends when a view is complete."""
         if not self._begun_view or self._begun_view in self._taken:
             return False
         view, self._begun_view = self._begun_view, ""
         with contextlib.suppress(CoupoleError, OSError):  # found, and told, when its samples are taken
-            look_ahead(self._run.folder, view)
+            look_ahead(self._run.folder, view, self._ahead, self._may_look_ahead)
+        if not self._may_look_ahead():  # the rest of it waits for the samples of complete views
+            self._begun_view = self._begun_view or view
         return True
+
+    def _may_look_ahead(self) -> bool:
+        self._read_news()
+        return not self._looks or not (self._is_done or self._remaining_views())
 
     def _grow(self) -> bool:
         """Make a result of the views so far, if it has more views than the newest one; False if there is nothing

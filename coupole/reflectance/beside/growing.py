@@ -39,6 +39,8 @@ _COPIES = 3
 exist side by side."""
 _FREE_BYTES = 2**30
 """Free space that must remain: more than a rig keeps free by default (`reserve_bytes`)."""
+_SHARE_OF_MEMORY = 8
+"""A result so far takes blocks of work that are smaller by this factor, so that it is given up without delay."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,8 @@ def fit_so_far(growth: Growth, memory_bytes: int, say: Said, ahead: Ahead) -> No
     try:
         _begin(growth)
         subtract_from(growth.folder, say, ahead)
-        fit_result(growth.folder, memory_bytes, say=say)
-        check_result(growth.folder, memory_bytes, say=say)
+        fit_result(growth.folder, memory_bytes // _SHARE_OF_MEMORY, say=say)
+        check_result(growth.folder, memory_bytes // _SHARE_OF_MEMORY, say=say)
         run_reflectance_page.write(growth.folder)
         so_far.put_in_place(growth.result, growth.folder)
     except BaseException:

@@ -1,4 +1,4 @@
-"""Lowest priority for a process beside an acquisition; it ends when its parent ends."""
+"""Lowest priority for a process beside an acquisition while frames come. The process ends when its parent ends."""
 
 from __future__ import annotations
 
@@ -8,23 +8,51 @@ import os
 import platform
 import signal
 import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 _IOPRIO_SET = {"x86_64": 251, "aarch64": 30}
 """Number of the system call, for which the C library has no name (ioprio_set(2))."""
 _IOPRIO_WHO_PROCESS, _IDLE_CLASS = 1, 3 << 13
 _PR_SET_PDEATHSIG = 1
+_NICE_OF_THE_END = 10
 
 
-def yield_to_all_others() -> None:
+class ThreadForTheEnd:
+    """A thread for the work after the last frame, for which a person waits. Only a privileged process can take
+    back a low priority (setpriority(2), sched(7)). So this thread is begun before `yield_to_all_others`, and keeps
+    its own."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1, "after the last frame")
+        self.number = self._pool.submit(threading.get_native_id).result()
+
+    def run(self, work: Callable[[], None]) -> None:
+        """Do the work in this thread and in threads that it begins, as usual background work: still below an
+        acquisition of another cell. Errors of the work are raised here."""
+        self._pool.submit(self._run, work).result()
+
+    def _run(self, work: Callable[[], None]) -> None:
+        if sys.platform == "linux":  # elsewhere, the priority is that of the whole process
+            with contextlib.suppress(OSError):
+                nice = max(_NICE_OF_THE_END, os.getpriority(os.PRIO_PROCESS, self.number))
+                os.setpriority(os.PRIO_PROCESS, self.number, nice)
+        work()
+
+
+def yield_to_all_others(but: ThreadForTheEnd) -> None:
     """Use processors and disk only while no other process wants them, and be the first to be ended if memory is
-    short. Threads that begin later inherit this. Each of the four measures is taken where the system has it."""
+    short. Threads that begin later inherit this, except those of one thread. Each of the four measures is taken
+    where the system has it."""
     if sys.platform != "linux":
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, 0, 19)
         return
     for task in Path("/proc/self/task").iterdir():  # libraries may have begun threads
-        thread = int(task.name)
+        if (thread := int(task.name)) == but.number:
+            continue
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, thread, 19)
         with contextlib.suppress(OSError):

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from coupole.intake.plain_data import json_of
-from coupole.reflectance.beside.lowest_priority import end_with, yield_to_all_others
+from coupole.reflectance.beside.lowest_priority import ThreadForTheEnd, end_with, yield_to_all_others
 
 
 def main() -> None:
@@ -26,13 +26,13 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGHUP):  # Ctrl-C is for the acquisition, which ends this
         signal.signal(number, signal.SIG_IGN)
     _say({"reasons": _reasons(_next_request())})  # before anything moves or shines, and for this somebody waits
-    yield_to_all_others()
+    yield_to_all_others(but=(thread_for_the_end := ThreadForTheEnd()))
     request = _next_request()
     threading.Thread(target=_end_with_input, name="end with input", daemon=True).start()
 
     from coupole.reflectance.beside.follower import process_run
 
-    is_whole = process_run(Path(request["run"]), Path(request["result"]), _say)
+    is_whole = process_run(Path(request["run"]), Path(request["result"]), _say, thread_for_the_end.run)
     sys.stdout.flush()
     os._exit(0 if is_whole else 1)  # no thread is waited for
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from coupole.calibration.light.tile_views import Positions
 from coupole.errors import InputError
 from coupole.geometry import apply
 from coupole.motion import occlusion
 from coupole.motion.packet_rays import PacketMesh
 from coupole.motion.remembered import Remembered
 from coupole.reflectance.extraction.frame_veils import GLARE, U_GLARE
-from coupole.reflectance.extraction.lamp_sight import Facets, lamp_codes, neighbours_of
+from coupole.reflectance.extraction.lamp_sight import CodesAhead, Facets, lamp_codes, neighbours_of
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
 from coupole.reflectance.extraction.sample_codes import BY_CELL, CODES, REACHED
@@ -40,6 +39,9 @@ MOST_BLUR_PX = 2.0
 """Largest diameter of the circle of confusion of a pixel that is used, px."""
 Say = Callable[[str, int, int], None]
 _newest_surface: Remembered[SeenSurface] = Remembered(1)
+_newest_codes = CodesAhead()
+_LEDS_AHEAD = 16
+"""Number of LEDs whose codes are found between two looks at whether this is still wanted."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,7 @@ def extract_view(
             digest.add_attributes(file)
 
     complete(path, write, unless=path.with_suffix(".json"))
+    _newest_codes.begin("")
     summary = {
         "view": path.stem,
         "pixels": surface.pixels,
@@ -156,19 +159,50 @@ def surface_of(measured_run: MeasuredRun, geometry: Geometry, view: MeasuredView
             threads=threads,
         )
 
-    mesh = hashlib.sha256(measured_run.corners_mm.tobytes()).hexdigest()
-    key = (mesh, repr(measured_run.lens), view.base_from_camera, size_px, measured_run.optics)
-    return _newest_surface.result(key, compute)
+    return _newest_surface.result((_sight_of(measured_run, view),), compute)
+
+
+def _sight_of(measured_run: MeasuredRun, view: MeasuredView) -> str:
+    """Identify the surface that a view sees, by all that decides it."""
+    sight = hashlib.sha256(measured_run.corners_mm.tobytes())
+    sight.update(repr((measured_run.lens, measured_run.frames.size_px, measured_run.optics)).encode())
+    sight.update(view.base_from_camera.tobytes())
+    return sight.hexdigest()
+
+
+def find_codes_ahead(
+    measured_run: MeasuredRun,
+    geometry: Geometry,
+    view: MeasuredView,
+    leds: NDArray[np.int64],
+    is_wanted: Callable[[], bool],
+) -> None:
+    """Find where the object hides LEDs from what a view sees, for `extract_view`. This needs no frame of them. It
+    ends when `is_wanted` says so; what was found remains."""
+    threads = len(os.sched_getaffinity(0))
+    facets = geometry.of(surface_of(measured_run, geometry, view, threads).triangles)
+    _newest_codes.begin(_sight_of(measured_run, view))
+    with ThreadPoolExecutor(threads) as pool:
+        for first in range(0, len(leds) if len(facets.centres_mm) else 0, _LEDS_AHEAD):
+            positions = measured_run.leds.only(leds[first : first + _LEDS_AHEAD])
+            if not is_wanted():
+                break
+            if not _newest_codes.keep(positions, lamp_codes(geometry.mesh, facets, positions, pool)):
+                break
 
 
 def shadows_of(work: ViewPass, geometry: Geometry) -> Callable[[slice, Executor], NDArray[np.uint8]]:
     """Return a function that gives the codes [leds, triangles] of some of the view's LEDs: they say what object
-    and cell hide."""
+    and cell hide. Codes that `find_codes_ahead` has found are used."""
     hidden_by_cell = _hidden_by_cell(work)
+    sight = _sight_of(work.measured_run, work.view)
 
     def codes_of(part: slice, pool: Executor) -> NDArray[np.uint8]:
         leds = work.leds[part]
-        codes = lamp_codes(geometry.mesh, work.facets, Positions(leds, *work.measured_run.leds.of(leds)), pool)
+        positions = work.measured_run.leds.only(leds)
+        codes = _newest_codes.codes(sight, positions)
+        if codes is None:
+            codes = lamp_codes(geometry.mesh, work.facets, positions, pool)
         if hidden_by_cell is not None:
             codes[(codes == REACHED) & hidden_by_cell(leds)] = BY_CELL
         return codes

@@ -6,6 +6,7 @@ corners.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
@@ -43,6 +44,39 @@ class Facets:
         """[n, 3]"""
         starts: NDArray[np.float32] = (self.centres_mm + RAY_START_MM * self.normals).astype(np.float32)
         return starts
+
+
+class CodesAhead:
+    """Codes that were found before a view's frames were complete. Object, pose and LEDs alone decide them. Those
+    of one view are kept, up to a limit of memory."""
+
+    def __init__(self, most_bytes: int = 500_000_000) -> None:
+        self._most_bytes = most_bytes
+        self._sight = ""
+        self._codes: dict[bytes, NDArray[np.uint8]] = {}
+
+    def begin(self, sight: str) -> None:
+        """Keep the codes of this view; those of another view are forgotten. `sight` identifies what the view
+        sees."""
+        if sight != self._sight:
+            self._sight, self._codes = sight, {}
+
+    def keep(self, leds: Positions, codes: NDArray[np.uint8]) -> bool:
+        """Keep the codes [leds, triangles] of some LEDs; False if they are too large to keep."""
+        if (len(self._codes) + len(codes)) * codes.shape[1] > self._most_bytes:
+            return False
+        self._codes |= zip(_keys_of(leds), codes, strict=True)
+        return True
+
+    def codes(self, sight: str, leds: Positions) -> NDArray[np.uint8] | None:
+        """[leds, triangles] codes that were kept; None if one of them was not."""
+        found = [self._codes.get(key) for key in _keys_of(leds)] if sight == self._sight else []
+        known = [codes for codes in found if codes is not None]
+        return np.stack(known) if len(known) == len(leds.ids) else None
+
+
+def _keys_of(leds: Positions) -> Sequence[bytes]:
+    return [row.tobytes() for row in np.hstack([leds.centres_mm, leds.normals])]
 
 
 def lamp_codes(mesh: PacketMesh, facets: Facets, leds: Positions, pool: Executor) -> NDArray[np.uint8]:

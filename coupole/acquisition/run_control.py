@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from coupole.acquisition.observer import Control
 from coupole.acquisition.runtime_folder import named_after, runtime_folder
 from coupole.acquisition.safeguard import Safeguard, unsure
-from coupole.acquisition.user_socket import PATIENCE_S, Gone, UserSocket, exchange, told_if_given_up
+from coupole.acquisition.user_socket import PATIENCE_S, Caller, UserSocket, exchange, told_if_given_up
 from coupole.errors import InputError, reason
 from coupole.intake.plain_data import json_of
 
@@ -86,7 +86,7 @@ class RunControl:
         progress = self._progress()
         return {**self._about, "state": state, **(vars(progress) if progress else {})}
 
-    def _answer(self, line: bytes, is_gone: Gone) -> State:
+    def _answer(self, line: bytes, caller: Caller) -> State:
         try:
             request = json_of(line, "request")
             version, command = request["version"], request["command"]
@@ -102,7 +102,7 @@ class RunControl:
             case "go-on":
                 if self._control.stands:  # which waits for the word of what was frozen
                     return {**self.state(), "unheard": _UNHEARD}
-                if not is_gone():
+                if not caller.is_gone():
                     self._control.let_go_on()
             case "stop":
                 self._control.stop_by(signal.SIGINT, "`coupole stop`, or the console")

@@ -103,6 +103,8 @@ class _Session:
     run: Run
     recorder: RunRecorder
     faults: ArmFaults
+    begun_s: float
+    """Time of its first line in the journal, by `_unset_clock_s`."""
 
 
 def acquire_plan(job: Job, console: Console, request: SessionRequest, figures: dict[str, Any]) -> None:
@@ -166,13 +168,14 @@ def _acquire_into(
             acknowledgement = on_disk(faults.where, partial(faults.begin_session, run.folder.name))
             event = event_class(simulated=cell.is_simulated, room_c=room_c, acknowledged=acknowledgement)
             fields = {"dose_budget_lux_h": preflight.dose_budget_lux_h, "trusted": trusted_by_name(job.cell.rig)}
+            begun_s = _unset_clock_s()
             recorder.note(event.model_copy(update=fields))
             if beside is not None:
                 _begin_processing(job, run, recorder, beside)
             tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
-            _acquire(job, _Session(cell, run, recorder, faults), console, light, figures)
+            _acquire(job, _Session(cell, run, recorder, faults, begun_s), console, light, figures)
         finally:
             _end_recording(recorder, beside)
 
@@ -274,12 +277,19 @@ def _acquire(
                 alarm(trouble)
             tell_changes(job.cell.files, recorder, console)
             note_unread(recorder)
-            recorder.note(SessionStopped(outcome=outcome, reason=str(failure or ""), robot=statistics(cell)))
+            end = SessionStopped(outcome=outcome, reason=str(failure or ""), robot=statistics(cell))
+            recorder.note(end.model_copy(update={"took_s": round(_unset_clock_s() - session.begun_s, 3)}))
             recorder.close_quietly()
             (sequencer.give_up if left_behind() else sequencer.conclude)(recorder.committed)
             figures.update({**_figures(run, job, sequencer.outcome, recorder.committed), "unsafe": cell.trouble})
             _say_outcome(console, run, sequencer.outcome, outcome)
             _say_what_comes_first(job, faults)
+
+
+def _unset_clock_s() -> float:
+    """Return the time of a clock that nobody sets, s. It goes on while the machine sleeps, where Linux has such a
+    clock."""
+    return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 def _say_what_comes_first(job: Job, faults: ArmFaults) -> None:

@@ -29,16 +29,28 @@ _SAID_AFTER_S = 1.5
 _MOST_WAITING = 256
 """Connections that a process may leave waiting, as one that is stopped does with each `coupole status`."""
 _CONNECTS_AGAIN_S = 0.05
-Gone = Callable[[], bool]
-"""Function that tells whether the other end has closed the connection."""
 _LONGEST_ANSWER_BYTES = 16 * 1024**2
+
+
+class Caller:
+    """The other end of a connection, which asks."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self.pid = peer_pid(connection)
+
+    def is_gone(self) -> bool:
+        """Tell whether the other end is closed. An open end that only sends nothing more does not count."""
+        poll = select.poll()
+        poll.register(self._connection, 0)
+        return any(events & (select.POLLHUP | select.POLLERR) for _, events in poll.poll(0))
 
 
 class UserSocket:
     """Serves a socket at a path while a context lasts. Raises OSError if it cannot."""
 
-    def __init__(self, path: Path, answer: Callable[[bytes, Gone], Mapping[str, Any]]) -> None:
-        """`answer` makes the answer to a request's line. It begins nothing if the other end has `Gone`. If there
+    def __init__(self, path: Path, answer: Callable[[bytes, Caller], Mapping[str, Any]]) -> None:
+        """`answer` makes the answer to a request's line. It begins nothing for a caller that is gone. If there
         is a file at the path, a killed process left it; the caller knows that this process is not alive.
         """
         self.path, self._answer = path, answer
@@ -79,7 +91,7 @@ class UserSocket:
             connection.settimeout(PATIENCE_S)
             if peer_uid(connection) in (os.getuid(), 0):
                 line = _line(connection, LONGEST_REQUEST_BYTES)
-                answer = self._answer(line, lambda: _hung_up(connection))
+                answer = self._answer(line, Caller(connection))
                 connection.sendall(json.dumps(answer).encode() + b"\n")
 
 
@@ -98,13 +110,6 @@ def _peer(connection: socket.socket) -> tuple[int, int, int]:
     credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     pid, uid, gid = struct.unpack("3i", credentials)
     return pid, uid, gid
-
-
-def _hung_up(connection: socket.socket) -> bool:
-    """Tell whether the other end is closed. An open end that only sends nothing more does not count."""
-    poll = select.poll()
-    poll.register(connection, 0)
-    return any(events & (select.POLLHUP | select.POLLERR) for _, events in poll.poll(0))
 
 
 def exchange(

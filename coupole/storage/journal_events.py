@@ -354,6 +354,8 @@ class SessionStopped(JournalEvent):
     done."""
     robot: dict[str, Any] = Field(default_factory=dict)
     """Figures of the robot's link."""
+    took_s: float | None = None
+    """Duration of the session by a clock that nobody sets, s. Journals of earlier versions have none."""
 
 
 Event: TypeAlias = (

@@ -67,10 +67,18 @@ class Session:
     light_s: float = 0.0
     """Sum of the on-times of its LEDs."""
 
+    took_s: float | None = None
+    """Duration by a clock that nobody sets, s; None while it runs, and for a killed session."""
+
     @property
     def duration_s(self) -> float:
-        """Time from its begin to its last event, s, by this machine's clock. Pauses are included."""
-        return _seconds(self.begun, self.ended)
+        """Time from its begin to its last event, s. Pauses are included."""
+        return _seconds(self.begun, self.ended) if self.took_s is None else self.took_s
+
+    @property
+    def clock_set_s(self) -> float:
+        """Time by which the machine's clock was set in the session, s; 0 if that is not known."""
+        return 0.0 if self.took_s is None else _difference_s(self.begun, self.ended) - self.took_s
 
 
 @dataclass
@@ -260,7 +268,7 @@ def _note_event(found: Status, event: Event) -> None:
             session.pauses += 1
         case SessionStopped():
             found.state, found.reason = event.outcome, event.reason or found.reason
-            session.outcome, session.reason = event.outcome, found.reason
+            session.outcome, session.reason, session.took_s = event.outcome, found.reason, event.took_s
         case ReshootBegun():
             found.reshot += len(event.shots)
         case FaultNoted():
@@ -293,6 +301,11 @@ def _note_fault(status: Status, event: FaultNoted) -> None:
 
 
 def _seconds(begin_time: str, end_time: str) -> float:
+    """Time between two events, not below 0: the machine's clock may have been set meanwhile."""
+    return max(0.0, _difference_s(begin_time, end_time))
+
+
+def _difference_s(begin_time: str, end_time: str) -> float:
     if not begin_time or not end_time:
         return 0.0
     return (datetime.fromisoformat(end_time) - datetime.fromisoformat(begin_time)).total_seconds()

@@ -30,6 +30,8 @@ from coupole.viewing.terminal import bytes_text, duration_text
 _MOST_LINES = 30
 """Greatest number of lines of trouble. The other lines are only counted."""
 _STOPPED_IN_0_1 = "Interrupted"
+_CLOCK_SET_S = 5.0
+"""Differences of the machine's clock below this are ordinary corrections of it."""
 
 
 def sign_of(state: str) -> Literal["ok", "stopped", "bad"]:
@@ -112,7 +114,13 @@ def sessions(run_status: Status) -> Section:
         pause_text = f"{session.pauses} ({duration_text(session.paused_s)})" if session.pauses else "none"
         rows.append((Moment(session.begun), duration_text(session.duration_s), pause_text, outcome, reason))
     head = ("begun (UTC)", "duration", "pauses", "ended", "why")
-    return Section("time", "Time", tables=[Table("Sessions", head, rows)])
+    notes = [
+        f"In the session of {session.begun} the machine's clock was set by {session.clock_set_s:+.0f} s. Times of "
+        "day in this report are those of that clock; the duration is not."
+        for session in run_status.sessions
+        if abs(session.clock_set_s) > _CLOCK_SET_S
+    ]
+    return Section("time", "Time", tables=[Table("Sessions", head, rows)], notes=notes)
 
 
 def _end_of(session: Session, run_status: Status, *, last: bool) -> tuple[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import cells
@@ -49,6 +50,25 @@ FAULT = FaultNoted(kind="DeviceLost", message="the box is gone", device="ledbox"
 def test_an_operators_stop_is_a_reason_and_no_fault(run: Run) -> None:
     found = told(run, [SessionStarted(), STOPPED])
     assert (found.state, found.reason, found.faults) == ("interrupted", "stopped by the operator (SIGINT)", [])
+
+
+@pytest.mark.parametrize("set_s", [-7200, 86_400])
+def test_a_clock_that_was_set_in_a_session_changes_no_duration_and_is_told(run: Run, set_s: int) -> None:
+    begun = datetime(2026, 5, 1, tzinfo=UTC)
+    times = [begun, begun + timedelta(seconds=set_s), begun + timedelta(seconds=23 + set_s)]
+    events = [SessionStarted(), FAULT, SessionStopped(outcome="done", took_s=23.0)]
+    run.journal_path.write_text(
+        "".join(
+            event_line(event.model_copy(update={"t": t.isoformat()}))
+            for event, t in zip(events, times, strict=True)
+        )
+    )
+    (session,) = status(run).sessions
+    assert session.duration_s == 23.0
+    assert session.clock_set_s == set_s
+    page = report.write(run).read_text()
+    assert f"the machine&#39;s clock was set by {set_s:+d} s" in page
+    assert "23.0 s in 1 session" in page
 
 
 def test_a_stop_that_version_0_1_noted_as_a_fault_is_none(run: Run) -> None:

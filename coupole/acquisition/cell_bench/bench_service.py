@@ -1,7 +1,7 @@
 """`coupole bench`: holds a cell's devices while no run uses the cell, and answers requests at a socket.
 
 The process that draws a console never touches a device; it asks this process, as any other client of the same user
-can. Even if a client dies, a motion by hand ends when it is no longer held, and a light ends with its picture.
+can. If a client dies or is stopped, the motion that it asked for ends, and a light ends with its picture.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any
 
 from rich.console import Console
 
+from coupole.acquisition.cell_bench.asking_process import AskingProcess
 from coupole.acquisition.cell_bench.bench_arm import BenchArm
 from coupole.acquisition.cell_bench.bench_client import bench_socket
 from coupole.acquisition.cell_bench.bench_devices import BenchDevices
@@ -45,7 +46,7 @@ from coupole.acquisition.opened_cell import ARM_STOPPED, OpenedCell, open_cell
 from coupole.acquisition.operator import ask_to_begin, identity_printer
 from coupole.acquisition.safeguard import unsure
 from coupole.acquisition.signals import obeyed_by
-from coupole.acquisition.user_socket import Gone, UserSocket
+from coupole.acquisition.user_socket import Caller, UserSocket
 from coupole.bounded import NOW, on_disk, refuse_overdue
 from coupole.errors import CoupoleError, DeviceError, InputError, StorageError, unsafe_end
 from coupole.plan.cell import Cell
@@ -88,9 +89,9 @@ class BenchService:
             self._asked_s = time.monotonic()
         return time.monotonic() - self._asked_s
 
-    def answer(self, line: bytes, is_gone: Gone) -> dict[str, Any]:
+    def answer(self, line: bytes, caller: Caller | None) -> dict[str, Any]:
         """Return the answer to a request. It has an `error` with its `kind` if the request was not obeyed. Nothing
-        moves or shines for a client that has gone (`is_gone`)."""
+        moves or shines for a caller that has disconnected. None is a caller in this process."""
         stops = self.works.stops
         try:
             request = read_request(line)
@@ -100,9 +101,9 @@ class BenchService:
                 self._control.await_word()
             if self._ending or self.closing.is_set() or (begins and self._control.stop.is_set()):
                 raise InputError("the bench is closing")
-            if begins and is_gone():
+            if begins and caller is not None and caller.is_gone():
                 raise InputError("the caller has disconnected: not begun")
-            return {"version": VERSION, **self._obey(request, stops)}
+            return {"version": VERSION, **self._obey(request, stops, caller)}
         except CoupoleError as error:
             if isinstance(error, DeviceError):
                 self._devices.note_error(error)
@@ -122,9 +123,9 @@ class BenchService:
 
     def ask(self, command: str, **fields: Any) -> dict[str, Any]:
         """Answer a request of a caller in this process."""
-        return self.answer(json.dumps({"version": VERSION, "command": command, **fields}).encode(), lambda: False)
+        return self.answer(json.dumps({"version": VERSION, "command": command, **fields}).encode(), None)
 
-    def _obey(self, request: Request, stops: int) -> dict[str, Any]:
+    def _obey(self, request: Request, stops: int, caller: Caller | None) -> dict[str, Any]:
         """Obey a request. `stops` is the number of stops before the request was read."""
         match request:
             case StateAsked():
@@ -135,7 +136,7 @@ class BenchService:
             case PathAsked():
                 return self._arm.plan_path(request)
             case DriveAsked():
-                return self._arm.drive(request.path, stops)
+                return self._arm.drive(request.path, stops, _asker(caller))
             case JogAsked():
                 return self._arm.jog(request, stops)
             case FrameAsked():
@@ -144,7 +145,7 @@ class BenchService:
             case LoupeAsked():
                 return self._frames.loupe(request)
             case MeterAsked():
-                return self._begin_metering(request, stops)
+                return self._begin_metering(request, stops, _asker(caller))
             case StopAsked():
                 return {"trouble": self._stop(), **self._state()}
             case CloseAsked():
@@ -157,7 +158,7 @@ class BenchService:
         if (work := self.works.running) is not None and work.kind == "meter":
             raise InputError("box and camera are metering; stop it or let it end")
 
-    def _begin_metering(self, asked: MeterAsked, stops: int) -> dict[str, Any]:
+    def _begin_metering(self, asked: MeterAsked, stops: int, asker: AskingProcess | None) -> dict[str, Any]:
         small = metering_job(self._arm.job_of(Path(asked.plan)))
         self._arm.refuse_motion()
         request = exposure_advice.Request(asked.saturated, asked.snr, asked.share)
@@ -172,7 +173,7 @@ class BenchService:
             return advice.figures()
 
         work = Work(self._control, "meter", {"plan": asked.plan}, meter)
-        self.works.begin(work, stops)
+        self.works.begin(work, stops, asker)
         return work.figures()
 
     def _stop(self) -> list[str]:
@@ -216,6 +217,10 @@ class BenchService:
         self._opened.make_safe()
         with contextlib.suppress(StorageError):  # what was planned then stands
             on_disk("the dose ledger", self._frames.end, stop=NOW)
+
+
+def _asker(caller: Caller | None) -> AskingProcess | None:
+    return None if caller is None else AskingProcess(caller.pid)
 
 
 @contextmanager

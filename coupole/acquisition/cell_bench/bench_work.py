@@ -28,7 +28,7 @@ class Work:
         self.control = Control(session=session)
         self._state, self._found, self._why = "running", {}, ""  # type: tuple[str, dict[str, Any], str]
         self._lost = ""
-        """Why the process that asked for the work no longer ran."""
+        """Reason why the process that asked for the work no longer ran."""
         self._thread = threading.Thread(target=self._run, name=kind, daemon=True)
 
     @property

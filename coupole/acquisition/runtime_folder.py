@@ -12,15 +12,35 @@ from coupole.errors import InputError
 
 _BASE = Path("/tmp")
 """A user's usual runtime folder is removed after the last log-out, but a run goes on."""
+_MOST_TAKEN = 10
 
 
 def runtime_folder() -> Path:
-    """Return the folder; make it if it is missing. Raises InputError if another user owns it or may enter it;
-    OSError."""
-    folder = _BASE / f"coupole-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
+    """Return the folder; make it if it is missing. If another user has taken its name, it is the next one that is
+    this user's or free, so that all processes of a user find the same. Raises InputError if others may enter it,
+    or if all names are taken; OSError."""
+    names = [f"coupole-{os.getuid()}", *(f"coupole-{os.getuid()}-{number}" for number in range(1, _MOST_TAKEN))]
+    folders = [_BASE / name for name in names]
+    for folder in folders:
+        if _owner(folder) == os.getuid():
+            return _refuse_open(folder)
+    for folder in folders:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        if _owner(folder) == os.getuid():
+            return _refuse_open(folder)
+    raise InputError(f"{folders[0]}: other users have taken this name and the next {_MOST_TAKEN - 1}")
+
+
+def _owner(folder: Path) -> int | None:
+    try:
+        return folder.stat(follow_symlinks=False).st_uid
+    except FileNotFoundError:
+        return None
+
+
+def _refuse_open(folder: Path) -> Path:
     status = folder.stat(follow_symlinks=False)
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
+    if not stat.S_ISDIR(status.st_mode) or status.st_mode & 0o077:
         raise InputError(f"{folder}: expected a folder of this user that nobody else may enter (mode 0700)")
     return folder
 

@@ -150,6 +150,28 @@ def test_nobody_else_can_enter(served: Served) -> None:
         ask(served.run, "pause")
 
 
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can make another user's folder")
+def test_a_folder_that_another_user_has_laid_out_is_passed_by(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All processes of a user find the same folder, though the other one goes away meanwhile."""
+    monkeypatch.setattr(runtime_folder, "_BASE", tmp_path)
+    taken = tmp_path / f"coupole-{os.getuid()}"
+    taken.mkdir(mode=0o777)
+    os.chown(taken, 65534, 65534)
+    folder = runtime_folder.runtime_folder()
+    assert folder == tmp_path / f"coupole-{os.getuid()}-1"
+    assert folder.stat().st_mode & 0o777 == 0o700
+    taken.rmdir()
+    assert runtime_folder.runtime_folder() == folder
+    for number in range(10):
+        other = tmp_path / (f"coupole-{os.getuid()}" + (f"-{number}" if number else ""))
+        other.mkdir(exist_ok=True)
+        os.chown(other, 65534, 65534)
+    with pytest.raises(InputError, match="other users have taken this name and the next 9"):
+        runtime_folder.runtime_folder()
+
+
 def test_another_user_gets_no_answer(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(user_socket, "peer_uid", lambda _: os.getuid() + 1)
     with pytest.raises(InputError, match="does not answer"):

@@ -38,7 +38,7 @@ class Size:
     """Rows of the sheet's grid, how many times as fine as 160 x 120 its view is, greatest width of the maps."""
 
     rows: int = 400
-    finer: int = 21
+    finer: int = 31
     map_px: int = 8192
 
 

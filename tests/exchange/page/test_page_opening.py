@@ -112,6 +112,41 @@ def test_a_coarse_picture_comes_first_and_the_whole_mesh_takes_its_place(page: P
     np.testing.assert_array_equal(mine, page.picture(1))
 
 
+SLOW_FINE_MESH = """
+window.drawn = [];
+const draw = WebGL2RenderingContext.prototype.drawArrays;
+WebGL2RenderingContext.prototype.drawArrays = function (mode, first, count) {
+  draw.call(this, mode, first, count);
+  if (count <= 3) return;
+  window.drawn.push([count / 3, this.canvas.width]);
+  const begun_ms = performance.now();
+  while (count / 3 > 500 && performance.now() - begun_ms < 300);
+};
+"""
+"""Graphics for which a mesh of more than 500 triangles is too much: each of its pictures takes longer than the
+page waits for the next motion."""
+
+
+def test_on_slow_graphics_the_coarse_mesh_is_turned_and_all_comes_back_at_rest(page: Page, folder: Path) -> None:
+    look = look_of_result(folder / "result", choice=PageChoice(coarse_over=500))
+    page.open(write_page(look, "waves", folder / "turned.html")[0])
+    page.wide()
+    fine, wide = look.about["triangles"], page.run("document.getElementById('picture').width")
+    page.run("coupole.whole()")
+    page.driver.execute_script(SLOW_FINE_MESH)
+    pointer = ActionChains(page.driver, duration=50).click_and_hold(page.browser.at("#picture"))
+    for number in range(30):
+        pointer.move_by_offset(5 if number % 10 < 5 else -5, 0)
+    pointer.release().perform()
+    drawn = cells.wait_until(
+        lambda: (seen := page.run("drawn"))[-1] == [fine, wide] and len(seen) > 5 and seen, "all of the detail"
+    )
+    turned = [width for triangles, width in drawn if triangles <= 500]
+    assert turned, "the coarse mesh was never drawn"
+    assert set(turned) == {round(wide / 4)}
+    assert len([one for one in drawn if one[0] == fine]) < 8
+
+
 def test_the_coarse_picture_stays_where_the_rest_is_missing(page: Page, folder: Path, tmp_path: Path) -> None:
     look = look_of_result(folder / "result", choice=PageChoice(coarse_over=500))
     files = write_page(look, "waves", tmp_path / "look.html", most_bytes=1000)

@@ -47,7 +47,7 @@ class App {
 
   /** All of the mesh has come. */
   refine(arrays) {
-    this.renderer.take(arrays);
+    this.renderer.refine(arrays);
     this.changed("light");
   }
 
@@ -205,7 +205,7 @@ class App {
       else if (this.wanted) this.renderer.show(this.state, this.theme.ground);
       this.wanted = false;
       if (this.moving.isMoving) setTimeout(() => this.schedule(), this.detail.took_ms);  // others want the machine too
-      else if (this.renderer.samples < this.most) this.schedule();
+      else if (this.renderer.samples < this.most || this.detail.share < 1) this.schedule();
     });
   }
 
@@ -223,9 +223,9 @@ class App {
 
   /** Draw; while something moves, in as much detail as comes fast enough. */
   drawInTime() {
-    const begun = performance.now();
+    const begun = performance.now(), { isInMotion } = this.detail;
     this.draw();
-    if (!this.detail.isInMotion) return;
+    if (!isInMotion) return;
     this.renderer.read(0, 0, 1, 1);  // waits for it
     if (this.detail.isTooFine(performance.now() - begun) && this.fitCanvas()) this.renderer.restart();
     if (this.moving.isMoving && this.detail.isHopeless) this.moving.stop();
@@ -263,8 +263,10 @@ class App {
     this.renderer.read(0, 0, 1, 1);  // waits for it
   }
 
-  /** Give the canvas the pixels of its place on the page; whether they are others than before. */
+  /** Give the canvas the pixels of its place on the page, and the mesh its detail; whether the pixels are others than
+   * before. */
   fitCanvas() {
+    this.renderer.isCoarse = this.detail.isCoarse;
     const { clientWidth: width, clientHeight: height } = byId("stage");
     const wished = Math.min(window.devicePixelRatio || 1, 2);
     this.scale = Math.min(wished, Math.sqrt(MOST_PIXELS / Math.max(width * height, 1))) * this.detail.share;

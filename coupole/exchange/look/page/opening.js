@@ -64,26 +64,33 @@ const MOST_HOPELESS = 8;  // of such pictures, one after the other, before a lig
 class Detail {
   constructor() {
     this.share = 1;
+    this.isCoarse = false;  // whether a coarse mesh is shown, if there is one
     this.until = 0;
+    this.hasMoved = false;  // since the last picture, which may have taken longer than a motion lasts
     this.slow = this.hopeless = 0;
     this.took_ms = 0;
   }
 
   moved() {
+    this.hasMoved = true;
     this.until = performance.now() + MOTION_MS;
   }
 
   get isInMotion() {
-    return performance.now() < this.until;
+    return this.hasMoved || performance.now() < this.until;
   }
 
-  /** A picture took a time; whether the next one is to be of less detail. */
+  /** A picture in motion took a time; whether the next one is to be of less detail. */
   isTooFine(took_ms) {
     this.took_ms = took_ms;
+    if (this.hasMoved) this.until = performance.now() + MOTION_MS;  // what waited for the picture comes after it
+    this.hasMoved = false;
     this.slow = took_ms > SLOW_MS ? this.slow + 1 : 0;
     this.hopeless = took_ms > HOPELESS_MS && this.share <= LEAST_DETAIL ? this.hopeless + 1 : 0;
-    if (this.slow < 2 || this.share <= LEAST_DETAIL) return false;
-    [this.share, this.slow] = [this.share / 2, 0];
+    if (this.isCoarse || this.slow < (took_ms > HOPELESS_MS ? 1 : 2)) return false;
+    this.isCoarse = this.share <= LEAST_DETAIL;
+    this.share = took_ms > HOPELESS_MS ? LEAST_DETAIL : Math.max(this.share / 2, LEAST_DETAIL);
+    this.slow = 0;
     return true;
   }
 
@@ -94,7 +101,7 @@ class Detail {
   /** All of it; whether it was less. */
   restore() {
     const was = this.share;
-    [this.share, this.slow] = [1, 0];
+    [this.share, this.isCoarse, this.slow] = [1, false, 0];
     return was < 1;
   }
 }

@@ -38,6 +38,8 @@ class Renderer {
     this.samples = 0;
     this.targets = null;
     this.depths = null;
+    this.coarse = null;
+    this.isCoarse = false;
     this.arrived = () => {};  // what is called when more has come
     this.measure();
     this.bodies = [{ about, texels: new Texels(this.gl, about) }];
@@ -176,6 +178,13 @@ class Renderer {
     this.restart();
   }
 
+  /** Show all of a mesh from now on. What was taken before, a coarse one, stands in its place while `isCoarse`. */
+  refine(arrays) {
+    this.coarse = this.bodies[0];
+    this.bodies[0] = { about: this.about, texels: this.coarse.texels };
+    this.take(arrays);
+  }
+
   /** Give a state of the object its numbers. */
   fill(body, arrays) {
     Object.assign(body, { arrays, triangles: arrays.triangles.length / 3, textures: body.textures ?? {} });
@@ -188,7 +197,8 @@ class Renderer {
 
   /** Draw the object, 0, or its other state, 1, until another is held. */
   hold(number) {
-    const { arrays, triangles, textures, texels } = this.bodies[number];
+    const body = number === 0 && this.isCoarse && this.coarse || this.bodies[number];
+    const { arrays, triangles, textures, texels } = body;
     Object.assign(this, { held: number, arrays, triangles, textures, texels });
   }
 
@@ -311,7 +321,7 @@ class Renderer {
     const at = this.use("shadow", { places, triangles });
     gl.viewport(0, 0, size, size);
     beams.forEach((beam, layer) => {
-      const drawn = `${this.held} ${beam.shadow}`;
+      const drawn = `${this.held} ${this.triangles} ${beam.shadow}`;
       if (maps.drawn[layer] === drawn) return;
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.depths.frames[layer]);
       gl.clear(gl.DEPTH_BUFFER_BIT);

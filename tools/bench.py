@@ -298,7 +298,7 @@ def bench_watching(options: Asked) -> None:
 
 
 def bench_page(options: Asked) -> None:
-    """The page of 20 million texels on the software renderer: its first picture against 3 s, and pictures while
+    """The page of 9 million texels on the software renderer: its first picture against 3 s, and pictures while
     the object is turned against 15 a second."""
     from bench_page import figures
 

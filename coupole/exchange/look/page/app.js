@@ -219,6 +219,7 @@ class App {
     } else if (!this.detail.isInMotion && this.detail.restore() && this.fitCanvas()) {
       this.renderer.restart();
     }
+    this.detail.frames += 1;
   }
 
   /** Draw; while something moves, in as much detail as comes fast enough. */

@@ -54,7 +54,8 @@ class MovingLight {
   }
 }
 
-const MOTION_MS = 250;  // after the last change, something is said to move
+const MOTION_MS = 250;  // after the last change, something is said to move,
+const MOTION_FRAMES = 16;  // or after the last picture of so many, as a browser that draws tells late of a change
 const SLOW_MS = 67;  // of a picture: 15 in a second
 const LEAST_DETAIL = 0.25;
 const HOPELESS_MS = 200;  // of a picture in the least detail
@@ -66,25 +67,24 @@ class Detail {
     this.share = 1;
     this.isCoarse = false;  // whether a coarse mesh is shown, if there is one
     this.until = 0;
-    this.hasMoved = false;  // since the last picture, which may have taken longer than a motion lasts
+    this.frames = 0;  // since the last change
     this.slow = this.hopeless = 0;
     this.took_ms = 0;
   }
 
   moved() {
-    this.hasMoved = true;
     this.until = performance.now() + MOTION_MS;
+    this.frames = 0;
   }
 
   get isInMotion() {
-    return this.hasMoved || performance.now() < this.until;
+    return this.frames <= 1 || performance.now() < this.until;
   }
 
   /** A picture in motion took a time; whether the next one is to be of less detail. */
   isTooFine(took_ms) {
     this.took_ms = took_ms;
-    if (this.hasMoved) this.until = performance.now() + MOTION_MS;  // what waited for the picture comes after it
-    this.hasMoved = false;
+    if (this.frames <= MOTION_FRAMES) this.until = performance.now() + MOTION_MS + took_ms;
     this.slow = took_ms > SLOW_MS ? this.slow + 1 : 0;
     this.hopeless = took_ms > HOPELESS_MS && this.share <= LEAST_DETAIL ? this.hopeless + 1 : 0;
     if (this.isCoarse || this.slow < (took_ms > HOPELESS_MS ? 1 : 2)) return false;

@@ -46,8 +46,11 @@ SMALLEST = Size(20, 1, 512)
 
 
 def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
-    """First picture and turning, for 9.4 million texels. Without Chromium there are none. With 20 million, a software
-    renderer needs more than two minutes until all of them have come, longer than the browser's driver waits."""
+    """First picture and turning, for 9.4 million texels. Without Chromium there are none.
+
+    With 20 million, a software renderer needs more than two minutes until all of them have come. The browser's
+    driver does not wait for so long.
+    """
     sys.path[:0] = [str(root), str(root / "tests")]
     from browser import CHROMIUM, DRIVER
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
+from contextlib import suppress
 from pathlib import Path
 
 from coupole.errors import InputError
@@ -25,7 +26,8 @@ def runtime_folder() -> Path:
         if _owner(folder) == os.getuid():
             return _refuse_open(folder)
     for folder in folders:
-        folder.mkdir(mode=0o700, exist_ok=True)
+        with suppress(FileExistsError):  # also what another user has put there that is no folder
+            folder.mkdir(mode=0o700)
         if _owner(folder) == os.getuid():
             return _refuse_open(folder)
     raise InputError(f"{folders[0]}: other users have taken this name and the next {_MOST_TAKEN - 1}")

@@ -66,7 +66,6 @@ class Session:
     paused_s: float = 0.0
     light_s: float = 0.0
     """Sum of the on-times of its LEDs."""
-
     took_s: float | None = None
     """Duration by a clock that nobody sets, s; None while it runs, and for a killed session."""
 

@@ -164,9 +164,10 @@ def test_a_folder_that_another_user_has_laid_out_is_passed_by(
     assert folder.stat().st_mode & 0o777 == 0o700
     taken.rmdir()
     assert runtime_folder.runtime_folder() == folder
+    folder.rmdir()
     for number in range(10):
         other = tmp_path / (f"coupole-{os.getuid()}" + (f"-{number}" if number else ""))
-        other.mkdir(exist_ok=True)
+        other.touch()  # a file does as well
         os.chown(other, 65534, 65534)
     with pytest.raises(InputError, match="other users have taken this name and the next 9"):
         runtime_folder.runtime_folder()

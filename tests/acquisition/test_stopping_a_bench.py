@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import subprocess
 import threading
 import time
 from types import SimpleNamespace
@@ -81,6 +84,32 @@ def test_a_stop_ends_what_is_under_way() -> None:
     works.begin(work, works.stops)
     works.stop()
     assert ended.wait(10.0)
+
+
+def test_work_is_stopped_if_the_process_that_asked_for_it_has_ended_or_cannot_be_watched(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def no_more_files(_: int) -> int:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    def outcome(pid: int) -> str:
+        works = Works()
+        work = Work(Control(), "drive", {}, until_stopped)
+        works.begin(work, works.stops, pid)
+        work.join(10.0)
+        figures = work.figures()
+        assert figures["state"] == "stopped"
+        return str(figures["why"])
+
+    def until_stopped(control: Control) -> dict[str, Any]:
+        assert control.stop.wait(10.0), "it went on"
+        raise control.interruption()
+
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    assert outcome(ended.pid) == f"process {ended.pid}, which asked for it, has ended"
+    monkeypatch.setattr(os, "pidfd_open", no_more_files)
+    assert "cannot be watched: Too many open files" in outcome(os.getpid())
 
 
 def test_no_work_of_a_bench_goes_on_before_it_is_known_why_its_process_stood_still() -> None:

@@ -346,32 +346,6 @@ def test_while_a_bench_holds_the_cell_no_other_does_and_the_command_asks_it(
     assert np.allclose(joints_deg(world), PARK_DEG, atol=0.01)
 
 
-@pytest.mark.parametrize("end", [signal.SIGSTOP, signal.SIGKILL])
-def test_the_arm_stops_with_the_process_that_asked_for_the_motion(
-    asked: Bench, cell: CellFolder, world: World, end: signal.Signals
-) -> None:
-    """As after Ctrl-Z: whoever sees `Stopped` at the terminal believes that the arm does not move."""
-    asked.drive("home")
-    client = cells.start("arm", cell.rig, "park", "--yes")
-    cells.wait_until(lambda: joints_deg(world)[0] > 5.0, "the arm under way")
-    client.send_signal(end)
-    ended_s = time.monotonic()
-    work = asked.ended_work()
-    assert work["state"] == "stopped"
-    assert time.monotonic() - ended_s < 5.0
-    why = "has ended" if end == signal.SIGKILL else "was stopped (Ctrl-Z, SIGSTOP)"
-    assert work["why"] == f"process {client.pid}, which asked for it, {why}"
-    at_rest_deg = joints_deg(world)
-    assert at_rest_deg[0] < 50.0, "of the 60 to park"
-    if end != signal.SIGKILL:
-        client.send_signal(signal.SIGCONT)
-    told = cells.finish(client)
-    assert np.allclose(joints_deg(world), at_rest_deg, atol=0.01), "the arm went on"
-    assert told.code == (-signal.SIGKILL if end == signal.SIGKILL else 4), told
-    assert end == signal.SIGKILL or "which asked for it, was stopped" in " ".join(told.err.split())
-    assert asked.done("state")["arm"]["faults_to_confirm"] == []
-
-
 def test_asked_to_close_it_makes_all_safe_and_ends(asked: Bench, world: World) -> None:
     assert asked.done("close")["trouble"] == []
     assert asked.process.wait(cells.PATIENCE_S) == 0

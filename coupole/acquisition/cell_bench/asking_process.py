@@ -6,36 +6,43 @@ from __future__ import annotations
 
 import os
 import select
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
-from coupole.errors import InputError
 from coupole.storage.stopped_process import is_stopped
 
+_LOOK_EVERY_S = 0.02
 
-class AskingProcess:
-    """A process of this machine, as long as the context lasts."""
 
-    def __init__(self, pid: int) -> None:
-        """Raises InputError if the process has ended already. `pid` 0 is a process that this one cannot see, as
-        one outside a container: it is not watched."""
-        self._pid = pid
+@contextmanager
+def watched_process(pid: int, lose: Callable[[str], None]) -> Iterator[None]:
+    """Call `lose` with the reason, from another thread, if a process of this machine ends or is stopped while the
+    context lasts, or if it cannot be watched. `pid` 0 is a process that this one cannot see, as one outside a
+    container: it is not watched. Raises RuntimeError if no thread can be begun."""
+    over = threading.Event()
+    if pid:
+        threading.Thread(target=_watch, args=(pid, lose, over), name="asking process", daemon=True).start()
+    try:
+        yield
+    finally:
+        over.set()
+
+
+def _watch(pid: int, lose: Callable[[str], None], over: threading.Event) -> None:
+    try:
+        process = os.pidfd_open(pid)  # the number may be used again
         try:
-            self._process = os.pidfd_open(pid) if pid else -1
-        except ProcessLookupError:
-            raise InputError("the caller has ended: not begun") from None
-
-    def __enter__(self) -> AskingProcess:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._process >= 0:
-            os.close(self._process)
-
-    def absence(self) -> str:
-        """Return why the process does not run; empty if it runs."""
-        if self._process < 0:
-            return ""
-        if select.select([self._process], [], [], 0)[0]:
-            return f"process {self._pid}, which asked for it, has ended"
-        if is_stopped(self._pid):
-            return f"process {self._pid}, which asked for it, was stopped (Ctrl-Z, SIGSTOP)"
-        return ""
+            end = select.poll()
+            end.register(process, select.POLLIN)
+            while not over.wait(_LOOK_EVERY_S):
+                if end.poll(0):
+                    raise ProcessLookupError
+                if is_stopped(pid):
+                    return lose(f"process {pid}, which asked for it, was stopped (Ctrl-Z, SIGSTOP)")
+        finally:
+            os.close(process)
+    except ProcessLookupError:
+        lose(f"process {pid}, which asked for it, has ended")
+    except OSError as error:
+        lose(f"process {pid}, which asked for it, cannot be watched: {error.strerror}")

@@ -14,7 +14,6 @@ import numpy as np
 
 from coupole.acquisition.arm_supervisor import ArmSupervisor
 from coupole.acquisition.cell_bench.arm_paths import ArmPaths, ShownPath, links_mm
-from coupole.acquisition.cell_bench.asking_process import AskingProcess
 from coupole.acquisition.cell_bench.bench_requests import JogAsked, PathAsked
 from coupole.acquisition.cell_bench.bench_work import Work, Works
 from coupole.acquisition.cell_bench.enabling_switch import EnablingSwitch, ReleasedError
@@ -87,9 +86,10 @@ class BenchArm:
                 del self._shown[old]
         return self._paths.figures(path)
 
-    def drive(self, number: str, stops: int, asker: AskingProcess | None) -> dict[str, Any]:
+    def drive(self, number: str, stops: int, asking_pid: int) -> dict[str, Any]:
         """Begin to follow a path that was shown. `stops` is the number of stops when this was requested. The
-        motion ends when the `asker` no longer runs. Raises InputError if the arm is not at the path's begin."""
+        motion ends when the process `asking_pid` no longer runs. Raises InputError if the arm is not at the path's
+        begin."""
         path = self._shown.get(number)
         if path is None:
             raise InputError(f"path: expected one that `plan_path` has shown, found {number!r}")
@@ -103,7 +103,7 @@ class BenchArm:
             )
         about = {"path": path.id, "to": path.to}
         work = Work(self._control, "drive", about, lambda control: self._follow(path, control))
-        self._works.begin(work, stops, asker)
+        self._works.begin(work, stops, asking_pid)
         return work.figures()
 
     def jog(self, request: JogAsked, stops: int) -> dict[str, Any]:

@@ -18,7 +18,6 @@ from typing import Any
 
 from rich.console import Console
 
-from coupole.acquisition.cell_bench.asking_process import AskingProcess
 from coupole.acquisition.cell_bench.bench_arm import BenchArm
 from coupole.acquisition.cell_bench.bench_client import bench_socket
 from coupole.acquisition.cell_bench.bench_devices import BenchDevices
@@ -103,7 +102,7 @@ class BenchService:
                 raise InputError("the bench is closing")
             if begins and caller is not None and caller.is_gone():
                 raise InputError("the caller has disconnected: not begun")
-            return {"version": VERSION, **self._obey(request, stops, caller)}
+            return {"version": VERSION, **self._obey(request, stops, caller.pid if caller else 0)}
         except CoupoleError as error:
             if isinstance(error, DeviceError):
                 self._devices.note_error(error)
@@ -125,8 +124,9 @@ class BenchService:
         """Answer a request of a caller in this process."""
         return self.answer(json.dumps({"version": VERSION, "command": command, **fields}).encode(), None)
 
-    def _obey(self, request: Request, stops: int, caller: Caller | None) -> dict[str, Any]:
-        """Obey a request. `stops` is the number of stops before the request was read."""
+    def _obey(self, request: Request, stops: int, asking_pid: int) -> dict[str, Any]:
+        """Obey a request. `stops` is the number of stops before the request was read. `asking_pid` is the process
+        that asks, 0 for this one."""
         match request:
             case StateAsked():
                 return self._state()
@@ -136,7 +136,7 @@ class BenchService:
             case PathAsked():
                 return self._arm.plan_path(request)
             case DriveAsked():
-                return self._arm.drive(request.path, stops, _asker(caller))
+                return self._arm.drive(request.path, stops, asking_pid)
             case JogAsked():
                 return self._arm.jog(request, stops)
             case FrameAsked():
@@ -145,7 +145,7 @@ class BenchService:
             case LoupeAsked():
                 return self._frames.loupe(request)
             case MeterAsked():
-                return self._begin_metering(request, stops, _asker(caller))
+                return self._begin_metering(request, stops, asking_pid)
             case StopAsked():
                 return {"trouble": self._stop(), **self._state()}
             case CloseAsked():
@@ -158,7 +158,7 @@ class BenchService:
         if (work := self.works.running) is not None and work.kind == "meter":
             raise InputError("box and camera are metering; stop it or let it end")
 
-    def _begin_metering(self, asked: MeterAsked, stops: int, asker: AskingProcess | None) -> dict[str, Any]:
+    def _begin_metering(self, asked: MeterAsked, stops: int, asking_pid: int) -> dict[str, Any]:
         small = metering_job(self._arm.job_of(Path(asked.plan)))
         self._arm.refuse_motion()
         request = exposure_advice.Request(asked.saturated, asked.snr, asked.share)
@@ -173,7 +173,7 @@ class BenchService:
             return advice.figures()
 
         work = Work(self._control, "meter", {"plan": asked.plan}, meter)
-        self.works.begin(work, stops, asker)
+        self.works.begin(work, stops, asking_pid)
         return work.figures()
 
     def _stop(self) -> list[str]:
@@ -217,10 +217,6 @@ class BenchService:
         self._opened.make_safe()
         with contextlib.suppress(StorageError):  # what was planned then stands
             on_disk("the dose ledger", self._frames.end, stop=NOW)
-
-
-def _asker(caller: Caller | None) -> AskingProcess | None:
-    return None if caller is None else AskingProcess(caller.pid)
 
 
 @contextmanager

@@ -5,15 +5,12 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
-from coupole.acquisition.cell_bench.asking_process import AskingProcess
+from coupole.acquisition.cell_bench.asking_process import watched_process
 from coupole.acquisition.observer import Control
 from coupole.errors import CoupoleError, InputError, Interrupted
-
-_LOOK_EVERY_S = 0.02
 
 
 class Work:
@@ -27,19 +24,17 @@ class Work:
         self.kind, self._about, self._act = kind, about, act
         self.control = Control(session=session)
         self._state, self._found, self._why = "running", {}, ""  # type: tuple[str, dict[str, Any], str]
-        self._lost = ""
-        """Reason why the process that asked for the work no longer ran."""
+        self._asking_pid, self._lost = 0, ""
         self._thread = threading.Thread(target=self._run, name=kind, daemon=True)
 
     @property
     def is_running(self) -> bool:
         return self._state == "running"
 
-    def begin(self, asker: AskingProcess | None = None) -> None:
-        """Begin the work. It is stopped when the `asker` no longer runs."""
+    def begin(self, asking_pid: int) -> None:
+        """Begin the work. It is stopped when the process that asked for it no longer runs (`watched_process`)."""
+        self._asking_pid = asking_pid
         self._thread.start()
-        if asker is not None:
-            threading.Thread(target=self._watch, args=(asker,), name="asking process", daemon=True).start()
 
     def stop(self) -> None:
         """Stop the work. Returns at once; nothing new is moved or lit after this."""
@@ -53,23 +48,19 @@ class Work:
         ended early."""
         return {"kind": self.kind, "state": self._state, **self._about, **self._found, "why": self._why}
 
-    def _watch(self, asker: AskingProcess) -> None:
-        with asker:
-            while self.is_running:
-                if why := asker.absence():
-                    self._lost = why
-                    self.stop()
-                    return
-                time.sleep(_LOOK_EVERY_S)
+    def _lose(self, why: str) -> None:
+        self._lost = why
+        self.stop()
 
     def _run(self) -> None:
         try:
-            self._found = self._act(self.control)
+            with watched_process(self._asking_pid, self._lose):
+                self._found = self._act(self.control)
         except Interrupted as error:
             self._why = self._lost or str(error)
             self._state = "stopped"
         except CoupoleError as error:
-            self._why = self._lost or str(error)
+            self._why = f"{self._lost}; {error}" if self._lost else str(error)
             self._state = "stopped" if self.control.stop.is_set() else "failed"
         except Exception as error:  # noqa: BLE001  told to whoever asks; the bench itself goes on
             self._why = f"{type(error).__name__}: {error}"
@@ -87,16 +78,17 @@ class Works:
         self.stops = 0
         """Number of stops that were requested."""
 
-    def begin(self, work: Work, stops: int, asker: AskingProcess | None = None) -> None:
-        """Begin the work. `stops` is the number of stops when the work was requested. The work is stopped when its
-        `asker` no longer runs. Raises InputError if a stop came since, or while other work is under way."""
+    def begin(self, work: Work, stops: int, asking_pid: int = 0) -> None:
+        """Begin the work. `stops` is the number of stops when the work was requested. The work is stopped when the
+        process `asking_pid` no longer runs; 0: no process is watched. Raises InputError if a stop came since, or
+        while other work is under way."""
         with self._lock:
             if self.stops != stops:
                 raise InputError(f"{work.kind}: it was stopped before it began")
             if self.last is not None and self.last.is_running:
                 raise InputError(f"{self.last.kind} is under way; stop it or let it end")
             self.last = work
-            work.begin(asker)
+            work.begin(asking_pid)
 
     def stop(self) -> None:
         """Stop the work. Returns at once. Work that was requested before and has not begun never begins."""

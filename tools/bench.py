@@ -12,11 +12,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,12 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from demo_plan import write_demo_plan
 from smallest import add_smallest
 
 ROOT = Path(__file__).resolve().parent.parent
-SMALL_DEMO = {"lights": {"kind": "every", "every": 40}}
-"""Changes of the demo's plan for the smallest size."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +42,6 @@ def line(name: str, value: float, unit: str, peer: str, ratio: float, **more: An
     """Print one figure."""
     figure = {"name": name, "value": round(value, 6), "unit": unit, "peer": peer, "ratio": round(ratio, 4), **more}
     print(json.dumps(figure), flush=True)
-
-
-def cpu_s() -> float:
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    return usage.ru_utime + usage.ru_stime
 
 
 # -- check ------------------------------------------------------------------------------------------------
@@ -85,45 +75,11 @@ def bench_check(options: Asked) -> None:
 
 
 def bench_sequencing(options: Asked) -> None:
-    """Measure a burst of 1080 LEDs at 100 frames/s, from INITiate to the last proven frame, against the table's
-    own duration; on the world's clock and on the machine's."""
-    from coupole.acquisition.opened_cell import open_cell
-    from coupole.acquisition.recorder import RunRecorder
-    from coupole.acquisition.run_description import about_run, metadata_of_views
-    from coupole.acquisition.sequencer import Sequencer
-    from coupole.devices import NO_LED
-    from coupole.preflight.job import read_job
-    from coupole.storage.run import Run
+    """Measure bursts and runs against the time of their tables."""
+    from bench_sequencing import figures
 
-    with tempfile.TemporaryDirectory() as folder:
-        plan = ROOT / "configs/plans/demo.yaml"
-        job = read_job(write_demo_plan(ROOT, Path(folder), **SMALL_DEMO) if options.smallest else plan)
-    table_s = job.schedule.bursts[0][0].duration_s
-    leds = len(set(job.schedule.bursts[0][0].table["led"].tolist()) - {NO_LED})
-    world_s, machine_s, whole, cpu = [], [], [], []
-    for _ in range(options.rounds):
-        with tempfile.TemporaryDirectory(dir=ROOT) as folder, open_cell(job.cell, job=job) as cell:
-            run = Run.create(Path(folder), "bench", job.inputs, about_run(job, cell))
-            recorder = RunRecorder(run, metadata_of_views(job, cell))
-            sequencer = Sequencer(job, cell, recorder)
-            started_s, used_s = time.perf_counter(), cpu_s()
-            outcome = sequencer.acquire()
-            machine_s.append(time.perf_counter() - started_s)
-            cpu.append((cpu_s() - used_s) / len(recorder.proven()))
-            world_s += sequencer.burst_times_s
-            whole.append(outcome.ideal_s / outcome.duration_s)
-            recorder.close()
-    value = statistics.median(world_s)
-    line(f"burst_{leds}_leds", value, "s", "table_time", table_s / value)
-    line("run_of_three_views", statistics.median(whole), "1", "ideal_time", statistics.median(whole))
-    line(
-        "run_of_three_views_machine_time",
-        statistics.median(machine_s),
-        "s",
-        "ideal_time",
-        outcome.ideal_s / statistics.median(machine_s),
-        cpu_ms_per_frame=round(1e3 * statistics.median(cpu), 3),
-    )
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
+        line(**figure)
 
 
 # -- store ------------------------------------------------------------------------------------------------

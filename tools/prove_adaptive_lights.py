@@ -108,9 +108,15 @@ def judge(material: str, frames: Frames) -> dict[str, Any]:
     candidates = np.setdiff1d(numbers, held_out)
     counts = [len(candidates) // part for part in PARTS]
     adaptive_leds = spread_lights(frames.directions, candidates, min(FIRST, counts[0]))
+    coming = 0  # LEDs of the last burst, whose frames are still to come when the next one is chosen
     while len(adaptive_leds) < counts[-1]:
-        following = next_lights(frames.signals[adaptive_leds], frames.directions, adaptive_leds, candidates, BURST)
+        seen_leds, coming_leds = np.split(adaptive_leds, [len(adaptive_leds) - coming])
+        signals = frames.signals[seen_leds]
+        following = next_lights(
+            signals, frames.directions, seen_leds, candidates, BURST, coming_lights=coming_leds
+        )
         adaptive_leds = np.append(adaptive_leds, following.lights)
+        coming = len(following.lights)
     random_leds = np.random.default_rng(0).permutation(candidates)
     ways = {
         "random": random_leds,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from concurrent import futures
 from dataclasses import dataclass, field
 from typing import Any
@@ -29,11 +30,17 @@ from coupole.storage.step_fields import step_fields
 from coupole.viewing.progress import Outcome
 
 _POLL_S = 0.05
+_LAST_POLL_S = 0.002
+"""Pause between looks at the log once the table should have run, as the next burst waits for it."""
 _STALL_S = 5.0
 """Time beyond the duration of a step. A box that logs no step for longer than this has stopped."""
 _LAST_STRETCH_S = 0.3
 """The last part of a burst runs in real time, so that a host that fell behind in a dry run catches up."""
 _BOX_JITTER_US = 20.0
+
+
+def unknown() -> None:
+    """The burst after one whose next burst is not known while it is fired."""
 
 
 @dataclass
@@ -43,6 +50,8 @@ class _RunningBurst:
     burst: Burst
     grabber: FrameGrabber
     arm_before: ArmState
+    following: Callable[[], Burst | None] | None
+    """The burst after this one, once it is known; None after its upload has begun."""
     arm_after: ArmState | None = None
     """Measured after the last frame; None while the burst runs, and if the arm was not still."""
     log: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, STEP_RECORD_DTYPE))
@@ -124,10 +133,10 @@ class BurstRunner:
                 upload, self._upload = self._upload, None
                 upload.result()
 
-    def fire(self, burst: Burst, following: Burst | None) -> Verdict:
+    def fire(self, burst: Burst, following: Callable[[], Burst | None] = unknown) -> Verdict:
         """Run one burst and prove its frames; dose and figures are recorded even if this raises.
 
-        The table of the `following` burst is uploaded meanwhile. Raises ArmMovedError.
+        The table of the `following` burst is uploaded meanwhile, as soon as it is not None. Raises ArmMovedError.
         """
         frame_format = self._cell.camera.configure(self.exposure(burst))
         if not burst.hardware:
@@ -148,10 +157,10 @@ class BurstRunner:
         self._buffers = max(self._buffers, buffers)
         return self._by_cable(burst, following, self._buffers)
 
-    def _by_cable(self, burst: Burst, following: Burst | None, buffers: int) -> Verdict:
+    def _by_cable(self, burst: Burst, following: Callable[[], Burst | None], buffers: int) -> Verdict:
         box, camera, clock = table_box(self._cell.ledbox), self._cell.camera, self._cell.clock
         grabber = FrameGrabber(camera, lambda frame: self._recorder.store(frame, burst.timing.exposure_us))
-        running = _RunningBurst(burst, grabber, self._cell.robot.measured())
+        running = _RunningBurst(burst, grabber, self._cell.robot.measured(), following)
         camera.arm(buffers)
         try:
             grabber.start()
@@ -163,8 +172,6 @@ class BurstRunner:
             running.started_ns = started_ns = clock.now_ns()
             box.start(burst.table)
             running.runs_since_ns = clock.now_ns()
-            if following is not None:
-                self.prepare(following)
             self._arm.hurry(burst.duration_s - _LAST_STRETCH_S)
             self._follow(running)
             self.times_s.append((clock.now_ns() - started_ns) / 1e9)
@@ -197,10 +204,14 @@ class BurstRunner:
         step_s = burst.timing.period_us * 1e-6
         next_step = Deadline(clock, step_s + _STALL_S)
         last_frames: Deadline | None = None
+        ends_ns = (running.started_ns or clock.now_ns()) + round(1e9 * burst.duration_s)
         edges = 0
         judged_at = (-1, -1)
         taken_frames, confirmed_frames, heard_ns = 0, 0, 0
         while True:
+            if running.following is not None and (following := running.following()) is not None:
+                self.prepare(following)
+                running.following = None
             if (news_ns := self._arm.heard_at_rest()) > heard_ns:
                 # frames that had arrived in the last round were taken at rest
                 heard_ns, confirmed_frames = news_ns, taken_frames
@@ -234,7 +245,7 @@ class BurstRunner:
                     f"{len(running.log)} of {len(burst.table)} are in its log",
                     remedy="Check the box, then resume the run.",
                 )
-            clock.sleep(_POLL_S)
+            clock.sleep(_pause_s((ends_ns - clock.now_ns()) / 1e9))
 
     def _match(self, running: _RunningBurst, frame_count: int, *, complete: bool) -> Match:
         frame_ids, timestamps_ns = running.grabber.frames(frame_count)
@@ -335,6 +346,14 @@ class BurstRunner:
                 self._dose.end(given_lux_h)
             raise
         self._dose.end(given_lux_h)
+
+
+def _pause_s(left_s: float) -> float:
+    """Return the pause before the next look at the log, `left_s` before the table's end. The last records, which
+    come over a slow line, are asked for as soon as they exist."""
+    if abs(left_s) > _POLL_S:
+        return _POLL_S
+    return max(left_s, _LAST_POLL_S)
 
 
 def _since_s(begun_ns: int | None, ended_ns: int) -> float:

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from coupole.acquisition.recorder import Recorder
+from coupole.bounded import Workers
 from coupole.plan import schedule
 from coupole.plan.bursts import Burst
-from coupole.plan.choices import Choice, FrameSample, OpenView, has_enough, refuse_beyond
+from coupole.plan.choices import (
+    Choice,
+    FrameSample,
+    OpenView,
+    before_last,
+    has_enough,
+    next_choice,
+    refuse_beyond,
+)
 from coupole.plan.schedule import chosen_bursts
 from coupole.plan.shot_id import ShotId, ShotLabel
 from coupole.preflight.checking import LED_DUTIES
@@ -21,8 +31,18 @@ from coupole.preflight.led_limits import BoardHeat
 from coupole.storage.journal_events import BurstsChosen
 
 
+@dataclass(frozen=True)
+class _Next:
+    """The next bursts of a view, and the heat of the boards after them."""
+
+    choice: Choice
+    bursts: list[Burst]
+    boards: BoardHeat
+
+
 class BurstsOfViews:
-    """Bursts that each view of a job still gets. Views are named by their numbers in the job's schedule."""
+    """Bursts that each view of a job still gets. Views are named by their numbers in the job's schedule. Only one
+    thread calls the methods."""
 
     def __init__(self, job: Job, recorder: Recorder) -> None:
         self._job, self._recorder = job, recorder
@@ -34,6 +54,11 @@ class BurstsOfViews:
         self._boards = BoardHeat(job.cell.rig.led_limits, job.cell.leds)
         """Heat of the boards after the session's chosen bursts. Moves and waits, in which the boards cool, are not
         counted."""
+        self._thinker = Workers(1, "choice")
+        self._thought: Future[_Next | None] | None = None
+        """The choice that is made while a burst is fired; None if there is none."""
+        self._ahead: list[Burst] = []
+        """Bursts that were chosen and noted while the last ones were fired."""
         self._taken_views: set[str] | None = (
             {choice.view for choice in job.chosen_views} if job.plan.chooses_views else None
         )
@@ -86,24 +111,70 @@ class BurstsOfViews:
         """Frames that a view's file must have room for."""
         return _frames(self.bound(number))
 
+    def think_ahead(self, number: int) -> None:
+        """Begin to choose, in another thread, what follows the last chosen bursts of a view, which are about to be
+        fired."""
+        if self._chooser is None or self._thought is not None or self._ahead or not self.may_want_more(number):
+            return
+        choices = tuple(self._choices_of(number))
+        if choices:
+            view = self._open_view(number)
+            samples = before_last(choices, _Seen(view.name, choices, self._recorder))
+            self._thought = self._thinker.submit(self._next_ahead, view, choices, samples)
+
+    def following(self, number: int) -> Burst | None:
+        """Return the first burst of the choice that `think_ahead` has begun, once it is made. The choice is on the
+        disk when this returns. None if it is not made yet, or is made only after the last chosen bursts."""
+        if self._thought is not None and self._thought.done() and self._thought.exception() is None:
+            following, self._thought = self._thought.result(), None
+            self._ahead = self._note(number, following) if following else []
+        return self._ahead[0] if self._ahead else None
+
     def more(self, number: int) -> list[Burst]:
         """Return the next bursts of a view, after all its known bursts were fired; none if the view has enough.
         The choice is on the disk when this returns. Raises RuntimeError if it exceeds the view's bound."""
+        if self._thought is not None:
+            thought, self._thought = self._thought, None
+            following = thought.result()
+            self._ahead = self._note(number, following) if following else []
+        if self._ahead:
+            bursts, self._ahead = self._ahead, []
+            return bursts
         if self._chooser is None or not self.may_want_more(number):
             return []
-        view, choices = self._open_view(number), self._choices_of(number)
-        choice = view.with_darks(
-            choices, self._chooser.choose(view, tuple(choices), _Seen(view.name, choices, self._recorder))
-        )
+        view, choices = self._open_view(number), tuple(self._choices_of(number))
+        choice = next_choice(self._chooser, view, choices, _Seen(view.name, choices, self._recorder))
+        return self._note(number, self._bursts_of(view, choices, choice))
+
+    def end(self) -> None:
+        """End the thread that chooses, once it is done. Does not wait for it."""
+        self._thinker.end_soon()
+
+    def _next_ahead(
+        self, view: OpenView, choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
+    ) -> _Next | None:
+        assert self._chooser is not None
+        choice = self._chooser.choose_ahead(view, choices, samples)
+        return None if choice is None else self._bursts_of(view, choices, choice)
+
+    def _bursts_of(self, view: OpenView, choices: Sequence[Choice], choice: Choice) -> _Next:
+        """Return the bursts of a choice. Raises RuntimeError if they exceed the view's bound."""
+        choice = view.with_darks(choices, choice)
         bursts = [view.burst_of(burst) for burst in choice.bursts]
-        refuse_beyond(view.bound, [*self.bursts(number), *bursts])
+        refuse_beyond(view.bound, [*chosen_bursts(view, choices), *bursts])
+        return _Next(choice, *self._cool(bursts))
+
+    def _note(self, number: int, following: _Next) -> list[Burst]:
+        """Bring a choice to the disk; return its bursts."""
+        view, choice = self._open_view(number), following.choice
         self._recorder.note(
             BurstsChosen(view=view.name, bursts=choice.bursts, reason=choice.reason, figures=choice.figures)
         )
         self._recorder.commit(now=True)
-        choices.append(choice)
+        self._choices_of(number).append(choice)
         self._frames.pop(number, None)
-        return self._cool(bursts)
+        self._boards = following.boards
+        return following.bursts
 
     def _open_view(self, number: int) -> OpenView:
         if number not in self._open_views:
@@ -113,16 +184,15 @@ class BurstsOfViews:
     def _choices_of(self, number: int) -> list[Choice]:
         return self._choices.setdefault(self._job.schedule.views[number].name, [])
 
-    def _cool(self, bursts: list[Burst]) -> list[Burst]:
-        """Return the same bursts, slowed down if boards would get too hot after the light of this session so far.
-        Chosen LEDs may all be on one board."""
+    def _cool(self, bursts: list[Burst]) -> tuple[list[Burst], BoardHeat]:
+        """Return the same bursts, slowed down if boards would get too hot after the light of this session so far,
+        and the heat after them. Chosen LEDs may all be on one board."""
         for duty in (1.0, *LED_DUTIES):
             cool_bursts, boards = [_at_duty(burst, duty) for burst in bursts], deepcopy(self._boards)
             boards.light(cool_bursts)
             if not boards.heat().too_hot:
                 break
-        self._boards = boards
-        return cool_bursts
+        return cool_bursts, boards
 
 
 def _frames(bursts: Iterable[Burst]) -> int:
@@ -141,7 +211,7 @@ def _at_duty(burst: Burst, duty: float) -> Burst:
 class _Seen(Mapping[ShotLabel, FrameSample]):
     """Samples of the proven frames of a view's choices; read when they are asked for."""
 
-    def __init__(self, view: str, choices: list[Choice], recorder: Recorder) -> None:
+    def __init__(self, view: str, choices: Sequence[Choice], recorder: Recorder) -> None:
         self._view, self._recorder = view, recorder
         proven = recorder.proven()
         chosen_labels = (label for choice in choices for burst in choice.bursts for label in burst.labels())

@@ -8,12 +8,14 @@ rest and measured, camera armed, lights. At the end it is reversed. On every exi
 from __future__ import annotations
 
 import contextlib
+import operator
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import numpy as np
 
 from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor, SettledPose
-from coupole.acquisition.burst_runner import BurstRunner, CameraSettings
+from coupole.acquisition.burst_runner import BurstRunner, CameraSettings, unknown
 from coupole.acquisition.bursts_of_views import BurstsOfViews
 from coupole.acquisition.collector import collected_when_asked
 from coupole.acquisition.dose import DoseMeter
@@ -123,6 +125,7 @@ class Sequencer:
             raise
         finally:
             self._burst_runner.end()
+            self._bursts.end()
             self.outcome.duration_s = (self._cell.clock.now_ns() - start_ns) / 1e9
             self.conclude(self._recorder.proven())
         if self.outcome.missing or self.outcome.missing_darks:
@@ -187,7 +190,11 @@ class Sequencer:
             while next_bursts:
                 for index, burst in enumerate(next_bursts):
                     self.outcome.ideal_s += burst.duration_s
-                    following = next_bursts[index + 1] if index + 1 < len(next_bursts) else None
+                    if index + 1 < len(next_bursts):
+                        following = partial(operator.getitem, next_bursts, index + 1)
+                    else:
+                        self._bursts.think_ahead(number)
+                        following = partial(self._bursts.following, number)
                     self._acquire_burst(burst, following, begin)
                     self._ahead_s -= _expected_s(burst)
                     allowed_s -= _expected_s(burst)
@@ -212,8 +219,11 @@ class Sequencer:
                 remedy="Correct the rig, or the camera's region of interest.",
             )
 
-    def _acquire_burst(self, burst: Burst, following: Burst | None, begin: Callable[[SettledPose], None]) -> None:
-        """Fire a burst and then its unproven shots again, up to the plan's limit.
+    def _acquire_burst(
+        self, burst: Burst, following: Callable[[], Burst | None], begin: Callable[[SettledPose], None]
+    ) -> None:
+        """Fire a burst and then its unproven shots again, up to the plan's limit. `following` is the burst after
+        it, once it is known.
 
         If somebody pushed the arm and it springs back, `begin` is called again for the next frames. The arm is
         never driven back, because a person may have pushed it.
@@ -227,7 +237,7 @@ class Sequencer:
                 self.outcome.reshot += len(shots)
                 self._recorder.note(ReshootBegun(view=burst.view, attempt=attempt, shots=shots))
             try:
-                verdict = self._burst_runner.fire(todo, following if todo is burst else None)
+                verdict = self._burst_runner.fire(todo, following if todo is burst else unknown)
                 attempt += 1
             except ArmMovedError as moved:
                 self._cell.ledbox.lights_off()

@@ -7,6 +7,9 @@ were the plan. In the run the chooser is asked again and again, until it has eno
 
     choice = chooser.choose(view, choices before, samples of the frames that are proven)
 
+While the bursts of a choice are fired, the chooser may already say what follows them (`choose_ahead`), so that the
+box need not wait for it.
+
 A choice is written into the journal, with its reason, and synced before its first light. A resumed run repeats the
 choices of its journal and goes on from there. So a chooser must be a function of its arguments alone.
 """
@@ -154,6 +157,33 @@ class Chooser(Protocol):
         their proven frames. A frame of an earlier session is read when it is requested. The same arguments must
         give the same choice, because a resumed run depends on it."""
         ...
+
+    def choose_ahead(
+        self, view: OpenView, choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
+    ) -> Choice | None:
+        """Return the next bursts while the last of these `choices` is being fired. `samples` has the proven frames
+        of the choices before it. None means that its frames are needed; then `choose` is asked. Again, the same
+        arguments must give the same choice. It is called in a thread of its own."""
+        del view, choices, samples
+        return None
+
+
+def next_choice(
+    chooser: Chooser, view: OpenView, choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
+) -> Choice:
+    """Return a view's next choice after these, all of which were fired; `samples` has their proven frames. It is
+    the same one that `choose_ahead` gave, or would have given, while the last of them was fired. So it does not
+    depend on when a run was interrupted."""
+    ahead = chooser.choose_ahead(view, choices, before_last(choices, samples)) if choices else None
+    return ahead or chooser.choose(view, choices, samples)
+
+
+def before_last(
+    choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
+) -> dict[ShotLabel, FrameSample]:
+    """Return the samples of all choices but the last."""
+    labels = (label for choice in choices[:-1] for burst in choice.bursts for label in burst.labels())
+    return {label: samples[label] for label in labels if label in samples}
 
 
 def bound_of(whole: Sequence[Burst], frames_of_light: int, again: Collection[int]) -> tuple[Burst, ...]:

@@ -1,8 +1,10 @@
 """Chooses LEDs in the run, from the frames under earlier LEDs of the view (`lights: {kind: adaptive}`).
 
-The first burst is spread over the dome. After each burst `next_lights` gives the expected error of pictures for
-the LEDs not yet lit, and the LEDs that would add most information. Pixels are divided by the illuminance that the
-LED table gives at the view's target. Mesh and records are not needed: only the frames are used.
+The first burst is spread over the dome. For each further burst `next_lights` gives the expected error of pictures
+for the LEDs not yet lit, and the LEDs that would add most information. The second burst follows from the frames of
+the first. Each later burst is chosen while the one before it is fired, from the frames before that one, so that
+the box does not wait. Only the end of a view is told from all frames. Pixels are divided by the illuminance that
+the LED table gives at the view's target. Mesh and records are not needed: only the frames are used.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform, apply
-from coupole.plan.choices import Choice, ChosenBurst, FrameSample, OpenView
+from coupole.plan.choices import Choice, Chooser, ChosenBurst, FrameSample, OpenView
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan_lights import AdaptiveLights, Lights
 from coupole.plan.shot_id import Led, ShotLabel
@@ -26,7 +28,7 @@ _SITES = 2048
 """Approximate number of pixels that are used to judge LEDs."""
 
 
-class AdaptiveLightsChooser:
+class AdaptiveLightsChooser(Chooser):
     """The `Chooser` of plans with `lights: {kind: adaptive}` in some view; other views get all their LEDs."""
 
     def __init__(
@@ -60,14 +62,28 @@ class AdaptiveLightsChooser:
             )
         return self._next(view, lights, choices, samples)
 
+    def choose_ahead(
+        self, view: OpenView, choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
+    ) -> Choice | None:
+        """See `coupole.plan.choices.Chooser`. None for the second burst, and for the end of a view."""
+        lights = self._lights[view.name]
+        if not isinstance(lights, AdaptiveLights) or len(choices) < 2:
+            return None
+        choice = self._next(view, lights, choices, samples, coming=choices[-1])
+        return choice if choice.bursts else None
+
     def _next(
         self,
         view: OpenView,
         lights: AdaptiveLights,
         choices: Sequence[Choice],
         samples: Mapping[ShotLabel, FrameSample],
+        *,
+        coming: Choice | None = None,
     ) -> Choice:
+        """Return the next bursts; the frames of the choice `coming` are not there yet."""
         lit_ids = [led for choice in choices for burst in choice.bursts for led in burst.leds]
+        coming_ids = [led for burst in (coming.bursts if coming else ()) for led in burst.leds]
         is_seen = [ShotLabel(Led(led), view.bursts[0].exposure_index, 0) in samples for led in lit_ids]
         seen_ids = [led for led, was_proven in zip(lit_ids, is_seen, strict=True) if was_proven]
         if len(lit_ids) == len(view.leds):
@@ -77,10 +93,17 @@ class AdaptiveLightsChooser:
         values = self._values(view, seen_ids, samples)
         unlit_rows = np.flatnonzero(~np.isin(view.leds, lit_ids))
         count = min(lights.burst_lights, lights.until.lights - len(lit_ids))
-        following = next_lights(values, self._ways(view), _rows(view, seen_ids), unlit_rows, count)
+        following = next_lights(
+            values,
+            self._ways(view),
+            _rows(view, seen_ids),
+            unlit_rows,
+            count,
+            coming_lights=_rows(view, coming_ids),
+        )
         next_ids = view.leds[following.lights].tolist()
         affordable_ids = self._affordable(view, lights, next_ids, len(lit_ids), len(choices))
-        figures = _figures(view, following, len(lit_ids))
+        figures = _figures(view, following, len(lit_ids), len(seen_ids))
         if reason := _enough(lights, figures, len(affordable_ids)):
             return Choice(bursts=(), reason=reason, figures=figures)
         errors = f"{100.0 * figures['relit_rms']:.2f} %, {100.0 * figures['relit_rms_after']:.2f} % after them"
@@ -143,9 +166,10 @@ def _rows(view: OpenView, ids: Sequence[int]) -> NDArray[np.int64]:
     return np.array([row_of_id[led] for led in ids], np.int64)
 
 
-def _figures(view: OpenView, following: NextLights, lit: int) -> dict[str, Any]:
+def _figures(view: OpenView, following: NextLights, lit: int, seen: int) -> dict[str, Any]:
     return {
         "lights": lit,
+        "seen": seen,
         "relit_rms": float(f"{following.expected_rms:.4g}"),
         "relit_rms_after": float(f"{following.expected_rms_after:.4g}"),
         "first": [int(led) for led in view.leds[following.lights[:1]]],

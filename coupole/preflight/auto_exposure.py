@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform, apply
-from coupole.plan.choices import Choice, ChosenBurst, FrameSample, OpenView
+from coupole.plan.choices import Choice, Chooser, ChosenBurst, FrameSample, OpenView
 from coupole.plan.exposures import STEPS_PER_STOP, AutoExposure
 from coupole.plan.led_table import LedTable
 from coupole.plan.light_selection import first_lights
@@ -52,7 +52,7 @@ _CORRECTIONS, _BURSTS_OF_A_CORRECTION = 2, 2
 _PROBE = "probe"
 
 
-class AutoExposureChooser:
+class AutoExposureChooser(Chooser):
     """The `Chooser` of plans with `exposure: {kind: auto}`."""
 
     def __init__(

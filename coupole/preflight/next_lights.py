@@ -5,7 +5,8 @@ Pictures between lights are interpolated from the pictures taken, by radial basi
 errors from one inverse. A large error shows that a highlight or an edge of shadow passes over the object. So the
 errors of pictures are modelled over the directions of light as a random field of exponential covariance. Its
 strength in each direction follows the errors found near this direction. The next light is the one with the largest
-expected error of its picture (MacKay 1992). It counts as taken while the next one is chosen.
+expected error of its picture (MacKay 1992). It counts as taken while the next one is chosen. So do lights whose
+pictures are still to come.
 
 Nothing is drawn at random, so a resumed run chooses the same lights.
 """
@@ -80,35 +81,69 @@ def next_lights(
     taken_lights: NDArray[np.int64],
     allowed_lights: NDArray[np.int64],
     count: int,
+    *,
+    coming_lights: NDArray[np.int64] | tuple[()] = (),
 ) -> NextLights:
     """Return the next `count` lights among `allowed_lights`, or fewer if there are no more.
 
     `values` [taken, sites] are the values under `taken_lights`, in their order, at places all over the picture.
-    `directions` [n, 3] are unit vectors to all lights. A picture is wanted for each of `allowed_lights`. Raises
-    ValueError for fewer than `FEWEST_TAKEN` lights.
+    `directions` [n, 3] are unit vectors to all lights. A picture is wanted for each of `allowed_lights`.
+    `coming_lights` are being taken just now: their values are not known, but they are not wanted again. Expected
+    errors count them as taken. Raises ValueError for fewer than `FEWEST_TAKEN` lights that were taken.
     """
     if len(taken_lights) < FEWEST_TAKEN:
         raise ValueError(f"expected at least {FEWEST_TAKEN} lights that were taken, got {len(taken_lights)}")
-    wanted_lights = np.union1d(allowed_lights, taken_lights)
-    covariance = _error_covariance(values, directions[wanted_lights], np.searchsorted(wanted_lights, taken_lights))
+    coming = np.asarray(coming_lights, np.int64)
+    wanted_lights = np.union1d(allowed_lights, np.union1d(taken_lights, coming))
+    errors = _Errors(
+        _error_covariance(values, directions[wanted_lights], np.searchsorted(wanted_lights, taken_lights))
+    )
     is_candidate = np.isin(wanted_lights, allowed_lights) & ~np.isin(wanted_lights, taken_lights)
+    for light in np.searchsorted(wanted_lights, coming).tolist():
+        errors.take(light)
+        is_candidate[light] = False
     bright = float(np.quantile(values, _BRIGHT_QUANTILE)) or 1.0
-    rms = _rms(covariance, is_candidate)
+    rms = errors.rms(is_candidate)
     chosen_rows: list[int] = []
     alternatives: tuple[int, ...] = ()
     for _ in range(min(count, int(np.count_nonzero(is_candidate)))):
-        variance = np.where(is_candidate, np.diag(covariance), -1.0)
-        order = np.argsort(-variance, kind="stable")
+        variances = np.where(is_candidate, errors.variances, -1.0)
+        order = np.argsort(-variances, kind="stable")
         if not chosen_rows:
-            other_lights = [light for light in order[1 : 1 + _ALTERNATIVES] if variance[light] >= 0.0]
+            other_lights = [light for light in order[1 : 1 + _ALTERNATIVES] if variances[light] >= 0.0]
             alternatives = tuple(int(wanted_lights[light]) for light in other_lights)
         best = int(order[0])
         chosen_rows.append(best)
         is_candidate[best] = False
-        column = covariance[:, best].copy()
-        covariance -= np.outer(column, column / max(column[best], 1e-300))
-    rms_after = _rms(covariance, is_candidate)
+        errors.take(best)
+    rms_after = errors.rms(is_candidate)
     return NextLights(wanted_lights[chosen_rows], rms / bright, rms_after / bright, alternatives)
+
+
+class _Errors:
+    """Expected errors of pictures, while one light after the other counts as taken: a Cholesky factor of the
+    covariance, of which only the columns of these lights are made."""
+
+    def __init__(self, covariance: Floats) -> None:
+        """`covariance` [n, n] is that of the errors before any light is taken."""
+        self._covariance = covariance
+        self._columns: list[Floats] = []
+        self.variances: Floats = np.diag(covariance).copy()
+        """[n] variances of the errors."""
+
+    def take(self, light: int) -> None:
+        """Count a light as taken."""
+        column = self._covariance[:, light].copy()
+        for earlier in self._columns:
+            column -= earlier * earlier[light]
+        column /= np.sqrt(max(float(column[light]), 1e-300))
+        self._columns.append(column)
+        self.variances -= column**2
+
+    def rms(self, is_wanted: NDArray[np.bool_]) -> float:
+        """Return the expected root mean square error of the wanted lights' pictures; 0 if there are none."""
+        variances = self.variances[is_wanted]
+        return float(np.sqrt(max(float(variances.mean()), 0.0))) if len(variances) else 0.0
 
 
 def _error_covariance(values: Floats, directions: Floats, taken_lights: NDArray[np.int64]) -> Floats:
@@ -126,8 +161,3 @@ def _error_covariance(values: Floats, directions: Floats, taken_lights: NDArray[
     covariance: Floats = plain * np.outer(local, local)
     taken_covariance = covariance[np.ix_(taken_lights, taken_lights)] + _NUGGET * np.diag(local[taken_lights] ** 2)
     return covariance - covariance[:, taken_lights] @ np.linalg.solve(taken_covariance, covariance[taken_lights])
-
-
-def _rms(covariance: Floats, is_candidate: NDArray[np.bool_]) -> float:
-    variances = np.diag(covariance)[is_candidate]
-    return float(np.sqrt(max(float(variances.mean()), 0.0))) if len(variances) else 0.0

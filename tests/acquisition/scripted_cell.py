@@ -191,7 +191,7 @@ class Cell:
         )
 
     def fire(self, following: Burst | None = None) -> Verdict:
-        return self.runner.fire(self.burst, following)
+        return self.runner.fire(self.burst, lambda: following)
 
     # clock
     def now_ns(self) -> int:

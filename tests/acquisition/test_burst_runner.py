@@ -205,6 +205,36 @@ def test_after_a_push_the_upload_that_lights_off_ended_is_made_anew() -> None:
     assert {str(shot) for shot in cell.proven} == shots_of(cell)
 
 
+def test_a_burst_that_becomes_known_in_the_middle_is_uploaded_before_the_end() -> None:
+    following = whole_burst(12)
+    cell = Cell(BURST, take(BURST))
+    asked_s: list[float] = []
+
+    def known() -> Any:
+        asked_s.append(cell.burst_us * 1e-6)
+        return following if asked_s[-1] > MIDDLE_S else None
+
+    cell.runner.fire(BURST, known)
+    assert MIDDLE_S < asked_s[-1] < BURST.duration_s, "and not asked for again"
+    wait_until(lambda: cell.box.uploads[-1] == len(following.table), "its upload")
+
+
+def test_the_last_records_are_asked_for_as_soon_as_the_table_is_over() -> None:
+    cell = Cell(BURST, take(BURST))
+    looks_s: list[float] = []
+    poll_log = cell.box.poll_log
+
+    def look() -> Any:
+        looks_s.append(cell.burst_us * 1e-6)
+        return poll_log()
+
+    cell.box.poll_log = look  # type: ignore[method-assign]
+    cell.fire()
+    after_s = [look_s for look_s in looks_s if look_s >= BURST.duration_s]
+    assert after_s[0] < BURST.duration_s + 0.002
+    assert len(looks_s) < 20, "it does not look all the time"
+
+
 def test_a_box_that_logs_nothing_more_is_a_time_out_and_the_cell_is_made_safe_first() -> None:
     what = take(BURST)
     cell = Cell(BURST, replace(what, edges_us=np.where(np.arange(len(what.edges_us)) < 20, what.edges_us, np.inf)))

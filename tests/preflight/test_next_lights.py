@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 
+from coupole.preflight import next_lights as next_lights_module
 from coupole.preflight.next_lights import FEWEST_TAKEN, left_out_squares, next_lights, spread_lights
 
 Floats = NDArray[np.float64]
@@ -108,6 +109,35 @@ def test_the_same_is_chosen_twice_and_alternatives_are_others() -> None:
     first, again = (next_lights(values[taken], directions, taken, np.arange(100), 6) for _ in range(2))
     assert first.lights.tolist() == again.lights.tolist()
     assert not set(first.alternatives) & {int(first.lights[0]), *taken.tolist()}
+
+
+@pytest.mark.parametrize("coming", [1, 5, 11])
+def test_lights_whose_pictures_are_still_to_come_count_as_taken(coming: int) -> None:
+    directions = dome(100)
+    values = shiny_ball(directions)
+    every, taken = np.arange(100), spread_lights(directions, np.arange(100), 24)
+    at_once = next_lights(values[taken], directions, taken, every, 12)
+    first = next_lights(values[taken], directions, taken, every, coming)
+    rest = next_lights(values[taken], directions, taken, every, 12 - coming, coming_lights=first.lights)
+    assert [*first.lights, *rest.lights] == at_once.lights.tolist()
+    assert rest.expected_rms == pytest.approx(first.expected_rms_after, rel=1e-9)
+    assert rest.expected_rms_after == pytest.approx(at_once.expected_rms_after, rel=1e-9)
+
+
+def test_expected_errors_are_those_of_a_field_given_the_lights_taken() -> None:
+    """By numpy's own inverse of the whole covariance, with a field as strong everywhere."""
+    directions = dome(60)
+    taken = spread_lights(directions, np.arange(60), 20)
+    errors = next_lights_module._Errors(np.exp(-np.arccos(np.clip(directions @ directions.T, -1, 1))))
+    whole = np.exp(-np.arccos(np.clip(directions @ directions.T, -1, 1)))
+    for light in taken.tolist():
+        errors.take(light)
+    left = np.setdiff1d(np.arange(60), taken)
+    given = (
+        whole[np.ix_(left, left)]
+        - whole[np.ix_(left, taken)] @ np.linalg.inv(whole[np.ix_(taken, taken)]) @ whole[np.ix_(taken, left)]
+    )
+    assert np.allclose(errors.variances[left], np.diag(given), rtol=1e-9)
 
 
 @pytest.mark.parametrize("directions", [np.tile(dome(12), (2, 1)), np.eye(3)[[0, 1, 0, 1]].repeat(3, axis=0)])

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 
 from coupole.acquisition.frame_samples import frame_sample
-from coupole.plan.choices import Choice, FrameSample, refuse_beyond
+from coupole.plan.choices import Choice, FrameSample, next_choice, refuse_beyond
 from coupole.plan.shot_id import ShotLabel
 from coupole.preflight.adaptive_lights import AdaptiveLightsChooser
 from coupole.preflight.choosers import chooser_of
@@ -91,6 +91,23 @@ def test_light_is_bounded_by_the_brightest_leds_not_by_all(whole: CellFolder, tm
     assert 60 / 216 <= some / every_led < 1.5 * 60 / 216
 
 
+def test_from_the_third_burst_on_leds_are_chosen_from_the_frames_before_the_last(whole: CellFolder) -> None:
+    for choices in Run(whole.run_folder).choices().values():
+        figures = [choice.figures for choice in choices[1:]]
+        assert [(each["seen"], each["lights"]) for each in figures] == [(16, 16), (16, 32), (32, 48), (60, 60)]
+
+
+def test_leds_are_chosen_while_the_burst_before_them_is_fired(tmp_path: Path) -> None:
+    cell = _cell(tmp_path, speed=1.0, burst_lights=64, until={"lights": 208})
+    cell.write(views=[TOP])
+    assert cell.acquire().code == 0
+    order = [
+        line["event"] for line in cells.events(cell.run_folder) if line["event"] in ("begin", "chosen", "burst")
+    ]
+    assert order.count("begin") == order.count("burst") == 4
+    assert order[:6] == ["chosen", "begin", "burst", "chosen", "begin", "chosen"], order
+
+
 def _rms_between(frames: dict[str, cells.Stored], job: Any, leds: list[int]) -> float:
     """Error of pictures made by scipy for the LEDs that were not lit, DN."""
     target_mm = np.array([0.0, 0.0, 30.0]) + job.cell.rig.support.base_from_support.matrix()[:3, 3]
@@ -128,7 +145,7 @@ def _chosen_anew(cell: CellFolder, run: Path) -> dict[str, list[Any]]:
         view, known = job.schedule.open_view(number), made[pose.name]
         samples: dict[ShotLabel, FrameSample] = {}
         for place, choice in enumerate(known):
-            anew = view.with_darks(known[:place], chooser.choose(view, tuple(known[:place]), dict(samples)))
+            anew = view.with_darks(known[:place], next_choice(chooser, view, tuple(known[:place]), dict(samples)))
             chosen.setdefault(pose.name, []).append(anew)
             for label in (label for burst in choice.bursts for label in burst.labels()):
                 samples[label] = frame_sample(stored[f"{pose.name}/{label}"].pixels, cells.BLACK_DN, 4095)
@@ -247,25 +264,24 @@ def test_a_choice_that_takes_seconds_leaves_all_dark_and_at_rest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
     """Longer than the box's watchdog, and than an arm in motion may be without news."""
-    cell = _cell(tmp_path, speed=1.0, until={"lights": 32})
+    cell = _cell(tmp_path, speed=1.0, until={"lights": 48})
     if model != "kuka":
         cell.moved_by_ur(model)
     cell.rig_data["ledbox"]["settings"]["watchdog_s"] = 2.0
     cell.write(views=[TOP])
-    choose = AdaptiveLightsChooser.choose
+    choose = AdaptiveLightsChooser._next  # not of the first burst, which is chosen before the arm moves
 
-    def think(chooser: AdaptiveLightsChooser, *arguments: Any) -> Choice:
-        if arguments[1]:  # not of the first burst, which is chosen before the arm moves
-            time.sleep(4.0)
-        return choose(chooser, *arguments)
+    def think(chooser: AdaptiveLightsChooser, *arguments: Any, **named: Any) -> Choice:
+        time.sleep(4.0)
+        return choose(chooser, *arguments, **named)
 
-    monkeypatch.setattr(AdaptiveLightsChooser, "choose", think)
+    monkeypatch.setattr(AdaptiveLightsChooser, "_next", think)
     ended = cell.acquire()
     assert ended.code == 0, ended.err
     assert ended.document["reshot"] == 0
     assert verify(Run(cell.run_folder)).ok
     bursts = cells.events(cell.run_folder, "burst")
-    lit_s = 32 * 0.02
+    lit_s = 48 * 0.02
     assert sum(burst["on_s"] for burst in bursts) < lit_s, "no lamp stays on while it thinks"
 
 

@@ -143,7 +143,7 @@ def serve(line: socket.socket, account: ForkAccount | None = None) -> None:
     lines = [line]
     while True:
         for asking in select.select(lines, [], [])[0]:
-            message, fds, _, _ = socket.recv_fds(asking, MOST_BYTES, FDS)
+            message, fds = received(asking)
             if not message and asking is line:
                 if account:
                     account.close()
@@ -161,7 +161,8 @@ def serve(line: socket.socket, account: ForkAccount | None = None) -> None:
             if pid := os.fork():
                 if account:
                     account.forked(pid, asking, ours)
-                asking.send(pid.to_bytes(8, "little"))
+                with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                    asking.send(pid.to_bytes(8, "little"))
                 for end in (*fds, theirs.detach()):
                     os.close(end)
                 lines.append(ours)
@@ -170,6 +171,15 @@ def serve(line: socket.socket, account: ForkAccount | None = None) -> None:
                 other.close()
             ended = account.of_fork() if account else None
             live(arguments, folder, environment, fds, Nursery(theirs), learnt, ended)
+
+
+def received(asking: socket.socket) -> tuple[bytes, list[int]]:
+    """The next message and its pipes; nothing from who has ended, also before it read its answer."""
+    try:
+        message, fds, _, _ = socket.recv_fds(asking, MOST_BYTES, FDS)
+    except ConnectionResetError:
+        return b"", []
+    return message, fds
 
 
 def live(

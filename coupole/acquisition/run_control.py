@@ -55,10 +55,12 @@ class RunControl:
         halt: Callable[[], Sequence[Safeguard]],
         progress: Callable[[], Progress | None],
         light_after_lux_h: Mapping[str, float] = MappingProxyType({}),
+        when_served: Callable[[], None] = lambda: None,
     ) -> None:
         """`halt` switches the lights off and stops the arm, at once, from any thread. `progress` is the newest
         progress. `light_after_lux_h` is the total light of each object (by its id) when the run is complete, as
-        preflight expects it."""
+        preflight expects it. `when_served` is called when the socket is there, or cannot be."""
+        self._when_served = when_served
         self._about: State = {"version": VERSION, "run": str(run), "rig": str(rig.resolve()), "pid": os.getpid()}
         self._about["light_after_lux_h"] = dict(light_after_lux_h)
         self._run, self._control, self._halt, self._progress = run, control, halt, progress
@@ -71,6 +73,7 @@ class RunControl:
         except (OSError, InputError) as error:
             self.trouble = f"`coupole pause` and `coupole stop` will not reach this run: {reason(error)}"
         self._served = stack
+        self._when_served()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -88,12 +91,9 @@ class RunControl:
 
     def _answer(self, line: bytes, caller: Caller) -> State:
         try:
-            request = json_of(line, "request")
-            version, command = request["version"], request["command"]
-        except (InputError, TypeError, KeyError):
-            return {"version": VERSION, "error": "expected one line of JSON with `version` and `command`"}
-        if version != VERSION:
-            return {"version": VERSION, "error": f"expected version {VERSION}, found {version!r}"}
+            command = request_of(line)
+        except InputError as error:
+            return {"version": VERSION, "error": str(error)}
         match command:
             case "state":
                 pass
@@ -110,6 +110,22 @@ class RunControl:
             case _:
                 return {"version": VERSION, "error": "expected the command pause, go-on, stop or state"}
         return self.state()
+
+
+def request_of(line: bytes) -> str:
+    """Return the command of a request. Raises InputError."""
+    try:
+        request = json_of(line, "request")
+        version, command = request["version"], request["command"]
+    except (InputError, TypeError, KeyError):
+        raise InputError("expected one line of JSON with `version` and `command`") from None
+    if version != VERSION:
+        raise InputError(f"expected version {VERSION}, found {version!r}")
+    return str(command)
+
+
+class NoRun(InputError):
+    """No process of this user on this machine acquires into a run."""
 
 
 class NoAnswer(InputError):
@@ -132,14 +148,14 @@ def ask(run: Path, command: Command, say: Callable[[str], object] = lambda _: No
     """Send a command to the process that acquires into `run`; return its state afterwards. `say` gets a message
     within 2 s if the process does not answer, and another if this gives up: it says what becomes of the command.
 
-    Raises InputError if no process of this user on this machine acquires into `run`, and NoAnswer.
+    Raises NoRun if no process of this user on this machine acquires into `run`, and NoAnswer.
     """
     path = named_after(run, "sock")
     try:
         with told_if_given_up(_WHEN_GIVEN_UP.get(command, ""), say):
-            return _exchange(path, command, say=lambda why: say(f"{run}: no answer yet: {why}"))
+            return exchange_command(path, command, say=lambda why: say(f"{run}: no answer yet: {why}"))
     except (FileNotFoundError, ConnectionRefusedError) as error:
-        raise InputError(f"{run}: no process of this user acquires into this run on this machine") from error
+        raise NoRun(f"{run}: no process of this user acquires into this run on this machine") from error
     except (OSError, ValueError) as error:
         raise NoAnswer(f"{run}: the process that acquires into it does not answer: {reason(error)}") from error
 
@@ -153,7 +169,7 @@ def running() -> list[State]:
 def _running() -> Iterator[State]:
     for path in runtime_folder().glob("*.sock"):
         try:
-            yield _exchange(path, "state", _LOOK_PATIENCE_S)
+            yield exchange_command(path, "state", _LOOK_PATIENCE_S)
         except (ConnectionRefusedError, FileNotFoundError):  # of a process that was killed, or has just ended
             continue
         except (OSError, ValueError) as error:
@@ -161,9 +177,10 @@ def _running() -> Iterator[State]:
             yield {**about, "state": "silent", "trouble": [str(error)]}
 
 
-def _exchange(
+def exchange_command(
     path: Path, command: Command, patience_s: float = PATIENCE_S, say: Callable[[str], object] = lambda _: None
 ) -> State:
+    """Return the answer to a command. Raises OSError, and ValueError for an answer that is an error."""
     state = exchange(path, {"version": VERSION, "command": command}, patience_s, say)
     if "error" in state:
         raise ValueError(state["error"])

@@ -6,7 +6,7 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -93,6 +93,8 @@ class SessionRequest:
     """True to copy a mesh of more than 100 MB into the folder too."""
     beside: ProcessingBeside | None = None
     """Processes the run's views while it is acquired."""
+    started: Callable[[], None] = lambda: None
+    """Called when the run has a socket of its own, by which others can stop it."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,8 @@ class _Session:
     faults: ArmFaults
     begun_s: float
     """Time of its first line in the journal, by `_unset_clock_s`."""
+    started: Callable[[], None]
+    """Called when the run has a socket of its own."""
 
 
 def acquire_plan(job: Job, console: Console, request: SessionRequest, figures: dict[str, Any]) -> None:
@@ -175,7 +179,7 @@ def _acquire_into(
             tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
-            _acquire(job, _Session(cell, run, recorder, faults, begun_s), console, light, figures)
+            _acquire(job, _Session(cell, run, recorder, faults, begun_s, request.started), console, light, figures)
         finally:
             _end_recording(recorder, beside)
 
@@ -241,7 +245,9 @@ def _acquire(
     sequencer = run_bounded(partial(Sequencer, job, cell, recorder, observer=observer, control=control))
     outcome: Literal["done", "interrupted", "failed"] = "failed"
     failure: BaseException | None = None
-    remote = RunControl(run.folder, job.cell.document.path, control, cell.halt, lambda: observer.newest, light)
+    remote = RunControl(
+        run.folder, job.cell.document.path, control, cell.halt, lambda: observer.newest, light, session.started
+    )
 
     def stop() -> None:
         control.stop_by(signal.SIGINT, "the key q")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +18,7 @@ from coupole.errors import DeviceError, InputError, unsafe_end
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from coupole.acquisition.run_control import Command, State
+    from coupole.acquisition.run_control import Command, NoRun, State
     from coupole.storage.run import Run
 
 RunningRun = Annotated[
@@ -61,6 +61,9 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     emergency stop: that is the button at the cell.
     """
     reply = _state_after(run, "stop")  # sent before the imports, which only the outcome needs
+    if "plan" in reply:
+        _await_end_before_the_run(reply, as_json=as_json)
+        return
 
     from coupole.storage.run import Run
     from coupole.storage.run_status import status
@@ -86,6 +89,31 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     if unsafe := _unsafe(folder):
         raise unsafe_end("; ".join(unsafe))
     make_console(quiet=as_json).print("lights are off, the arm is at rest, the camera is disarmed")
+
+
+def _await_end_before_the_run(reply: State, *, as_json: bool) -> None:
+    """Wait until a session has ended that was stopped while it was starting. Raises DeviceError."""
+    import os
+    import select
+
+    from coupole.viewing.terminal import make_console
+
+    with contextlib.suppress(ProcessLookupError):
+        process = os.pidfd_open(reply["pid"])
+        try:
+            if not select.select([process], [], [], _ENDS_WITHIN_S)[0]:
+                raise DeviceError(
+                    "cell",
+                    expected=f"the process {reply['pid']} to end within {_ENDS_WITHIN_S:g} s of its stop",
+                    happened="it is still there; its run had not begun when it was stopped",
+                    remedy="Look at the cell, then end the process (`kill -9`).",
+                )
+        finally:
+            os.close(process)
+    if as_json:
+        print(json.dumps(reply))
+    words = f"stopped before the run began: {reply['plan']}; the process {reply['pid']} has ended"
+    make_console(quiet=as_json).print(words, markup=False)
 
 
 def _unsafe(run: Run) -> list[str]:
@@ -134,7 +162,7 @@ def _states(folder: Path) -> Iterator[State]:
 
 def running_run(run: Path | None) -> State:
     """Return the state of the given run, or of the only run that is being acquired. Raises InputError."""
-    from coupole.acquisition.run_control import ask, running
+    from coupole.acquisition.run_control import NoRun, ask, running
 
     if run is not None:
         return ask(run, "state")
@@ -142,9 +170,7 @@ def running_run(run: Path | None) -> State:
     states = [state for state in answers if state["run"]]
     if not states:
         silent = [why for state in answers for why in state.get("trouble", ())]
-        raise InputError(
-            "; ".join(["no run that answers is being acquired by this user on this machine", *silent])
-        )
+        raise NoRun("; ".join(["no run that answers is being acquired by this user on this machine", *silent]))
     if len(states) > 1:
         folders = "\n".join(f"  {state['run']}" for state in states)
         raise InputError(f"several runs are being acquired; name one of\n{folders}")
@@ -154,7 +180,7 @@ def running_run(run: Path | None) -> State:
 def _state_after(run: Path | None, command: Command, *, until: str = "") -> State:
     """Send a command; return the state after it, or the state in which it is `until`. Raises InputError if the run
     is not being acquired, or has ended."""
-    from coupole.acquisition.run_control import ask
+    from coupole.acquisition.run_control import NoRun, ask
 
     def alarm(message: str) -> None:
         """Print a warning: a run does not answer."""
@@ -162,14 +188,32 @@ def _state_after(run: Path | None, command: Command, *, until: str = "") -> Stat
 
         terminal.alarm(message)
 
-    folder = run or Path(running_run(run)["run"])
-    state = ask(folder, command, alarm)
+    try:
+        folder = run or Path(running_run(run)["run"])
+        state = ask(folder, command, alarm)
+    except NoRun as none:
+        return _state_of_starting(run, command, alarm, none)
     while until and state["state"] != until:
         time.sleep(_LOOK_EVERY_S)
         state = ask(folder, "state")
         if state["state"] in ("running", "stopping"):
             break
     return state
+
+
+def _state_of_starting(run: Path | None, command: Command, alarm: Callable[[str], None], none: NoRun) -> State:
+    """Send a command to the only session that is starting, or to the one that resumes this run or reads this plan;
+    return its state. Raises InputError: `none` if there is no such session."""
+    from coupole.acquisition.starting import ask_starting, starting
+
+    wanted = str(run.resolve()) if run else ""
+    sessions = [(path, state) for path, state in starting() if not run or wanted in (state["run"], state["plan"])]
+    if not sessions:
+        raise none
+    if len(sessions) > 1:
+        plans = "\n".join(f"  {state['run'] or state['plan']}" for _, state in sessions)
+        raise InputError(f"several sessions are starting; name one of\n{plans}")
+    return ask_starting(*sessions[0], command, alarm)
 
 
 def _say(state: State, *, as_json: bool) -> None:

@@ -66,12 +66,14 @@ def acquire(
     """Run a plan: check it, move, trigger, prove the frames, store them.
 
     Ctrl-C stops safely (lights off, arm still). Resume the run with `acquire --resume RUN`, which uses the run's
-    own copies of plan and rig. Or name the plan again; only its comments may have changed. On a terminal the key p
+    own copies of plan and rig. Or name the plan again; only its comments and the object's budget of light may have
+    changed. On a terminal the key p
     pauses between bursts and continues, q stops. From elsewhere use `coupole pause`, `go-on` and `stop`. If a
     console owns the cell (`coupole serve`), the command acquires in the console's name, if nothing runs or waits
     there.
     """
     from coupole.acquisition.session import SessionRequest, acquire_plan, rehearse
+    from coupole.acquisition.starting import StartingSession
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
 
@@ -91,12 +93,14 @@ def acquire(
         elif dry_run:
             rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, figures=summary)
         else:
-            job = read_job(plan or plan_of(resume), rig)
-            with _beside(job, console, resume, result, summary, is_asked=reflectance) as beside:
-                wanted_session = SessionRequest(
-                    output, resume, confirm=not yes, with_mesh=with_mesh, beside=beside
-                )
-                acquire_plan(job, console, wanted_session, summary)
+            path = plan or plan_of(resume)
+            with StartingSession(path, resume) as starting:
+                job = read_job(path, rig)
+                with _beside(job, console, resume, result, summary, is_asked=reflectance) as beside:
+                    wanted_session = SessionRequest(
+                        output, resume, confirm=not yes, with_mesh=with_mesh, beside=beside, started=starting.end
+                    )
+                    acquire_plan(job, console, wanted_session, summary)
     except CoupoleError as error:
         fail(error, as_json=as_json, figures=summary)
         raise

@@ -184,7 +184,10 @@ class Asked:
             return
         remedy = f"If it may receive more, give `coupole dose {object_id} --budget LUX_H --name NAME`"
         if history.budget_lux_h is None or allowed_lux_h < history.budget_lux_h:
-            remedy = "Raise `dose_budget_lux_h` in the plan if the object may receive it"
+            remedy = (
+                "Raise `dose_budget_lux_h` in the plan if the object may receive it (and name the plan when you "
+                "resume a run: `coupole acquire PLAN --resume RUN`)"
+            )
         raise DoseBudgetReached(
             f"object {object_id}: the next {self.lux_h:.3g} lux.h after {total_lux_h:.3f} lux.h would exceed its "
             f"budget of {allowed_lux_h:g} lux.h. {remedy}"

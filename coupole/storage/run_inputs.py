@@ -238,8 +238,8 @@ def _files_of_record(path: Path, files: InputFiles) -> Iterator[str]:
 def changes_since(about: Mapping[str, Any], run: Path, now: Inputs) -> list[str]:
     """List how plan, rig and the files that they name differ in meaning from those that a run began with.
 
-    Comments, the order of keys, and the place of a file do not count as changes. Any changed byte of a mesh or a
-    record counts.
+    Comments, the order of keys, the place of a file, and the plan's budget of light do not count as changes. Any
+    changed byte of a mesh or a record counts.
     """
     arm_known = now.arm is not None and "arm_sha256" in about
     changes = [
@@ -280,8 +280,18 @@ def _changes_of(
         yield f"the {kind} {path} has changed, and this version cannot read the run's copy to compare them"
         return
     now = yamlfile.read_document(path, files).validate(model)
+    if isinstance(then, Plan) and isinstance(now, Plan):
+        then = _with_budget_of(now, then)
     if changes := differences(then, now, apart):
         yield f"the {kind} {path}: {'; '.join(changes)}"
+
+
+def _with_budget_of(now: Plan, then: Plan) -> Plan:
+    """Return the plan `then` with the budget of light of the plan `now`: a run may be resumed with another one."""
+    if then.object is None or now.object is None:
+        return then
+    budget = {"dose_budget_lux_h": now.object.dose_budget_lux_h}
+    return then.model_copy(update={"object": then.object.model_copy(update=budget)})
 
 
 def _plain(text: str) -> str:

@@ -122,6 +122,31 @@ def test_light_entered_by_hand_during_a_pause_is_asked_for_before_the_next_burst
     assert_refused_and_resumable(real, ended)
 
 
+def test_a_run_stopped_by_the_stricter_budget_of_its_plan_goes_on_with_the_raised_one(
+    real: CellFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    foreseen, thing = foreseen_lux_h(real), real.plan_data["object"]
+    ledger_of(real).set_budget(100.0 * foreseen, "A. Keeper")
+    real.write(object={**thing, "dose_budget_lux_h": 2.0 * foreseen})
+    begun = when_a_burst_begins(monkeypatch, lambda: ledger_of(real).enter(1.5 * foreseen, "studio"))
+    ended = real.acquire()
+    assert (ended.code, len(begun)) == (3, 1)
+    assert "Raise `dose_budget_lux_h` in the plan" in ended.document["error"]
+    run = Path(ended.document["run"])
+    real.write(object={**thing, "dose_budget_lux_h": 9.0 * foreseen})
+    again = cells.here("acquire", "--resume", run, "--yes", "--json")
+    assert again.code == 3, "the run's own copy has the old budget"
+    lights = real.plan_data["lights"]
+    real.write(lights={"kind": "ids", "ids": [3]})
+    other = cells.here("acquire", real.plan, "--resume", run, "--yes", "--json")
+    assert other.code == 2, "nothing else of the plan may change with it"
+    real.write(lights=lights)
+    resumed = cells.here("acquire", real.plan, "--resume", run, "--yes", "--json")
+    assert resumed.code == 0, resumed.err
+    cells.assert_each_shot_proven_once(run)
+    assert cells.here("verify", run).code == 0
+
+
 def test_the_first_budget_of_a_plan_holds_for_the_plans_that_follow(real: CellFolder) -> None:
     thing = real.plan_data["object"]
     real.write(object={**thing, "dose_budget_lux_h": 1.5 * foreseen_lux_h(real)})

@@ -8,7 +8,6 @@ rest and measured, camera armed, lights. At the end it is reversed. On every exi
 from __future__ import annotations
 
 import contextlib
-import operator
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
@@ -190,12 +189,7 @@ class Sequencer:
             while next_bursts:
                 for index, burst in enumerate(next_bursts):
                     self.outcome.ideal_s += burst.duration_s
-                    if index + 1 < len(next_bursts):
-                        following = partial(operator.getitem, next_bursts, index + 1)
-                    else:
-                        self._bursts.think_ahead(number)
-                        following = partial(self._bursts.following, number)
-                    self._acquire_burst(burst, following, begin)
+                    self._acquire_burst(burst, self._following(number, next_bursts[index + 1 :]), begin)
                     self._ahead_s -= _expected_s(burst)
                     allowed_s -= _expected_s(burst)
                 next_bursts = self._bursts.more(number)
@@ -218,6 +212,14 @@ class Sequencer:
                 happened=f"the camera makes {frame_format.width_px} x {frame_format.height_px}",
                 remedy="Correct the rig, or the camera's region of interest.",
             )
+
+    def _following(self, number: int, known_bursts: list[Burst]) -> Callable[[], Burst | None]:
+        """Return a function that gives the next burst of a view, once it is known: the first of these, or of the
+        choice that begins now."""
+        if known_bursts:
+            return lambda: known_bursts[0]
+        self._bursts.think_ahead(number)
+        return partial(self._bursts.following, number)
 
     def _acquire_burst(
         self, burst: Burst, following: Callable[[], Burst | None], begin: Callable[[SettledPose], None]

@@ -91,7 +91,8 @@ class Happenings:
                 while True:
                     os.open(self.folder / "fifo", os.O_RDONLY)  # nobody ever writes
             case "world":
-                os.kill(self.world_pid, signal.SIGKILL)
+                with suppress(ProcessLookupError):  # the second time
+                    os.kill(self.world_pid, signal.SIGKILL)
             case "sigkill" | "sigint" | "sigterm" | "sighup":
                 os.kill(os.getpid(), SIGNALS.get(kind, signal.SIGKILL))
             case _:

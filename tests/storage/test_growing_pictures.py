@@ -75,9 +75,10 @@ def test_a_writer_that_is_killed_between_pictures_and_index_leaves_the_earlier_o
     def killed(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as since, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as since:
         since.setattr(Path, "write_text", killed)
-        put(writer, "top", 2)
+        with pytest.raises(KeyboardInterrupt):
+            put(writer, "top", 2)
     assert read_growing(tmp_path) == before
     assert all(file_so_far(tmp_path, name) for name in before.files)
 

@@ -141,7 +141,7 @@ def state_in_words(run: Path, processing: Processing, *, is_acquired: bool) -> t
         case "growing":
             return f"The processing fits the views so far; {views}.", ""
         case "fitting":
-            return f"All frames are there. The processing makes the final result.", ""
+            return "All frames are there. The processing makes the final result.", ""
         case "done":
             return f"The result is complete: {processing.result}", "good"
         case "failed" | "ended":

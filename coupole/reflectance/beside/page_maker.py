@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import IO
 
@@ -34,7 +35,8 @@ class PageMaker:
     _made: PageSoFar | None = None
     """Page that the process makes."""
     _process: subprocess.Popen[bytes] | None = None
-    _errors: IO[bytes] = field(default_factory=tempfile.TemporaryFile)
+    _errors: IO[bytes] = field(default_factory=BytesIO)
+    """Its stderr."""
 
     def want(self, result: Path, fitted_views: int) -> None:
         """Make a page of this result, as soon as the page before is complete."""
@@ -48,13 +50,15 @@ class PageMaker:
             if self._process.poll() is None:
                 return
             code, self._process = self._process.returncode, None
-            if code != 0 or self._made is None:
-                raise StorageError(self._last_words(code))
+            with self._errors:
+                if code != 0 or self._made is None:
+                    raise StorageError(self._last_words(code))
             self.growing.put_page(self._made)
         if self._wanted is not None:
             (result, fitted_views), self._wanted = self._wanted, None
             name = self.growing.new_page()
             self._made = PageSoFar(file=name, fitted_views=fitted_views, views=self.views, t=utc_now())
+            self._errors = tempfile.TemporaryFile()  # noqa: SIM115  closed when the program has ended
             self._process = subprocess.Popen(
                 [
                     sys.executable,
@@ -83,3 +87,4 @@ class PageMaker:
             self._process.kill()
             self._process.wait(_ENDS_WITHIN_S)
             self._process = None
+        self._errors.close()

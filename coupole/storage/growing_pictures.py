@@ -77,7 +77,7 @@ class ViewPictures(_Plain):
     """Time when they were drawn, UTC."""
     pictures: tuple[PictureShown, ...]
     remark: str = ""
-    """What is not drawn, and why."""
+    """Sentence about what is not drawn, and why."""
 
 
 class PageSoFar(_Plain):
@@ -92,9 +92,9 @@ class PageSoFar(_Plain):
 class Growing(_Plain):
     """All that can be looked at while a run goes on."""
 
-    simulated: bool = False
+    is_simulated: bool = False
     of_views: tuple[ViewPictures, ...] = ()
-    """In the order in which the views were drawn first, the newest view last."""
+    """Pictures of each view, in the order in which the views were drawn first."""
     page: PageSoFar | None = None
 
     @property
@@ -107,10 +107,10 @@ class Growing(_Plain):
 class GrowingPictures:
     """Writes the pictures of one result. There is one writer: the process that holds the result."""
 
-    def __init__(self, result: Path, *, simulated: bool) -> None:
+    def __init__(self, result: Path, *, is_simulated: bool) -> None:
         """Continue with the pictures that an earlier session left."""
         self.folder = result / PICTURES
-        self._shown = read_growing(result).model_copy(update={"simulated": simulated})
+        self._shown = read_growing(result).model_copy(update={"is_simulated": is_simulated})
         self._unnamed_s: dict[str, float] = {}
         """Monotonic time since which the index does not name a file."""
 
@@ -126,21 +126,21 @@ class GrowingPictures:
         for name, png in pngs.items():
             (self.folder / name).write_bytes(png)
         of_views = {view.view: view for view in self._shown.of_views} | {shown.view: shown}
-        self._put(self._shown.model_copy(update={"of_views": tuple(of_views.values())}))
+        self._write_index(self._shown.model_copy(update={"of_views": tuple(of_views.values())}))
 
     def put_page(self, page: PageSoFar) -> None:
         """Show a complete page instead of the earlier one. Raises OSError."""
-        self._put(self._shown.model_copy(update={"page": page}))
+        self._write_index(self._shown.model_copy(update={"page": page}))
 
-    def _put(self, shown: Growing) -> None:
+    def _write_index(self, shown: Growing) -> None:
         part = self.folder / f"{_INDEX}.part"
         part.write_text(shown.model_dump_json() + "\n", encoding="utf-8")
         part.replace(self.folder / _INDEX)
         self._shown, now_s = shown, time.monotonic()
-        unnamed = {
+        unnamed_files = {
             path.name for path in self.folder.iterdir() if path.suffix in (".png", ".html")
         } - shown.files  # fmt: skip
-        self._unnamed_s = {name: self._unnamed_s.get(name, now_s) for name in unnamed}
+        self._unnamed_s = {name: self._unnamed_s.get(name, now_s) for name in unnamed_files}
         for name, since_s in self._unnamed_s.items():
             if now_s - since_s > _KEPT_S:
                 with contextlib.suppress(OSError):

@@ -20,10 +20,10 @@ from PIL import Image
 from coupole.errors import StorageError
 from coupole.pages import palettes
 from coupole.reflectance import light_paths
-from coupole.reflectance.beside.drawing import Drawing
 from coupole.reflectance.beside.growing import Growth, fit_so_far
 from coupole.reflectance.beside.looking_ahead import look_ahead
 from coupole.reflectance.beside.page_maker import PageMaker
+from coupole.reflectance.beside.view_drawing import Drawing
 from coupole.reflectance.extraction import extraction
 from coupole.reflectance.light_paths import Ahead
 from coupole.reflectance.run_job import RunRequest, extract_beside, reflectance_of
@@ -106,7 +106,7 @@ def picture_of(result: Path, view: str, title: str) -> PictureShown:
 
 def test_pictures_grow_and_say_on_how_many_frames_they_rest(acquired: CellFolder, tmp_path: Path) -> None:
     run, result = acquired.run_folder, tmp_path / "result"
-    drawing = Drawing(result, GrowingPictures(result, simulated=True), 3)
+    drawing = Drawing(result, GrowingPictures(result, is_simulated=True), 3)
     extract_beside(run, "top", result)
     drawing.first_look("top")
     (first,) = read_growing(result).of_views
@@ -119,7 +119,7 @@ def test_pictures_grow_and_say_on_how_many_frames_they_rest(acquired: CellFolder
     fit_so_far(growth, MEMORY_BYTES, lambda *_: None, Ahead())
     drawing.so_far(growth.folder, lambda: True)
     growing = read_growing(result)
-    assert growing.simulated
+    assert growing.is_simulated
     assert [view.view for view in growing.of_views] == ["top", "side"]
     second = growing.of_views[0]
     assert (second.kind, second.fitted_views) == ("so-far", 2)
@@ -159,7 +159,7 @@ def shows_what_was_fitted(folder: Path, result: Path) -> None:
 
 def test_a_page_that_cannot_be_made_is_told_and_the_next_one_is_made(acquired: CellFolder, tmp_path: Path) -> None:
     run, result = acquired.run_folder, tmp_path / "result"
-    growing = GrowingPictures(result, simulated=True)
+    growing = GrowingPictures(result, is_simulated=True)
     extract_beside(run, "top", result)
     growth = Growth.of_views(run, result, ("top",), 3)
     fit_so_far(growth, MEMORY_BYTES, lambda *_: None, Ahead())

@@ -44,7 +44,7 @@ def put(writer: GrowingPictures, view: str, frames: int, count: int = 3) -> None
 
 
 def test_a_reader_never_finds_half_a_picture_nor_one_that_is_gone(tmp_path: Path) -> None:
-    writer, over = GrowingPictures(tmp_path, simulated=True), threading.Event()
+    writer, over = GrowingPictures(tmp_path, is_simulated=True), threading.Event()
     put(writer, "top", 0)
 
     def write() -> None:
@@ -68,7 +68,7 @@ def test_a_reader_never_finds_half_a_picture_nor_one_that_is_gone(tmp_path: Path
 def test_a_writer_that_is_killed_between_pictures_and_index_leaves_the_earlier_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    writer = GrowingPictures(tmp_path, simulated=True)
+    writer = GrowingPictures(tmp_path, is_simulated=True)
     put(writer, "top", 1)
     before = read_growing(tmp_path)
 
@@ -86,8 +86,8 @@ def test_a_writer_that_is_killed_between_pictures_and_index_leaves_the_earlier_o
 def test_another_session_keeps_what_was_drawn_and_files_go_a_minute_after_their_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    put(GrowingPictures(tmp_path, simulated=True), "top", 1)
-    writer = GrowingPictures(tmp_path, simulated=True)
+    put(GrowingPictures(tmp_path, is_simulated=True), "top", 1)
+    writer = GrowingPictures(tmp_path, is_simulated=True)
     put(writer, "side", 2)
     first, second = read_growing(tmp_path).of_views
     assert (first.view, second.view) == ("top", "side")
@@ -104,7 +104,7 @@ def test_another_session_keeps_what_was_drawn_and_files_go_a_minute_after_their_
 
 def test_only_whole_files_of_the_index_inside_the_folder_are_served(tmp_path: Path) -> None:
     result = tmp_path / "result"
-    writer = GrowingPictures(result, simulated=True)
+    writer = GrowingPictures(result, is_simulated=True)
     put(writer, "top", 1)
     half, gone, linked = (picture.file for picture in read_growing(result).of_views[0].pictures)
     for name in (half, gone, linked):
@@ -120,7 +120,7 @@ def test_only_whole_files_of_the_index_inside_the_folder_are_served(tmp_path: Pa
 
 
 def test_an_index_that_is_damaged_or_names_other_places_shows_nothing(tmp_path: Path) -> None:
-    writer = GrowingPictures(tmp_path, simulated=True)
+    writer = GrowingPictures(tmp_path, is_simulated=True)
     put(writer, "top", 1)
     index = tmp_path / PICTURES / "pictures.json"
     text, name = index.read_text(), read_growing(tmp_path).of_views[0].pictures[0].file
@@ -130,7 +130,7 @@ def test_an_index_that_is_damaged_or_names_other_places_shows_nothing(tmp_path: 
 
 
 def test_the_page_stays_when_pictures_are_replaced(tmp_path: Path) -> None:
-    writer = GrowingPictures(tmp_path, simulated=True)
+    writer = GrowingPictures(tmp_path, is_simulated=True)
     name = writer.new_page()
     (writer.folder / name).write_text("<p>")
     page = PageSoFar(file=name, fitted_views=1, views=2, t="2026-01-01T00:00:00.000Z")

@@ -49,6 +49,33 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
         jpeg = service.runs.picture(run, shot, width, saturation=saturation)
         return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})
 
+    @app.get("/api/v1/runs/{run}/report", response_class=FileResponse)
+    def report_page(run: Text) -> FileResponse:
+        """Return the run's report, which may not run scripts."""
+        return _file(service.runs.run(run).report_path, "text/html", _STILL)
+
+    @app.get("/api/v1/runs/{run}/readme", response_class=FileResponse)
+    def readme(run: Text) -> FileResponse:
+        """Return the README.txt of the run's folder, which describes the folder."""
+        return _file(service.runs.run(run).folder / "README.txt", "text/plain; charset=utf-8", _STILL)
+
+    @app.get("/api/v1/support-bundles/{name}", response_class=FileResponse)
+    def support_bundle(name: Text, request: Request) -> FileResponse:
+        """Return a support bundle that was made at the console; for engineers."""
+        session: Session = request.state.session
+        if account_here(session.account, of_this_machine=is_of_this_machine(request)).role < Role.ENGINEER:
+            raise NotAllowed(403, "support bundles: only for engineers")
+        return FileResponse(service.bundles.path(name), media_type="application/zip", filename=name)
+
+    @app.get("/api/v1/runs/{run}/look", response_class=FileResponse)
+    def look(run: Text) -> FileResponse:
+        """Return the page that `coupole show` made of the run, if all its data are in it."""
+        return _file(look_page(service.cell, service.runs.run(run)), "text/html", _LIVELY)
+
+
+def add_routes_so_far(app: FastAPI, service: Service) -> None:
+    """Add the routes to what can be looked at while a run is processed during its acquisition."""
+
     @app.get("/api/v1/runs/{run}/pictures-so-far")
     def pictures_so_far(run: Text) -> Growing:
         """Return the pictures of normals, materials and uncertainty that there are during the run, with their
@@ -73,29 +100,6 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
     def result_so_far(run: Text) -> FileResponse:
         """Return the report of the result of the views so far, during the run: normals, materials, uncertainty."""
         return _file(service.watch.result_of(run) / LINK / REPORT, "text/html", _STILL)
-
-    @app.get("/api/v1/runs/{run}/report", response_class=FileResponse)
-    def report_page(run: Text) -> FileResponse:
-        """Return the run's report, which may not run scripts."""
-        return _file(service.runs.run(run).report_path, "text/html", _STILL)
-
-    @app.get("/api/v1/runs/{run}/readme", response_class=FileResponse)
-    def readme(run: Text) -> FileResponse:
-        """Return the README.txt of the run's folder, which describes the folder."""
-        return _file(service.runs.run(run).folder / "README.txt", "text/plain; charset=utf-8", _STILL)
-
-    @app.get("/api/v1/support-bundles/{name}", response_class=FileResponse)
-    def support_bundle(name: Text, request: Request) -> FileResponse:
-        """Return a support bundle that was made at the console; for engineers."""
-        session: Session = request.state.session
-        if account_here(session.account, of_this_machine=is_of_this_machine(request)).role < Role.ENGINEER:
-            raise NotAllowed(403, "support bundles: only for engineers")
-        return FileResponse(service.bundles.path(name), media_type="application/zip", filename=name)
-
-    @app.get("/api/v1/runs/{run}/look", response_class=FileResponse)
-    def look(run: Text) -> FileResponse:
-        """Return the page that `coupole show` made of the run, if all its data are in it."""
-        return _file(look_page(service.cell, service.runs.run(run)), "text/html", _LIVELY)
 
 
 def _so_far(result: Path, name: str) -> Path:

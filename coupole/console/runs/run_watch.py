@@ -67,10 +67,10 @@ class _SignsOfLife:
             self.signs = ()
             return 0.0
         try:
-            told = (result / PROGRESS).stat().st_mtime
+            told_s = (result / PROGRESS).stat().st_mtime
         except OSError:
-            told = 0.0
-        signs = float(pid), told, cpu_time_s(pid)
+            told_s = 0.0
+        signs = float(pid), told_s, cpu_time_s(pid)
         if signs != self.signs:
             self.signs, self.since_s = signs, now_s
         return now_s - self.since_s

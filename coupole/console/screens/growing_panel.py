@@ -24,14 +24,14 @@ _NEWEST = ""
 """Choice of the view that was drawn last."""
 _SCRIPT = """<script>document.addEventListener('error', ({target}) => {
   const words = target.dataset && target.dataset.missing;
-  const said = Object.assign(document.createElement('p'), {className: 'hint', textContent: words});
-  if (words) target.replaceWith(said);
+  const sentence = Object.assign(document.createElement('p'), {className: 'hint', textContent: words});
+  if (words) target.replaceWith(sentence);
 }, true)</script>"""
 """Shows words in place of a picture that does not load."""
 
 
 @dataclass(frozen=True)
-class _Found:
+class _Files:
     """Files that are there now."""
 
     pictures: frozenset[str]
@@ -86,41 +86,50 @@ class GrowingPanel:
         self._undrawn.set_visibility(bool(processing.undrawn))
         names = {view.view: view.view for view in growing.of_views}
         if list(names) != list(self._view.options)[1:]:
-            chosen = self._view.value if self._view.value in names else _NEWEST
-            self._view.set_options({_NEWEST: "the newest", **names}, chosen)
+            choice = self._view.value if self._view.value in names else _NEWEST
+            self._view.set_options({_NEWEST: "the newest", **names}, choice)
         self._view.set_visibility(len(names) > 1)
-        shown = next(
+        view_pictures = next(
             (view for view in growing.of_views if view.view == self._view.value),
             growing.of_views[-1] if growing.of_views else None,
         )
-        found = await in_thread(_find, Path(processing.result), growing, shown)
-        self._draw(processing, growing, shown, found)
+        files = await in_thread(_find, Path(processing.result), growing, view_pictures)
+        self._draw(processing, growing, view_pictures, files)
 
-    def _draw(self, processing: Processing, growing: Growing, shown: ViewPictures | None, found: _Found) -> None:
-        what = (self._run, shown, found, growing.page, processing.fitted_views, processing.state == "done")
-        if what == self._shown:
+    def _draw(
+        self, processing: Processing, growing: Growing, view_pictures: ViewPictures | None, files: _Files
+    ) -> None:
+        state_key = (
+            self._run,
+            view_pictures,
+            files,
+            growing.page,
+            processing.fitted_views,
+            processing.state == "done",
+        )
+        if state_key == self._shown:
             return
-        self._shown = what
-        if shown is None:
+        self._shown = state_key
+        if view_pictures is None:
             self._basis.set_text("" if processing.state == "done" else _NO_PICTURES)
             self._pictures.set_content("")
         else:
-            self._basis.set_text(basis_in_words(shown, simulated=growing.simulated))
+            self._basis.set_text(basis_in_words(view_pictures, is_simulated=growing.is_simulated))
             figures = "".join(
-                _figure(self._run, shown.view, picture, is_there=picture.file in found.pictures)
-                for picture in shown.pictures
+                _figure(self._run, view_pictures.view, picture, is_there=picture.file in files.pictures)
+                for picture in view_pictures.pictures
             )
             self._pictures.set_content(f'<div class="value-pictures">{figures}</div>')
-        self._remark.set_text(shown.remark if shown else "")
+        self._remark.set_text(view_pictures.remark if view_pictures else "")
         self._links.clear()
         with self._links:
             address = f"/api/v1/runs/{quote(self._run)}"
-            if growing.page is not None and found.has_page:
+            if growing.page is not None and files.has_page:
                 of = f"{growing.page.fitted_views} of {growing.page.views} views"
                 link(f"Open the page to relight ({of})", f"{address}/relight-so-far", name="relight-so-far")
             elif processing.state != "done" and self._is_acquired:
                 ui.label(_NO_PAGE).classes("hint")
-            if found.has_report:
+            if files.has_report:
                 of = f" ({processing.fitted_views} of {processing.views} views)" if processing.fitted_views else ""
                 link(f"Report of the result so far{of}", f"{address}/so-far", name="so-far")
 
@@ -146,33 +155,33 @@ def state_in_words(run: Path, processing: Processing, *, is_acquired: bool) -> t
             return f"The result is complete: {processing.result}", "good"
         case "failed" | "ended":
             outcome = "has ended" if processing.state == "ended" else "failed"
-            said = f"The processing {outcome}: {processing.why}. {views}."
+            sentence = f"The processing {outcome}: {processing.why}. {views}."
             if processing.remedy:
-                return f"{said} This continues: {processing.remedy}", "bad"
+                return f"{sentence} This continues: {processing.remedy}", "bad"
             if not is_acquired:
-                return f"{said} Resume the run: it continues with these views.", "warm"
+                return f"{sentence} Resume the run: it continues with these views.", "warm"
             command = go_on_command(run, Path(processing.result))
             return (
-                f"{said} No frame is lost by this, and the run goes on without it. When all frames are there, "
+                f"{sentence} No frame is lost by this, and the run goes on without it. When all frames are there, "
                 f"this continues: {command}"
             ), "bad"
 
 
-def basis_in_words(shown: ViewPictures, *, simulated: bool) -> str:
+def basis_in_words(view_pictures: ViewPictures, *, is_simulated: bool) -> str:
     """Say on which data pictures rest, and when they were drawn."""
-    frames = f"{count(shown.frames, 'frame')}; {count(shown.triangles, 'triangle')} in this view"
+    frames = f"{count(view_pictures.frames, 'frame')}; {count(view_pictures.triangles, 'triangle')} in this view"
     how = (
         f"first look by a quick fit to this view alone ({frames}); light from other surfaces is still in it"
-        if shown.kind == "first-look"
-        else f"result of {shown.fitted_views} of {count(shown.views, 'view')} so far ({frames})"
+        if view_pictures.kind == "first-look"
+        else f"result of {view_pictures.fitted_views} of {count(view_pictures.views, 'view')} so far ({frames})"
     )
-    words = f"View {shown.view}: {how}. Drawn at {shown.t[11:19]} UTC."
-    return f"{words} The data are simulated." if simulated else words
+    words = f"View {view_pictures.view}: {how}. Drawn at {view_pictures.t[11:19]} UTC."
+    return f"{words} The data are simulated." if is_simulated else words
 
 
-def _find(result: Path, growing: Growing, shown: ViewPictures | None) -> _Found:
-    pictures = shown.pictures if shown else ()
-    return _Found(
+def _find(result: Path, growing: Growing, view_pictures: ViewPictures | None) -> _Files:
+    pictures = view_pictures.pictures if view_pictures else ()
+    return _Files(
         frozenset(picture.file for picture in pictures if file_so_far(result, picture.file)),
         growing.page is not None and file_so_far(result, growing.page.file) is not None,
         (result / LINK / REPORT).is_file(),

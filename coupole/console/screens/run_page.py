@@ -55,7 +55,7 @@ class _Known:
     places: dict[int, LedPlace]
     events: list[tuple[str, str]]
     growing: Growing
-    """What was drawn of a result that is not complete."""
+    """Pictures of a result that is not complete."""
 
 
 def build(visit: Visit, name: str) -> None:

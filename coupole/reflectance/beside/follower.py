@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from coupole.errors import CoupoleError, reason
-from coupole.reflectance.beside.drawing import Drawing
 from coupole.reflectance.beside.growing import Growth, fit_so_far
 from coupole.reflectance.beside.looking_ahead import look_ahead
 from coupole.reflectance.beside.page_maker import PageMaker
+from coupole.reflectance.beside.view_drawing import Drawing
 from coupole.reflectance.light_paths import Ahead
 from coupole.reflectance.result_pages import run_reflectance_page
 from coupole.reflectance.run_job import RunRequest, extract_beside, reflectance_of
@@ -89,7 +89,7 @@ class _Follower:
 
     def __init__(self, run: Run, result: Path, teller: _Teller, page_program: str) -> None:
         self._run, self._result, self._teller = run, result, teller
-        growing = GrowingPictures(result, simulated=run.is_simulated)
+        growing = GrowingPictures(result, is_simulated=run.is_simulated)
         self._drawing = Drawing(result, growing, run.expected_views)
         self._page = PageMaker(page_program, growing, run.expected_views)
         self._request, self._ahead = RunRequest((run.folder,)), Ahead()
@@ -175,12 +175,12 @@ class _Follower:
         self._teller.step("waiting", views_done=len(self._taken), views=self._run.expected_views)
         return True
 
-    def _draw(self, what: str, draw: Callable[[], None]) -> None:
+    def _draw(self, subject: str, draw: Callable[[], None]) -> None:
         """Draw what is only looked at. The result does not need it, so a failure is reported and no more."""
         try:
             draw()
         except Exception as error:  # noqa: BLE001  of a picture alone
-            self._teller.tell(undrawn=f"{what}: {reason(error)}")
+            self._teller.tell(undrawn=f"{subject}: {reason(error)}")
 
     def _remaining_views(self) -> list[str]:
         return [view for view in self._run.complete_views() if view not in self._taken]

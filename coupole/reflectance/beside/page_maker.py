@@ -30,9 +30,9 @@ class PageMaker:
     growing: GrowingPictures
     views: int
     """Views of the plan."""
-    _wanted: tuple[Path, int] | None = None
+    _next_source: tuple[Path, int] | None = None
     """Result, and the number of its views, of which the next page is made."""
-    _made: PageSoFar | None = None
+    _page: PageSoFar | None = None
     """Page that the process makes."""
     _process: subprocess.Popen[bytes] | None = None
     _errors: IO[bytes] = field(default_factory=BytesIO)
@@ -41,7 +41,7 @@ class PageMaker:
     def want(self, result: Path, fitted_views: int) -> None:
         """Make a page of this result, as soon as the page before is complete."""
         if self.program:
-            self._wanted = result, fitted_views
+            self._next_source = result, fitted_views
 
     def look(self) -> None:
         """Show a page that is complete, and begin the next one. It does not wait. Raises OSError; StorageError if
@@ -51,13 +51,13 @@ class PageMaker:
                 return
             code, self._process = self._process.returncode, None
             with self._errors:
-                if code != 0 or self._made is None:
+                if code != 0 or self._page is None:
                     raise StorageError(self._last_words(code))
-            self.growing.put_page(self._made)
-        if self._wanted is not None:
-            (result, fitted_views), self._wanted = self._wanted, None
+            self.growing.put_page(self._page)
+        if self._next_source is not None:
+            (result, fitted_views), self._next_source = self._next_source, None
             name = self.growing.new_page()
-            self._made = PageSoFar(file=name, fitted_views=fitted_views, views=self.views, t=utc_now())
+            self._page = PageSoFar(file=name, fitted_views=fitted_views, views=self.views, t=utc_now())
             self._errors = tempfile.TemporaryFile()  # noqa: SIM115  closed when the program has ended
             self._process = subprocess.Popen(
                 [
@@ -82,7 +82,7 @@ class PageMaker:
 
     def end(self) -> None:
         """End the work on a page."""
-        self._wanted = None
+        self._next_source = None
         if self._process is not None:
             self._process.kill()
             self._process.wait(_ENDS_WITHIN_S)

@@ -21,7 +21,7 @@ _ROUND_ENDS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 class MapValues:
     """Materials that are drawn, one row for each triangle."""
 
-    seen: NDArray[np.int32]
+    pixel_rows: NDArray[np.int32]
     """[h, w] row of the triangle that a pixel sees; below 0 for none."""
     normals: Floats
     """[n, 3]"""
@@ -53,15 +53,15 @@ def material_maps(values: MapValues, *, has_own_scales: bool = False) -> Materia
     """Return the maps of a view. A value that is nearly nothing is stated in words, not drawn. Scales of
     uncertainties are the same for all results, or with `has_own_scales` end at a round number above nearly all
     values."""
-    seen, uncertain = values.seen, values.uncertain
+    pixel_rows, uncertain = values.pixel_rows, values.uncertain
     medians: dict[str, float] = {}
 
     def one_value(title: str, of_triangles: Floats, unit: str, usual_end: float, *, is_fixed: bool = False) -> Map:
-        known = of_triangles[np.isfinite(of_triangles)]
-        if len(known):
-            medians[title] = float(np.median(known))
-        end = _round_end(known) if has_own_scales and not is_fixed else usual_end
-        return value_map(title, picture_of(seen, of_triangles), unit, end)
+        known_values = of_triangles[np.isfinite(of_triangles)]
+        if len(known_values):
+            medians[title] = float(np.median(known_values))
+        end = _round_end(known_values) if has_own_scales and not is_fixed else usual_end
+        return value_map(title, picture_of(pixel_rows, of_triangles), unit, end)
 
     lobe: tuple[Map, ...] = ()
     is_told = lobes_told.is_told_by_uncertainty(values.ks, uncertain[:, 3])
@@ -74,7 +74,7 @@ def material_maps(values: MapValues, *, has_own_scales: bool = False) -> Materia
         u_percent = np.where(is_told[:, None], 100 * uncertain[:, 3:5], np.nan)
         ks, alpha = np.where(is_told[:, None], values.ks, np.nan), np.where(is_told, values.alpha, np.nan)
         lobe = (
-            eye_map("specular ks", in_three(picture_of(seen, ks))),
+            eye_map("specular ks", in_three(picture_of(pixel_rows, ks))),
             one_value("standard uncertainty of specular", u_percent[:, 0], "%", _MOST_U_LOBE_PERCENT),
             one_value("roughness alpha", alpha, "", 1.0, is_fixed=True),
             one_value("standard uncertainty of roughness", u_percent[:, 1], "%", _MOST_U_LOBE_PERCENT),
@@ -85,11 +85,11 @@ def material_maps(values: MapValues, *, has_own_scales: bool = False) -> Materia
         )
     u_normals_deg = np.degrees(np.hypot(uncertain[:, 0], uncertain[:, 1]))
     return MaterialMaps(
-        normals=normal_map("fitted normals", picture_of(seen, values.normals)),
+        normals=normal_map("fitted normals", picture_of(pixel_rows, values.normals)),
         u_normals=one_value(
             "standard uncertainty of fitted normals", u_normals_deg, "degrees", _MOST_U_NORMAL_DEG
         ),
-        kd=eye_map("diffuse kd", in_three(picture_of(seen, values.kd)), unit="1/sr"),
+        kd=eye_map("diffuse kd", in_three(picture_of(pixel_rows, values.kd)), unit="1/sr"),
         u_kd=one_value("standard uncertainty of diffuse", 100 * uncertain[:, 2], "%", _MOST_U_PERCENT),
         lobe=lobe,
         medians=medians,
@@ -109,7 +109,7 @@ def in_three(values: Floats) -> Floats:
 
 
 def picture_of(triangle_rows: NDArray[np.int32], values: Floats) -> NDArray[np.float32]:
-    """[h, w, ...] picture of values [triangles, ...]; NaN where no triangle is seen."""
+    """[h, w, ...] picture of values [triangles, ...]; NaN where no triangle is pixel_rows."""
     picture = np.full((*triangle_rows.shape, *values.shape[1:]), np.nan, np.float32)
     picture[triangle_rows >= 0] = values[triangle_rows[triangle_rows >= 0]]
     return picture

@@ -54,12 +54,12 @@ class Drawing:
         uncertainty = GGX_NORMAL.uncertainty(samples, all_of_them, materials, _SCAN_NOISE_UM, middle_mm, None)
         uncertain = np.sqrt(np.diagonal(uncertainty.covariance, axis1=1, axis2=2))
         with h5py.File(samples_of_view.path, "r") as file:
-            seen, centres_mm = file["seen"][()], file["centres_mm"][()]
-        seen = _cropped(seen)
+            pixel_rows, centres_mm = file["seen"][()], file["centres_mm"][()]
+        pixel_rows = _crop(pixel_rows)
         nearest = np.append(cKDTree(samples.centres_mm).query(centres_mm)[1], -1)  # the last: a pixel sees nothing
-        rows_seen = nearest[np.where(seen >= 0, seen, -1)]
+        rows_seen = nearest[np.where(pixel_rows >= 0, pixel_rows, -1)]
         values = _map_values(rows_seen, materials, uncertain, result.base_from_support)
-        shown = ViewPictures(
+        view_pictures = ViewPictures(
             view=view,
             kind="first-look",
             fitted_views=1,
@@ -69,7 +69,7 @@ class Drawing:
             t=utc_now(),
             pictures=(),
         )
-        self._put(shown, material_maps(values, has_own_scales=True))
+        self._put_maps(view_pictures, material_maps(values, has_own_scales=True))
 
     def so_far(self, folder: Path, is_wanted: Callable[[], bool]) -> None:
         """Draw the views of a result of the views so far, the newest first, while `is_wanted` says so. Raises
@@ -86,9 +86,9 @@ class Drawing:
             rows = np.searchsorted(result.triangles, view.triangles)
             of_view = materials.at(rows)
             with h5py.File(view.path, "r") as file:
-                seen = _cropped(file["seen"][()])
-            values = _map_values(seen, of_view, uncertain[rows], result.base_from_support)
-            shown = ViewPictures(
+                pixel_rows = _crop(file["seen"][()])
+            values = _map_values(pixel_rows, of_view, uncertain[rows], result.base_from_support)
+            view_pictures = ViewPictures(
                 view=view.path.stem,
                 kind="so-far",
                 fitted_views=len(result.views),
@@ -98,14 +98,14 @@ class Drawing:
                 t=utc_now(),
                 pictures=(),
             )
-            self._put(shown, material_maps(values, has_own_scales=True))
+            self._put_maps(view_pictures, material_maps(values, has_own_scales=True))
 
     def _taken_ns(self, view: ViewSamples) -> int:
         """Return when the samples of a view were taken."""
         return (self.result / "samples" / view.path.name).stat().st_mtime_ns
 
-    def _put(self, shown: ViewPictures, maps: MaterialMaps) -> None:
-        named = [
+    def _put_maps(self, view_pictures: ViewPictures, maps: MaterialMaps) -> None:
+        titled_maps = [
             ("normals", "Normals", maps.normals),
             ("u-normals", "Uncertainty of normals", maps.u_normals),
             ("kd", "Base colour (kd)", maps.kd),
@@ -117,35 +117,36 @@ class Drawing:
                 strict=False,
             ),
         ]  # fmt: skip
-        files = {kind: new_picture_name(kind) for kind, _, _ in named}
+        files = {kind: new_picture_name(kind) for kind, _, _ in titled_maps}
         pictures = tuple(
-            _shown(files[kind], title, of_map, maps.medians.get(of_map.title)) for kind, title, of_map in named
+            _picture_shown(files[kind], title, of_map, maps.medians.get(of_map.title))
+            for kind, title, of_map in titled_maps
         )
         remark = "" if maps.lobe else maps.lobe_words
         self.growing.put_view(
-            shown.model_copy(update={"pictures": pictures, "remark": remark}),
-            {files[kind]: of_map.png for kind, _, of_map in named},
+            view_pictures.model_copy(update={"pictures": pictures, "remark": remark}),
+            {files[kind]: of_map.png for kind, _, of_map in titled_maps},
         )
 
 
 def _map_values(
-    seen: NDArray[np.int32],
+    pixel_rows: NDArray[np.int32],
     materials: TriangleMaterials,
     uncertain: NDArray[np.float64],
     base_from_support: NDArray[np.float64],
 ) -> MapValues:
     """Return what is drawn, with normals in the frame of the support, whose z is up."""
     normals = materials.normals @ base_from_support[:3, :3]
-    return MapValues(seen, normals, materials.kd, materials.ks, materials.alpha, uncertain)
+    return MapValues(pixel_rows, normals, materials.kd, materials.ks, materials.alpha, uncertain)
 
 
-def _cropped(seen: NDArray[np.int32]) -> NDArray[np.int32]:
+def _crop(pixel_rows: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return the part [h, w] of a view that sees the object, with a margin, at most `_MOST_WIDTH_PX` wide."""
-    rows, columns = (np.flatnonzero((seen >= 0).any(axis=axis)) for axis in (1, 0))
+    rows, columns = (np.flatnonzero((pixel_rows >= 0).any(axis=axis)) for axis in (1, 0))
     if not len(rows):
-        return seen[:1, :1]
+        return pixel_rows[:1, :1]
     margin_px = 1 + max(int(np.ptp(rows)), int(np.ptp(columns))) // 40
-    part = seen[
+    part = pixel_rows[
         max(0, rows[0] - margin_px) : rows[-1] + margin_px + 1,
         max(0, columns[0] - margin_px) : columns[-1] + margin_px + 1,
     ]
@@ -153,7 +154,7 @@ def _cropped(seen: NDArray[np.int32]) -> NDArray[np.int32]:
     return part[::step, ::step]
 
 
-def _shown(file: str, title: str, of_map: Map, median: float | None) -> PictureShown:
+def _picture_shown(file: str, title: str, of_map: Map, median: float | None) -> PictureShown:
     with Image.open(BytesIO(of_map.png)) as image:
         width_px, height_px = image.size
     return PictureShown(

@@ -104,6 +104,8 @@ class GrowingPanel:
             view_pictures,
             files,
             growing.page,
+            processing.undrawn,
+            processing.is_at_work,
             processing.fitted_views,
             processing.state == "done",
         )
@@ -127,7 +129,7 @@ class GrowingPanel:
             if growing.page is not None and files.has_page:
                 of = f"{growing.page.fitted_views} of {growing.page.views} views"
                 link(f"Open the page to relight ({of})", f"{address}/relight-so-far", name="relight-so-far")
-            elif processing.state != "done" and self._is_acquired:
+            elif processing.is_at_work and self._is_acquired and not processing.undrawn:
                 ui.label(_NO_PAGE).classes("hint")
             if files.has_report:
                 of = f" ({processing.fitted_views} of {processing.views} views)" if processing.fitted_views else ""

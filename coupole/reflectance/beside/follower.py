@@ -28,6 +28,7 @@ from coupole.storage.run import Run
 
 _LOOK_EVERY_S = 0.2
 _TELL_EVERY_S = 1.0
+_NONE_SO_FAR = "result so far and page to relight"
 Say = Callable[[dict[str, Any]], object]
 AtTheEnd = Callable[[Callable[[], None]], None]
 
@@ -115,7 +116,8 @@ class _Follower:
 
     def until_all_frames_are_there(self) -> None:
         """Take samples, look ahead and make results so far while the run goes on. Raises as `reflectance_of`."""
-        self._teller.step("waiting", views=self._run.expected_views)
+        why_none = _why_none_so_far(self._run)
+        self._teller.step("waiting", views=self._run.expected_views, undrawn=why_none)
         self._read_news()
         try:
             while not self._is_done:
@@ -217,6 +219,7 @@ class _Follower:
         changes: dict[str, Any] = {}
         try:
             if not growth.has_room():
+                self._teller.tell(undrawn=_why_none_so_far(self._run) or f"{_NONE_SO_FAR}: the disk has no room")
                 return True
             self._teller.step("growing")
             fit_so_far(growth, self._request.memory_bytes, self._part_of_growth, self._ahead)
@@ -265,3 +268,10 @@ class _Follower:
         if not self._last_frame:
             return None
         return round((datetime.now(UTC) - datetime.fromisoformat(self._last_frame)).total_seconds(), 3)
+
+
+def _why_none_so_far(run: Run) -> str:
+    """Return why a run will have no result of the views so far; empty if it may have one."""
+    if run.is_open:
+        return f"{_NONE_SO_FAR}: the run chooses its frames"
+    return f"{_NONE_SO_FAR}: the plan discards frames" if run.discards else ""

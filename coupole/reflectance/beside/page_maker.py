@@ -5,6 +5,7 @@ The program has the priority of this process, and ends with it. It runs while sa
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -85,6 +86,7 @@ class PageMaker:
         self._next_source = None
         if self._process is not None:
             self._process.kill()
-            self._process.wait(_ENDS_WITHIN_S)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_ENDS_WITHIN_S)
             self._process = None
         self._errors.close()

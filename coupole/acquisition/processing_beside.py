@@ -27,13 +27,14 @@ from coupole.errors import InputError
 from coupole.intake.plain_data import json_of
 from coupole.preflight.discard_room import DiscardRoom
 from coupole.storage.journal_events import FramesDiscarded
-from coupole.storage.processing import Progress, default_result, go_on_command
+from coupole.storage.processing import Progress, default_result, go_on_command, tell
 from coupole.storage.run import Run
 from coupole.storage.so_far import LINK
-from coupole.storage.stopped_process import is_stopped
+from coupole.storage.stopped_process import cpu_time_s, is_stopped
 from coupole.viewing.terminal import alarm, step_bars
 
 _PROGRAM = "coupole.reflectance.beside.process"
+_PAGE_PROGRAM = "coupole.exchange.look.page_beside"
 _READY_WITHIN_S = 120.0
 """Longer than its imports take on a busy machine."""
 _TOLD_AFTER_S = 1.0
@@ -125,7 +126,9 @@ class ProcessingBeside:
         """Process this run from now on."""
         self._run, self._result = run, self.result_of(run)
         self._console.print(f"reflectance {self._result}", markup=False)
-        self._ask({"run": str(run), "result": str(self._result)})
+        with contextlib.suppress(OSError):  # what an earlier session left there is over
+            tell(self._result, Progress())
+        self._ask({"run": str(run), "result": str(self._result), "page_program": _PAGE_PROGRAM})
 
     def discard(
         self, run: Run, note: Callable[[FramesDiscarded], None], room: DiscardRoom
@@ -215,13 +218,10 @@ class ProcessingBeside:
     def _give_up(self, why: str) -> None:
         self._end()
         self._why = why
+        self._leave_word()
 
     def _cpu_s(self) -> float:
-        """CPU time of the process, s; 0 if it is not known."""
-        with contextlib.suppress(OSError, ValueError, IndexError):
-            words = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-            return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
-        return 0.0
+        return cpu_time_s(self._process.pid)
 
     @property
     def _is_whole(self) -> bool:
@@ -288,10 +288,17 @@ class ProcessingBeside:
         self._console.print(f"reflectance so far, from {count} of {of} views: {self._result / LINK}", markup=False)
 
     def _tell_of_failure(self) -> None:
+        self._leave_word()
         alarm(
             f"reflectance failed: {self._reason}. The acquisition continues without it; "
             f"the samples of {self._views_text} are kept"
         )
+
+    def _leave_word(self) -> None:
+        """Write why the process has ended, for those who only see the folder of the result."""
+        assert self._result is not None
+        with contextlib.suppress(OSError):
+            tell(self._result, self._progress.model_copy(update={"why": self._reason}))
 
     @property
     def _last_words(self) -> str:

@@ -6,7 +6,7 @@
       samples.json          frames that the samples of each view were taken from; synced
       progress.json         progress, for people: written again and again, never synced
       lock                  locked by the process at work
-      normals.png           normals of the newest view, by a quick fit
+      pictures/             normals and materials of the views so far (`coupole.storage.growing_pictures`)
       RUN-2-of-3-views-.../ result of the views so far (`coupole.storage.so_far`)
 
 The run's journal names the result's folder (`ProcessingAsked`); nothing else connects the two processes.
@@ -33,8 +33,7 @@ from coupole.storage.stopped_process import holder_of, is_locked, is_stopped
 FOLDER = "beside"
 RESULT = "result.json"
 """File that a complete result has."""
-PICTURE = f"{FOLDER}/normals.png"
-_LOCK, _PROGRESS = f"{FOLDER}/lock", f"{FOLDER}/progress.json"
+LOCK, PROGRESS = f"{FOLDER}/lock", f"{FOLDER}/progress.json"
 _SUFFIX = "-reflectance"
 Step = Literal["waiting", "extracting", "growing", "fitting", "failed"]
 _own_results: set[Path] = set()
@@ -60,7 +59,9 @@ class Progress(BaseModel):
     fitted_views: Annotated[int, Field(ge=0)] = 0
     """Number of views in the result so far; 0 while there is no result."""
     why: str = ""
-    """Reason of a failure."""
+    """Reason of a failure, or of the end of the process."""
+    undrawn: str = ""
+    """The newest picture or page that could not be drawn, and the reason."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +86,17 @@ class Processing:
     """Reason why it failed, ended or stands still."""
     remedy: str = ""
     """The command line that continues with the present data; empty while nothing is wrong."""
+    undrawn: str = ""
+    """The newest picture or page that could not be drawn, and the reason."""
 
     def figures(self) -> dict[str, Any]:
         """Content of `processing` in `--json`."""
         return asdict(self)
+
+    @property
+    def is_at_work(self) -> bool:
+        """Tell whether its process is there."""
+        return self.state not in ("done", "failed", "ended")
 
     @property
     def words(self) -> str:
@@ -120,7 +128,7 @@ def go_on_command(run: Path, result: Path) -> str:
 def tell(result: Path, progress: Progress) -> None:
     """Write the progress for `processing_of`. It is not synced, because it must not slow the acquisition. Raises
     OSError."""
-    path = result / _PROGRESS
+    path = result / PROGRESS
     part = path.with_suffix(".json.part")
     part.write_text(progress.model_dump_json() + "\n", encoding="utf-8")
     part.replace(path)
@@ -137,16 +145,17 @@ def processing_of(run: Path, result: Path, *, frames_left: bool, in_use: bool) -
     remedy = "" if frames_left else go_on_command(run, result)
     if progress.step == "failed":
         return Processing(place, "failed", *counts, why=progress.why, remedy=remedy)
-    if not _is_held(result / _LOCK):
+    if not _is_held(result / LOCK):
         if in_use and not counts[1]:
             return Processing(place, "waiting")
-        return Processing(
-            place, "ended", *counts, why="its process ended before the result was complete", remedy=remedy
-        )
+        why = progress.why or "its process ended before the result was complete"
+        return Processing(place, "ended", *counts, why=why, remedy=remedy)
     share = f" {progress.done_count} of {progress.of}" if progress.of else ""
-    pid = holder_of(result / _LOCK)
+    pid = holder_of(result / LOCK)
     still = f"its process {pid} is stopped; `kill -CONT {pid}` lets it go on" if pid and is_stopped(pid) else ""
-    return Processing(place, progress.step, *counts, detail=f"{progress.detail}{share}", why=still)
+    return Processing(
+        place, progress.step, *counts, detail=f"{progress.detail}{share}", why=still, undrawn=progress.undrawn
+    )
 
 
 def _is_whole(run: Path, result: Path) -> bool:
@@ -160,7 +169,7 @@ def _is_whole(run: Path, result: Path) -> bool:
 def _read_progress(result: Path) -> Progress:
     """Return the progress. It is empty if no progress was written yet, or if the file is not valid."""
     try:
-        return Progress.model_validate(read_json(result / _PROGRESS))
+        return Progress.model_validate(read_json(result / PROGRESS))
     except (OSError, InputError, ValidationError):
         return Progress()
 
@@ -170,7 +179,7 @@ def hold_result(result: Path) -> Iterator[None]:
     """Keep a result for this process: make its folder, and lock it while the context lasts. Raises InputError if
     another process has it, OSError."""
     (result / FOLDER).mkdir(parents=True, exist_ok=True)
-    fd = os.open(result / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    fd = os.open(result / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -185,13 +194,13 @@ def hold_result(result: Path) -> Iterator[None]:
 
 def refuse_held(result: Path) -> None:
     """Raise InputError if another process is making a result beside an acquisition."""
-    if result.resolve() not in _own_results and _is_held(result / _LOCK):
+    if result.resolve() not in _own_results and _is_held(result / LOCK):
         raise InputError(_at_work(result))
 
 
 def refuse_while_processed(run: Path, result: Path) -> None:
     """Raise InputError while a process makes the result of a run from the run's frames."""
-    if _is_held(result / _LOCK):
+    if _is_held(result / LOCK):
         raise InputError(
             f"{run}: {_worker(result)} still makes {result} from its frames; `coupole status RUN` shows the "
             "progress. Wait until it has ended"
@@ -199,7 +208,7 @@ def refuse_while_processed(run: Path, result: Path) -> None:
 
 
 def _worker(result: Path) -> str:
-    pid = holder_of(result / _LOCK)
+    pid = holder_of(result / LOCK)
     return f"process {pid}" if pid else "another process"
 
 

@@ -1,5 +1,5 @@
-"""Processes of this machine, from Linux's `/proc`: the process that has locked a file, and whether a process is
-stopped."""
+"""Processes of this machine, from Linux's `/proc`: the process that has locked a file, whether a process is
+stopped, and its CPU time."""
 
 from __future__ import annotations
 
@@ -19,6 +19,15 @@ def is_stopped(pid: int) -> bool:
     except (OSError, IndexError):
         return False
     return state in ("T", "t")
+
+
+def cpu_time_s(pid: int) -> float:
+    """Return the CPU time of a process, s; 0 if it is not known."""
+    try:
+        words = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, IndexError):
+        return 0.0
 
 
 def is_locked(file: Path) -> bool:

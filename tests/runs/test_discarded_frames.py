@@ -249,6 +249,8 @@ def test_an_acquisition_that_is_killed_while_it_discards_is_resumed(tmp_path: Pa
     cell = discarding_cell(tmp_path)
     process, worker = begun(cell)
     cells.wait_until(lambda: cells.events(cell.run_folder, "discard"), "a view that is discarded")
+    progress = json.loads((result_of(cell) / "beside/progress.json").read_text())
+    assert progress["undrawn"] == "result so far and page to relight: the plan discards frames"
     process.kill()
     cells.finish(process)
     end_s = time.monotonic() + 5.0

@@ -4,25 +4,35 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import cells
+import h5py
 import numpy as np
 import pytest
 from beside_runs import acquired_run, begun, cell_of_three_views, files, result_of, same_result
 from cells import CellFolder
+from PIL import Image
 
+from coupole.errors import StorageError
+from coupole.pages import palettes
 from coupole.reflectance import light_paths
 from coupole.reflectance.beside.growing import Growth, fit_so_far
 from coupole.reflectance.beside.looking_ahead import look_ahead
+from coupole.reflectance.beside.page_maker import PageMaker
+from coupole.reflectance.beside.view_drawing import Drawing
 from coupole.reflectance.extraction import extraction
 from coupole.reflectance.light_paths import Ahead
 from coupole.reflectance.run_job import RunRequest, extract_beside, reflectance_of
-from coupole.reflectance.run_result import RunResult
+from coupole.reflectance.run_result import RunResult, read_view_samples
+from coupole.storage.growing_pictures import PICTURES, GrowingPictures, PictureShown, read_growing
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("hurried")]
 MEMORY_BYTES = 2_000_000_000
+PAGE_PROGRAM = "coupole.exchange.look.page_beside"
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +89,103 @@ def test_without_room_on_the_disk_none_is_made(
     for free_bytes, has_room in ((2**30 + 2 * view_bytes, False), (2**30 + 20 * view_bytes, True)):
         monkeypatch.setattr(shutil, "disk_usage", lambda _, free=free_bytes: total._replace(free=free))
         assert growth.has_room() == has_room
+
+
+def values_of(result: Path, picture: PictureShown) -> np.ndarray:
+    """[n] the values that the colours of the pixels stand for, by the scale that is told."""
+    image = Image.open(result / PICTURES / picture.file)
+    assert image.size == (picture.width_px, picture.height_px)
+    codes = np.asarray(image)
+    return (codes[codes > 0] - 1.0) / (palettes.LEVELS - 1) * (picture.high - picture.low) + picture.low
+
+
+def picture_of(result: Path, view: str, title: str) -> PictureShown:
+    (shown,) = (view_shown for view_shown in read_growing(result).of_views if view_shown.view == view)
+    return next(picture for picture in shown.pictures if picture.title == title)
+
+
+def test_pictures_grow_and_say_on_how_many_frames_they_rest(acquired: CellFolder, tmp_path: Path) -> None:
+    run, result = acquired.run_folder, tmp_path / "result"
+    drawing = Drawing(result, GrowingPictures(result, is_simulated=True), 3)
+    extract_beside(run, "top", result)
+    drawing.first_look("top")
+    (first,) = read_growing(result).of_views
+    assert (first.kind, first.fitted_views, first.views) == ("first-look", 1, 3)
+    assert first.frames == len(read_view_samples(result / "samples/top.h5").leds)
+    before = {picture.title: (result / PICTURES / picture.file).read_bytes() for picture in first.pictures}
+    extract_beside(run, "side", result)
+    drawing.first_look("side")
+    growth = Growth.of_views(run, result, ("top", "side"), 3)
+    fit_so_far(growth, MEMORY_BYTES, lambda *_: None, Ahead())
+    drawing.so_far(growth.folder, lambda: True)
+    growing = read_growing(result)
+    assert growing.is_simulated
+    assert [view.view for view in growing.of_views] == ["top", "side"]
+    second = growing.of_views[0]
+    assert (second.kind, second.fitted_views) == ("so-far", 2)
+    assert first.frames < second.frames < 2 * first.frames + 1
+    titles = ["Normals", "Uncertainty of normals", "Base colour (kd)", "Uncertainty of base colour"]
+    assert [picture.title for picture in second.pictures][:4] == titles
+    for picture in second.pictures[:4]:
+        assert (result / PICTURES / picture.file).read_bytes() != before[picture.title]
+    shows_what_was_fitted(growth.folder, result)
+
+
+def shows_what_was_fitted(folder: Path, result: Path) -> None:
+    """Colours and medians, against the result's own files, which are read with nothing but h5py."""
+    with h5py.File(folder / "fits/ggx_normal.h5") as fit, h5py.File(folder / "samples/top.h5") as samples:
+        rows = np.searchsorted(fit["triangles"][()], samples["triangles"][()])
+        variances = fit["covariance"][()][rows][:, [0, 2, 5]]
+        seen, normals = samples["seen"][()], fit["normals"][()][rows]
+    u_deg, u_percent = np.degrees(np.sqrt(variances[:, 0] + variances[:, 1])), 100 * np.sqrt(variances[:, 2])
+    for title, unit, truth in (
+        ("Uncertainty of normals", "degrees", u_deg),
+        ("Uncertainty of base colour", "%", u_percent),
+    ):
+        picture = picture_of(result, "top", title)
+        assert picture.unit == unit
+        assert picture.median == pytest.approx(np.nanmedian(truth))
+        of_pixels = truth[seen[seen >= 0]]
+        of_pixels = np.sort(of_pixels[np.isfinite(of_pixels)].clip(picture.low, picture.high))
+        step = (picture.high - picture.low) / (palettes.LEVELS - 1)
+        assert np.sort(values_of(result, picture)) == pytest.approx(of_pixels, abs=0.51 * step)
+    picture = picture_of(result, "top", "Normals")
+    colours = np.asarray(Image.open(result / PICTURES / picture.file)).astype(float)
+    shown = colours[colours[..., 3] > 0][:, :3] / 255 * 2 - 1
+    known = seen[seen >= 0][np.isfinite(normals[seen[seen >= 0], 0])]
+    upwards = -normals[known, 2]  # the cell's base hangs upside down
+    assert np.sort(shown[:, 2]) == pytest.approx(np.sort(upwards), abs=0.005)
+
+
+def test_a_page_that_cannot_be_made_is_told_and_the_next_one_is_made(acquired: CellFolder, tmp_path: Path) -> None:
+    run, result = acquired.run_folder, tmp_path / "result"
+    growing = GrowingPictures(result, is_simulated=True)
+    extract_beside(run, "top", result)
+    growth = Growth.of_views(run, result, ("top",), 3)
+    fit_so_far(growth, MEMORY_BYTES, lambda *_: None, Ahead())
+    maker = PageMaker(PAGE_PROGRAM, growing, 3)
+    for folder, words in ((tmp_path / "none", "none"), (growth.folder, "")):
+        maker.want(folder, 1)
+        maker.look()
+        made = cells.wait_until(lambda: looked_at(maker, result), "the end of its program")
+        assert words in made
+    page = read_growing(result).page
+    assert page is not None
+    assert (page.fitted_views, page.views) == (1, 3)
+    assert "made from 1 of 3 views so far" in (result / PICTURES / page.file).read_text()
+    assert not list((result / PICTURES).glob(".*"))
+    orphan = [sys.executable, "-m", PAGE_PROGRAM, "1", str(growth.folder), str(tmp_path / "page.html")]
+    assert subprocess.run(orphan, check=False).returncode == 1, "its parent is another one, so its own is dead"
+    assert not (tmp_path / "page.html").exists()
+
+
+def looked_at(maker: PageMaker, result: Path) -> str:
+    """What is told, once a page is there or cannot be made."""
+    try:
+        maker.look()
+    except StorageError as error:
+        return str(error)
+    return "made" if read_growing(result).page else ""
 
 
 def test_a_run_that_goes_on_has_a_result_of_its_views_so_far(tmp_path: Path) -> None:

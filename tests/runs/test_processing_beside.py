@@ -20,6 +20,7 @@ from cells import CellFolder
 from PIL import Image
 
 from coupole.reflectance.beside.beforehand import reasons_against
+from coupole.storage.growing_pictures import PICTURES, file_so_far, read_growing
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("hurried")]
 NICE_OF_THE_END = 10
@@ -65,13 +66,13 @@ def test_the_result_is_the_one_that_is_made_afterwards(tmp_path: Path) -> None:
     cell = cell_of_three_views(tmp_path)
     process, worker = begun(cell)
     cells.wait_until(lambda: status(cell.run_folder).get("views_done"), "samples of a view")
-    picture = cells.wait_until(
-        lambda: (result_of(cell) / "beside/normals.png").exists() or not is_beside(worker), "a first look"
+    drawn = cells.wait_until(
+        lambda: read_growing(result_of(cell)).of_views or not is_beside(worker), "a first look"
     )
-    assert picture
     if is_beside(worker):
-        pixels = np.asarray(Image.open(result_of(cell) / "beside/normals.png"))
-        assert np.count_nonzero(pixels.any(axis=2)) > 1000
+        assert drawn[0].kind == "first-look"
+        pixels = np.asarray(Image.open(result_of(cell) / PICTURES / drawn[0].pictures[0].file))
+        assert np.count_nonzero(pixels[..., 3]) > 1000
         refused = cells.here("reflectance", cell.run_folder, "--out", result_of(cell))
         if is_beside(worker):  # it has not ended meanwhile
             assert refused.code == 2
@@ -89,7 +90,11 @@ def test_the_result_is_the_one_that_is_made_afterwards(tmp_path: Path) -> None:
 def test_a_run_ends_as_it_would_when_the_processing_is_killed_and_what_is_there_is_used(tmp_path: Path) -> None:
     cell = cell_of_three_views(tmp_path)
     process, worker = begun(cell)
-    cells.wait_until(lambda: has_samples(cell), "samples of a view")
+    (result_of(cell) / PICTURES).parent.mkdir(parents=True, exist_ok=True)
+    (result_of(cell) / PICTURES).write_text("no folder: nothing can be drawn")
+    cells.wait_until(lambda: status(cell.run_folder)["undrawn"], "a picture that cannot be drawn")
+    assert is_beside(worker), "a picture is no reason to end"
+    assert has_samples(cell)
     os.kill(worker, signal.SIGKILL)
     ended = cells.finish(process)
     said = frames_alone_count(ended)
@@ -98,6 +103,7 @@ def test_a_run_ends_as_it_would_when_the_processing_is_killed_and_what_is_there_
     assert "The acquisition continues without it" in ended.err
     told = status(cell.run_folder)
     assert told["state"] == "ended"
+    assert "killed by signal 9" in told["why"]
     assert told["remedy"] == f"coupole reflectance {cell.run_folder} --out {result_of(cell)}"
     assert told["remedy"] in ended.err
     kept = {path.name: path.stat().st_mtime_ns for path in (result_of(cell) / "samples").glob("*.json")}
@@ -139,11 +145,14 @@ def test_a_resumed_run_goes_on_with_what_was_asked(tmp_path: Path) -> None:
     process, worker = begun(cell)
     cells.wait_until(lambda: len(cells.events(cell.run_folder, "view")) == 2, "the second view")
     assert cells.here("pause", cell.run_folder).code == 0  # the third is not begun
-    cells.wait_until(lambda: has_samples(cell), "samples of a view")
+    cells.wait_until(lambda: read_growing(result_of(cell)).of_views, "pictures of a view")
     process.send_signal(signal.SIGINT)
     ended = cells.finish(process)
     assert ended.code == 130, ended.err
     assert not is_beside(worker)
+    drawn = read_growing(result_of(cell))
+    assert drawn.of_views
+    assert all(file_so_far(result_of(cell), name) for name in drawn.files), "they stay until others replace them"
     assert ended.document["reflectance"]["why"] == "the processing ended with the run, which is not complete"
     kept = {path.name: path.stat().st_mtime_ns for path in (result_of(cell) / "samples").glob("*.json")}
     resumed = cells.here("acquire", "--resume", cell.run_folder, "--yes", "--json")

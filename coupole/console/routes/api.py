@@ -32,7 +32,7 @@ from coupole.console.routes.bench_routes import add_bench_routes
 from coupole.console.routes.messages import Hand, NewAccount, NewEntry, SignIn, StateNow, Text
 from coupole.console.routes.object_routes import add_object_routes
 from coupole.console.routes.plan_routes import add_plan_routes
-from coupole.console.routes.run_routes import add_run_routes
+from coupole.console.routes.run_routes import add_routes_so_far, add_run_routes
 from coupole.console.service_parts import Service
 
 _EVENT_EVERY_S, _ALIVE_EVERY_S = 0.2, 1.0
@@ -45,6 +45,7 @@ def make_app(service: Service) -> FastAPI:
     _add_sign_in(app, service)
     _add_cell(app, service)
     add_run_routes(app, service)
+    add_routes_so_far(app, service)
     _add_people(app, service)
     add_plan_routes(app, service)
     add_object_routes(app, service)

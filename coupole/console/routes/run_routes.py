@@ -17,7 +17,7 @@ from coupole.console.runs.run_files import RunRow
 from coupole.console.runs.run_results import look_page
 from coupole.console.service_parts import Service
 from coupole.errors import InputError
-from coupole.storage.processing import PICTURE
+from coupole.storage.growing_pictures import Growing, file_so_far, read_growing
 from coupole.storage.so_far import LINK, REPORT
 
 _STILL = (
@@ -49,22 +49,6 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
         jpeg = service.runs.picture(run, shot, width, saturation=saturation)
         return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})
 
-    @app.get("/api/v1/runs/{run}/first-look", response_class=FileResponse)
-    def first_look(run: Text) -> FileResponse:
-        """Return normals and diffuse colour of the view that was processed last, as PNG, during the run."""
-        result = service.runs.run(run).asked_result
-        if result is None:
-            raise InputError(f"{run}: is not processed during its acquisition")
-        return _file(result / PICTURE, "image/png", _STILL)
-
-    @app.get("/api/v1/runs/{run}/so-far", response_class=FileResponse)
-    def result_so_far(run: Text) -> FileResponse:
-        """Return the report of the result of the views so far, during the run: normals, materials, uncertainty."""
-        result = service.runs.run(run).asked_result
-        if result is None:
-            raise InputError(f"{run}: is not processed during its acquisition")
-        return _file(result / LINK / REPORT, "text/html", _STILL)
-
     @app.get("/api/v1/runs/{run}/report", response_class=FileResponse)
     def report_page(run: Text) -> FileResponse:
         """Return the run's report, which may not run scripts."""
@@ -87,6 +71,43 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
     def look(run: Text) -> FileResponse:
         """Return the page that `coupole show` made of the run, if all its data are in it."""
         return _file(look_page(service.cell, service.runs.run(run)), "text/html", _LIVELY)
+
+
+def add_routes_so_far(app: FastAPI, service: Service) -> None:
+    """Add the routes to what can be looked at while a run is processed during its acquisition."""
+
+    @app.get("/api/v1/runs/{run}/pictures-so-far")
+    def pictures_so_far(run: Text) -> Growing:
+        """Return the pictures of normals, materials and uncertainty that there are during the run, with their
+        scales and the data on which they rest."""
+        return read_growing(service.watch.result_of(run))
+
+    @app.get("/api/v1/runs/{run}/pictures-so-far/{name}", response_class=FileResponse)
+    def picture_so_far(run: Text, name: Text) -> FileResponse:
+        """Return one of these pictures, as PNG."""
+        return _file(_so_far(service.watch.result_of(run), name), "image/png", _STILL)
+
+    @app.get("/api/v1/runs/{run}/relight-so-far", response_class=FileResponse)
+    def relight_so_far(run: Text) -> FileResponse:
+        """Return the page to relight of a result of the views so far, during the run."""
+        result = service.watch.result_of(run)
+        page = read_growing(result).page
+        if page is None:
+            raise InputError(f"{run}: there is no page to relight yet")
+        return _file(_so_far(result, page.file), "text/html", _LIVELY)
+
+    @app.get("/api/v1/runs/{run}/so-far", response_class=FileResponse)
+    def result_so_far(run: Text) -> FileResponse:
+        """Return the report of the result of the views so far, during the run: normals, materials, uncertainty."""
+        return _file(service.watch.result_of(run) / LINK / REPORT, "text/html", _STILL)
+
+
+def _so_far(result: Path, name: str) -> Path:
+    """Return the path of a file that is shown during a run. Raises InputError for any other file."""
+    path = file_so_far(result, name)
+    if path is None:
+        raise InputError(f"{name}: there is no such picture or page, or it is not whole")
+    return path
 
 
 def _file(path: Path, kind: str, policy: str) -> FileResponse:

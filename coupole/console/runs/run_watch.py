@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from coupole.console.runs.event_words import words_of
 from coupole.console.runs.run_files import RunFiles
+from coupole.errors import InputError
 from coupole.plan.shot_id import Led
+from coupole.storage.growing_pictures import Growing, read_growing
 from coupole.storage.journal import Follower
 from coupole.storage.journal_events import (
     BurstEnded,
@@ -20,10 +22,14 @@ from coupole.storage.journal_events import (
     ReshootBegun,
     ViewChosen,
 )
-from coupole.storage.processing import Processing, processing_of
+from coupole.storage.processing import LOCK, PROGRESS, Processing, processing_of
 from coupole.storage.run import Run
+from coupole.storage.stopped_process import cpu_time_s, holder_of
+from coupole.viewing.terminal import duration_text
 
 _NO_OFTENER_S = 0.4
+SILENT_S = 120.0
+"""Time without a sign of life after which it is said. A process with the lowest priority may wait for long."""
 _EVENTS_KEPT = 200
 
 
@@ -42,6 +48,32 @@ class Watched:
     """Time (UTC) and words, the newest first."""
     processing: Processing | None
     """State of the processing during the run; None if it was not asked for."""
+    growing: Growing
+    """Pictures and page of the views so far."""
+
+
+@dataclass
+class _SignsOfLife:
+    """Signs of life of the process beside the run: its words and its CPU time."""
+
+    signs: tuple[float, ...] = ()
+    since_s: float = 0.0
+    """Monotonic time at which they were seen first."""
+
+    def missing_s(self, result: Path) -> float:
+        """Return the seconds since the newest sign; 0 if no process is at work."""
+        pid, now_s = holder_of(result / LOCK), time.monotonic()
+        if pid is None:
+            self.signs = ()
+            return 0.0
+        try:
+            told_s = (result / PROGRESS).stat().st_mtime
+        except OSError:
+            told_s = 0.0
+        signs = float(pid), told_s, cpu_time_s(pid)
+        if signs != self.signs:
+            self.signs, self.since_s = signs, now_s
+        return now_s - self.since_s
 
 
 @dataclass
@@ -55,6 +87,7 @@ class _Followed:
     hottest_board_c: float | None = None
     result: str = ""
     """Folder of the result that is made during the run."""
+    life: _SignsOfLife = field(default_factory=_SignsOfLife)
     events: deque[tuple[str, str]] = field(default_factory=lambda: deque(maxlen=_EVENTS_KEPT))
 
     def read_news(self) -> None:
@@ -90,6 +123,16 @@ class RunWatch:
         self._known: Watched | None = None
         self._read_s = 0.0
 
+    def result_of(self, name: str) -> Path:
+        """Return the folder of the result that is made beside a run's acquisition. Raises InputError if there is
+        none, or no such run; StorageError."""
+        run, followed_run = self._runs.run(name), self._followed
+        if followed_run is not None and followed_run.run.folder.name == name and followed_run.result:
+            return Path(followed_run.result)
+        if (result := run.asked_result) is None:
+            raise InputError(f"{name}: is not processed during its acquisition")
+        return result
+
     def of(self, name: str) -> Watched:
         """Return the progress of a run of this cell. Raises InputError, StorageError."""
         with self._lock:
@@ -108,12 +151,7 @@ class RunWatch:
 
 
 def _watched_run(followed_run: _Followed) -> Watched:
-    run = followed_run.run
-    processing = (
-        processing_of(run.folder, Path(followed_run.result), frames_left=True, in_use=True)
-        if followed_run.result
-        else None
-    )
+    result = Path(followed_run.result) if followed_run.result else None
     return Watched(
         run=followed_run.run.folder.name,
         views=tuple(
@@ -123,5 +161,20 @@ def _watched_run(followed_run: _Followed) -> Watched:
         reshot=followed_run.reshot,
         hottest_board_c=followed_run.hottest_board_c,
         events=tuple(followed_run.events),
-        processing=processing,
+        processing=None if result is None else _processing(followed_run, result),
+        growing=Growing() if result is None else read_growing(result),
     )
+
+
+def _processing(followed_run: _Followed, result: Path) -> Processing:
+    """Return the state of the processing; `why` also says if its process shows no sign of life."""
+    processing = processing_of(followed_run.run.folder, result, frames_left=True, in_use=True)
+    missing_s = followed_run.life.missing_s(result)
+    if processing.is_at_work and not processing.why and missing_s > SILENT_S:
+        pid = holder_of(result / LOCK)
+        why = (
+            f"its process {pid} told nothing and computed nothing for {duration_text(missing_s)}: it hangs, or "
+            f"other work leaves it no processor. The run goes on; `kill {pid}` ends this process alone"
+        )
+        return replace(processing, why=why)
+    return processing

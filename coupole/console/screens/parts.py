@@ -173,6 +173,11 @@ class Choice:
             f'<label><span>{words}</span><select data-name="{self._name}">{inner}</select></label>'
         )
 
+    @property
+    def options(self) -> Mapping[str, str]:
+        """The words of each value."""
+        return self._options
+
     def set_visibility(self, visible: bool) -> None:
         self._box.set_visibility(visible)
 

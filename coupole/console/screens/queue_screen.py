@@ -29,6 +29,9 @@ class _Screen:
         with panel():
             with ui.row().classes("bar"):
                 self._plan = Choice("Plan", {}, name="plan")
+                self._reflectance = with_name(
+                    ui.checkbox("With normals and materials, beside the run"), "reflectance"
+                )
                 button("Put in the queue", self._enter, icon="playlist_add", name="enter", kind="main")
                 self._hold = with_name(
                     ui.input("Or the task for a person", placeholder="change the object"), "hold"
@@ -55,7 +58,8 @@ class _Screen:
 
     async def _enter(self) -> None:
         if self._plan.value:
-            await enter(self._visit, NewEntry(plan=self._plan.value), self._plan.value)
+            entry = NewEntry(plan=self._plan.value, reflectance=bool(self._reflectance.value))
+            await enter(self._visit, entry, self._plan.value)
 
     async def _enter_hold(self) -> None:
         words = str(self._hold.value or "").strip()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from nicegui import events, ui
@@ -14,6 +15,7 @@ from coupole.console.runs.run_files import RunRow
 from coupole.console.screens.contact_sheet import ContactSheet
 from coupole.console.screens.dome_picture import DomePicture
 from coupole.console.screens.frame_viewer import FrameViewer
+from coupole.console.screens.growing_panel import GrowingPanel
 from coupole.console.screens.parts import (
     Choice,
     button,
@@ -33,8 +35,9 @@ from coupole.console.screens.visit import Visit, enter, in_long_thread, in_threa
 from coupole.console.service_parts import Service
 from coupole.errors import CoupoleError
 from coupole.storage import journal
+from coupole.storage.growing_pictures import Growing, read_growing
 from coupole.storage.run import Run
-from coupole.storage.run_status import Status
+from coupole.storage.run_status import PAUSED, RUNNING, Status
 from coupole.viewing.terminal import bytes_text, duration_text
 
 _EVENTS_SHOWN, _LOOK_EVERY_S = 200, 2.0
@@ -51,6 +54,8 @@ class _Known:
     status: Status
     places: dict[int, LedPlace]
     events: list[tuple[str, str]]
+    growing: Growing
+    """Pictures of a result that is not complete."""
 
 
 def build(visit: Visit, name: str) -> None:
@@ -69,6 +74,7 @@ def build(visit: Visit, name: str) -> None:
         with box:
             page = _Page(visit, run_facts)
         await page.choose()
+        await page.show_growing()
 
     ui.timer(0.01, fill, once=True)
 
@@ -77,7 +83,10 @@ def _read_run(service: Service, name: str) -> _Known:
     run = service.runs.run(name)
     events = [(event.t, words) for event in journal.read_events(run.journal_path) if (words := words_of(event))]
     row = service.runs.row(name)
-    return _Known(run, row, service.runs.status(name), led_places(service.sheets, name), events[::-1])
+    run_status = service.runs.status(name)
+    processing = run_status.processing
+    growing = read_growing(Path(processing.result)) if processing else Growing()
+    return _Known(run, row, run_status, led_places(service.sheets, name), events[::-1], growing)
 
 
 class _Page:
@@ -88,6 +97,7 @@ class _Page:
         self._current = ""
         self._of_view: dict[str, list[SheetFrame]] = {}
         self._head()
+        self._growing = GrowingPanel(visit, self._name)
         with panel():
             self._choosers()
         with ui.element("div").classes("columns"):
@@ -116,6 +126,12 @@ class _Page:
             ui.timer(_LOOK_EVERY_S, self._renew)
             RunActions(self._visit, row.name, can_resume=status.has_left, frames=row.proven)
             TaskList(self._visit, lambda task: task.words.endswith(f" {self._name}"), empty="", most=4)
+
+    async def show_growing(self) -> None:
+        """Show what the processing beside a run has left that was stopped or killed. While the run goes on, the
+        screen of the run shows it."""
+        if self._known.growing.of_views and self._known.status.state not in (RUNNING, PAUSED):
+            await self._growing.show(self._name, self._known.status.processing, self._known.growing)
 
     async def _renew(self) -> None:
         """Show the changes that commands have made."""

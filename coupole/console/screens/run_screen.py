@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 from pathlib import Path
-from urllib.parse import quote
 
 from nicegui import ui
 
@@ -12,6 +11,7 @@ from coupole.console.routes.messages import EntryNow, NewEntry, StateNow
 from coupole.console.runs.run_files import Frame
 from coupole.console.runs.run_watch import Watched
 from coupole.console.screens.fault_of_arm import FaultOfArm
+from coupole.console.screens.growing_panel import GrowingPanel
 from coupole.console.screens.parts import (
     button,
     clipping_words,
@@ -49,25 +49,21 @@ class _Screen:
                 self._picture = ui.html("", sanitize=False).style("width:100%")
                 self._histogram = ui.html("", sanitize=False).style("width:100%")
                 self._exposure = ui.html("", sanitize=False).style("width:100%")
-                with ui.column().style("width:100%") as self._first_look_box:
-                    ui.label("First look at the view processed last: normals, diffuse colour").classes("hint")
-                    self._first_look = ui.html("", sanitize=False).style("width:100%")
-                    self._so_far = with_name(ui.link("", "", new_tab=True), "so-far")
-                    self._so_far.set_visibility(False)
-                self._first_look_box.set_visibility(False)
-                self._first_look_of = ("", 0)
             with ui.column().classes("gap"):
                 with panel("Progress"):
                     self._facts = ui.html("", sanitize=False).style("width:100%")
                     self._views = ui.html("", sanitize=False).style("width:100%")
                 with panel("What happened"):
                     self._events = ui.html("", sanitize=False).style("width:100%").props("data-name=events")
+        self._growing = GrowingPanel(visit, "")
         visit.follow(self._state)
         ui.timer(_LOOK_EVERY_S, self._look)
 
     def _state(self, now: StateNow) -> None:
         at_work = now.run is not None
         self._work.set_visibility(at_work)
+        if not at_work:
+            self._growing.hide()
         self._idle.set_visibility(not at_work)
         waiting = sum(entry.state == "waiting" for entry in now.queue)
         self._idle_words.text = (
@@ -118,6 +114,7 @@ class _Screen:
         try:
             watched_run = await in_thread(service.watch.of, name)
             self._show(now, watched_run)
+            await self._growing.show(name, watched_run.processing, watched_run.growing)
             if watched_run.newest is not None and str(watched_run.newest.shot) != self._shown:
                 shot = str(watched_run.newest.shot)
                 frame = await in_thread(service.runs.frame, name, shot)
@@ -138,33 +135,14 @@ class _Screen:
                     "light on the object": f"{now.dose:.3f} lux h in this run",
                     "taken again": f"{run_progress.reshot} shots",
                     "hottest LED board": hot,
-                    **({} if processing is None else {"reflectance": processing.words}),
+                    "reflectance": "not asked for with this run" if processing is None else processing.words,
                 }
             )
         )
-        self._show_first_look(run_progress)
         self._views.set_content(_bars(run_progress, now.view))
         self._events.set_content(
             table_html(("UTC", "what"), [(t[11:19], words) for t, words in run_progress.events[:40]])
         )
-
-    def _show_first_look(self, run_progress: Watched) -> None:
-        """Show the newest view's normals; they are loaded again when there are new ones."""
-        processing = run_progress.processing
-        views = 0 if processing is None else processing.views_done
-        self._first_look_box.set_visibility(views > 0)
-        fitted_views = 0 if processing is None else processing.fitted_views
-        self._so_far.set_visibility(fitted_views > 0)
-        if processing is not None and fitted_views:
-            self._so_far.text = (
-                f"Result so far, from {fitted_views} of {processing.views} views: normals, materials, uncertainty"
-            )
-            self._so_far.props(f'href="/api/v1/runs/{quote(run_progress.run)}/so-far"')
-        if views and (run_progress.run, views) != self._first_look_of:
-            self._first_look_of = run_progress.run, views
-            address = f"/api/v1/runs/{quote(run_progress.run)}/first-look?views={views}"
-            words = "normals (left) and diffuse colour of the view that was processed last"
-            self._first_look.set_content(f'<img class="frame-picture" src="{address}" alt="{words}">')
 
     def _show_frame(self, name: str, frame: Frame) -> None:
         address = picture_address(name, frame.shot, 1280, saturation=True)

@@ -7,36 +7,40 @@ import contextlib
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from coupole.errors import CoupoleError, reason
-from coupole.reflectance.beside.first_look import write_normals
 from coupole.reflectance.beside.growing import Growth, fit_so_far
 from coupole.reflectance.beside.looking_ahead import look_ahead
+from coupole.reflectance.beside.page_maker import PageMaker
+from coupole.reflectance.beside.view_drawing import Drawing
 from coupole.reflectance.light_paths import Ahead
 from coupole.reflectance.result_pages import run_reflectance_page
 from coupole.reflectance.run_job import RunRequest, extract_beside, reflectance_of
 from coupole.storage.discarding import NOT_YET, reason_to_keep, to_discard
+from coupole.storage.growing_pictures import GrowingPictures
 from coupole.storage.journal import Follower
 from coupole.storage.journal_events import FrameProven, SessionStopped, ViewBegun, ViewSealed
-from coupole.storage.processing import PICTURE, Progress, Step, hold_result, tell
+from coupole.storage.processing import Progress, Step, hold_result, tell
 from coupole.storage.run import Run
 
 _LOOK_EVERY_S = 0.2
 _TELL_EVERY_S = 1.0
+_NONE_SO_FAR = "result so far and page to relight"
 Say = Callable[[dict[str, Any]], object]
 AtTheEnd = Callable[[Callable[[], None]], None]
 
 
-def process_run(folder: Path, result: Path, say: Say, at_the_end: AtTheEnd) -> bool:
+def process_run(folder: Path, result: Path, say: Say, at_the_end: AtTheEnd, page_program: str = "") -> bool:
     """Process a run into its result, during its acquisition and after it; True if the result is complete. `say`
     receives the progress, and `times` at the end. `at_the_end` calls what is to be done when all frames are there.
-    Failures are reported, and existing results stay."""
+    `page_program` is the module that makes pages to relight. Failures are reported, and existing results stay."""
     teller = _Teller(result, say)
     try:
         with hold_result(result):
-            follower = _Follower(Run(folder), result, teller)
+            follower = _Follower(Run(folder), result, teller, page_program)
             follower.until_all_frames_are_there()
             at_the_end(follower.make_result)
     except (CoupoleError, OSError, MemoryError) as error:
@@ -84,8 +88,11 @@ class _Teller:
 class _Follower:
     """One run, and the progress of its result."""
 
-    def __init__(self, run: Run, result: Path, teller: _Teller) -> None:
+    def __init__(self, run: Run, result: Path, teller: _Teller, page_program: str) -> None:
         self._run, self._result, self._teller = run, result, teller
+        growing = GrowingPictures(result, is_simulated=run.is_simulated)
+        self._drawing = Drawing(result, growing, run.expected_views)
+        self._page = PageMaker(page_program, growing, run.expected_views)
         self._request, self._ahead = RunRequest((run.folder,)), Ahead()
         self._journal = Follower(run.journal_path)
         self._taken: set[str] = set()
@@ -109,16 +116,21 @@ class _Follower:
 
     def until_all_frames_are_there(self) -> None:
         """Take samples, look ahead and make results so far while the run goes on. Raises as `reflectance_of`."""
-        self._teller.step("waiting", views=self._run.expected_views)
+        why_none = _why_none_so_far(self._run)
+        self._teller.step("waiting", views=self._run.expected_views, undrawn=why_none)
         self._read_news()
-        while not self._is_done:
-            if self._looks:
-                self._offer_safe()
-                if not self._take_samples():
-                    self._looks = False
-            elif not (self._look_ahead() or self._grow()):
-                time.sleep(_LOOK_EVERY_S)
-            self._read_news()
+        try:
+            while not self._is_done:
+                self._draw("page to relight", self._page.look)
+                if self._looks:
+                    self._offer_safe()
+                    if not self._take_samples():
+                        self._looks = False
+                elif not (self._look_ahead() or self._grow()):
+                    time.sleep(_LOOK_EVERY_S)
+                self._read_news()
+        finally:
+            self._page.end()
 
     def make_result(self) -> None:
         """Take the samples that remain, and make the result. Raises as `reflectance_of`."""
@@ -159,11 +171,18 @@ class _Follower:
         if digest := extract_beside(self._run.folder, view, self._result, self._teller.part):
             self._safe[view] = digest
         self._taken.add(view)
-        if not self._is_done:
-            with contextlib.suppress(OSError):  # a picture alone
-                write_normals(self._result, view, self._result / PICTURE)
+        if not self._is_done and self._has_samples(view):
+            self._draw("page to relight", self._page.look)
+            self._draw(f"pictures of {view}", partial(self._drawing.first_look, view))
         self._teller.step("waiting", views_done=len(self._taken), views=self._run.expected_views)
         return True
+
+    def _draw(self, subject: str, draw: Callable[[], None]) -> None:
+        """Draw what is only looked at. The result does not need it, so a failure is reported and no more."""
+        try:
+            draw()
+        except Exception as error:  # noqa: BLE001  of a picture alone
+            self._teller.tell(undrawn=f"{subject}: {reason(error)}")
 
     def _remaining_views(self) -> list[str]:
         return [view for view in self._run.complete_views() if view not in self._taken]
@@ -200,16 +219,26 @@ class _Follower:
         changes: dict[str, Any] = {}
         try:
             if not growth.has_room():
+                self._teller.tell(undrawn=_why_none_so_far(self._run) or f"{_NONE_SO_FAR}: the disk has no room")
                 return True
             self._teller.step("growing")
             fit_so_far(growth, self._request.memory_bytes, self._part_of_growth, self._ahead)
             self._may_give_up, changes = True, {"fitted_views": len(views)}
+            self._page.want(growth.folder, len(views))
+            self._draw(f"pictures of {len(views)} views", self._draw_so_far(growth.folder))
         except _ViewsCameError:
             self._may_give_up = False
         except Exception as error:  # noqa: BLE001  the result at the end comes to it again
             changes = {"detail": f"no result of {len(views)} views ({reason(error)})"}
         self._teller.step("waiting", **changes)
         return True
+
+    def _draw_so_far(self, folder: Path) -> Callable[[], None]:
+        def is_wanted() -> bool:
+            self._read_news()
+            return not (self._is_done or (self._looks and self._remaining_views()))
+
+        return partial(self._drawing.so_far, folder, is_wanted)
 
     def _has_samples(self, view: str) -> bool:
         """Tell whether the view has samples; False also for a view that has only dark frames or panels."""
@@ -239,3 +268,10 @@ class _Follower:
         if not self._last_frame:
             return None
         return round((datetime.now(UTC) - datetime.fromisoformat(self._last_frame)).total_seconds(), 3)
+
+
+def _why_none_so_far(run: Run) -> str:
+    """Return why a run will have no result of the views so far; empty if it may have one."""
+    if run.is_open:
+        return f"{_NONE_SO_FAR}: the run chooses its frames"
+    return f"{_NONE_SO_FAR}: the plan discards frames" if run.discards else ""

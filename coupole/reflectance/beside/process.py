@@ -1,7 +1,8 @@
 """The process beside an acquisition: `python -m coupole.reflectance.beside.process PARENT`.
 
 It reads lines of JSON from its input. The first names plan, rig and result; the process answers with the `reasons`
-against a result. The next names the run's folder and the result's folder. From then on the process follows the
+against a result. The next names the run's folder, the result's folder, and the module that makes pages to relight.
+From then on the process follows the
 run's journal, and reports its progress in lines on its output. It ends when its input ends: then its parent has
 died, or does not need it any more.
 """
@@ -32,7 +33,9 @@ def main() -> None:
 
     from coupole.reflectance.beside.follower import process_run
 
-    is_whole = process_run(Path(request["run"]), Path(request["result"]), _say, thread_for_the_end.run)
+    is_whole = process_run(
+        Path(request["run"]), Path(request["result"]), _say, thread_for_the_end.run, request["page_program"]
+    )
     sys.stdout.flush()
     os._exit(0 if is_whole else 1)  # no thread is waited for
 

@@ -17,10 +17,10 @@ from coupole.pages.page_parts import Code, Figure, Inline, Link, Page, Section, 
 from coupole.pages.page_rendering import write_page
 from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.fits import FITS, GGX, GGX_NORMAL, MATERIALS
-from coupole.reflectance.result_pages import lobes_told
+from coupole.reflectance.result_pages.material_maps import MapValues, in_three, material_maps, picture_of
 from coupole.reflectance.run_fits import predict_samples
 from coupole.reflectance.run_pictures import read_check_frames
-from coupole.reflectance.run_result import REPORT, RunResult, ViewSamples, read_about
+from coupole.reflectance.run_result import REPORT, VARIANCES, RunResult, ViewSamples, read_about
 from coupole.reflectance.triangle_fit import FEWEST
 from coupole.storage import so_far
 from coupole.storage.run import name_without_time
@@ -28,8 +28,6 @@ from coupole.storage.run import name_without_time
 SIMULATED = "frames of a simulated cell"
 POOR_RESIDUAL = 0.05
 """Residual of square roots, as a share of the diffuse part, above which the material model is in doubt."""
-_VARIANCES = [0, 2, 5, 9, 14]
-"""Places of the variances in the lower half of a covariance."""
 PUBLISHED = (
     ("the paper, scanner of 30 um", (-10.66, 14.00), (-15.23, 22.42), "57 to 74 % without vertices"),
     ("the paper, scanner of 20 um", (-8.11, 9.51), None, ""),
@@ -320,13 +318,13 @@ def _reconstruction(result: RunResult, view: ViewSamples, about: dict[str, Any])
     is_known = np.isfinite(photo).all(axis=2, keepdims=True)
     white = float(np.nanquantile(photo, 0.995)) if is_known.any() else 1.0
     unit = "of full scale"
-    yield eye_map(f"LED {lamp}, measured", _rgb(photo), white, unit)
+    yield eye_map(f"LED {lamp}, measured", in_three(photo), white, unit)
     for name in FITS:
         model = np.where(
             is_known, frames.picture(predict_samples(result, name, view, rows, under)[:, 0] * share), np.nan
         )
         off = np.abs(model - photo).mean(axis=2)
-        yield eye_map(f"made by {FITS[name].title}", _rgb(model), white, unit)
+        yield eye_map(f"made by {FITS[name].title}", in_three(model), white, unit)
         yield value_map(f"{FITS[name].title}: off", 100 * off / white, "% of white", 10.0)
 
 
@@ -342,58 +340,26 @@ def _maps(path: Path, fits: dict[str, dict[str, NDArray[Any]]]) -> Section:
     materials = fits[GGX_NORMAL.name]
     row = np.searchsorted(materials["triangles"], triangles)
     mesh, fit_normals = fits[GGX.name]["normals"][row], materials["normals"][row]
-    uncertain = np.sqrt(materials["covariance"][row][:, _VARIANCES])
+    uncertain = np.sqrt(materials["covariance"][row][:, VARIANCES])
     angles_deg = np.degrees(np.arccos(np.clip(np.sum(mesh * fit_normals, axis=1), -1, 1)))
-    sd_deg = np.degrees(np.hypot(uncertain[:, 0], uncertain[:, 1]))
     left_percent = 100 * materials["residual"][row]
-    lobe_figures, lobe_words = _lobe(rows, materials["ks"][row], materials["alpha"][row], uncertain)
+    maps = material_maps(
+        MapValues(
+            rows, fit_normals, materials["kd"][row], materials["ks"][row], materials["alpha"][row], uncertain
+        )
+    )
     return Section(
         f"maps-{anchor(path.stem)}",
         "Maps",
         figures=[
-            eye_map("diffuse kd", _rgb(_picture(rows, materials["kd"][row]))),
-            normal_map("fitted normals", _picture(rows, fit_normals)),
-            value_map("standard uncertainty of diffuse", 100 * _picture(rows, uncertain[:, 2]), "%", 10.0),
-            normal_map("normals of the mesh", _picture(rows, mesh)),
-            value_map("angle between them", _picture(rows, angles_deg), "degrees", 10.0),
-            value_map("standard uncertainty of fitted normals", _picture(rows, sd_deg), "degrees", 10.0),
-            *lobe_figures,
-            value_map("what is left", _picture(rows, left_percent), "% of the diffuse part", 10.0),
+            maps.kd,
+            maps.normals,
+            maps.u_kd,
+            normal_map("normals of the mesh", picture_of(rows, mesh)),
+            value_map("angle between them", picture_of(rows, angles_deg), "degrees", 10.0),
+            maps.u_normals,
+            *maps.lobe,
+            value_map("what is left", picture_of(rows, left_percent), "% of the diffuse part", 10.0),
         ],
-        notes=[lobe_words],
+        notes=[maps.lobe_words],
     )
-
-
-def _lobe(
-    rows: NDArray[np.int32], ks: NDArray[Any], alpha: NDArray[Any], uncertain: NDArray[Any]
-) -> tuple[list[Figure], str]:
-    """Return maps of the specular lobe where it is determined, and a sentence about this share of the view."""
-    is_told = lobes_told.is_told_by_uncertainty(ks, uncertain[:, 3])
-    share = float(is_told.mean()) if len(is_told) else 0.0
-    limit = f"{lobes_told.MOST_RELATIVE_U:.0%}"
-    if share < lobes_told.LEAST_SHARE:
-        return [], lobes_told.no_lobe_in_words(share, f"ks has a standard uncertainty of more than {limit}")
-    told_ks = np.where(is_told[:, None], ks, np.nan)
-    told_alpha, doubt = np.where(is_told, alpha, np.nan), np.where(is_told, 100 * uncertain[:, 4], np.nan)
-    figures: list[Figure] = [
-        eye_map("specular ks", _rgb(_picture(rows, told_ks))),
-        value_map("roughness alpha", _picture(rows, told_alpha), "", 1.0),
-        value_map("standard uncertainty of roughness", _picture(rows, doubt), "%", 50.0),
-    ]
-    words = (
-        f"The lobe is drawn where ks has a standard uncertainty of at most {limit}: in {share:.0%} of the "
-        "triangles."
-    )
-    return figures, words
-
-
-def _rgb(values: NDArray[Any]) -> NDArray[Any]:
-    """Repeat a single channel three times."""
-    return values if values.shape[-1] == 3 else np.repeat(values, 3, axis=-1)
-
-
-def _picture(triangle_rows: NDArray[np.int32], values: NDArray[Any]) -> NDArray[np.float32]:
-    """[h, w, ...] picture of values [triangles, ...]; NaN where no triangle is seen."""
-    picture = np.full((*triangle_rows.shape, *values.shape[1:]), np.nan, np.float32)
-    picture[triangle_rows >= 0] = values[triangle_rows[triangle_rows >= 0]]
-    return picture

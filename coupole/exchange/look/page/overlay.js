@@ -66,6 +66,7 @@ function coloursTold(about, state) {
 function bannerOf(about, state, compared, left) {
   const kinds = { true: "Simulated object", false: "Measured object", null: "Pictures of an object" };
   const told = [kinds[about.simulated]];
+  if (about.told?.["So far"]) told.push(about.told["So far"]);
   if (isLit(state.mode)) {
     told.push(`light computed from a fit (${[about.fit, ...left].join(", ")})`);
     if (about.environment && state.environment > 0) told.push(`surroundings ${about.environment.name}`);

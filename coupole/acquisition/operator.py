@@ -15,7 +15,7 @@ from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import in_world
 from coupole.preflight.commissioned import commissioning_refusals
 from coupole.preflight.preflight import Report
-from coupole.viewing.terminal import ask
+from coupole.viewing.questions import ask
 
 UNLIMITED_BYTES = 2**62
 """Free bytes that a dry run assumes, because it stores nothing."""

@@ -113,15 +113,16 @@ def _say(words: str) -> None:
 def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> dict[str, Any]:
     """Plan a path, show it, ask, and drive the arm. Return the figures of the motion when the arm has arrived."""
     from coupole.acquisition.cell_bench.bench_client import checked_answer
-    from coupole.viewing.terminal import ask
+    from coupole.viewing.questions import ask
 
     path = checked_answer(send_request("plan_path", to=goal))
     steps = len(path["waypoints_deg"]) - 1
     print(f"{path['to']}: {path['duration_s']:.1f} s, {steps} straight motion(s)", file=sys.stderr)
-    if not yes and not ask("Drive the arm along this path?"):
-        raise Interrupted("the arm was not driven: answer the question, or give `--yes`")
+    agrees = yes or ask("Drive the arm along this path?", control.stop.is_set)
     control.await_word()  # the answer may have been given while this process did not run
     control.go_on()
+    if not agrees:
+        raise Interrupted("the arm was not driven: answer the question, or give `--yes`")
     try:
         work = checked_answer(send_request("drive", path=path["path"]))
         while work["state"] == "running":

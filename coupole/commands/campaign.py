@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
 from coupole.calibration.campaign_steps import OBJECT, STEPS, Step
 from coupole.commands import calibrate_geometry, calibrate_lens, calibrate_light
 from coupole.commands.simulated_support import BOARD, CERTIFICATE_OF_SIMULATED_TILE, TILE, with_things
 from coupole.errors import CalibrationRefused, Interrupted
-from coupole.viewing.terminal import forget_typing
+from coupole.viewing.questions import ask
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -120,8 +118,7 @@ class Campaign:
         self._console.rule(f"acquire {step.name}")
         if self._operator.is_asked:
             self._console.print(f"Place on the support: [bold]{step.stands}[/].")
-            forget_typing()
-            if not typer.confirm("Ready?", default=True):
+            if not ask("Ready?", default=True):
                 raise Interrupted("stopped by the operator; call it again to continue")
         summary: dict[str, Any] = {}
         job = read_job(plan)

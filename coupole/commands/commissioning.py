@@ -63,8 +63,8 @@ def commission(
     if board is not None:
         read_board(board)
     console, cell = make_console(quiet=as_json), read_cell(rig)
-    if yes and not in_world(cell.rig, dry_run=False):
-        raise InputError(f"--yes: {rig} is a real cell, where a person must see and answer; leave --yes out")
+    if not in_world(cell.rig, dry_run=False):
+        _refuse_without_person(rig, yes=yes)
 
     try:
         with borrowed_cell(cell, f"commission, {name}"):
@@ -74,10 +74,10 @@ def commission(
                 name=name,
                 only=step,
                 board=board,
-                person_at=lambda opened_cell: (
+                person_at=lambda opened_cell, control: (
                     SimulatedPerson(console, opened_cell.world_endpoints)
                     if yes and opened_cell.world_endpoints is not None
-                    else PersonAtTerminal()
+                    else PersonAtTerminal(control)
                 ),
             )
     except CoupoleError as error:
@@ -93,6 +93,19 @@ def commission(
     )
     if as_json:
         print(json.dumps(_figures(cell)))
+
+
+def _refuse_without_person(rig: Path, *, yes: bool) -> None:
+    """Raise InputError unless a person answers here. `rig` is the file of a real cell."""
+    from coupole.viewing.questions import is_asked_at_a_terminal
+
+    if yes:
+        raise InputError(f"--yes: {rig} is a real cell, where a person must see and answer; leave --yes out")
+    if not is_asked_at_a_terminal():
+        raise InputError(
+            f"{rig} is a real cell, where a person must see and answer: type the command at a terminal; its "
+            "standard input is none"
+        )
 
 
 def _figures(cell: Cell) -> dict[str, Any]:

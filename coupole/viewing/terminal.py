@@ -6,7 +6,6 @@ import contextlib
 import math
 import re
 import sys
-import termios
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -127,40 +126,6 @@ def step_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
 def alarm(message: str) -> None:
     """Show a message that a person must see: on standard error, even with `--json`."""
     print(message, file=_Terminal(sys.stderr), flush=True)
-
-
-def forget_typing() -> None:
-    """Drop what was typed at the terminal before a question: it was no answer to it."""
-    with contextlib.suppress(OSError, ValueError, AttributeError, termios.error):  # no terminal
-        termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
-
-
-def ask(question: str) -> bool:
-    """Ask a yes-or-no question on standard error, even with `--json`; any answer but yes counts as no. What was
-    typed before the question does not count."""
-    forget_typing()
-    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
-    try:
-        return sys.stdin.readline().strip().lower() in {"y", "yes"}
-    except OSError:  # no standard input
-        return False
-
-
-def ask_number(question: str) -> float | None:
-    """Ask for a number on standard error, again if the answer is not a number; None for an empty answer."""
-    while True:
-        forget_typing()
-        print(f"{question} ", end="", file=sys.stderr, flush=True)
-        try:
-            answer = sys.stdin.readline().strip()
-        except OSError:  # no standard input
-            return None
-        if not answer:
-            return None
-        with contextlib.suppress(ValueError):
-            if math.isfinite(number := float(answer.removesuffix("mm").replace(",", "."))):
-                return number
-        print(f"expected a number, found {answer!r}", file=sys.stderr)
 
 
 def duration_text(seconds: float) -> str:

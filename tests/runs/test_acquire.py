@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import pty
-import subprocess
 import termios
 import threading
 from collections.abc import Iterator
@@ -19,9 +16,9 @@ import cells
 import h5py
 import numpy as np
 import pytest
+from at_a_terminal import Typist, at_a_terminal
 from cells import SIDE, TOP, CellFolder, Ended
 from expected_pictures import Expectation, mislabelled
-from nursery import NURSERY
 
 TWO_LIGHTS = {"kind": "ids", "ids": [0, 700]}
 
@@ -192,58 +189,36 @@ def test_without_a_terminal_the_run_is_told_in_plain_lines(cell: CellFolder) -> 
 
 
 @contextmanager
-def on_a_terminal(cell: CellFolder) -> Iterator[tuple[subprocess.Popen[str], int, bytearray]]:
-    """`acquire` on a terminal of its own: the process, the person's end of the terminal, and what it has shown."""
-    terminal, terminal_end = pty.openpty()
-    shown = bytearray()
-
-    def watch() -> None:
-        while True:
-            try:
-                shown.extend(os.read(terminal, 65536))
-            except OSError:  # the last process has closed the other end
-                return
-
-    watcher = threading.Thread(target=watch)
-    watcher.start()
-    modes = termios.tcgetattr(terminal_end)
-    process = NURSERY.function(
-        "terminals:on_terminal", ["acquire", str(cell.plan)],
-        stdin=terminal_end, stdout=subprocess.PIPE, stderr=terminal_end, text=True,
-    )  # fmt: skip
-    try:
-        cells.wait_until(lambda: b"keys: p pauses" in shown, "the keys")
-        yield process, terminal, shown
+def with_keys(cell: CellFolder) -> Iterator[Typist]:
+    """`acquire` on a terminal of its own, once it listens to keys; at its end the terminal is as it was."""
+    with at_a_terminal("acquire", cell.plan) as typist:
+        modes = termios.tcgetattr(typist.terminal_fd)
+        typist.waits_for("keys: p pauses")
+        yield typist
         cells.wait_until(lambda: cells.events(cell.run_folder, "stop"), "the end")
-        cells.wait_until(lambda: termios.tcgetattr(terminal_end) == modes, "the terminal as it was")
-    finally:
-        process.terminate()  # nothing, where it has ended
-        os.close(terminal_end)
-        cells.finish(process)
-        watcher.join()
-        os.close(terminal)
+        cells.wait_until(lambda: termios.tcgetattr(typist.terminal_fd) == modes, "the terminal as it was")
 
 
 def test_on_a_terminal_there_are_bars_with_view_and_rates(cell: CellFolder) -> None:
     """The key p, pressed twice, pauses and goes on."""
     cell.write(lights={"kind": "every", "every": 4})
-    with on_a_terminal(cell) as (process, terminal, shown):
-        os.write(terminal, b"p")
+    with with_keys(cell) as typist:
+        typist.types("p")
         cells.wait_until(lambda: cells.events(cell.run_folder, "pause"), "the pause")
-        os.write(terminal, b"p")
-        assert process.wait(cells.PATIENCE_S) == 0
+        typist.types("p")
+        assert typist.process.wait(cells.PATIENCE_S) == 0
     for words in ("\x1b[", "view top", "frames/s", "MB/s", "lux.h", " left", "continued", "282/282"):
-        assert words in shown.decode()
+        assert words in typist.shown.decode()
 
 
 def test_the_key_q_stops_the_run_safely_and_is_named_as_what_stopped_it(cell: CellFolder) -> None:
     cell.write(lights={"kind": "every", "every": 4})
-    with on_a_terminal(cell) as (process, terminal, shown):
+    with with_keys(cell) as typist:
         cells.wait_until(lambda: cells.events(cell.run_folder, "frame"), "a frame")
-        os.write(terminal, b"q")
-        assert process.wait(cells.PATIENCE_S) == 130
+        typist.types("q")
+        assert typist.process.wait(cells.PATIENCE_S) == 130
     assert cells.events(cell.run_folder, "stop")[-1]["outcome"] == "interrupted"
-    assert "the key q" in shown.decode()
+    assert "the key q" in typist.shown.decode()
     assert cell.acquire("--resume", cell.run_folder).code == 0
     cells.assert_each_shot_proven_once(cell.run_folder)
 

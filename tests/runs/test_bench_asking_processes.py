@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,7 +14,7 @@ import cells
 import numpy as np
 import psutil
 import pytest
-from benches import Bench, begun, bench
+from benches import HERE, Bench, begun, bench, holding
 from cells import CellFolder
 
 from sim.world.client import World
@@ -107,3 +108,59 @@ def test_many_refused_requests_leave_no_file_open(cell: CellFolder, world: World
 
 def open_files(asked: Bench) -> int:
     return psutil.Process(asked.process.pid).num_fds()
+
+
+def test_a_motion_by_hand_stops_with_a_console_that_is_frozen(cell: CellFolder, world: World) -> None:
+    """Also where another process has guessed its hold and would renew it."""
+    with bench(cell.rig, "--object", cell.plan) as asked:
+        asked.drive("home")
+        with holding(asked, "A1", 1, share=1.0) as console:
+            cells.wait_until(lambda: turned_deg(world) > 1.0, "the arm under way")
+            console.send_signal(signal.SIGSTOP)
+            frozen_s = time.monotonic()
+            work = asked.ended_work()
+            print(f"ended {time.monotonic() - frozen_s:.3f} s after the freeze")
+            why = f"process {console.pid}, which asked for it, was stopped (Ctrl-Z, SIGSTOP)"
+            assert (work["state"], work["why"]) == ("stopped", why)
+        asked.drive("home")
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_button_is_held_only_by_the_process_that_pressed_it(
+    cell: CellFolder, world: World, *, killed: bool
+) -> None:
+    with bench(cell.rig, "--object", cell.plan) as asked:
+        asked.drive("home")
+        request = {"version": 1, "command": "jog", "axis": "A1", "direction": 1, "from": HERE}
+        line = [sys.executable, "-c", ASKS_AND_STAYS, str(asked.path), json.dumps(request)]
+        with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as console:
+            assert console.stdout is not None
+            hold = json.loads(console.stdout.readline())["hold"]
+            if killed:
+                console.kill()
+                console.wait()
+            refused = asked.ask("jog", axis="A1", direction=1, hold=hold, **{"from": HERE})
+            console.kill()
+        assert f"hold: {hold} is of another process" in refused["error"]
+        assert refused["exit_code"] == 2
+        work = asked.ended_work()
+        for _ in range(10):
+            assert "error" in asked.ask("jog", axis="A1", direction=1, hold=hold, **{"from": HERE})
+        if killed:
+            assert work["state"] in ("stopped", "done")
+        else:
+            assert work["ended"] == "another process renewed it"
+        at_rest_deg = at_rest(world)["joints_deg"]
+        time.sleep(0.3)
+        assert np.allclose(at_rest(world)["joints_deg"], at_rest_deg, atol=0.01)
+
+
+@pytest.mark.parametrize("plan", ["/tmp/a\0b", "/tmp/" + 5000 * "a", "relative.yaml", "/proc/self/mem"])
+def test_a_plan_whose_name_is_none_is_bad_input(cell: CellFolder, world: World, plan: str) -> None:
+    with bench(cell.rig) as asked:
+        for request in (
+            {"command": "meter", "plan": plan},
+            {"command": "plan_path", "to": {"view": "top", "plan": plan}},
+        ):
+            answer = asked.ask(**request)
+            assert (answer["kind"], answer["exit_code"]) == ("InputError", 2), answer

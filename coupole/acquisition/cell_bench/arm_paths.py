@@ -120,6 +120,8 @@ class ArmPaths:
             key = str(plan), plan.stat().st_mtime_ns
         except OSError as error:
             raise InputError(f"{plan}: cannot be read: {error.strerror}") from error
+        except ValueError as error:  # no name of a file, as one with a NUL
+            raise InputError(f"{str(plan)!r}: cannot be read: {error}") from error
         if key not in self._jobs:
             self._jobs = {key: read_job(plan, self._cell.document.path)}
         job = self._jobs[key]

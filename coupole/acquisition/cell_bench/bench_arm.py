@@ -106,9 +106,10 @@ class BenchArm:
         self._works.begin(work, stops, asking_pid)
         return work.figures()
 
-    def jog(self, request: JogAsked, stops: int) -> dict[str, Any]:
-        """Begin a motion by hand, or renew it. `stops` is the number of stops when this was requested. Raises
-        InputError if the motion is not allowed."""
+    def jog(self, request: JogAsked, stops: int, asking_pid: int) -> dict[str, Any]:
+        """Begin a motion by hand, or renew it. `stops` is the number of stops when this was requested. The motion
+        ends when the process `asking_pid` no longer runs, and only this process renews it. Raises InputError if
+        the motion is not allowed."""
         consoles = self._cell.rig.console.at_the_cell
         if request.at not in consoles:
             raise InputError(
@@ -116,13 +117,13 @@ class BenchArm:
                 f"`console: at_the_cell:` of {self._cell.document.path}"
             )
         if request.hold is not None:
-            return self._renew(request)
+            return self._renew(request, asking_pid)
         self.refuse_motion()
         self._switch.refuse_released()
-        hold = _Hold(next(self._numbers), request)
+        hold = _Hold(next(self._numbers), request, asking_pid)
         about = {"hold": hold.number, "axis": request.axis, "direction": request.direction}
         work = Work(self._control, "jog", about, lambda control: self._go_on(hold, control))
-        self._works.begin(work, stops)
+        self._works.begin(work, stops, asking_pid)
         self._hold, hold.work = hold, work
         return work.figures()
 
@@ -130,14 +131,19 @@ class BenchArm:
         """Return the plan's job in this cell. Raises InputError if its object is not the bench's object."""
         return self._paths.job_of(plan)
 
-    def _renew(self, request: JogAsked) -> dict[str, Any]:
+    def _renew(self, request: JogAsked, asking_pid: int) -> dict[str, Any]:
         hold = self._hold
         if hold is None or hold.number != request.hold:
             raise InputError(f"hold: {request.hold} has ended; release the button and press it again")
+        if asking_pid != hold.asking_pid:
+            hold.let_go("another process renewed it")
+            raise InputError(
+                f"hold: {request.hold} is of another process, and only that one may renew it; it was ended"
+            )
         if (request.axis, request.direction) == (hold.asked.axis, hold.asked.direction):
             hold.renew()
         else:
-            hold.let_go()
+            hold.let_go("the button was released")
         assert hold.work is not None
         return hold.work.figures()
 
@@ -198,8 +204,8 @@ class BenchArm:
 class _Hold:
     """A button that is held."""
 
-    def __init__(self, number: int, request: JogAsked) -> None:
-        self.number, self.asked = number, request
+    def __init__(self, number: int, request: JogAsked, asking_pid: int) -> None:
+        self.number, self.asked, self.asking_pid = number, request, asking_pid
         self.work: Work | None = None
         self._ended = ""
         self._renewed_s = time.monotonic()
@@ -209,8 +215,9 @@ class _Hold:
         self._note_lapse()
         self._renewed_s = time.monotonic()
 
-    def let_go(self) -> None:
-        self._ended = "the button was released"
+    def let_go(self, why: str) -> None:
+        """End the hold for this reason, unless it has ended for another."""
+        self._ended = self._ended or why
 
     def check(self) -> None:
         """Raise HoldLostError unless it is still held."""

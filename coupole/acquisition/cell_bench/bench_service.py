@@ -138,7 +138,7 @@ class BenchService:
             case DriveAsked():
                 return self._arm.drive(request.path, stops, asking_pid)
             case JogAsked():
-                return self._arm.jog(request, stops)
+                return self._arm.jog(request, stops, asking_pid)
             case FrameAsked():
                 self._refuse_while_metering()
                 return {**self._frames.frame(request, stops), "dose": self._frames.dose()}

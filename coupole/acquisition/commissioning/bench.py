@@ -112,21 +112,26 @@ class Bench:
     def ask_before(self, announcement: str) -> None:
         """Ask the person to agree. Raises Interrupted if the person does not."""
         self.control.go_on()
-        if not self.person.is_ready(announcement):
-            raise Interrupted("the commissioning was not continued; the steps that were done are kept")
+        is_ready = self.person.is_ready(announcement)
         self.control.go_on()
+        if not is_ready:
+            raise Interrupted("the commissioning was not continued; the steps that were done are kept")
 
     def ask_whether(self, question: str) -> bool:
-        """Ask the person what was seen; the answer is noted."""
+        """Ask the person what was seen; the answer is noted. Raises Interrupted after the operator's stop, which
+        is no answer."""
         self.control.go_on()
         yes = self.person.confirms(question)
+        self.control.go_on()
         self.findings.answers.append(Answer(question=question, yes=yes))
         return yes
 
     def measured_mm(self, quantity: str, question: str) -> float:
-        """Ask the person to measure a length, mm, and note it. Raises StepFailedError if it was not measured."""
+        """Ask the person to measure a length, mm, and note it. Raises StepFailedError if it was not measured, and
+        Interrupted after the operator's stop."""
         self.control.go_on()
         found_mm = self.person.measures(quantity, question)
+        self.control.go_on()
         if found_mm is None:
             raise StepFailedError(f"not measured: {question}. Repeat the step with ruler and tape at hand")
         self.findings.remarks.append(f"measured: {question}: {found_mm:g} mm")

@@ -7,21 +7,26 @@ from typing import Any
 
 from rich.console import Console
 
+from coupole.acquisition.observer import Control
 from coupole.plan.registry import WORLD, load_class
-from coupole.viewing.terminal import alarm, ask, ask_number
+from coupole.viewing.questions import ask, ask_number
+from coupole.viewing.terminal import alarm
 
 
 class PersonAtTerminal:
-    """A `Person` who reads and types here."""
+    """A `Person` who reads and types here. A question is given up when the session is to end."""
+
+    def __init__(self, control: Control) -> None:
+        self._is_over = control.stop.is_set
 
     def is_ready(self, announcement: str) -> bool:
-        return ask(f"\n{announcement}\nGo on?")
+        return ask(f"\n{announcement}\nGo on?", self._is_over)
 
     def confirms(self, question: str) -> bool:
-        return ask(question)
+        return ask(question, self._is_over)
 
     def measures(self, quantity: str, question: str) -> float | None:
-        return ask_number(f"Measure, in mm: {question}:")
+        return ask_number(f"Measure, in mm: {question}:", self._is_over)
 
     def tell(self, message: str) -> None:
         alarm(message)

@@ -76,15 +76,15 @@ def commission(
     *,
     name: str,
     only: Step | None,
-    person_at: Callable[[OpenedCell], Person],
+    person_at: Callable[[OpenedCell, Control], Person],
     board: Path | None = None,
 ) -> CommissioningRecord:
     """Do the steps that are due, or `only` one; returns the record.
 
-    `name` is the person's name; `person_at` gives the person for the opened cell. `board` is the file that
-    describes the board of the step geometry. A step is due if it was not done, did not pass, or does not fit the
-    rig and its devices any more. Raises CommissioningFailed after the first step that does not pass, DeviceError
-    if a device fails, Interrupted if the person does not go on.
+    `name` is the person's name; `person_at` gives the person for the opened cell and the session's control.
+    `board` is the file that describes the board of the step geometry. A step is due if it was not done, did not
+    pass, or does not fit the rig and its devices any more. Raises CommissioningFailed after the first step that
+    does not pass, DeviceError if a device fails, Interrupted if the person does not go on.
     """
     faults_of(cell).refuse(cell.document.path)
     bodies = bodies_of(cell.rig, cell.leds, np.zeros((0, 3, 3)), cell.link_meshes, cell.files)
@@ -95,7 +95,7 @@ def commission(
         faults_of(cell, opened_cell.identities["robot"]).refuse(cell.document.path)
         record = _record_so_far(cell, console)  # of this controller, wherever it was reached before
         bench = replace(
-            run_bounded(lambda: _bench(slow, opened_cell, bodies, person_at(opened_cell), control)),
+            run_bounded(lambda: _bench(slow, opened_cell, bodies, person_at(opened_cell, control), control)),
             bars=lambda: step_bars(console),
             board=board,
         )

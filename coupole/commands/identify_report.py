@@ -1,0 +1,132 @@
+"""What `coupole identify --report` says about object, instrument, persons and files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from coupole.commands.common import LONGEST_NAME
+from coupole.errors import InputError
+
+if TYPE_CHECKING:
+    from coupole.heritage.analysis.references import References
+    from coupole.heritage.result_pages.identification_record import Origin
+
+_PANEL = "Report"
+
+PageOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--report",
+        help="Folder for a report to sign: page, record, and the maps of an image or a line, which need it.",
+        rich_help_panel=_PANEL,
+    ),
+]
+ObjectOption = Annotated[str | None, typer.Option("--object", help="Object.", rich_help_panel=_PANEL)]
+SampleOption = Annotated[
+    str | None, typer.Option("--sample", help="Sample, point or area.", rich_help_panel=_PANEL)
+]
+InstrumentOption = Annotated[str | None, typer.Option("--instrument", help="Instrument.", rich_help_panel=_PANEL)]
+MeasuredByOption = Annotated[
+    str | None, typer.Option("--measured-by", help="Person who measured.", rich_help_panel=_PANEL)
+]
+MeasuredOnOption = Annotated[
+    str | None, typer.Option("--measured-on", help="Date of the measurement.", rich_help_panel=_PANEL)
+]
+SimulatedOption = Annotated[
+    bool, typer.Option("--simulated", help="The data are simulated; the report says so.", rich_help_panel=_PANEL)
+]
+LicenceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--library-licence",
+        help="Licence of the library, if no file LICENSE is beside it.",
+        rich_help_panel=_PANEL,
+    ),
+]
+SignedByOption = Annotated[
+    str | None, typer.Option("--signed-by", help="Person who signs the report.", rich_help_panel=_PANEL)
+]
+RoleOption = Annotated[str | None, typer.Option("--role", help="Role of this person.", rich_help_panel=_PANEL)]
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """What a report says besides the findings."""
+
+    report: PageOption = None
+    object_name: ObjectOption = None
+    sample: SampleOption = None
+    instrument: InstrumentOption = None
+    measured_by: MeasuredByOption = None
+    measured_on: MeasuredOnOption = None
+    simulated: SimulatedOption = False
+    library_licence: LicenceOption = None
+    signed_by: SignedByOption = None
+    role: RoleOption = None
+
+    def refuse_half(self) -> None:
+        """Raise InputError for a signature without a role, or for options of a report without `--report`."""
+        if (self.signed_by is None) != (self.role is None):
+            raise InputError("expected --signed-by and --role together, found one of them")
+        for option, words in (("--signed-by", self.signed_by), ("--role", self.role)):
+            if words is not None and not 0 < len(words.strip()) <= LONGEST_NAME:
+                raise InputError(f"{option}: expected 1 to {LONGEST_NAME} characters, found {len(words.strip())}")
+        if self.report is None and (self != ReportOptions()):
+            raise InputError("expected --report with a folder; the other options of a report go with it")
+
+
+def origin_of(
+    options: ReportOptions,
+    inputs: Sequence[Path],
+    library: Path,
+    classes: Path | None,
+    references: References,
+    header_fields: Mapping[str, object] | None = None,
+) -> Origin:
+    """Gather what is known about inputs and library. Options precede what the files say. Of an image cube,
+    `header_fields` are those of its header. Raises InputError."""
+    from coupole.heritage.analysis import spectra_origin
+    from coupole.heritage.result_pages.identification_record import LibraryFacts, Origin, signature_of
+
+    facts: dict[str, str] = {}
+    is_simulated = options.simulated
+    if header_fields is not None:
+        facts, said = spectra_origin.header_facts(header_fields)
+        is_simulated |= said
+    else:
+        of_files = [
+            spectra_origin.file_facts(file) for path in inputs for file in spectra_origin.library_files(path)
+        ]
+        is_simulated |= any(said for _, said in of_files)
+        for name in {name for found, _ in of_files for name in found}:
+            words = dict.fromkeys(found[name] for found, _ in of_files if name in found)
+            facts[name] = "; ".join(words)
+    typed = (options.object_name, options.sample, options.instrument, options.measured_by, options.measured_on)
+    facts |= {name: words for name, words in zip(spectra_origin.FACTS, typed, strict=True) if words}
+    files = spectra_origin.digests([library])
+    table = "tables that come with Coupole"
+    if classes is not None:
+        files |= spectra_origin.digests([classes])
+        table = classes.name
+    signature = None
+    if options.signed_by is not None and options.role is not None:
+        signature = signature_of(options.signed_by.strip(), options.role.strip())
+    return Origin(
+        spectra_origin.digests(inputs),
+        LibraryFacts(
+            library.name,
+            files,
+            len(references.names),
+            len(set(references.class_of)),
+            table,
+            options.library_licence or spectra_origin.licence_beside(library),
+        ),
+        facts,
+        is_simulated,
+        signature,
+    )

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from coupole.appearance.spectra.spectra_library import LibrarySpectrum
     from coupole.heritage.analysis.identification import PigmentFinding
-    from coupole.heritage.analysis.line_points import LinePoints
     from coupole.heritage.analysis.references import References
+    from coupole.heritage.pigment_maps.line_points import LinePoints
 
 _SHOWN = 3
 _COLOURS = {"match": "green", "mixture": "green", "ambiguous": "yellow", "unknown": "yellow"}
@@ -157,7 +157,7 @@ def _identify_spectra(
 ) -> tuple[list[dict[str, Any]], Path | None]:
     """Identify spectra, or points along a line, print the findings, and write the report. Returns the findings as
     JSON's values, and the page."""
-    from coupole.heritage.analysis.line_points import is_line, read_line
+    from coupole.heritage.pigment_maps.line_points import is_line, read_line
     from coupole.heritage.result_pages import identification_page
     from coupole.heritage.result_pages.line_profile import LineProfile
 
@@ -184,8 +184,8 @@ def _findings(
     from coupole.scripting.analyses import identify_spectra
     from coupole.viewing.terminal import step_bars
 
-    read = (spectrum for path in paths for spectrum in read_library(path, unit=unit))
-    spectra = list(read if line is None else line.spectra)
+    library_spectra = (spectrum for path in paths for spectrum in read_library(path, unit=unit))
+    spectra = list(library_spectra if line is None else line.spectra)
     with step_bars(console) as say:
         findings = identify_spectra(spectra, references, say)
     return list(zip(spectra, findings, strict=True))

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from coupole.appearance.spectra.envi_cube import Cube
-    from coupole.heritage.analysis.image_identification import ImageFinding
     from coupole.heritage.analysis.references import References
+    from coupole.heritage.pigment_maps.image_identification import ImageFinding
 
 _PANEL = "Image cubes"
 _AREA = re.compile(r"(\d+):(\d+),(\d+):(\d+)")
@@ -51,7 +51,7 @@ RegionsOption = Annotated[
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """What the user says about an image cube."""
+    """Options of an image cube."""
 
     mask: MaskOption = None
     area: AreaOption = None
@@ -71,7 +71,7 @@ def identify_cube(
 ) -> dict[str, Any]:
     """Make the maps and the report of a cube, print them, and return the content of `--json`."""
     from coupole.appearance.spectra.envi_cube import CubeOptions, open_cube
-    from coupole.heritage.analysis.image_identification import identify_image
+    from coupole.heritage.pigment_maps.image_identification import identify_image
     from coupole.heritage.result_pages import image_page
     from coupole.heritage.result_pages.class_maps import map_document
     from coupole.storage.durable import make_folder
@@ -108,14 +108,14 @@ def _mask_of(cube: Cube, options: ImageOptions) -> NDArray[Any] | None:
     if options.area is not None:
         match = _AREA.fullmatch(options.area.replace(" ", ""))
         ends = [int(number) for number in match.groups()] if match else [0, 0, 0, 0]
-        top, bottom, left, right = ends
-        if not (top < bottom <= cube.rows and left < right <= cube.columns):
+        first_row, end_row, first_column, end_column = ends
+        if not (first_row < end_row <= cube.rows and first_column < end_column <= cube.columns):
             raise InputError(
                 f"--area {options.area}: expected rows and columns FIRST:END,FIRST:END within 0:{cube.rows},"
                 f"0:{cube.columns}"
             )
         inside = np.zeros_like(looks)
-        inside[top:bottom, left:right] = True
+        inside[first_row:end_row, first_column:end_column] = True
         looks &= inside
     return looks
 

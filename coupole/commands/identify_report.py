@@ -1,4 +1,4 @@
-"""What `coupole identify --report` says about object, instrument, persons and files."""
+"""Options of the report of `coupole identify`: object, instrument, persons, licence, signature."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ RoleOption = Annotated[str | None, typer.Option("--role", help="Role of this per
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """What a report says besides the findings."""
+    """Words of a report besides the findings."""
 
     report: PageOption = None
     object_name: ObjectOption = None
@@ -64,7 +64,7 @@ class ReportOptions:
     instrument: InstrumentOption = None
     measured_by: MeasuredByOption = None
     measured_on: MeasuredOnOption = None
-    simulated: SimulatedOption = False
+    is_simulated: SimulatedOption = False
     library_licence: LicenceOption = None
     signed_by: SignedByOption = None
     role: RoleOption = None
@@ -90,24 +90,29 @@ def origin_of(
 ) -> Origin:
     """Gather what is known about inputs and library. Options precede what the files say. Of an image cube,
     `header_fields` are those of its header. Raises InputError."""
-    from coupole.heritage.analysis import spectra_origin
+    from coupole.appearance.spectra.spectra_library import library_files
+    from coupole.heritage.pigment_maps import spectra_origin
     from coupole.heritage.result_pages.identification_record import LibraryFacts, Origin, signature_of
 
     facts: dict[str, str] = {}
-    is_simulated = options.simulated
+    is_simulated = options.is_simulated
     if header_fields is not None:
-        facts, said = spectra_origin.header_facts(header_fields)
-        is_simulated |= said
+        facts, is_called_so = spectra_origin.header_facts(header_fields)
+        is_simulated |= is_called_so
     else:
-        of_files = [
-            spectra_origin.file_facts(file) for path in inputs for file in spectra_origin.library_files(path)
-        ]
-        is_simulated |= any(said for _, said in of_files)
-        for name in {name for found, _ in of_files for name in found}:
-            words = dict.fromkeys(found[name] for found, _ in of_files if name in found)
+        of_files = [spectra_origin.file_facts(file) for path in inputs for file in library_files(path)]
+        is_simulated |= any(is_called_so for _, is_called_so in of_files)
+        for name in {name for file_facts, _ in of_files for name in file_facts}:
+            words = dict.fromkeys(file_facts[name] for file_facts, _ in of_files if name in file_facts)
             facts[name] = "; ".join(words)
-    typed = (options.object_name, options.sample, options.instrument, options.measured_by, options.measured_on)
-    facts |= {name: words for name, words in zip(spectra_origin.FACTS, typed, strict=True) if words}
+    option_words = (
+        options.object_name,
+        options.sample,
+        options.instrument,
+        options.measured_by,
+        options.measured_on,
+    )
+    facts |= {name: words for name, words in zip(spectra_origin.FACTS, option_words, strict=True) if words}
     files = spectra_origin.digests([library])
     table = "tables that come with Coupole"
     if classes is not None:

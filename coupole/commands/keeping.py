@@ -69,10 +69,8 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Read a run back: every frame, and every file that the manifest lists. Check that the run is complete, that
-    all checksums are right, and that light, exposure and pose of each frame agree with the run's plan.
-
-    Of the folder of a report of `coupole identify`: tell whether anything was changed after it was written.
-    """
+    all checksums are right, and that light, exposure and pose of each frame agree with the run's plan. Of a report
+    of `coupole identify`: tell whether anything was changed after it was written."""
     from coupole.heritage.result_pages.identification_record import is_record
 
     if is_record(run):
@@ -133,12 +131,16 @@ def _verify_report(folder: Path, *, as_json: bool) -> None:
     check = check_record(folder)
     for problem in check.problems:
         console.print("[red]changed:[/]", problem)
-    signed = check.signature
-    words = "not signed" if signed is None else f"signed by {signed.name}, {signed.role}, {signed.time_utc}"
+    signature = check.signature
+    words = (
+        "not signed"
+        if signature is None
+        else f"signed by {signature.name}, {signature.role}, {signature.time_utc}"
+    )
     if as_json:
         document = {
             "ok": not check.problems,
-            "signature": None if signed is None else signed.__dict__,
+            "signature": None if signature is None else signature.__dict__,
             "files": check.files,
             "bad": list(check.problems),
         }

@@ -36,12 +36,12 @@ _UNITS = {
 _NM = (150.0, 3000.0)
 _LEAST_BANDS = 3
 _LONGEST_HEADER = 4_000_000
-_BLOCK_BYTES = 16_000_000
+_BLOCK_VALUES = 4_000_000
 
 
 @dataclass(frozen=True)
 class CubeOptions:
-    """What the user says about a cube; each replaces what its header says."""
+    """The user's words about a cube; they precede those of its header."""
 
     scale: float | None = None
     """Number in the file that is a reflectance of 1."""
@@ -70,7 +70,7 @@ class Cube:
     _dtype: np.dtype[Any]
     _interleave: str
     _offset: int
-    _ignored: float | None
+    _ignore_value: float | None
 
     @property
     def description(self) -> str:
@@ -79,16 +79,15 @@ class Cube:
 
     @cached_property
     def rows_at_once(self) -> int:
-        """Rows of a block: at most 16 MB of the file, and at least one row."""
-        row_bytes = self.columns * self._all_bands * self._dtype.itemsize
-        return max(1, min(self.rows, _BLOCK_BYTES // row_bytes))
+        """Rows of a block: at most 4 million values, and at least one row."""
+        return max(1, min(self.rows, _BLOCK_VALUES // (self.columns * self._all_bands)))
 
     def blocks(self) -> Iterator[tuple[int, int]]:
         """First row, and the row behind the last one, of each block."""
         for first in range(0, self.rows, self.rows_at_once):
             yield first, min(first + self.rows_at_once, self.rows)
 
-    def read(self, first: int, end: int) -> NDArray[np.float32]:
+    def read_rows(self, first: int, end: int) -> NDArray[np.float32]:
         """[rows, columns, bands used] reflectance of the rows from `first` to before `end`. Pixels of the header's
         ignored value are NaN in this band. Raises InputError if the file cannot be read, or is too short."""
         count, size = end - first, self._dtype.itemsize
@@ -110,9 +109,10 @@ class Cube:
                         pixels = values.reshape(count, self.columns, -1)[:, :, self._bands]
         except OSError as error:
             raise InputError(f"{self.data}: {reason(error)}") from error
-        reflectance = np.asarray(pixels / self.scale, np.float32)
-        if self._ignored is not None:
-            reflectance[pixels == self._dtype.type(self._ignored)] = np.nan
+        reflectance = pixels.astype(np.float32)
+        reflectance /= np.float32(self.scale)
+        if self._ignore_value is not None:
+            reflectance[pixels == self._dtype.type(self._ignore_value)] = np.nan
         return reflectance
 
     def _values(self, file: Any, at: int, count: int) -> NDArray[Any]:
@@ -133,7 +133,7 @@ def open_cube(path: Path, options: CubeOptions | None = None) -> Cube:
 
     Raises InputError, with file and line, for headers that do not state what is needed.
     """
-    said = options or CubeOptions()
+    user = options or CubeOptions()
     header = path if path.suffix.lower() == HEADER else _header_beside(path)
     if header is None:
         raise InputError(f"{path}: expected an ENVI header beside it, {path.name}{HEADER}")
@@ -148,7 +148,7 @@ def open_cube(path: Path, options: CubeOptions | None = None) -> Cube:
     if offset < 0:
         raise fields.wrong("header offset", f"expected 0 or more bytes, found {offset}")
     fields.refuse_other_kinds()
-    scale = said.scale if said.scale is not None else fields.number("reflectance scale factor", 0.0)
+    scale = user.scale if user.scale is not None else fields.number("reflectance scale factor", 0.0)
     if scale == 0.0 and dtype.kind == "f" and "reflectance scale factor" not in fields.values:
         scale = 1.0
     if not (np.isfinite(scale) and scale > 0.0):
@@ -157,21 +157,21 @@ def open_cube(path: Path, options: CubeOptions | None = None) -> Cube:
             "expected the number that is a reflectance of 1, because the values are integers; give --scale, such "
             "as 10000" if scale == 0.0 else f"expected a number above 0, found {scale:g}",
         )  # fmt: skip
-    nm = fields.wavelengths_nm(bands, said.wavelength_unit)
+    nm = fields.wavelengths_nm(bands, user.wavelength_unit)
     good = fields.good_bands(bands)
     order = np.flatnonzero(good)[np.argsort(nm[good], kind="stable")]
-    ignored = fields.number("data ignore value", np.nan)
+    ignore_value = fields.number("data ignore value", np.nan)
     data = _data_beside(header) if path == header else path
-    needed = offset + rows * columns * bands * dtype.itemsize
-    if (size := data.stat().st_size) < needed:
+    needed_bytes = offset + rows * columns * bands * dtype.itemsize
+    if (size := data.stat().st_size) < needed_bytes:
         raise InputError(
-            f"{data}: expected {needed} bytes ({rows} lines, {columns} samples, {bands} bands of "
+            f"{data}: expected {needed_bytes} bytes ({rows} lines, {columns} samples, {bands} bands of "
             f"{dtype.itemsize} bytes{f', after {offset}' if offset else ''}, by {header.name}), found {size}"
         )
     return Cube(
         header, data, rows, columns, nm[order], float(scale), fields.values,
         tuple(int(band) + 1 for band in np.flatnonzero(~good)), order, bands, dtype, interleave, offset,
-        None if np.isnan(ignored) else ignored,
+        None if np.isnan(ignore_value) else ignore_value,
     )  # fmt: skip
 
 
@@ -200,8 +200,8 @@ def _header_text(header: Path) -> str:
     is_binary = len(raw) > _LONGEST_HEADER or (b"\0" in raw and not raw.startswith((b"\xff\xfe", b"\xfe\xff")))
     text = "" if is_binary else decode_text(raw)
     if not text.startswith("ENVI"):
-        found = text.split("\n", 1)[0][:40] if text else "a binary file"
-        raise InputError([Problem(str(header), 1, 1, "", f"expected the word ENVI, found {found!r}")])
+        found_words = text.split("\n", 1)[0][:40] if text else "a binary file"
+        raise InputError([Problem(str(header), 1, 1, "", f"expected the word ENVI, found {found_words!r}")])
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -218,8 +218,8 @@ class _Fields:
             if mark and not line.startswith(";"):
                 self._lines.setdefault(" ".join(name.lower().split()), number)
         if text.count("{") != text.count("}"):
-            opened = [number for number, line in enumerate(text.split("\n"), start=1) if "{" in line]
-            raise InputError([Problem(str(header), opened[-1] if opened else 0, 1, "",
+            opening_lines = [number for number, line in enumerate(text.split("\n"), start=1) if "{" in line]
+            raise InputError([Problem(str(header), opening_lines[-1] if opening_lines else 0, 1, "",
                                       "expected as many closing braces as opening ones")])  # fmt: skip
         plain = text.replace("µ", "u").replace("μ", "u").encode("ascii", "replace")
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
@@ -297,12 +297,13 @@ class _Fields:
             raise self.wrong(
                 "wavelength", f"expected {bands} wavelengths, one for each band; found {len(numbers)}"
             )
-        found = " ".join(str(self.values.get("wavelength units", "")).lower().split())
-        factor = {"nm": 1.0, "um": 1e3}[unit] if unit else _UNITS.get(found)
+        found_words = " ".join(str(self.values.get("wavelength units", "")).lower().split())
+        factor = {"nm": 1.0, "um": 1e3}[unit] if unit else _UNITS.get(found_words)
         if factor is None:
             raise self.wrong(
                 "wavelength units",
-                f"expected Nanometers or Micrometers, found {found or 'none'}; give --wavelength-unit nm or um",
+                f"expected Nanometers or Micrometers, found {found_words or 'none'}; give --wavelength-unit "
+                "nm or um",
             )
         nm = factor * np.array(numbers)
         if not np.all((nm >= _NM[0]) & (nm <= _NM[1])):

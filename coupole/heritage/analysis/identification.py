@@ -65,7 +65,7 @@ class Evidence:
     """[n] reflectance of the nearest reference of the first class, with K/S scaled by the best factor."""
     runner_up: Array
     """[n] the same for the second class."""
-    fitted: Array
+    fit: Array
     """[n] reflectance of the answer: that of the nearest reference, or of the mixture's two references
     together."""
     log_odds: Array
@@ -212,10 +212,10 @@ def _evidence(
         scaled_reference(runner_up),
     )
     log_odds = 0.5 * (missed_by_two**2 - missed_by_one**2)
-    fitted = best_shape
+    fit = best_shape
     if mixture is not None:
         pair = np.exp(log_k_over_s(of_bands.reflectance[list(mixture.references)]))
         weight = weights_of_bands(reflectance)
         amounts = np.linalg.lstsq((pair * np.exp(-log_ratio) * weight).T, weight, rcond=None)[0]
-        fitted = kubelka_munk.opaque(amounts @ pair)
-    return Evidence(BANDS_NM[of_bands.bands], reflectance, best_shape, second_shape, fitted, log_odds)
+        fit = kubelka_munk.opaque(amounts @ pair)
+    return Evidence(BANDS_NM[of_bands.bands], reflectance, best_shape, second_shape, fit, log_odds)

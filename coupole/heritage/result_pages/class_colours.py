@@ -43,14 +43,14 @@ def with_legend(pixels: NDArray[np.uint8], entries: Sequence[tuple[str, RGB]]) -
     large ones are thinned out."""
     from PIL import Image, ImageDraw, ImageFont
 
-    thinned = pixels[:: -(-pixels.shape[0] // _LARGEST_PX), :: -(-pixels.shape[1] // _LARGEST_PX)]
-    factor = max(1, -(-_SMALLEST_PX // max(thinned.shape[:2])))
-    shown = np.repeat(np.repeat(thinned, factor, axis=0), factor, axis=1)
-    height, width = shown.shape[:2]
-    needed = max((_PATCH_PX + 16 + _LETTER_PX * len(name) for name, _ in entries), default=0)
-    width = max(width, needed)
+    some_pixels = pixels[:: -(-pixels.shape[0] // _LARGEST_PX), :: -(-pixels.shape[1] // _LARGEST_PX)]
+    factor = max(1, -(-_SMALLEST_PX // max(some_pixels.shape[:2])))
+    shown_pixels = np.repeat(np.repeat(some_pixels, factor, axis=0), factor, axis=1)
+    height, width = shown_pixels.shape[:2]
+    needed_px = max((_PATCH_PX + 16 + _LETTER_PX * len(name) for name, _ in entries), default=0)
+    width = max(width, needed_px)
     sheet = Image.new("RGB", (width, height + 10 + _ROW_PX * len(entries)), "white")
-    sheet.paste(Image.fromarray(shown), (0, 0))
+    sheet.paste(Image.fromarray(shown_pixels), (0, 0))
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(15)
     for row, (name, colour) in enumerate(entries):
         top = height + 8 + row * _ROW_PX

@@ -12,7 +12,7 @@ import numpy as np
 
 from coupole.appearance.spectra.envi_cube import Cube
 from coupole.errors import StorageError, reason
-from coupole.heritage.analysis.image_identification import NOT_LOOKED_AT, ImageFinding
+from coupole.heritage.pigment_maps.image_identification import NOT_LOOKED_AT, ImageFinding
 from coupole.heritage.result_pages.class_colours import RGB, code_colours, with_legend
 from coupole.pages.maps import picture_png
 from coupole.storage.durable import write_synced
@@ -47,7 +47,7 @@ def write_maps(folder: Path, finding: ImageFinding, cube: Cube) -> list[Path]:
     }
     try:
         write_synced(folder / f"{CLASSES}.png", class_picture(finding))
-        write_synced(folder / "seen.png", picture_png(finding.seen))
+        write_synced(folder / "seen.png", picture_png(finding.picture))
         write_synced(folder / f"{REGIONS}.csv", _spectra(finding, cube))
         names = [name.replace(",", " ") for name in finding.names]
         options: dict[str, Any] = {"force": True, "interleave": "bsq", "metadata": place, "ext": ".img"}
@@ -59,8 +59,8 @@ def write_maps(folder: Path, finding: ImageFinding, cube: Cube) -> list[Path]:
     except OSError as error:
         raise StorageError(f"{folder}: {reason(error)}") from error
     endings = {CLASSES: (".png", ".hdr", ".img"), CONFIDENCE: (".hdr", ".img"), REGIONS: (".csv", ".hdr", ".img")}
-    written = [folder / f"{name}{ending}" for name, ends in endings.items() for ending in ends]
-    return [*written, folder / "seen.png"]
+    paths = [folder / f"{name}{ending}" for name, ends in endings.items() for ending in ends]
+    return [*paths, folder / "seen.png"]
 
 
 def map_document(finding: ImageFinding, cube: Cube) -> dict[str, Any]:
@@ -94,7 +94,7 @@ def _spectra(finding: ImageFinding, cube: Cube) -> str:
     """Wavelengths in rows; mean and standard deviation of each region in columns."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    heads = [f"{what} {region.number}" for region in finding.regions for what in ("mean", "deviation")]
+    heads = [f"{quantity} {region.number}" for region in finding.regions for quantity in ("mean", "deviation")]
     writer.writerow(["nm", *heads])
     columns = [values for region in finding.regions for values in (region.mean, region.deviation)]
     for row, nm in enumerate(cube.wavelengths_nm):

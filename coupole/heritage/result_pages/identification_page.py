@@ -74,10 +74,17 @@ def _page(
     pictures: list[Figure] = [_plot(first)]
     if profile is not None:
         pictures = [Picture("Classes along the line, and the reflectance", profile.png(), is_broad=True)]
+    subject, of_line = first.name if is_one else f"{len(findings)} spectra", ""
+    if profile is not None:
+        subject, of_line = f"{len(findings)} points along a line", f" along {profile.length_mm:.1f} mm"
     return Page(
-        title=f"{first.name if is_one else f'{len(findings)} spectra'}: pigments identified",
+        title=f"{subject}: pigments identified",
         pictures=pictures,
-        summary=["Reflectance was compared with the library ", Code(origin.library.name), ", band by band."],
+        summary=[
+            f"Reflectance{of_line} was compared with the library ",
+            Code(origin.library.name),
+            ", band by band.",
+        ],
         quality=_quality(findings),
         next_step=_next_step(findings),
         remark=remark_of(origin),
@@ -99,7 +106,7 @@ def _page(
 def _quality(findings: Sequence[PigmentFinding]) -> Inline:
     if len(findings) == 1:
         only = findings[0]
-        return [_verdict(only), f": {only.class_name}, probable by {_percent(only)}; {only.reason}."]
+        return [_verdict(only), f": {words_of(only)}"]
     counts = [
         (word, sum(finding.verdict == word for finding in findings))
         for word in ("match", "mixture", "ambiguous", "unknown")
@@ -145,7 +152,7 @@ def finding_section(
         f"s{number}",
         name or finding.name,
         words=[words_of(finding)],
-        figures=[*fit_plots(finding), *([_plot(finding)] if has_evidence else [])],
+        figures=[_plot(finding)] if has_evidence else [],
         figure_size="wide",
         facts={
             "verdict": _verdict(finding),
@@ -159,6 +166,7 @@ def finding_section(
             Table("Most probable classes", ("class", "probability", "nearest reference"), candidates),
         ],
         notes=[] if has_evidence else ["The evidence of its bands is the picture at the top."],
+        sections=[Section(f"s{number}-fit", "Measured against fitted", figures=fit_plots(finding))],
         is_folded=is_folded,
     )
 
@@ -184,7 +192,7 @@ def _percent(finding: PigmentFinding) -> str:
 
 
 def reliability_section(rates: HeldOutRates) -> Section:
-    """How often the library is right about its own spectra."""
+    """Return the rates at which the library is right about its own spectra."""
     return Section(
         "library",
         "How reliable the verdicts are",

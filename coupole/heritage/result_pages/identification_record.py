@@ -29,7 +29,7 @@ _SUMS = ("files", "content_sha256", "sha256")
 
 @dataclass(frozen=True)
 class Signature:
-    """Who signs a report, and when."""
+    """A person who signs a report, and the time."""
 
     name: str
     role: str
@@ -47,14 +47,14 @@ class LibraryFacts:
     spectra: int
     classes: int
     table: str
-    """Where the classes of its spectra stand."""
+    """Table with the classes of its spectra."""
     licence: str
     """Words of its licence; empty if it is not stated."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Where spectra come from, and what they were compared with."""
+    """The origin of spectra, and their library."""
 
     inputs: Mapping[str, str]
     """SHA-256 of each input file by its name."""
@@ -109,13 +109,13 @@ def write_record(folder: Path, record: dict[str, Any], files: Sequence[Path]) ->
 
 @dataclass(frozen=True)
 class RecordCheck:
-    """What a check of a record found."""
+    """Result of the check of a record."""
 
     signature: Signature | None
     files: int
     """Number of files that were compared."""
     problems: tuple[str, ...]
-    """What was changed, as sentences; none if all is as it was written."""
+    """Changes, as sentences; none if all is as it was written."""
 
 
 def is_record(folder: Path) -> bool:
@@ -151,10 +151,10 @@ def check_record(folder: Path) -> RecordCheck:
                 problems.append(f"{name}: it was changed after the record was written")
         except OSError as error:
             problems.append(f"{name}: {reason(error)}")
-    said = whole.get("signature")
+    signature_words = whole.get("signature")
     signature = None
-    if isinstance(said, dict):
-        signature = Signature(*(str(said.get(key, "")) for key in ("name", "role", "time_utc")))
+    if isinstance(signature_words, dict):
+        signature = Signature(*(str(signature_words.get(key, "")) for key in ("name", "role", "time_utc")))
     return RecordCheck(signature, len(whole["files"]), tuple(problems))
 
 

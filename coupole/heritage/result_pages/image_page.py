@@ -8,13 +8,14 @@ from typing import Any
 
 from coupole.appearance.spectra.envi_cube import Cube
 from coupole.errors import StorageError, reason
-from coupole.heritage.analysis.image_identification import (
+from coupole.heritage.pigment_maps.image_identification import (
     AMBIGUOUS,
     FIRST_CLASS,
     UNKNOWN,
     UNLIKE,
     ImageFinding,
     ImageRegion,
+    named_classes,
 )
 from coupole.heritage.result_pages import class_maps
 from coupole.heritage.result_pages.class_colours import code_colours, css
@@ -44,6 +45,8 @@ from coupole.pages.page_parts import (
 from coupole.pages.page_rendering import write_page
 from coupole.storage.durable import make_folder
 
+_STEADY = 0.95
+
 
 def write(folder: Path, finding: ImageFinding, cube: Cube, origin: Origin) -> Path:
     """Write maps, page and record. Raises StorageError."""
@@ -62,12 +65,12 @@ def write(folder: Path, finding: ImageFinding, cube: Cube, origin: Origin) -> Pa
 
 def _page(finding: ImageFinding, cube: Cube, origin: Origin, record: dict[str, Any]) -> Page:
     step = max(1, -(-cube.columns // WIDTH_PX))
-    seen = Picture("The object in three bands of the cube (620, 550 and 460 nm, or the nearest)",
-                   picture_png(finding.seen[::step, ::step]))  # fmt: skip
+    picture = Picture("The object in three bands of the cube (620, 550 and 460 nm, or the nearest)",
+                   picture_png(finding.picture[::step, ::step]))  # fmt: skip
     classes = Picture("Classes of pigments; grey: no class is stated", class_maps.class_picture(finding))
     return Page(
         title=f"{cube.header.stem}: map of pigments",
-        pictures=[seen, classes],
+        pictures=[picture, classes],
         summary=[
             f"{finding.looked_at:,} pixels were put into {len(finding.regions)} regions of like spectra, "
             "whose means "
@@ -97,13 +100,14 @@ def _page(finding: ImageFinding, cube: Cube, origin: Origin, record: dict[str, A
 
 def _quality(finding: ImageFinding) -> str:
     total = max(finding.looked_at, 1)
-    stated = sum(finding.pixels_of(code) for code in range(FIRST_CLASS, len(finding.names)))
+    stated_pixels = sum(finding.pixels_of(code) for code in range(FIRST_CLASS, len(finding.names)))
     agree = sum(region.agreement * region.pixels for region in finding.regions) / max(
         sum(region.pixels for region in finding.regions), 1
     )
     unknown, ambiguous, unlike = (finding.pixels_of(code) / total for code in (UNKNOWN, AMBIGUOUS, UNLIKE))
     return (
-        f"A class or mixture is stated for {stated / total:.1%} of the pixels; {unknown:.1%} are not in the "
+        f"A class or mixture is stated for {stated_pixels / total:.1%} of the pixels; {unknown:.1%} are not "
+        "in the "
         f"library, {ambiguous:.1%} not decided, {unlike:.1%} like no region. The spectra of {agree:.1%} of the "
         "pixels agree by themselves with their region's answer."
     )
@@ -116,11 +120,11 @@ def _shares(finding: ImageFinding) -> Section:
         if pixels := finding.pixels_of(code):
             patch = Shape("rect", {"width": 20, "height": 12, "style": f"fill:{css(colours[code])}"})
             swatch = Drawing(f"colour of {finding.names[code]}", 20, 12, [patch], most_px=20)
-            rows.append(((swatch, " ", finding.names[code]), f"{pixels:,}", f"{pixels / total:.1%}"))
+            rows.append((finding.names[code], swatch, f"{pixels:,}", f"{pixels / total:.1%}"))
     return Section(
         "shares",
         "Shares of classes",
-        tables=[Table("Shares of classes", ("class", "pixels", "share"), rows)],
+        tables=[Table("Shares of classes", ("class", "colour", "pixels", "share"), rows)],
         notes=[
             "Shares are of pixels, not of pigment. Not in the library: the verdict of the region's mean is "
             "unknown. Not "
@@ -158,30 +162,44 @@ def _regions(finding: ImageFinding) -> Section:
             f"{region.finding.not_in_library:.0%}",
             f"{region.share:.1%}",
             f"{region.agreement:.1%}",
-            f"{region.draws_alike:.0%}",
         )
         for region in finding.regions
     ]
-    head = ("region", "verdict", "class", "probability", "not in library", "share", "pixels agree", "draws agree")
-    used = sorted({region.code for region in finding.regions})
+    head = ("region", "verdict", "class", "probability", "not in library", "share", "pixels agree")
+    used_codes = sorted({region.code for region in finding.regions})
     return Section(
         "regions",
         "Regions",
         tables=[Table("Regions", head, rows)],
-        legend=Legend({finding.names[code]: css(colours[code]) for code in used}),
+        legend=Legend({finding.names[code]: css(colours[code]) for code in used_codes}),
         notes=[
-            "Pixels agree: share of the region's pixels whose own spectrum has the region's answer. Draws "
-            "agree: share "
-            "of 200 draws of the mean, by its standard error from the pixels' scatter, with the same first class; "
-            "errors that all pixels share, such as those of the white, are not in it."
+            "Pixels agree: share of the region's pixels whose own spectrum has the region's answer.",
+            _steadiness(finding),
         ],
     )
+
+
+def _steadiness(finding: ImageFinding) -> str:
+    """Return a sentence about the effect of the means' noise on the answers."""
+    words = (
+        "The mean of each region was drawn 200 times with its standard error, which follows from the scatter "
+        "of the "
+        "pixels; errors that all pixels share, such as those of the white, are not in it. The first class, or the "
+        "verdict unknown, stayed in "
+    )
+    unsteady_regions = [region for region in finding.regions if region.draws_alike < _STEADY]
+    if not unsteady_regions:
+        return f"{words}{_STEADY:.0%} or more of the draws of every region."
+    shares = ", ".join(
+        f"{region.draws_alike:.0%} of those of region {region.number}" for region in unsteady_regions
+    )
+    return f"{words}{shares}, and in {_STEADY:.0%} or more of the draws of the others."
 
 
 def _answer(region: ImageRegion) -> str:
     finding = region.finding
     if finding.verdict == "ambiguous":
-        return finding.reason
+        return " or ".join(sorted(named_classes(finding)))
     if finding.verdict == "unknown":
         return f"(nearest: {finding.class_name})"
     return " + ".join(part.class_name for part in finding.parts) or finding.class_name

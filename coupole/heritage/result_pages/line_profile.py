@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import StorageError, reason
 from coupole.heritage.analysis.identification import PigmentFinding
-from coupole.heritage.analysis.line_points import LinePoints
+from coupole.heritage.pigment_maps.line_points import LinePoints
 from coupole.heritage.result_pages.class_colours import AMBIGUOUS, RGB, UNKNOWN, class_colour, with_legend
 from coupole.pages.palettes import colours_of
 from coupole.storage.durable import write_synced
@@ -32,8 +32,13 @@ class LineProfile:
     points: LinePoints
     findings: Sequence[PigmentFinding]
 
+    @property
+    def length_mm(self) -> float:
+        """Length from the first point to the last."""
+        return float(self.points.distances_mm[-1])
+
     def names(self) -> list[str]:
-        """What the profile says at each point: a class, a mixture, or why there is none."""
+        """Return the answer at each point: a class, a mixture, or the reason why there is none."""
         return [
             " + ".join(sorted({part.class_name for part in finding.parts}))
             or _WORDS.get(finding.verdict, finding.class_name)
@@ -61,12 +66,12 @@ class LineProfile:
         bars = picture[_CLASSES_PX + _GAP_PX : _CLASSES_PX + _GAP_PX + _BARS_PX]
         bars[:] = np.where((heights <= probabilities)[..., None], np.uint8(90), np.uint8(235))
         picture[-_SPECTRA_PX:] = self._spectra()[:, points]
-        length = self.points.distances_mm[-1]
         nm = self._wavelengths()
         entries = [
             *colours.items(),
             (
-                f"from left to right: 0 to {length:g} mm; bars: probability of the first class, 0 to 100 %",
+                f"from left to right: 0 to {self.length_mm:.1f} mm; bars: probability of the first class, 0 "
+                "to 100 %",
                 (90, 90, 90),
             ),
             (
@@ -97,7 +102,7 @@ class LineProfile:
         return np.asarray(np.rint(255 * colours_of(values / max(float(values.max()), 1e-6))), np.uint8)
 
     def rows(self) -> list[dict[str, Any]]:
-        """What is known of each point, as JSON's values."""
+        """Return the results of each point, as JSON's values."""
         return [
             {
                 "name": finding.name,
@@ -118,7 +123,7 @@ class LineProfile:
 
     def document(self) -> dict[str, Any]:
         """The line as JSON's values."""
-        return {"length_mm": float(self.points.distances_mm[-1]), "points": self.rows()}
+        return {"length_mm": self.length_mm, "points": self.rows()}
 
     def write(self, folder: Path) -> list[Path]:
         """Write picture and table, and return their paths. Raises StorageError."""

@@ -10,7 +10,7 @@ import numpy as np
 import coupole
 from coupole.heritage.analysis.identification import PigmentFinding
 from coupole.heritage.analysis.pigment_classes import FAMILIES
-from coupole.heritage.analysis.spectra_origin import FACTS
+from coupole.heritage.pigment_maps.spectra_origin import FACTS
 from coupole.heritage.result_pages.identification_record import RECORD, Origin
 from coupole.pages.page_charts import Curve, chart
 from coupole.pages.page_parts import Code, Inline, Moment, Plot, Section, Table
@@ -53,21 +53,21 @@ def words_of(finding: PigmentFinding) -> str:
             parts = " and ".join(f"{part.class_name} ({part.share:.0%} of K/S)" for part in finding.parts)
             return f"The spectrum shows a mixture of {parts}."
         case "ambiguous":
-            return f"The spectrum does not decide between classes: {finding.reason}."
+            return f"The spectrum does not decide for a class: {finding.reason}."
         case _:
             return f"The pigment is not identified: {finding.reason}."
 
 
 def confusions_of(finding: PigmentFinding) -> str:
-    """What the finding could be confused with, as a sentence."""
-    named = {finding.class_name} | {part.class_name for part in finding.parts}
-    others = [
-        f"{one.class_name} ({one.probability:.0%})"
-        for one in finding.candidates
-        if one.class_name not in named and one.probability >= _CONFUSED_AT
+    """Return the classes with which the finding could be confused, as a sentence."""
+    finding_names = {finding.class_name} | {part.class_name for part in finding.parts}
+    other_classes = [
+        f"{candidate.class_name} ({candidate.probability:.0%})"
+        for candidate in finding.candidates
+        if candidate.class_name not in finding_names and candidate.probability >= _CONFUSED_AT
     ]
-    kin = sorted({name for family in FAMILIES if family & named for name in family - named})
-    sentences = [f"other classes of the library: {', '.join(others)}" if others else
+    kin = sorted({name for family in FAMILIES if family & finding_names for name in family - finding_names})
+    sentences = [f"other classes of the library: {', '.join(other_classes)}" if other_classes else
                  f"no other class of the library has a probability of {_CONFUSED_AT:.0%} or more"]  # fmt: skip
     if kin:
         sentences.append(f"of the same family, with bands of the same kind: {', '.join(kin)}")
@@ -79,17 +79,17 @@ def fit_plots(finding: PigmentFinding) -> list[Plot]:
     """The spectrum with what was fitted to it, and the difference of the two."""
     evidence = finding.evidence
     parts = " and ".join(part.name for part in finding.parts) or finding.candidates[0].name
-    difference = 100.0 * (evidence.reflectance - evidence.fitted)
+    difference = 100.0 * (evidence.reflectance - evidence.fit)
     rms = float(np.sqrt(np.mean(difference**2)))
     fit = chart(
         f"{finding.name}: reflectance measured, and fitted by {parts}",
         evidence.wavelengths_nm,
-        [Curve("measured", evidence.reflectance), Curve("fitted", evidence.fitted, is_dashed=True)],
+        [Curve("measured", evidence.reflectance), Curve("fitted", evidence.fit, is_dashed=True)],
     )
     rest = chart(
         f"{finding.name}: measured minus fitted, in percent of reflectance; rms {rms:.2f} %",
         evidence.wavelengths_nm,
-        [Curve("measured minus fitted", difference), Curve("none", np.zeros(len(difference)), is_dashed=True)],
+        [Curve("measured minus fitted", difference), Curve("zero", np.zeros(len(difference)), is_dashed=True)],
     )
     return [fit, rest]
 
@@ -113,7 +113,7 @@ def compared_section(origin: Origin) -> Section:
 
 
 def limits_section() -> Section:
-    """What the method cannot do, in plain words."""
+    """Return the limits of the method, in plain words."""
     return Section("limits", "Limits of the method", items=LIMITS)
 
 

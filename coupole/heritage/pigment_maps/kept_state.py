@@ -26,13 +26,13 @@ class KeptState:
     def __init__(self, folder: Path, key: str) -> None:
         self._folder = folder
         try:
-            named = folder / _KEY
-            if folder.is_dir() and not (named.is_file() and named.read_text(encoding="utf-8") == key):
+            key_file = folder / _KEY
+            if folder.is_dir() and not (key_file.is_file() and key_file.read_text(encoding="utf-8") == key):
                 shutil.rmtree(folder)
             make_folder(folder)
-            write_synced(named, key)
+            write_synced(key_file, key)
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._error(error) from error
 
     def load(self, step: str) -> dict[str, NDArray[Any]] | None:
         """The arrays that were kept of a step; None if there are none."""
@@ -43,7 +43,7 @@ class KeptState:
             with np.load(path, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._error(error) from error
 
     def save(self, step: str, **arrays: Any) -> None:
         """Keep arrays of a step instead of those before."""
@@ -52,7 +52,7 @@ class KeptState:
         try:
             write_synced(self._folder / f"{step}.npz", buffer.getvalue())
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._error(error) from error
 
     def map(self, name: str, shape: tuple[int, ...], dtype: type[np.generic]) -> NDArray[Any]:
         """A map on the disk, zero where nothing was written yet."""
@@ -62,11 +62,11 @@ class KeptState:
                 return np.lib.format.open_memmap(path, mode="r+")
             return np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._error(error) from error
 
     def remove(self) -> None:
         """Delete the state: the job is done."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _failed(self, error: OSError) -> StorageError:
+    def _error(self, error: OSError) -> StorageError:
         return StorageError(f"{self._folder}: {reason(error)}")

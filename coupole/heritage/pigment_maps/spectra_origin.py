@@ -1,4 +1,4 @@
-"""What the files of spectra say about object, instrument and person, and which files a library consists of."""
+"""Facts in the files of spectra about object, instrument and person; the files of a library."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ def digests(paths: Sequence[Path]) -> dict[str, str]:
     """Return the SHA-256 of files by name; folders stand for their spectra. Raises InputError."""
     files = [file for path in paths for file in library_files(path)]
     files += [beside for file in files if (beside := file.parent / WAVELENGTHS).is_file() and beside not in files]
-    found: dict[str, str] = {}
+    file_digests: dict[str, str] = {}
     for file in dict.fromkeys(files):
         try:
-            found[file.name if file.name not in found else str(file)] = sha256(file)
+            file_digests[file.name if file.name not in file_digests else str(file)] = sha256(file)
         except OSError as error:
             raise InputError(f"{file}: {reason(error)}") from error
-    return found
+    return file_digests
 
 
 def licence_beside(library: Path) -> str:

@@ -55,10 +55,10 @@ class Regions:
         return nearest, distance <= self.farthest, self.mean + (scores @ self.basis.T) * self.noise
 
 
-def noise_of_neighbours(left: Array, right: Array) -> Array:
+def noise_of_neighbours(left_pixels: Array, right_pixels: Array) -> Array:
     """[bands] standard deviation of noise from pairs of neighbours [n, bands], by the median of their differences,
     so that edges between areas count little."""
-    apart = np.abs(left - right)
+    apart = np.abs(left_pixels - right_pixels)
     noise: Array = np.maximum(1.4826 * np.median(apart, axis=0) / np.sqrt(2.0), _LEAST_NOISE)
     return noise
 
@@ -72,7 +72,7 @@ def find_regions(sample: Array, noise: Array, most: int) -> Regions:
     basis = vectors[:, keep if len(keep) else [-1]]
     scores = in_noise @ basis
     groups = _split(scores, (mean / noise) @ basis, most)
-    centres = _settled(scores, np.stack([scores[rows].mean(axis=0) for rows in groups]))
+    centres = _settle(scores, np.stack([scores[rows].mean(axis=0) for rows in groups]))
     beyond = (in_noise**2).sum(axis=1) - (scores**2).sum(axis=1)
     distance = (_squares(scores, centres).min(axis=1) + np.maximum(beyond, 0.0)) / len(mean)
     farthest = max(_FAR_AT_LEAST, _FAR_FACTOR * float(np.quantile(distance, _FAR_QUANTILE)))
@@ -88,16 +88,16 @@ def _split(scores: Array, origin: Array, most: int) -> list[NDArray[np.intp]]:
         return _Group(rows, apart, float(variances[-1]), vectors[:, -1])
 
     waiting = [group(np.arange(len(scores)))]
-    settled: list[NDArray[np.intp]] = []
-    while waiting and len(waiting) + len(settled) < most:
+    narrow_groups: list[NDArray[np.intp]] = []
+    while waiting and len(waiting) + len(narrow_groups) < most:
         place = max(range(len(waiting)), key=lambda at: waiting[at].variance * len(waiting[at].rows))
         widest = waiting.pop(place)
         half = _first_half(widest) if widest.variance > _WIDER_THAN_NOISE else None
         if half is None:
-            settled.append(widest.rows)
+            narrow_groups.append(widest.rows)
         else:
             waiting += [group(widest.rows[half]), group(widest.rows[~half])]
-    return settled + [each.rows for each in waiting]
+    return narrow_groups + [group_.rows for group_ in waiting]
 
 
 def _without_shading(scores: Array, origin: Array) -> Array:
@@ -137,16 +137,16 @@ def _first_half(group: _Group) -> NDArray[np.bool_] | None:
     return first if _LEAST_PIXELS <= first.sum() <= len(first) - _LEAST_PIXELS else None
 
 
-def _settled(scores: Array, centres: Array) -> Array:
+def _settle(scores: Array, centres: Array) -> Array:
     nearest = np.full(len(scores), -1)
     for _ in range(_SETTLINGS):
-        moved = _squares(scores, centres).argmin(axis=1)
-        if np.array_equal(moved, nearest):
+        new_nearest = _squares(scores, centres).argmin(axis=1)
+        if np.array_equal(new_nearest, nearest):
             break
-        nearest = moved
-        kept = [number for number in range(len(centres)) if np.any(nearest == number)]
-        centres = np.stack([scores[nearest == number].mean(axis=0) for number in kept])
-        nearest = np.searchsorted(kept, nearest)
+        nearest = new_nearest
+        kept_numbers = [number for number in range(len(centres)) if np.any(nearest == number)]
+        centres = np.stack([scores[nearest == number].mean(axis=0) for number in kept_numbers])
+        nearest = np.searchsorted(kept_numbers, nearest)
     return centres
 
 

@@ -22,18 +22,17 @@ from coupole.appearance.spectra.measured import Measured
 from coupole.appearance.spectra.resampling import resample
 from coupole.errors import InputError
 from coupole.heritage.analysis.identification import PigmentFinding, identify
-from coupole.heritage.analysis.kept_state import KeptState
-from coupole.heritage.analysis.pixel_regions import Regions, find_regions, noise_of_neighbours
 from coupole.heritage.analysis.references import OfBands, References
 from coupole.heritage.analysis.spectral_features import BANDS_NM, STEP_NM, on_bands
+from coupole.heritage.pigment_maps.kept_state import KeptState
+from coupole.heritage.pigment_maps.pixel_regions import Regions, find_regions, noise_of_neighbours
 
 Say = Callable[[str, int, int], None]
 Mask = NDArray[np.bool_]
 NOT_LOOKED_AT, UNLIKE, UNKNOWN, AMBIGUOUS, FIRST_CLASS = 0, 1, 2, 3, 4
 """Codes of the map; classes have codes from `FIRST_CLASS`, the largest first."""
 CODE_NAMES = ("not looked at", "like no region", "not in the library", "not decided")
-MOST_REGIONS = 200
-_SAMPLED_ROWS, _SAMPLED_PIXELS = 256, 20_000
+_SAMPLED_ROWS, _SAMPLED_PIXELS = 128, 20_000
 _PIXELS_AT_ONCE = 1024
 _DRAWS, _SEED = 200, 5
 _NAMED_SHARE = 0.25
@@ -48,7 +47,7 @@ class ImageRegion:
     """Pixels of like spectra, with the identification of their mean."""
 
     number: int
-    """From 1, the largest first."""
+    """Number from 1, the largest first."""
     pixels: int
     share: float
     """Share of the pixels that were looked at."""
@@ -75,7 +74,7 @@ class ImageFinding:
     """0: like no region, or not looked at."""
     confidence: NDArray[np.float32]
     """Probability that the pixel's own spectrum gives to the answer of the map; NaN where there is none."""
-    seen: NDArray[np.uint8]
+    picture: NDArray[np.uint8]
     """[rows, columns, 3] three bands as red, green and blue, for the eye."""
     names: tuple[str, ...]
     """Meaning of the codes."""
@@ -112,13 +111,13 @@ def identify_image(
 def band_matrix(nm: Array) -> tuple[NDArray[np.intp], Array]:
     """Return the numbers of the bands of `BANDS_NM` that wavelengths `nm` [n] cover, and the matrix [n, bands]
     that resamples spectra to them: averages of finer samples, straight lines between coarser ones."""
-    covered = np.flatnonzero(np.isfinite(on_bands(Measured("cube", nm, np.ones(len(nm)), ()))))
+    covered_bands = np.flatnonzero(np.isfinite(on_bands(Measured("cube", nm, np.ones(len(nm)), ()))))
     unit = np.eye(len(nm))
     if np.median(np.diff(nm)) < STEP_NM - 1e-6:
-        rows = [resample(Measured("cube", nm, values, ()), BANDS_NM, STEP_NM)[0][covered] for values in unit]
+        rows = [resample(Measured("cube", nm, values, ()), BANDS_NM, STEP_NM)[0][covered_bands] for values in unit]
     else:
-        rows = [np.interp(BANDS_NM[covered], nm, values) for values in unit]
-    return covered, np.stack(rows)
+        rows = [np.interp(BANDS_NM[covered_bands], nm, values) for values in unit]
+    return covered_bands, np.stack(rows)
 
 
 def _key(cube: Cube, references: References, looks: Mask, most_regions: int) -> str:
@@ -142,7 +141,7 @@ class _Mean:
     finding: PigmentFinding
     draws_alike: float
     of_bands: OfBands
-    named: tuple[int, ...]
+    answer_columns: tuple[int, ...]
     """Columns of the probabilities that are the region's answer; -1 is none of the classes."""
 
     @property
@@ -166,26 +165,28 @@ class _Job:
         self._confidence = state.map("confidence", shape, np.float32)
         self._agrees = state.map("agrees", shape, np.bool_)
         self._is_valid = state.map("valid", shape, np.bool_)
-        self._seen = state.map("seen", (*shape, 3), np.uint8)
+        self._picture = state.map("seen", (*shape, 3), np.uint8)
         self._seen_bands = [int(np.abs(cube.wavelengths_nm - nm).argmin()) for nm in _SEEN_NM]
 
     def find_regions(self, most: int) -> Regions:
         """Find the regions in a sample of pixels, unless they were kept."""
-        if kept := self.state.load("found"):
-            return Regions(kept["mean"], kept["noise"], kept["basis"], kept["centres"], float(kept["farthest"]))
+        if state := self.state.load("found"):
+            return Regions(
+                state["mean"], state["noise"], state["basis"], state["centres"], float(state["farthest"])
+            )
         rows = np.flatnonzero(self._looks.any(axis=1))
         if not len(rows):
             raise InputError("expected pixels to look at, found none: mask and --area leave out all")
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), _SAMPLED_ROWS)).astype(int))]
-        left, right, sample = [], [], []
+        left_pixels, right, sample = [], [], []
         for count, row in enumerate(rows):
             self._say("sample", count, len(rows))
-            spectra = self._cube.read(int(row), int(row) + 1)[0]
+            spectra = self._cube.read_rows(int(row), int(row) + 1)[0]
             is_valid = _valid(spectra) & self._looks[row]
             sample.append(spectra[is_valid])
             pairs = np.flatnonzero(is_valid[:-1] & is_valid[1:])
             pairs = pairs[:: max(1, len(pairs) * len(rows) // _SAMPLED_PIXELS)]
-            left.append(spectra[pairs] @ self._matrix)
+            left_pixels.append(spectra[pairs] @ self._matrix)
             right.append(spectra[pairs + 1] @ self._matrix)
             step = max(1, len(sample[-1]) * len(rows) // _SAMPLED_PIXELS)
             sample[-1] = sample[-1][row % step :: step]
@@ -197,15 +198,15 @@ class _Job:
                 "name bands without data in the header's bbl"
             )
         self._refuse_other_quantities(pixels)
-        pairs_left, pairs_right = np.concatenate(left), np.concatenate(right)
+        pairs_left, pairs_right = np.concatenate(left_pixels), np.concatenate(right)
         if not len(pairs_left):
             raise InputError("expected neighbouring pixels, from which noise is known; found none")
-        found = find_regions(pixels @ self._matrix, noise_of_neighbours(pairs_left, pairs_right), most)
+        result = find_regions(pixels @ self._matrix, noise_of_neighbours(pairs_left, pairs_right), most)
         self.state.save(
-            "found", mean=found.mean, noise=found.noise, basis=found.basis, centres=found.centres,
-            farthest=found.farthest,
+            "found", mean=result.mean, noise=result.noise, basis=result.basis, centres=result.centres,
+            farthest=result.farthest,
         )  # fmt: skip
-        return found
+        return result
 
     def _refuse_other_quantities(self, pixels: Array) -> None:
         least, dark, most = _REFLECTANCE
@@ -220,33 +221,33 @@ class _Job:
     def identify_means(self, regions: Regions) -> list[_Mean]:
         """Give each pixel its region, and identify the regions' means."""
         count, bands = len(regions.centres), len(self._cube.wavelengths_nm)
-        kept = self.state.load("means") or {
+        state = self.state.load("means") or {
             "row": np.array(0),
             "pixels": np.zeros(count),
             "sums": np.zeros((count, bands)),
             "squares": np.zeros((count, bands)),
         }
-        pixels, sums, squares = kept["pixels"], kept["sums"], kept["squares"]
+        pixels, sums, squares = state["pixels"], state["sums"], state["squares"]
         for first, end in self._cube.blocks():
             self._say("regions", first, self._cube.rows)
-            if end <= int(kept["row"]):
+            if end <= int(state["row"]):
                 continue
             if self._looks[first:end].any():
-                spectra = self._cube.read(first, end)
+                spectra = self._cube.read_rows(first, end)
                 is_valid = _valid(spectra) & self._looks[first:end]
                 inside = spectra[is_valid].astype(np.float64)
                 nearest, is_like, _ = regions.places(inside @ self._matrix)
                 numbers = np.where(is_like, nearest + 1, 0)
                 for number in np.unique(numbers[numbers > 0]):
-                    mine = inside[numbers == number]
-                    pixels[number - 1] += len(mine)
-                    sums[number - 1] += mine.sum(axis=0)
-                    squares[number - 1] += (mine**2).sum(axis=0)
+                    is_mine = inside[numbers == number]
+                    pixels[number - 1] += len(is_mine)
+                    sums[number - 1] += is_mine.sum(axis=0)
+                    squares[number - 1] += (is_mine**2).sum(axis=0)
                 self._numbers[first:end][is_valid] = numbers
                 self._is_valid[first:end] = is_valid
-                seen = np.clip(np.nan_to_num(spectra[:, :, self._seen_bands]), 0.0, 1.0) ** (1.0 / _SEEN_GAMMA)
-                self._seen[first:end] = np.rint(255 * seen)
-                _flush(self._numbers, self._is_valid, self._seen)
+                picture = np.clip(np.nan_to_num(spectra[:, :, self._seen_bands]), 0.0, 1.0) ** (1.0 / _SEEN_GAMMA)
+                self._picture[first:end] = np.rint(255 * picture)
+                _flush(self._numbers, self._is_valid, self._picture)
             self.state.save("means", row=end, pixels=pixels, sums=sums, squares=squares)
         self._say("regions", self._cube.rows, self._cube.rows)
         means = []
@@ -268,52 +269,52 @@ class _Job:
         draws = values[of_bands.bands] + error * np.random.default_rng(_SEED).standard_normal(
             (_DRAWS, len(places))
         )
-        drawn = model.probabilities(draws)
+        draw_probabilities = model.probabilities(draws)
         best = model.class_names.index(finding.candidates[0].class_name)
         is_known = model.is_known(np.array([[*np.zeros(len(model.class_names)), finding.not_in_library]]))[0]
-        named: tuple[int, ...]
+        answer_columns: tuple[int, ...]
         if finding.verdict == "unknown":
-            named = (best, -1) if is_known else (-1,)
-            alike = model.is_known(drawn) == is_known
+            answer_columns = (best, -1) if is_known else (-1,)
+            alike = model.is_known(draw_probabilities) == is_known
         else:
-            names = {part.class_name for part in finding.parts} or _named(finding)
-            named = tuple(model.class_names.index(name) for name in names)
-            alike = drawn[:, :-1].argmax(axis=1) == best
-        return _Mean(mean, deviation, finding, float(alike.mean()), of_bands, named)
+            names = {part.class_name for part in finding.parts} or named_classes(finding)
+            answer_columns = tuple(model.class_names.index(name) for name in names)
+            alike = draw_probabilities[:, :-1].argmax(axis=1) == best
+        return _Mean(mean, deviation, finding, float(alike.mean()), of_bands, answer_columns)
 
     def classify_pixels(self, regions: Regions, means: Sequence[_Mean]) -> ImageFinding:
         """Compare each pixel with its region's answer, and put the maps together."""
-        kept = self.state.load("pixels")
-        done = int(kept["row"]) if kept else 0
+        state = self.state.load("pixels")
+        done_rows = int(state["row"]) if state else 0
         for first, end in self._cube.blocks():
             self._say("pixels", first, self._cube.rows)
-            if end <= done:
+            if end <= done_rows:
                 continue
             numbers = self._numbers[first:end]
             if (numbers > 0).any():
-                spectra = self._cube.read(first, end)
+                spectra = self._cube.read_rows(first, end)
                 for number in np.unique(numbers[numbers > 0]):
-                    mine = numbers == number
-                    clean = regions.places(spectra[mine].astype(np.float64) @ self._matrix)[2]
-                    self._compare(first, end, mine, clean, means[number - 1])
+                    is_mine = numbers == number
+                    clean = regions.places(spectra[is_mine].astype(np.float64) @ self._matrix)[2]
+                    self._compare(first, end, is_mine, clean, means[number - 1])
                 _flush(self._confidence, self._agrees)
             self.state.save("pixels", row=end)
         self._say("pixels", self._cube.rows, self._cube.rows)
         return self._result(means)
 
-    def _compare(self, first: int, end: int, mine: Mask, clean: Array, mean: _Mean) -> None:
+    def _compare(self, first: int, end: int, is_mine: Mask, clean: Array, mean: _Mean) -> None:
         model = mean.of_bands.model
         values = clean[:, np.searchsorted(self._covered, mean.of_bands.bands)]
         confidence, agrees = np.empty(len(values), np.float32), np.empty(len(values), bool)
         for start in range(0, len(values), _PIXELS_AT_ONCE):
             part = slice(start, start + _PIXELS_AT_ONCE)
             probabilities = model.quick_probabilities(values[part])
-            confidence[part] = probabilities[:, list(mean.named)].sum(axis=1)
-            agrees[part] = np.isin(probabilities[:, :-1].argmax(axis=1), mean.named)
-            if -1 in mean.named:
+            confidence[part] = probabilities[:, list(mean.answer_columns)].sum(axis=1)
+            agrees[part] = np.isin(probabilities[:, :-1].argmax(axis=1), mean.answer_columns)
+            if -1 in mean.answer_columns:
                 agrees[part] |= ~model.is_known(probabilities)
-        self._confidence[first:end][mine] = confidence
-        self._agrees[first:end][mine] = agrees
+        self._confidence[first:end][is_mine] = confidence
+        self._agrees[first:end][is_mine] = agrees
 
     def _result(self, means: Sequence[_Mean]) -> ImageFinding:
         old = np.asarray(self._numbers)
@@ -324,25 +325,25 @@ class _Job:
             areas[mean.label] = areas.get(mean.label, 0) + int(count)
         names = sorted((name for name in areas if name and areas[name]), key=lambda name: (-areas[name], name))
         lookup = np.zeros(len(means) + 1, np.uint8)
-        renumbered = np.zeros(len(means) + 1, np.uint8)
-        found = []
+        new_numbers = np.zeros(len(means) + 1, np.uint8)
+        result = []
         order = [number for number in np.argsort(-pixels, kind="stable") if pixels[number]]
         for place, number in enumerate(order, start=1):
             mean = means[number]
             code = AMBIGUOUS if mean.finding.verdict == "ambiguous" else UNKNOWN
             code = FIRST_CLASS + names.index(mean.label) if mean.label else code
-            lookup[number + 1], renumbered[number + 1] = code, place
+            lookup[number + 1], new_numbers[number + 1] = code, place
             agreement = float(self._agrees[old == number + 1].mean())
             count = int(pixels[number])
-            found.append(
+            result.append(
                 ImageRegion(place, count, count / total, mean.mean, mean.deviation,
-                            _renamed(mean.finding, place), mean.draws_alike, agreement, code)
+                            _with_number(mean.finding, place), mean.draws_alike, agreement, code)
             )  # fmt: skip
         codes = lookup[old]
         codes[(old == 0) & self._is_valid] = UNLIKE
         confidence = np.where(old > 0, self._confidence, np.float32(np.nan))
         return ImageFinding(
-            codes, renumbered[old], confidence, np.array(self._seen), (*CODE_NAMES, *names), tuple(found)
+            codes, new_numbers[old], confidence, np.array(self._picture), (*CODE_NAMES, *names), tuple(result)
         )
 
 
@@ -352,21 +353,23 @@ def _valid(spectra: NDArray[np.float32]) -> Mask:
     return is_valid
 
 
-def _named(finding: PigmentFinding) -> set[str]:
+def named_classes(finding: PigmentFinding) -> set[str]:
     """Return the class of a match, or the classes between which an ambiguous verdict does not decide."""
     if finding.verdict == "match":
         return {finding.class_name}
     best = finding.candidates[0].probability
-    return {one.class_name for one in finding.candidates if one.probability >= _NAMED_SHARE * best}
+    return {
+        candidate.class_name for candidate in finding.candidates if candidate.probability >= _NAMED_SHARE * best
+    }
 
 
-def _renamed(finding: PigmentFinding, place: int) -> PigmentFinding:
+def _with_number(finding: PigmentFinding, place: int) -> PigmentFinding:
     from dataclasses import replace
 
     return replace(finding, name=f"region {place}")
 
 
 def _flush(*maps: NDArray[np.generic]) -> None:
-    for each in maps:
-        if isinstance(each, np.memmap):
-            each.flush()
+    for pixel_map in maps:
+        if isinstance(pixel_map, np.memmap):
+            pixel_map.flush()

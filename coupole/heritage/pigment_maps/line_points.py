@@ -59,8 +59,8 @@ def read_line(path: Path, *, unit: Unit = "auto") -> LinePoints:
     separator = max(_SEPARATORS, key=lines[head].count)
     columns = [field.strip().strip('"').lower() for field in lines[head].split(separator)]
     places = [number for number, field in enumerate(columns) if _POSITION.fullmatch(field)]
-    named = columns.index(_NAME) if _NAME in columns else None
-    first = max([*places, -1 if named is None else named]) + 1
+    name_column = columns.index(_NAME) if _NAME in columns else None
+    first = max([*places, -1 if name_column is None else name_column]) + 1
     axes = tuple(columns[number] for number in places)
     if len({axis.split("_")[0] for axis in axes}) < len(axes) or ("position" in {a.split("_")[0] for a in axes} and
                                                                   len(axes) > 1):  # fmt: skip
@@ -78,7 +78,7 @@ def read_line(path: Path, *, unit: Unit = "auto") -> LinePoints:
         else:
             values = [_number(path, number, columns[place], fields, place) for place in places]
             positions.append([value * factor for value, factor in zip(values, factors, strict=True)])
-            name = fields[named].strip('"') if named is not None else f"point {len(positions)}"
+            name = fields[name_column].strip('"') if name_column is not None else f"point {len(positions)}"
             rows.append(separator.join([f'"{name}"', *fields[first:]]))
     spectra = with_unique_names(parse_library("\n".join(rows), path, unit=unit))
     places_mm = np.array(positions)

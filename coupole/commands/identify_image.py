@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from coupole.commands.identify_report import ReportOptions, origin_of
-from coupole.errors import InputError, reason
+from coupole.errors import InputError, StorageError, reason
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -83,7 +83,10 @@ def identify_cube(
         raise InputError(f"--scale {options.scale:g}: expected a number above 0, such as 10000")
     cube = open_cube(path, CubeOptions(options.scale, options.wavelength_unit))
     mask = _mask_of(cube, options)
-    make_folder(report.report)
+    try:
+        make_folder(report.report)
+    except OSError as error:
+        raise StorageError(f"{report.report}: {reason(error)}") from error
     with step_bars(console) as say:
         finding = identify_image(
             cube, references, report.report / _STATE, say, mask=mask, most_regions=options.regions

@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import Browser, needs_chromium
-from cubes import SHAPES, batch, write_library
+from cubes import SHAPES, areas, batch, write_cube, write_library
 from PIL import Image
 
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM
 from coupole.commands.identify import identify
 from coupole.commands.keeping import verify
-from coupole.errors import ChecksumMismatch, InputError
+from coupole.errors import ChecksumMismatch, InputError, StorageError
 from coupole.heritage.result_pages.class_colours import class_colour, code_colours
 from coupole.heritage.result_pages.identification_record import RECORD, check_record
+from coupole.storage.durable import sha256
 
 NAMED = {"signed_by": "Test Person", "role": "conservator"}
 
@@ -128,11 +129,33 @@ def test_a_changed_report_is_told(
     assert any(problem.startswith(said) for problem in told["bad"])
 
 
+def test_a_changed_page_whose_checksum_was_entered_is_told(library: dict[str, Path], tmp_path: Path) -> None:
+    out = tmp_path / "seen"
+    identify([spot(tmp_path, "azurite")], **library, report=out, **NAMED)
+    page = out / "identification.html"
+    page.write_text(page.read_text().replace("azurite", "malachite"))
+    record = json.loads((out / RECORD).read_text())
+    record["files"][page.name] = sha256(page)
+    (out / RECORD).write_text(json.dumps(record))
+
+    assert [problem.split(":")[0] for problem in check_record(out).problems] == [RECORD]
+
+
+def test_a_folder_that_cannot_be_written_is_refused(library: dict[str, Path], tmp_path: Path) -> None:
+    (tmp_path / "seen").write_text("a file")
+
+    with pytest.raises(StorageError, match="seen"):
+        identify([spot(tmp_path, "azurite")], **library, report=tmp_path / "seen")
+    cube = write_cube(tmp_path / "panel.hdr", areas(SHAPES[:1], 4)[0])
+    with pytest.raises(StorageError, match="seen"):
+        identify([cube], **library, report=tmp_path / "seen")
+
+
 def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
     (tmp_path / RECORD).write_text("{")
     with pytest.raises(InputError, match=r"identification.json: expected JSON"):
         verify(tmp_path)
-    (tmp_path / RECORD).write_text('{"kind": "other"}')
+    (tmp_path / RECORD).write_text('{"kind": "other", "files": {}}')
     with pytest.raises(InputError, match="expected a record of an identification"):
         verify(tmp_path)
 

@@ -10,6 +10,7 @@ import io
 import shutil
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +43,7 @@ class KeptState:
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
-        except OSError as error:
+        except (OSError, ValueError, BadZipFile) as error:
             raise self._error(error) from error
 
     def save(self, step: str, **arrays: Any) -> None:
@@ -60,13 +61,18 @@ class KeptState:
         try:
             if path.is_file():
                 return np.lib.format.open_memmap(path, mode="r+")
-            return np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
-        except OSError as error:
+            partial = path.with_suffix(".part")
+            pixel_map = np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=shape)
+            partial.replace(path)
+        except (OSError, ValueError) as error:
             raise self._error(error) from error
+        return pixel_map
 
     def remove(self) -> None:
         """Delete the state: the job is done."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _error(self, error: OSError) -> StorageError:
-        return StorageError(f"{self._folder}: {reason(error)}")
+    def _error(self, error: Exception) -> StorageError:
+        return StorageError(
+            f"{self._folder}: {reason(error)}; free its disk, or delete this folder to begin again"
+        )

@@ -64,7 +64,7 @@ def write(folder: Path, finding: ImageFinding, cube: Cube, origin: Origin) -> Pa
 
 
 def _page(finding: ImageFinding, cube: Cube, origin: Origin, record: dict[str, Any]) -> Page:
-    step = max(1, -(-cube.columns // WIDTH_PX))
+    step = max(1, -(-max(cube.rows, cube.columns) // (2 * WIDTH_PX)))
     picture = Picture("The object in three bands of the cube (620, 550 and 460 nm, or the nearest)",
                    picture_png(finding.picture[::step, ::step]))  # fmt: skip
     classes = Picture("Classes of pigments; grey: no class is stated", class_maps.class_picture(finding))

@@ -11,9 +11,7 @@ import typer
 
 from coupole.commands.common import JsonOption, fail
 from coupole.commands.export_options import LedsOption, SensorOption
-from coupole.commands.identify_image import ImageOptions, identify_cube
-from coupole.commands.identify_report import ReportOptions, origin_of
-from coupole.commands.identify_spot import asked_spot, identify_spot
+from coupole.commands.identify_options import ImageOptions, ReportOptions
 from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError
 
@@ -98,6 +96,7 @@ def identify(
     verdict. Below, the error rates of the library about its own spectra are printed. Of an image cube, a map of
     classes is made. If it was interrupted, the same command continues.
     """
+    from coupole.commands.identify_spot import asked_spot, identify_spot
     from coupole.scripting.analyses import references_of
     from coupole.viewing.terminal import make_console
 
@@ -120,6 +119,8 @@ def identify(
         for remark in references.remarks:
             console.print(remark, markup=False)
         if cube := _cube_among(spectra, image):
+            from coupole.commands.identify_image import identify_cube
+
             document = identify_cube(console, cube, library, classes, references, image, report)
             if as_json:
                 print(json.dumps(document))
@@ -157,6 +158,7 @@ def _identify_spectra(
 ) -> tuple[list[dict[str, Any]], Path | None]:
     """Identify spectra, or points along a line, print the findings, and write the report. Returns the findings as
     JSON's values, and the page."""
+    from coupole.commands.identify_report import origin_of
     from coupole.heritage.pigment_maps.line_points import is_line, read_line
     from coupole.heritage.result_pages import identification_page
     from coupole.heritage.result_pages.line_profile import LineProfile

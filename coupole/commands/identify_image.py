@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from coupole.commands.identify_report import ReportOptions, origin_of
+from coupole.commands.identify_options import ImageOptions, ReportOptions
+from coupole.commands.identify_report import origin_of
 from coupole.errors import InputError, StorageError, reason
 
 if TYPE_CHECKING:
@@ -20,44 +18,8 @@ if TYPE_CHECKING:
     from coupole.heritage.analysis.references import References
     from coupole.heritage.pigment_maps.image_identification import ImageFinding
 
-_PANEL = "Image cubes"
 _AREA = re.compile(r"(\d+):(\d+),(\d+):(\d+)")
 _STATE = ".identify"
-
-MaskOption = Annotated[
-    Path | None,
-    typer.Option("--mask", help="Picture of the cube's size; black pixels are left out.", rich_help_panel=_PANEL),
-]
-AreaOption = Annotated[
-    str | None,
-    typer.Option(
-        "--area",
-        help="Rows and columns FIRST:END,FIRST:END, counted from 0; END is left out.",
-        rich_help_panel=_PANEL,
-    ),
-]
-ScaleOption = Annotated[
-    float | None,
-    typer.Option("--scale", help="Number in the cube that is a reflectance of 1.", rich_help_panel=_PANEL),
-]
-WavelengthOption = Annotated[
-    Literal["nm", "um"] | None,
-    typer.Option("--wavelength-unit", help="Unit of the header's wavelengths.", rich_help_panel=_PANEL),
-]
-RegionsOption = Annotated[
-    int, typer.Option("--regions", min=2, max=200, help="Most regions of like spectra.", rich_help_panel=_PANEL)
-]
-
-
-@dataclass(frozen=True)
-class ImageOptions:
-    """Options of an image cube."""
-
-    mask: MaskOption = None
-    area: AreaOption = None
-    scale: ScaleOption = None
-    wavelength_unit: WavelengthOption = None
-    regions: RegionsOption = 40
 
 
 def identify_cube(

@@ -1,83 +1,15 @@
-"""Options of the report of `coupole identify`: object, instrument, persons, licence, signature."""
+"""The origin of spectra, for the report of `coupole identify`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
-
-from coupole.commands.common import LONGEST_NAME
-from coupole.errors import InputError
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from coupole.commands.identify_options import ReportOptions
     from coupole.heritage.analysis.references import References
     from coupole.heritage.result_pages.identification_record import Origin
-
-_PANEL = "Report"
-
-PageOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--report",
-        help="Folder for a report to sign: page, record, and the maps of an image or a line, which need it.",
-        rich_help_panel=_PANEL,
-    ),
-]
-ObjectOption = Annotated[str | None, typer.Option("--object", help="Object.", rich_help_panel=_PANEL)]
-SampleOption = Annotated[
-    str | None, typer.Option("--sample", help="Sample, point or area.", rich_help_panel=_PANEL)
-]
-InstrumentOption = Annotated[str | None, typer.Option("--instrument", help="Instrument.", rich_help_panel=_PANEL)]
-MeasuredByOption = Annotated[
-    str | None, typer.Option("--measured-by", help="Person who measured.", rich_help_panel=_PANEL)
-]
-MeasuredOnOption = Annotated[
-    str | None, typer.Option("--measured-on", help="Date of the measurement.", rich_help_panel=_PANEL)
-]
-SimulatedOption = Annotated[
-    bool, typer.Option("--simulated", help="The data are simulated; the report says so.", rich_help_panel=_PANEL)
-]
-LicenceOption = Annotated[
-    str | None,
-    typer.Option(
-        "--library-licence",
-        help="Licence of the library, if no file LICENSE is beside it.",
-        rich_help_panel=_PANEL,
-    ),
-]
-SignedByOption = Annotated[
-    str | None, typer.Option("--signed-by", help="Person who signs the report.", rich_help_panel=_PANEL)
-]
-RoleOption = Annotated[str | None, typer.Option("--role", help="Role of this person.", rich_help_panel=_PANEL)]
-
-
-@dataclass(frozen=True)
-class ReportOptions:
-    """Words of a report besides the findings."""
-
-    report: PageOption = None
-    object_name: ObjectOption = None
-    sample: SampleOption = None
-    instrument: InstrumentOption = None
-    measured_by: MeasuredByOption = None
-    measured_on: MeasuredOnOption = None
-    is_simulated: SimulatedOption = False
-    library_licence: LicenceOption = None
-    signed_by: SignedByOption = None
-    role: RoleOption = None
-
-    def refuse_half(self) -> None:
-        """Raise InputError for a signature without a role, or for options of a report without `--report`."""
-        if (self.signed_by is None) != (self.role is None):
-            raise InputError("expected --signed-by and --role together, found one of them")
-        for option, words in (("--signed-by", self.signed_by), ("--role", self.role)):
-            if words is not None and not 0 < len(words.strip()) <= LONGEST_NAME:
-                raise InputError(f"{option}: expected 1 to {LONGEST_NAME} characters, found {len(words.strip())}")
-        if self.report is None and (self != ReportOptions()):
-            raise InputError("expected --report with a folder; the other options of a report go with it")
 
 
 def origin_of(

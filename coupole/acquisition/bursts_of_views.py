@@ -55,7 +55,7 @@ class BurstsOfViews:
         """Heat of the boards after the session's chosen bursts. Moves and waits, in which the boards cool, are not
         counted."""
         self._thinker = Workers(1, "choice")
-        self._thought: Future[_Next | None] | None = None
+        self._choice_ahead: Future[_Next | None] | None = None
         """The choice that is made while a burst is fired; None if there is none."""
         self._ahead: list[Burst] = []
         """Bursts that were chosen and noted while the last ones were fired."""
@@ -114,28 +114,33 @@ class BurstsOfViews:
     def think_ahead(self, number: int) -> None:
         """Begin to choose, in another thread, what follows the last chosen bursts of a view, which are about to be
         fired."""
-        if self._chooser is None or self._thought is not None or self._ahead or not self.may_want_more(number):
+        if (
+            self._chooser is None
+            or self._choice_ahead is not None
+            or self._ahead
+            or not self.may_want_more(number)
+        ):
             return
         choices = tuple(self._choices_of(number))
         if choices:
             view = self._open_view(number)
             samples = before_last(choices, _Seen(view.name, choices, self._recorder))
-            self._thought = self._thinker.submit(self._next_ahead, view, choices, samples)
+            self._choice_ahead = self._thinker.submit(self._next_ahead, view, choices, samples)
 
     def following(self, number: int) -> Burst | None:
         """Return the first burst of the choice that `think_ahead` has begun, once it is made. The choice is on the
         disk when this returns. None if it is not made yet, or is made only after the last chosen bursts."""
-        if self._thought is not None and self._thought.done() and self._thought.exception() is None:
-            following, self._thought = self._thought.result(), None
+        if self._choice_ahead is not None and self._choice_ahead.done() and self._choice_ahead.exception() is None:
+            following, self._choice_ahead = self._choice_ahead.result(), None
             self._ahead = self._note(number, following) if following else []
         return self._ahead[0] if self._ahead else None
 
     def more(self, number: int) -> list[Burst]:
         """Return the next bursts of a view, after all its known bursts were fired; none if the view has enough.
         The choice is on the disk when this returns. Raises RuntimeError if it exceeds the view's bound."""
-        if self._thought is not None:
-            thought, self._thought = self._thought, None
-            following = thought.result()
+        if self._choice_ahead is not None:
+            future, self._choice_ahead = self._choice_ahead, None
+            following = future.result()
             self._ahead = self._note(number, following) if following else []
         if self._ahead:
             bursts, self._ahead = self._ahead, []

@@ -93,7 +93,7 @@ class SessionRequest:
     """True to copy a mesh of more than 100 MB into the folder too."""
     beside: ProcessingBeside | None = None
     """Processes the run's views while it is acquired."""
-    started: Callable[[], None] = lambda: None
+    when_served: Callable[[], None] = lambda: None
     """Called when the run has a socket of its own, by which others can stop it."""
 
 
@@ -107,7 +107,7 @@ class _Session:
     faults: ArmFaults
     begun_s: float
     """Time of its first line in the journal, by `_unset_clock_s`."""
-    started: Callable[[], None]
+    when_served: Callable[[], None]
     """Called when the run has a socket of its own."""
 
 
@@ -179,7 +179,9 @@ def _acquire_into(
             tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
-            _acquire(job, _Session(cell, run, recorder, faults, begun_s, request.started), console, light, figures)
+            _acquire(
+                job, _Session(cell, run, recorder, faults, begun_s, request.when_served), console, light, figures
+            )
         finally:
             _end_recording(recorder, beside)
 

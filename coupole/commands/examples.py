@@ -119,7 +119,7 @@ EXAMPLES: dict[str, tuple[str, str]] = {
     "archive": ("archive RUN", "archive RUN --keep"),
     "identify": (
         "identify spot.csv --library KremerHistorical.rs",
-        "identify spots.csv --library my-pigments --classes classes.csv --report seen",
+        "identify painting.hdr --library KremerHistorical.rs --report seen",
     ),
     "compare": (
         "compare before.ply after.ply --out changes",

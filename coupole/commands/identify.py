@@ -11,7 +11,7 @@ import typer
 
 from coupole.commands.common import JsonOption, fail
 from coupole.commands.export_options import LedsOption, SensorOption
-from coupole.commands.identify_spot import asked_spot, identify_spot
+from coupole.commands.identify_options import ImageOptions, ReportOptions
 from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError
 
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
     from coupole.appearance.spectra.spectra_library import LibrarySpectrum
     from coupole.heritage.analysis.identification import PigmentFinding
-    from coupole.heritage.analysis.references import Rate
+    from coupole.heritage.analysis.references import References
+    from coupole.heritage.pigment_maps.line_points import LinePoints
 
 _SHOWN = 3
 _COLOURS = {"match": "green", "mixture": "green", "ambiguous": "yellow", "unknown": "yellow"}
@@ -29,7 +30,8 @@ _COLOURS = {"match": "green", "mixture": "green", "ambiguous": "yellow", "unknow
 SpectraArgument = Annotated[
     list[Path] | None,
     typer.Argument(
-        help="Spectra: an instrument's export, a table with one spectrum in each row, or a folder of such files.",
+        help="Spectra: an instrument's export, a table with one spectrum in each row, a folder of such files, a "
+        "table of points along a line (x_mm, y_mm, then wavelengths), or the header (.hdr) of an ENVI image cube.",
         metavar="SPECTRUM",
         show_default=False,
     ),
@@ -55,9 +57,6 @@ ClassesOption = Annotated[
 UnitOption = Annotated[
     Literal["auto", "percent", "fraction"],
     typer.Option("--unit", help="Unit of the spectra's reflectance, if their files do not state it."),
-]
-PageOption = Annotated[
-    Path | None, typer.Option("--report", help="Folder for a page with the curves and the evidence in each band.")
 ]
 ResultOption = Annotated[
     Path | None,
@@ -86,58 +85,109 @@ def identify(
     library: LibraryOption,
     classes: ClassesOption = None,
     unit: UnitOption = "auto",
-    report: PageOption = None,
     spot: SpotOptions,
+    image: ImageOptions,
+    report: ReportOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Which class of pigments each spectrum shows, or that the library has none for it.
 
     A verdict is match, mixture, ambiguous or unknown. The class and its probability are printed beside every
-    verdict. Below, the error rates of the library about its own spectra are printed.
+    verdict. Below, the error rates of the library about its own spectra are printed. Of an image cube, a map of
+    classes is made. If it was interrupted, the same command continues.
     """
+    from coupole.commands.identify_spot import asked_spot, identify_spot
     from coupole.scripting.analyses import references_of
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     try:
+        report.refuse_half()
         spot_of_result = asked_spot(spot.result, spot.at, spot.sensor_spectra, spot.led_spectrum)
         if (spot_of_result is None) == (not spectra):
             raise InputError("expected spectra, or a spot of a result (--result, --at); found both or neither")
         if spot_of_result is not None:
+            if report.report is not None:
+                raise InputError("--report: three channels of a camera identify nothing that could be signed")
             document = identify_spot(spot_of_result, references_of(library, classes))
             console.print(f"{document['name']}: {document['verdict']}; {document['reason']}", markup=False)
             if as_json:
                 print(json.dumps(document))
             return
         assert spectra is not None
-        findings = _findings(console, spectra, library, classes, unit)
-        page = None
-        if report is not None:
-            from coupole.heritage.result_pages.identification_page import write
+        references = references_of(library, classes)
+        for remark in references.remarks:
+            console.print(remark, markup=False)
+        if cube := _cube_among(spectra, image):
+            from coupole.commands.identify_image import identify_cube
 
-            page = write(report, [finding for _, finding in findings], str(library))
+            document = identify_cube(console, cube, library, classes, references, image, report)
+            if as_json:
+                print(json.dumps(document))
+            return
+        documents, page = _identify_spectra(console, spectra, references, unit, report, (library, classes))
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
-    _show(console, [finding for _, finding in findings])
     if page is not None:
         console.print(f"page: {page}", markup=False)
     if as_json:
-        documents = [_document_of(spectrum, finding, page) for spectrum, finding in findings]
         print(json.dumps(documents[0] if len(documents) == 1 else documents))
 
 
+def _cube_among(paths: list[Path], options: ImageOptions) -> Path | None:
+    """Return the cube among the arguments. Raises InputError for a cube among others, and for options of cubes
+    without one."""
+    from coupole.appearance.spectra.envi_cube import is_cube
+
+    cubes = [path for path in paths if is_cube(path)]
+    if cubes and len(paths) > 1:
+        raise InputError(f"{cubes[0]}: expected one image cube and nothing else, found {len(paths)} arguments")
+    if not cubes and options != ImageOptions():
+        raise InputError("--mask, --area, --scale, --wavelength-unit, --regions: expected an image cube (.hdr)")
+    return cubes[0] if cubes else None
+
+
+def _identify_spectra(
+    console: Console,
+    paths: list[Path],
+    references: References,
+    unit: Any,
+    report: ReportOptions,
+    library: tuple[Path, Path | None],
+) -> tuple[list[dict[str, Any]], Path | None]:
+    """Identify spectra, or points along a line, print the findings, and write the report. Returns the findings as
+    JSON's values, and the page."""
+    from coupole.commands.identify_report import origin_of
+    from coupole.heritage.pigment_maps.line_points import is_line, read_line
+    from coupole.heritage.result_pages import identification_page
+    from coupole.heritage.result_pages.line_profile import LineProfile
+
+    line = None
+    if any(is_line(path) for path in paths):
+        if len(paths) > 1 or report.report is None:
+            raise InputError(f"{paths[0]}: a line of points needs --report, and no other spectra beside it")
+        line = read_line(paths[0], unit=unit)
+    findings = _findings(console, paths, references, unit, line)
+    page = None
+    if report.report is not None:
+        origin = origin_of(report, paths, *library, references)
+        only = [finding for _, finding in findings]
+        profile = None if line is None else LineProfile(line, only)
+        page = identification_page.write(report.report, only, origin, profile)
+    _show(console, [finding for _, finding in findings])
+    return [_document_of(spectrum, finding, page) for spectrum, finding in findings], page
+
+
 def _findings(
-    console: Console, paths: list[Path], library: Path, classes: Path | None, unit: Any
+    console: Console, paths: list[Path], references: References, unit: Any, line: LinePoints | None
 ) -> list[tuple[LibrarySpectrum, PigmentFinding]]:
     from coupole.appearance.spectra.spectra_library import read_library
-    from coupole.scripting.analyses import identify_spectra, references_of
+    from coupole.scripting.analyses import identify_spectra
     from coupole.viewing.terminal import step_bars
 
-    spectra = [spectrum for path in paths for spectrum in read_library(path, unit=unit)]
-    references = references_of(library, classes)
-    for remark in references.remarks:
-        console.print(remark, markup=False)
+    library_spectra = (spectrum for path in paths for spectrum in read_library(path, unit=unit))
+    spectra = list(library_spectra if line is None else line.spectra)
     with step_bars(console) as say:
         findings = identify_spectra(spectra, references, say)
     return list(zip(spectra, findings, strict=True))
@@ -177,38 +227,7 @@ def _show(console: Console, findings: list[PigmentFinding]) -> None:
 
 
 def _document_of(spectrum: LibrarySpectrum, finding: PigmentFinding, page: Path | None) -> dict[str, Any]:
-    evidence, rates = finding.evidence, finding.rates
-    return {
-        "name": finding.name,
-        "file": spectrum.file,
-        "line": spectrum.line,
-        "verdict": finding.verdict,
-        "class": finding.class_name,
-        "candidates": [
-            {"name": candidate.name, "class": candidate.class_name, "probability": candidate.probability}
-            for candidate in finding.candidates
-        ],
-        "not_in_library": finding.not_in_library,
-        "mixture": [
-            {"name": part.name, "class": part.class_name, "share": part.share, "interval": list(part.interval)}
-            for part in finding.parts
-        ],
-        "reason": finding.reason,
-        "remarks": list(finding.remarks),
-        "evidence": {
-            "wavelengths_nm": evidence.wavelengths_nm.tolist(),
-            "log_odds_first_against_second": evidence.log_odds.tolist(),
-        },
-        "near_infrared": finding.near_infrared,
-        "held_out": {
-            "first_class_right": _rate(rates.right),
-            "match_right": _rate(rates.matches),
-            "match_wrong": _rate(rates.false_matches),
-            "unknown_without_the_class": _rate(rates.unknown),
-        },
-        "page": None if page is None else str(page.resolve()),
-    }
+    from coupole.heritage.result_pages.identification_record import finding_document
 
-
-def _rate(rate: Rate) -> dict[str, Any]:
-    return {"count": rate.count, "of": rate.of, "interval_95": list(rate.interval)}
+    place = {"file": spectrum.file, "line": spectrum.line}
+    return {**finding_document(finding), **place, "page": None if page is None else str(page.resolve())}

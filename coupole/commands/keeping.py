@@ -69,8 +69,13 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Read a run back: every frame, and every file that the manifest lists. Check that the run is complete, that
-    all checksums are right, and that light, exposure and pose of each frame agree with the run's plan.
-    """
+    all checksums are right, and that light, exposure and pose of each frame agree with the run's plan. Of a report
+    of `coupole identify`: tell whether anything was changed after it was written."""
+    from coupole.heritage.result_pages.identification_record import is_record
+
+    if is_record(run):
+        _verify_report(run, as_json=as_json)
+        return
     from rich.progress import Progress
 
     from coupole.storage import manifest
@@ -115,6 +120,40 @@ def verify(
             at_work = f"process {folder.holder}" if folder.holder else "another process"
             goes_on = f"{at_work} is at work on this run: verify it again when that has ended"
         raise UnprovenError(f"{len(check.missing)} frames of the plan are missing; {goes_on}")
+
+
+def _verify_report(folder: Path, *, as_json: bool) -> None:
+    """Compare a report of an identification with its checksums. Raises ChecksumMismatch."""
+    from coupole.heritage.result_pages.identification_record import check_record
+    from coupole.viewing.terminal import make_console
+
+    console = make_console(quiet=as_json)
+    check = check_record(folder)
+    for problem in check.problems:
+        console.print("[red]changed:[/]", problem)
+    signature = check.signature
+    words = (
+        "not signed"
+        if signature is None
+        else f"signed by {signature.name}, {signature.role}, {signature.time_utc}"
+    )
+    if as_json:
+        document = {
+            "ok": not check.problems,
+            "signature": None if signature is None else signature.__dict__,
+            "files": check.files,
+            "bad": list(check.problems),
+        }
+        print(json.dumps(document))
+    if check.problems:
+        raise ChecksumMismatch(f"{folder}: the report ({words}) is not as it was written: {len(check.problems)} "
+                               "differences (above)")  # fmt: skip
+    console.print(
+        f"ok: record and {check.files} files are as they were written; {words}. The checksums tell of "
+        "changes, not "
+        "who signed",
+        markup=False,
+    )
 
 
 def _show_verified(console: Console, run: Run, verification: Verification) -> None:

@@ -98,7 +98,12 @@ def acquire(
                 job = read_job(path, rig)
                 with _beside(job, console, resume, result, summary, is_asked=reflectance) as beside:
                     wanted_session = SessionRequest(
-                        output, resume, confirm=not yes, with_mesh=with_mesh, beside=beside, started=starting.end
+                        output,
+                        resume,
+                        confirm=not yes,
+                        with_mesh=with_mesh,
+                        beside=beside,
+                        when_served=starting.end,
                     )
                     acquire_plan(job, console, wanted_session, summary)
     except CoupoleError as error:

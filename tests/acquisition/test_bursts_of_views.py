@@ -143,7 +143,7 @@ def test_a_choice_that_fails_does_not_end_the_burst_that_is_fired(
     chosen, recorder = _bursts(read_job(cell.plan), monkeypatch, chooser)
     chosen.more(0)
     chosen.think_ahead(0)
-    wait_until(lambda: chosen._thought is not None and chosen._thought.done(), "its end")
+    wait_until(lambda: chosen._choice_ahead is not None and chosen._choice_ahead.done(), "its end")
     assert chosen.following(0) is None
     with pytest.raises(ZeroDivisionError, match="a defect of the chooser"):
         chosen.more(0)

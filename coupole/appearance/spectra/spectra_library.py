@@ -55,13 +55,21 @@ def read_library(path: Path, *, unit: Unit = "auto") -> tuple[LibrarySpectrum, .
     Raises InputError, with file and line, for content that cannot be read without guessing, and for names that
     occur twice.
     """
-    if path.is_dir():
-        files = sorted(f for f in path.iterdir() if f.suffix.lower() in _ENDINGS and f.name != WAVELENGTHS)
-        if not files:
-            raise InputError(f"{path}: expected spectra, {', '.join(sorted(_ENDINGS))}; found none")
-    else:
-        files = [path]
-    spectra = [spectrum for file in files for spectrum in _read_file(file, unit)]
+    return with_unique_names([spectrum for file in library_files(path) for spectrum in _read_file(file, unit)])
+
+
+def library_files(path: Path) -> list[Path]:
+    """Return the files of a folder that have spectra, or the file itself. Raises InputError if there is none."""
+    if not path.is_dir():
+        return [path]
+    files = sorted(f for f in path.iterdir() if f.suffix.lower() in _ENDINGS and f.name != WAVELENGTHS)
+    if not files:
+        raise InputError(f"{path}: expected spectra, {', '.join(sorted(_ENDINGS))}; found none")
+    return files
+
+
+def with_unique_names(spectra: Sequence[LibrarySpectrum]) -> tuple[LibrarySpectrum, ...]:
+    """Return the spectra. Raises InputError if a name occurs twice."""
     by_name: dict[str, LibrarySpectrum] = {}
     for spectrum in spectra:
         if spectrum.name in by_name:
@@ -81,6 +89,11 @@ def _read_file(path: Path, unit: Unit) -> list[LibrarySpectrum]:
         text = decode_text(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: {reason(error)}") from error
+    return parse_library(text, path, unit=unit)
+
+
+def parse_library(text: str, path: Path, *, unit: Unit = "auto") -> list[LibrarySpectrum]:
+    """Read the text of one file. `path` names it in errors. Raises InputError, with file and line."""
     lines = [(number, line.strip("\r ")) for number, line in enumerate(text.split("\n"), start=1)]
     rows = [(number, *_parse_row(line)) for number, line in lines if line.strip() and not line.startswith("#")]
     if not any(_are_numbers(fields) for _, name, fields in rows if name and not _NUMBER.fullmatch(name)):

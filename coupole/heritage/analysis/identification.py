@@ -24,7 +24,7 @@ from coupole.appearance.spectra.measured import Measured
 from coupole.heritage.analysis.pigment_classes import lacking
 from coupole.heritage.analysis.references import HeldOutRates, OfBands, References
 from coupole.heritage.analysis.spectral_features import BANDS_NM, NEAR_INFRARED_NM, log_k_over_s, on_bands
-from coupole.heritage.analysis.unmixing import Unmixed, unmix
+from coupole.heritage.analysis.unmixing import Unmixed, unmix, weights_of_bands
 
 Verdict = Literal["match", "mixture", "ambiguous", "unknown"]
 _FLAT = 0.1
@@ -65,6 +65,9 @@ class Evidence:
     """[n] reflectance of the nearest reference of the first class, with K/S scaled by the best factor."""
     runner_up: Array
     """[n] the same for the second class."""
+    fit: Array
+    """[n] reflectance of the answer: that of the nearest reference, or of the mixture's two references
+    together."""
     log_odds: Array
     """[n] for the first class against the second: positive where the spectrum is nearer to the first, in units of
     the spread within classes. Bands are correlated, so their sum is too large."""
@@ -135,7 +138,7 @@ def identify(spectrum: Measured, references: References) -> PigmentFinding:
         candidates,
         float(probabilities[0, -1]),
         parts,
-        _evidence(of_bands, reflectance, nearest[order[0]], nearest[order[1]]),
+        _evidence(of_bands, reflectance, nearest[order[0]], nearest[order[1]], mixture if parts else None),
         bool(BANDS_NM[of_bands.bands[-1]] > NEAR_INFRARED_NM),
         (left_out,) if left_out else (),
         of_bands.rates,
@@ -192,7 +195,9 @@ def _parts(references: References, of_bands: OfBands, mixture: Unmixed) -> tuple
     )
 
 
-def _evidence(of_bands: OfBands, reflectance: Array, best: int, runner_up: int) -> Evidence:
+def _evidence(
+    of_bands: OfBands, reflectance: Array, best: int, runner_up: int, mixture: Unmixed | None
+) -> Evidence:
     from coupole.appearance.matter import kubelka_munk
 
     log_ratio = log_k_over_s(reflectance)
@@ -207,4 +212,10 @@ def _evidence(of_bands: OfBands, reflectance: Array, best: int, runner_up: int) 
         scaled_reference(runner_up),
     )
     log_odds = 0.5 * (missed_by_two**2 - missed_by_one**2)
-    return Evidence(BANDS_NM[of_bands.bands], reflectance, best_shape, second_shape, log_odds)
+    fit = best_shape
+    if mixture is not None:
+        pair = np.exp(log_k_over_s(of_bands.reflectance[list(mixture.references)]))
+        weight = weights_of_bands(reflectance)
+        amounts = np.linalg.lstsq((pair * np.exp(-log_ratio) * weight).T, weight, rcond=None)[0]
+        fit = kubelka_munk.opaque(amounts @ pair)
+    return Evidence(BANDS_NM[of_bands.bands], reflectance, best_shape, second_shape, fit, log_odds)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,9 +12,35 @@ from coupole.appearance.spectra.grid import Array
 from coupole.errors import StorageError, reason
 from coupole.heritage.analysis.identification import Evidence, PigmentFinding
 from coupole.heritage.analysis.references import HeldOutRates
+from coupole.heritage.result_pages.identification_record import Origin, new_record, write_record
+from coupole.heritage.result_pages.line_profile import LineProfile
+from coupole.heritage.result_pages.report_parts import (
+    compared_section,
+    confusions_of,
+    facts_of,
+    fit_plots,
+    limits_section,
+    remark_of,
+    signature_section,
+    words_of,
+)
 from coupole.pages.page_charts import mark, points
-from coupole.pages.page_parts import Code, Drawing, Inline, Link, Page, Plot, Section, Shape, Table, Verdict
+from coupole.pages.page_parts import (
+    Code,
+    Drawing,
+    Figure,
+    Inline,
+    Link,
+    Page,
+    Picture,
+    Plot,
+    Section,
+    Shape,
+    Table,
+    Verdict,
+)
 from coupole.pages.page_rendering import write_page
+from coupole.storage.durable import make_folder
 
 PAGE = "identification.html"
 _CANDIDATES = 6
@@ -21,30 +48,57 @@ _WIDTH, _LEFT, _CURVES, _BARS = 720.0, 46.0, 240.0, 110.0
 _HEIGHT = _CURVES + _BARS + 60.0
 
 
-def write(folder: Path, findings: Sequence[PigmentFinding], library: str) -> Path:
-    """Write the page of findings that share a library. Raises StorageError."""
+def write(
+    folder: Path, findings: Sequence[PigmentFinding], origin: Origin, profile: LineProfile | None = None
+) -> Path:
+    """Write the page of findings that share a library, and its record; with a profile, the points' line. Raises
+    StorageError."""
     path = folder / PAGE
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
     except OSError as error:
         raise StorageError(f"{path}: {reason(error)}") from error
-    write_page(path, _page(findings, library))
+    results = {} if profile is None else {"line": profile.document()}
+    record = new_record(origin, findings, results)
+    files = [] if profile is None else profile.write(folder)
+    write_page(path, _page(findings, origin, record, profile))
+    write_record(folder, record, [path, *files])
     return path
 
 
-def _page(findings: Sequence[PigmentFinding], library: str) -> Page:
+def _page(
+    findings: Sequence[PigmentFinding], origin: Origin, record: dict[str, Any], profile: LineProfile | None
+) -> Page:
     first = findings[0]
     is_one = len(findings) == 1
+    pictures: list[Figure] = [_plot(first)]
+    if profile is not None:
+        pictures = [Picture("Classes along the line, and the reflectance", profile.png(), is_broad=True)]
+    subject, of_line = first.name if is_one else f"{len(findings)} spectra", ""
+    if profile is not None:
+        subject, of_line = f"{len(findings)} points along a line", f" along {profile.length_mm:.1f} mm"
     return Page(
-        title=f"{first.name if is_one else f'{len(findings)} spectra'}: pigments identified",
-        pictures=[_plot(first)],
-        summary=["Reflectance was compared with the library ", Code(library), ", band by band."],
+        title=f"{subject}: pigments identified",
+        pictures=pictures,
+        summary=[
+            f"Reflectance{of_line} was compared with the library ",
+            Code(origin.library.name),
+            ", band by band.",
+        ],
         quality=_quality(findings),
         next_step=_next_step(findings),
+        remark=remark_of(origin),
+        facts=facts_of(origin),
         sections=[
             Section("spectra", "Spectra", tables=[] if is_one else [_overview(findings)]),
-            *(_section(number, finding) for number, finding in enumerate(findings)),
-            _worth(findings[-1].rates),
+            *(
+                finding_section(number, finding, has_evidence=bool(number or profile))
+                for number, finding in enumerate(findings)
+            ),
+            reliability_section(findings[-1].rates),
+            compared_section(origin),
+            limits_section(),
+            signature_section(origin, record),
         ],
     )
 
@@ -52,7 +106,7 @@ def _page(findings: Sequence[PigmentFinding], library: str) -> Page:
 def _quality(findings: Sequence[PigmentFinding]) -> Inline:
     if len(findings) == 1:
         only = findings[0]
-        return [_verdict(only), f": {only.class_name}, probable by {_percent(only)}; {only.reason}."]
+        return [_verdict(only), f": {words_of(only)}"]
     counts = [
         (word, sum(finding.verdict == word for finding in findings))
         for word in ("match", "mixture", "ambiguous", "unknown")
@@ -80,7 +134,10 @@ def _overview(findings: Sequence[PigmentFinding]) -> Table:
     return Table("Spectra", ("spectrum", "verdict", "class", "probability"), rows)
 
 
-def _section(number: int, finding: PigmentFinding) -> Section:
+def finding_section(
+    number: int, finding: PigmentFinding, *, has_evidence: bool = True, name: str = "", is_folded: bool = False
+) -> Section:
+    """The section of one spectrum. Without `has_evidence` its evidence is the picture at the top."""
     nm = finding.evidence.wavelengths_nm
     extent = f"{nm[0]:g} to {nm[-1]:g} nm{', near infrared too' if finding.near_infrared else ''}"
     parts = [
@@ -93,12 +150,14 @@ def _section(number: int, finding: PigmentFinding) -> Section:
     ]
     return Section(
         f"s{number}",
-        finding.name,
-        figures=[_plot(finding)] if number else [],
+        name or finding.name,
+        words=[words_of(finding)],
+        figures=[_plot(finding)] if has_evidence else [],
         figure_size="wide",
         facts={
             "verdict": _verdict(finding),
             "why": finding.reason,
+            "could be confused with": confusions_of(finding),
             "compared": "; ".join((extent, *finding.remarks)),
             "not in the library": f"{finding.not_in_library:.0%}",
         },
@@ -106,7 +165,9 @@ def _section(number: int, finding: PigmentFinding) -> Section:
             Table("Parts of the mixture", ("class", "reference", "share of K/S", "95 % interval"), parts),
             Table("Most probable classes", ("class", "probability", "nearest reference"), candidates),
         ],
-        notes=[] if number else ["Its spectrum is the picture at the top."],
+        notes=[] if has_evidence else ["The evidence of its bands is the picture at the top."],
+        sections=[Section(f"s{number}-fit", "Measured against fitted", figures=fit_plots(finding))],
+        is_folded=is_folded,
     )
 
 
@@ -130,7 +191,8 @@ def _percent(finding: PigmentFinding) -> str:
     return f"{finding.candidates[0].probability:.0%}"
 
 
-def _worth(rates: HeldOutRates) -> Section:
+def reliability_section(rates: HeldOutRates) -> Section:
+    """Return the rates at which the library is right about its own spectra."""
     return Section(
         "library",
         "How reliable the verdicts are",

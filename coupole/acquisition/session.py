@@ -248,7 +248,7 @@ def _acquire(
     outcome: Literal["done", "interrupted", "failed"] = "failed"
     failure: BaseException | None = None
     remote = RunControl(
-        run.folder, job.cell.document.path, control, cell.halt, lambda: observer.newest, light, session.started
+        run.folder, job.cell.document.path, control, cell.halt, lambda: observer.newest, light, session.when_served
     )
 
     def stop() -> None:

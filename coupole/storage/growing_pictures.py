@@ -77,7 +77,7 @@ class ViewPictures(_Plain):
     """Time when they were drawn, UTC."""
     pictures: tuple[PictureShown, ...]
     remark: str = ""
-    """Sentence about what is not drawn, and why."""
+    """Sentence about the part of the view that is not drawn, and why."""
 
 
 class PageSoFar(_Plain):

@@ -122,9 +122,8 @@ class Drawing:
             _picture_shown(files[kind], title, of_map, maps.medians.get(of_map.title))
             for kind, title, of_map in titled_maps
         )
-        remark = "" if maps.lobe else maps.lobe_words
         self.growing.put_view(
-            view_pictures.model_copy(update={"pictures": pictures, "remark": remark}),
+            view_pictures.model_copy(update={"pictures": pictures, "remark": maps.lobe_words}),
             {files[kind]: of_map.png for kind, _, of_map in titled_maps},
         )
 

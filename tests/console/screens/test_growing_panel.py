@@ -59,7 +59,12 @@ def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[House]:
         try:
             ada = Visitor(window, service.url)
             ada.signs_in("Ada", PASSWORD)
-            yield House(cell, service, service.browser(name="Ada", password=PASSWORD), ada)
+            operator = service.browser(name="Ada", password=PASSWORD)
+            house = House(cell, service, operator, ada)
+            yield house
+            if run := operator.state()["run"]:  # the test has failed; a paused run would stay for ever
+                operator.post(f"/api/v1/runs/{run}/stop")
+                house.until("halted", "idle")
         finally:
             window.driver.quit()
 

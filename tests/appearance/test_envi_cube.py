@@ -26,7 +26,7 @@ def read_whole(cube: Cube, rows_at_once: int) -> np.ndarray:
 
 @settings(deadline=None, max_examples=60)
 @given(
-    shape=st.tuples(st.integers(1, 5), st.integers(1, 6)),
+    shape=st.tuples(st.integers(1, 5), st.integers(2, 6)),
     dtype=st.sampled_from(TYPES),
     interleave=st.sampled_from(("bsq", "bil", "bip")),
     order=st.sampled_from((0, 1)),
@@ -109,6 +109,11 @@ def cube_of(folder: Path, text: str = HEADER, values: int = 24) -> Path:
             r"cube.dat: expected 480 bytes \(30 lines, 2 samples, 4 bands of 2 .* found 48",
         ),
         ("data type = 12", "data type = 6", r"cube.hdr:8:1: data type: expected one of 1, 2, .* complex"),
+        (
+            "offset = 0",
+            "offset = nan",
+            r"cube.hdr:6:1: header offset: expected a whole number of 0 .* found 'nan'",
+        ),
         ("= bsq", "= bsp", r"cube.hdr:9:1: interleave: expected bsq, bil, bip; found 'bsp'"),
         ("byte order = 0", "byte order = 2", r"cube.hdr:10:1: byte order: expected 0 .* or 1 .*, found '2'"),
         (
@@ -170,6 +175,13 @@ def test_bad_bands_are_left_out_and_ignored_values_are_unknown(tmp_path: Path) -
 
     assert cube.left_out == (3,)
     np.testing.assert_allclose(cube.read_rows(0, 1)[0], [[0.0, 0.006, 0.018], [0.001, np.nan, 0.019]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("value", ["-9999", "7.5", "1e99", "nan"])
+def test_an_ignored_value_that_the_type_does_not_have_is_nowhere(tmp_path: Path, value: str) -> None:
+    cube = open_cube(cube_of(tmp_path, HEADER.replace("a cube}", f"a cube}}\ndata ignore value = {value}")))
+
+    assert np.isfinite(cube.read_rows(0, 3)).all()
 
 
 def test_what_the_user_says_replaces_what_the_header_says(tmp_path: Path) -> None:

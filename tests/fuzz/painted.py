@@ -23,6 +23,15 @@ films:
 """
 
 
+CUBE = (
+    "ENVI\ndescription = {a panel}\nsamples = 2\nlines = 3\nbands = 4\nheader offset = 0\ndata type = 12\n"
+    "interleave = bil\nbyte order = 0\nbbl = {1, 1, 1, 0}\nwavelength units = Nanometers\n"
+    "reflectance scale factor = 1000\ndata ignore value = 9\nwavelength = {400, 500,\n 600, 700}\n"
+)
+LINE = "name,x_mm,y_mm," + ",".join(map(str, _NM)) + "\n"
+LINE += "".join(f"p{row},{row},{2 * row}," + ",".join(["0.4"] * len(_NM)) + "\n" for row in range(3))
+
+
 def read_paint(path: Path) -> None:
     from coupole.appearance.matter.paint_file import read_paint
 
@@ -46,7 +55,25 @@ def read_films(path: Path) -> None:
     read_samples(*read_films(path))
 
 
+def read_cube(path: Path) -> None:
+    from coupole.appearance.spectra.envi_cube import open_cube
+
+    (path.parent / "case.dat").write_bytes(bytes(48))
+    cube = open_cube(path)
+    for first, end in cube.blocks():
+        cube.read_rows(first, end)
+
+
+def read_line_of_points(path: Path) -> None:
+    from coupole.heritage.pigment_maps.line_points import is_line, read_line
+
+    if is_line(path):
+        read_line(path)
+
+
 PAINTED = (
+    Target("cube", "plans/case.hdr", lambda: [CUBE.encode()], read_cube),
+    Target("line-of-points", "plans/case.csv", lambda: [LINE.encode()], read_line_of_points),
     Target("paint", "plans/case.paint.csv", lambda: [PAINT.encode()], read_paint),
     Target("index", "plans/case.yml", lambda: [INDEX.encode()], read_index),
     Target("films", "plans/films.yaml", lambda: [FILMS.encode()], read_films),

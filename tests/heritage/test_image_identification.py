@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 from cubes import NM, SHAPES, areas, batch, write_cube, write_library
 from PIL import Image
-from places import REPO
+from places import REPO, SHARED_DATA
 from spectral.io import envi
 
 from coupole.appearance.spectra.envi_cube import Cube, open_cube
-from coupole.appearance.spectra.spectra_library import read_library
+from coupole.appearance.spectra.measured import Measured
+from coupole.appearance.spectra.spectra_library import LibrarySpectrum, read_library
 from coupole.commands.identify import identify
 from coupole.errors import InputError
-from coupole.heritage.analysis.pigment_classes import read_classes
+from coupole.heritage.analysis.identification import identify as identify_spectrum
+from coupole.heritage.analysis.pigment_classes import read_classes, shipped_classes
 from coupole.heritage.analysis.references import References, make_references
 from coupole.heritage.analysis.spectral_features import BANDS_NM
 from coupole.heritage.pigment_maps.image_identification import (
@@ -32,6 +34,7 @@ from coupole.heritage.pigment_maps.image_identification import (
 from coupole.heritage.pigment_maps.pixel_regions import find_regions, noise_of_neighbours
 
 SIDE = 24
+PIGMENTS = SHARED_DATA / "pigments" / "KremerHistorical.rs"
 MISSING = "red lead"
 
 
@@ -173,7 +176,6 @@ def test_the_matrix_of_bands_resamples_as_spectra_are() -> None:
     covered, matrix = band_matrix(NM)
     truth = np.interp(NM, np.arange(380.0, 781.0, 5.0), batch("azurite", 1))
 
-    from coupole.appearance.spectra.measured import Measured
     from coupole.heritage.analysis.spectral_features import on_bands
 
     expected = on_bands(Measured("one", NM, truth, ()))
@@ -278,6 +280,50 @@ def test_options_of_cubes_are_for_cubes(tmp_path: Path) -> None:
         identify([header], **named, report=tmp_path / "seen", area="0:5,0:2")
     with pytest.raises(InputError, match=r"expected a picture of 8 x 4 pixels, .* found 3 x 3"):
         identify([header], **named, report=tmp_path / "seen", mask=tmp_path / "small.png")
+
+
+@pytest.mark.skipif(not PIGMENTS.is_file(), reason="shared data are not here")
+def test_areas_of_published_spectra_that_the_library_does_not_contain(tmp_path: Path) -> None:
+    # Two spectra of each of eight classes; the library has the others of seven of these classes.
+    spectra = read_library(PIGMENTS)
+    table = shipped_classes(spectra)
+    of_class: dict[str, list[LibrarySpectrum]] = {}
+    for spectrum in spectra:
+        of_class.setdefault(table[spectrum.name].class_name, []).append(spectrum)
+    classes = sorted((name for name in of_class if name), key=lambda name: (-len(of_class[name]), name))[:8]
+    missing = classes[5]
+    used = [(name, spectrum) for name in classes for spectrum in of_class[name][1:3]]
+    names = {spectrum.name for _, spectrum in used}
+    rest = [one for one in spectra if one.name not in names and table[one.name].class_name != missing]
+    random = np.random.default_rng(9)
+    columns = [
+        np.interp(NM, one.wavelengths_nm, one.reflectance) * (1.0 + 0.02 * random.standard_normal((SIDE, SIDE, 1)))
+        for _, one in used
+    ]
+    panel = np.concatenate(columns, axis=1)
+    header = write_cube(tmp_path / "panel.hdr", panel + 0.004 * random.standard_normal(panel.shape))
+
+    references = make_references(rest, table)
+    found = identify_image(open_cube(header), references, tmp_path / "state", silent)
+
+    right = wrong = alike = 0
+    for number, (name, spectrum) in enumerate(used):
+        codes = found.codes[:, number * SIDE : (number + 1) * SIDE]
+        says = np.array(found.names)[codes]
+        truth = np.interp(NM, spectrum.wavelengths_nm, spectrum.reflectance)
+        alone = identify_spectrum(Measured("alone", NM, truth, ()), references)
+        if name == missing:
+            assert (codes == UNKNOWN).mean() > 0.99
+        alike += int((says == {"match": alone.class_name}.get(alone.verdict, says)).sum())
+        right += int((says == name).sum())
+        is_part = np.array([name in each for each in found.names])[
+            codes
+        ]  # of a mixture, such as an ochre's two irons
+        wrong += int(((codes >= FIRST_CLASS) & ~is_part).sum())
+    # Of spectra that it does not contain, the library matches about half (docs/reference/materials.md).
+    assert right > 0.3 * found.codes.size
+    assert wrong < 0.02 * found.codes.size
+    assert alike > 0.98 * found.codes.size
 
 
 MEASURED = """

@@ -70,7 +70,7 @@ class Cube:
     _dtype: np.dtype[Any]
     _interleave: str
     _offset: int
-    _ignore_value: float | None
+    _ignore_value: np.generic | None
 
     @property
     def description(self) -> str:
@@ -109,10 +109,11 @@ class Cube:
                         pixels = values.reshape(count, self.columns, -1)[:, :, self._bands]
         except OSError as error:
             raise InputError(f"{self.data}: {reason(error)}") from error
-        reflectance = pixels.astype(np.float32)
-        reflectance /= np.float32(self.scale)
+        with np.errstate(over="ignore", invalid="ignore"):  # such values are infinite, so they are no reflectances
+            reflectance = pixels.astype(np.float32)
+            reflectance /= np.float32(self.scale)
         if self._ignore_value is not None:
-            reflectance[pixels == self._dtype.type(self._ignore_value)] = np.nan
+            reflectance[pixels == self._ignore_value] = np.nan
         return reflectance
 
     def _values(self, file: Any, at: int, count: int) -> NDArray[Any]:
@@ -144,9 +145,7 @@ def open_cube(path: Path, options: CubeOptions | None = None) -> Cube:
     interleave = fields.word("interleave").lower()
     if interleave not in _INTERLEAVES:
         raise fields.wrong("interleave", f"expected {', '.join(_INTERLEAVES)}; found {interleave!r}")
-    offset = int(fields.number("header offset", 0.0))
-    if offset < 0:
-        raise fields.wrong("header offset", f"expected 0 or more bytes, found {offset}")
+    offset = fields.count("header offset", least=0) if "header offset" in fields.values else 0
     fields.refuse_other_kinds()
     scale = user.scale if user.scale is not None else fields.number("reflectance scale factor", 0.0)
     if scale == 0.0 and dtype.kind == "f" and "reflectance scale factor" not in fields.values:
@@ -160,7 +159,6 @@ def open_cube(path: Path, options: CubeOptions | None = None) -> Cube:
     nm = fields.wavelengths_nm(bands, user.wavelength_unit)
     good = fields.good_bands(bands)
     order = np.flatnonzero(good)[np.argsort(nm[good], kind="stable")]
-    ignore_value = fields.number("data ignore value", np.nan)
     data = _data_beside(header) if path == header else path
     needed_bytes = offset + rows * columns * bands * dtype.itemsize
     if (size := data.stat().st_size) < needed_bytes:
@@ -171,7 +169,7 @@ def open_cube(path: Path, options: CubeOptions | None = None) -> Cube:
     return Cube(
         header, data, rows, columns, nm[order], float(scale), fields.values,
         tuple(int(band) + 1 for band in np.flatnonzero(~good)), order, bands, dtype, interleave, offset,
-        None if np.isnan(ignore_value) else ignore_value,
+        fields.ignore_value(dtype),
     )  # fmt: skip
 
 
@@ -251,11 +249,23 @@ class _Fields:
             return float(self.word(name))
         raise self.wrong(name, f"expected a number, found {self.word(name)!r}")
 
-    def count(self, name: str) -> int:
-        """A whole number above 0."""
+    def ignore_value(self, dtype: np.dtype[Any]) -> np.generic | None:
+        """The value of pixels without data, as the file has it; None if no value of its type is it."""
+        number = self.number("data ignore value", np.nan)
+        with np.errstate(over="ignore"):
+            if np.isfinite(number) and (dtype.kind == "f" or (
+                number == int(number) and np.iinfo(dtype).min <= number <= np.iinfo(dtype).max
+            )):  # fmt: skip
+                value: np.generic = dtype.type(int(number) if dtype.kind != "f" else number)
+                return value
+        return None
+
+    def count(self, name: str, least: int = 1) -> int:
+        """A whole number of `least` or more."""
         word = self.word(name)
-        if not re.fullmatch(r"\d{1,9}", word) or int(word) < 1:
-            raise self.wrong(name, f"expected a whole number above 0, found {word!r}")
+        if not re.fullmatch(r"[0-9]{1,9}", word) or int(word) < least:
+            above = "above 0" if least else "of 0 or more"
+            raise self.wrong(name, f"expected a whole number {above}, found {word!r}")
         return int(word)
 
     def dtype(self) -> np.dtype[Any]:

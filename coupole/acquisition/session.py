@@ -94,7 +94,7 @@ class SessionRequest:
     beside: ProcessingBeside | None = None
     """Processes the run's views while it is acquired."""
     when_served: Callable[[], None] = lambda: None
-    """Called when the run has a socket of its own, by which others can stop it."""
+    """Called when the run has a socket of its own."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,6 @@ class _Session:
     begun_s: float
     """Time of its first line in the journal, by `_unset_clock_s`."""
     when_served: Callable[[], None]
-    """Called when the run has a socket of its own."""
 
 
 def acquire_plan(job: Job, console: Console, request: SessionRequest, figures: dict[str, Any]) -> None:

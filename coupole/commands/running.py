@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from coupole.acquisition.processing_beside import ProcessingBeside
+    from coupole.acquisition.session import SessionRequest
     from coupole.plan.cell import Cell
     from coupole.preflight.job import Job
 
@@ -72,8 +74,7 @@ def acquire(
     console owns the cell (`coupole serve`), the command acquires in the console's name, if nothing runs or waits
     there.
     """
-    from coupole.acquisition.session import SessionRequest, acquire_plan, rehearse
-    from coupole.acquisition.starting import StartingSession
+    from coupole.acquisition.session import SessionRequest, rehearse
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
 
@@ -93,19 +94,9 @@ def acquire(
         elif dry_run:
             rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, figures=summary)
         else:
-            path = plan or plan_of(resume)
-            with StartingSession(path, resume) as starting:
-                job = read_job(path, rig)
-                with _beside(job, console, resume, result, summary, is_asked=reflectance) as beside:
-                    wanted_session = SessionRequest(
-                        output,
-                        resume,
-                        confirm=not yes,
-                        with_mesh=with_mesh,
-                        beside=beside,
-                        when_served=starting.end,
-                    )
-                    acquire_plan(job, console, wanted_session, summary)
+            wanted_session = SessionRequest(output, resume, confirm=not yes, with_mesh=with_mesh)
+            asked_result = result, reflectance
+            _acquire_here(plan or plan_of(resume), rig, console, wanted_session, asked_result, summary)
     except CoupoleError as error:
         fail(error, as_json=as_json, figures=summary)
         raise
@@ -120,6 +111,26 @@ def _refuse_exclusive(resume: Path | None, output: Path | None, *, dry_run: bool
         )
     if resume and output:
         raise typer.BadParameter("a resumed run keeps its folder: --resume excludes --output")
+
+
+def _acquire_here(
+    plan: Path,
+    rig: Path | None,
+    console: Console,
+    wanted_session: SessionRequest,
+    asked_result: tuple[Path | None, bool],
+    summary: dict[str, Any],
+) -> None:
+    """Acquire in this process. `asked_result` is the folder of the result, and whether one is asked for."""
+    from coupole.acquisition.session import acquire_plan
+    from coupole.acquisition.starting import StartingSession
+    from coupole.preflight.job import read_job
+
+    resume, (result, is_asked) = wanted_session.resume, asked_result
+    with StartingSession(plan, resume) as starting:
+        job = read_job(plan, rig)
+        with _beside(job, console, resume, result, summary, is_asked=is_asked) as beside:
+            acquire_plan(job, console, replace(wanted_session, beside=beside, when_served=starting.end), summary)
 
 
 @contextmanager

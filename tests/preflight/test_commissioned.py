@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cells
 import pytest
+from at_a_terminal import at_a_terminal
 from cells import CellFolder
 from real_cells import commission
 
@@ -212,6 +213,6 @@ def test_a_cell_with_a_fault_of_the_arm_is_not_commissioned_before_a_persons_wor
     real: CellFolder,
 ) -> None:
     faults_of(read_cell(real.rig)).note("it fell")
-    ended = cells.here("commission", real.rig, "--name", "A")
-    assert ended.code == 4
-    assert "coupole confirm" in ended.err
+    with at_a_terminal("commission", real.rig, "--name", "A") as person:
+        person.waits_for("coupole confirm")
+        assert person.process.wait(30.0) == 4

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from coupole.pages.page_parts import Map
 from coupole.reflectance.ggx import lobe
 from coupole.reflectance.result_pages import lobes_told, run_reflectance_page
+from coupole.reflectance.result_pages.material_maps import MapValues, MaterialMaps, material_maps
 
 ROWS = np.arange(100, dtype=np.int32).reshape(10, 10)
 """A view of a hundred triangles, a pixel each."""
@@ -18,6 +18,11 @@ ROWS = np.arange(100, dtype=np.int32).reshape(10, 10)
 
 def uncertainties(of_ks: np.ndarray) -> np.ndarray:
     return np.stack([*np.full((3, 100), 0.01), of_ks, np.full(100, 0.2)], axis=1)
+
+
+def maps_of(ks: np.ndarray, alpha: np.ndarray, uncertain: np.ndarray) -> MaterialMaps:
+    normals, kd = np.tile([0.0, 0.0, 1.0], (100, 1)), np.full((100, 3), 0.2)
+    return material_maps(MapValues(ROWS, normals, kd, ks, alpha, uncertain))
 
 
 def test_a_lobe_is_told_where_its_uncertainty_is_at_most_a_half() -> None:
@@ -37,20 +42,19 @@ def test_a_matt_object_has_a_sentence_in_place_of_maps() -> None:
     ks, alpha = np.full((100, 3), 0.01), np.full(100, 0.5)
     of_ks = np.full(100, 6.1)
     of_ks[0] = 0.1
-    figures, words = run_reflectance_page._lobe(ROWS, ks, alpha, uncertainties(of_ks))
-    assert figures == []
-    assert "not drawn" in words
-    assert "99%" in words
+    maps = maps_of(ks, alpha, uncertainties(of_ks))
+    assert maps.lobe == ()
+    assert "not drawn" in maps.lobe_words
+    assert "99%" in maps.lobe_words
 
 
 def test_an_object_that_shines_in_part_has_maps_of_that_part_alone() -> None:
     ks, alpha = np.full((100, 3), 0.05), np.full(100, 0.5)
     of_ks = np.where(np.arange(100) < 30, 0.2, 3.0)
-    figures, words = run_reflectance_page._lobe(ROWS, ks, alpha, uncertainties(of_ks))
-    assert len(figures) == 3
-    assert "30%" in words
-    for figure in figures:
-        assert isinstance(figure, Map)
+    maps = maps_of(ks, alpha, uncertainties(of_ks))
+    assert len(maps.lobe) == 4
+    assert "30%" in maps.lobe_words
+    for figure in maps.lobe:
         with Image.open(io.BytesIO(figure.png)) as opened:
             assert (np.asarray(opened.convert("RGBA"))[..., 3].ravel() == np.where(of_ks < 1, 255, 0)).all()
 

@@ -46,6 +46,7 @@ def test_a_session_that_is_starting_is_stopped_and_does_nothing(tmp_path: Path, 
 
 def test_a_run_that_is_being_resumed_is_stopped_by_its_folder(tmp_path: Path) -> None:
     cell = CellFolder(tmp_path)
+    cell.write(lights={"kind": "every", "every": 2})  # it has long not ended when it is stopped
     process = cell.start_acquire()
     run = cell.run_folder
     cells.wait_until(lambda: cells.frame_lines(run) > 3, "proven frames")

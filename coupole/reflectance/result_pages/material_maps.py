@@ -109,7 +109,7 @@ def in_three(values: Floats) -> Floats:
 
 
 def picture_of(triangle_rows: NDArray[np.int32], values: Floats) -> NDArray[np.float32]:
-    """[h, w, ...] picture of values [triangles, ...]; NaN where no triangle is pixel_rows."""
+    """[h, w, ...] picture of values [triangles, ...]; NaN where no triangle is seen."""
     picture = np.full((*triangle_rows.shape, *values.shape[1:]), np.nan, np.float32)
     picture[triangle_rows >= 0] = values[triangle_rows[triangle_rows >= 0]]
     return picture

@@ -1,4 +1,4 @@
-"""`coupole stop` reaches a session from its first second on: while it checks the plan, or opens devices."""
+"""`coupole stop` reaches a session before its run begins: while it checks the plan, or opens devices."""
 
 from __future__ import annotations
 

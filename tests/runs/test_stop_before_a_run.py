@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import cells
 import pytest
 from cells import CellFolder
 
+from coupole.acquisition import runtime_folder
 from coupole.acquisition.starting import starting
 
 PREFLIGHT, OPENING = "views, shots, frames", "opening the devices"
@@ -32,7 +36,7 @@ def test_a_session_that_is_starting_is_stopped_and_does_nothing(tmp_path: Path, 
     with cell.world() as world:
         process = cells.start("acquire", cell.plan, "--yes")
         _until(process, words)
-        stopped = cells.here("stop", *([cell.plan] if words == PREFLIGHT else []))
+        stopped = cells.here("stop", cell.plan)
         assert stopped.code == 0, stopped.err
         assert f"stopped before the run began: {cell.plan}" in " ".join((stopped.out + stopped.err).split())
         assert process.poll() is not None, "it has ended when the answer is given"
@@ -41,7 +45,7 @@ def test_a_session_that_is_starting_is_stopped_and_does_nothing(tmp_path: Path, 
         assert not state["shining"]
         assert not state["arm_moving"]
         assert _moves_and_lights(cell) == []
-        assert not list(starting())
+        assert str(cell.plan) not in [state["plan"] for _, state in starting()]
 
 
 def test_a_run_that_is_being_resumed_is_stopped_by_its_folder(tmp_path: Path) -> None:
@@ -62,27 +66,65 @@ def test_a_run_that_is_being_resumed_is_stopped_by_its_folder(tmp_path: Path) ->
     assert cell.acquire("--resume", run).document["missing"] == 0
 
 
-def test_a_session_that_is_starting_has_nothing_to_pause(tmp_path: Path) -> None:
-    cell = CellFolder(tmp_path)
-    process = cells.start("acquire", cell.plan, "--yes")
-    _until(process, PREFLIGHT)
-    paused = cells.here("pause")
-    assert paused.code == 2
-    assert "the run has not begun; `coupole stop` ends it" in " ".join((paused.out + paused.err).split())
-    process.terminate()
-    assert cells.finish(process).code == 143
+# -- in a runtime folder of their own, without the sessions of other tests ---------------------------------------
+
+_STARTING = """
+import sys, time
+from pathlib import Path
+from coupole.acquisition import runtime_folder
+from coupole.acquisition.starting import StartingSession
+runtime_folder._BASE = Path(sys.argv[1])
+with StartingSession(Path(sys.argv[2]), None):
+    print("serves", flush=True)
+    time.sleep(60)
+"""
 
 
-def test_of_several_sessions_that_are_starting_one_must_be_named(tmp_path: Path) -> None:
-    names = ("one", "other")
-    for name in names:
-        (tmp_path / name).mkdir()
-    all_cells = [CellFolder(tmp_path / name) for name in names]
-    processes = [cells.start("acquire", cell.plan, "--yes") for cell in all_cells]
-    cells.wait_until(lambda: len(list(starting())) == 2, "two sessions")
-    stopped = cells.here("stop")
-    assert stopped.code == 2
-    assert all(str(cell.plan) in stopped.err for cell in all_cells)
-    for cell, process in zip(all_cells, processes, strict=True):
-        assert cells.here("stop", cell.plan).code == 0
-        assert cells.finish(process).code == 130
+@contextmanager
+def _starts(plan: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that is starting, for as long as nobody stops it."""
+    arguments = [sys.executable, "-c", _STARTING, str(runtime_folder._BASE), str(plan)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "serves\n"
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.fixture
+def apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(runtime_folder, "_BASE", tmp_path)
+    return tmp_path
+
+
+def test_the_only_session_that_is_starting_needs_no_name(apart: Path) -> None:
+    with _starts(apart / "plan.yaml") as process:
+        stopped = cells.here("stop")
+        assert stopped.code == 0, stopped.err
+        assert process.poll() is not None
+    nobody = cells.here("stop")
+    assert nobody.code == 2
+    assert "no run that answers" in nobody.err
+
+
+def test_a_session_that_is_starting_has_nothing_to_pause(apart: Path) -> None:
+    with _starts(apart / "plan.yaml") as process:
+        paused = cells.here("pause")
+        assert paused.code == 2
+        assert "the run has not begun; `coupole stop` ends it" in " ".join((paused.out + paused.err).split())
+        assert process.poll() is None
+
+
+def test_of_several_sessions_that_are_starting_one_must_be_named(apart: Path) -> None:
+    plans = [apart / "one.yaml", apart / "other.yaml"]
+    with ExitStack() as stack:
+        processes = [stack.enter_context(_starts(plan)) for plan in plans]
+        stopped = cells.here("stop")
+        assert stopped.code == 2
+        assert all(str(plan) in stopped.err for plan in plans)
+        for plan, process in zip(plans, processes, strict=True):
+            assert process.poll() is None
+            assert cells.here("stop", plan).code == 0
+            assert process.poll() is not None

@@ -7,6 +7,7 @@ import json
 import re
 from pathlib import Path
 
+import cells
 import numpy as np
 import pytest
 from axe_selenium_python import Axe
@@ -20,16 +21,23 @@ from shown_page import CONTROLS, Page
 pytestmark = needs_chromium
 
 
+def _pixel(page: Page) -> list[int]:
+    """A pixel, once the picture has its whole size: while something moves it may have less."""
+    look = "(() => { try { return coupole.readPixel(230, 110); } catch (error) { return null; } })()"
+    found: list[int] = cells.wait_until(lambda: page.run(look), "the picture in its whole size")
+    return found
+
+
 def test_dragging_the_light_moves_it_and_changes_the_picture(page: Page, folder: Path) -> None:
     page.open(folder / "look.html")
     page.wide()
-    before, way = page.run("coupole.readPixel(230, 110)"), page.run("coupole.state.lights[0].direction")
+    before, way = _pixel(page), page.run("coupole.state.lights[0].direction")
     page.browser.at("[data-tool=light]").click()
     canvas = page.browser.at("#picture")
     ActionChains(page.driver).drag_and_drop_by_offset(canvas, 60, 0).perform()
     after = page.run("coupole.state.lights[0].direction")
     assert after[0] > way[0] + 0.2
-    assert page.run("coupole.readPixel(230, 110)") != before
+    assert _pixel(page) != before
 
 
 def test_keys_alone_turn_light_measure_and_note(page: Page, folder: Path) -> None:

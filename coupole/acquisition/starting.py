@@ -21,10 +21,11 @@ from pathlib import Path
 from coupole.acquisition.run_control import VERSION, Command, NoAnswer, State, exchange_command, request_of
 from coupole.acquisition.runtime_folder import runtime_folder
 from coupole.acquisition.user_socket import Caller, UserSocket
-from coupole.errors import InputError
+from coupole.errors import InputError, reason
 
 _SUFFIX = ".start"
-_LOOK_PATIENCE_S = 0.5
+_LOOK_PATIENCE_S = 5.0
+"""A session that loads its modules on a busy machine answers late."""
 
 
 class StartingSession:
@@ -68,19 +69,35 @@ class StartingSession:
 
 
 def starting() -> Iterator[tuple[Path, State]]:
-    """Yield sockets and states of all sessions of this user on this machine that are starting."""
+    """Yield sockets and states of all sessions of this user on this machine that are starting. One that does not
+    answer is `silent`: its run and plan are not known."""
     for path in sorted(runtime_folder().glob(f"*{_SUFFIX}")):
-        with contextlib.suppress(OSError, ValueError):
+        try:
             yield path, exchange_command(path, "state", _LOOK_PATIENCE_S)
+        except (ConnectionRefusedError, FileNotFoundError):  # of a process that was killed, or has just ended
+            continue
+        except (OSError, ValueError):
+            yield path, {"version": VERSION, "run": "", "plan": "", "pid": int(path.stem), "state": "silent"}
+
+
+def name_of(state: State) -> str:
+    """Return the run or the plan of a session that is starting, or its process if these are not known."""
+    return str(state["run"] or state["plan"] or f"process {state['pid']}, which does not answer")
 
 
 def ask_starting(path: Path, state: State, command: Command, say: Callable[[str], object]) -> State:
     """Send a command to the session behind a socket, whose state is known; return its state afterwards. Raises
     InputError if the session has ended meanwhile, does not answer, or cannot do this before its run begins."""
-    name = state["run"] or state["plan"]
+    name = name_of(state)
     try:
         return exchange_command(path, command, say=lambda why: say(f"{name}: no answer yet: {why}"))
     except ValueError as error:
         raise InputError(f"{name}: {error}") from error
+    except (ConnectionResetError, BrokenPipeError) as error:
+        if command == "stop":  # it was faster than its answer
+            return {**state, "state": "stopping", "trouble": []}
+        raise InputError(f"{name}: {reason(error)}") from error
     except OSError as error:
-        raise NoAnswer(f"{name}: the process {state['pid']}, which starts it, gives no answer: {error}") from error
+        raise NoAnswer(
+            f"{name}: the process {state['pid']}, which starts it, gives no answer: {reason(error)}"
+        ) from error

@@ -118,8 +118,9 @@ def exchange(
     patience_s: float = PATIENCE_S,
     say: Callable[[str], object] = lambda _: None,
 ) -> dict[str, Any]:
-    """Return the answer to a request. If there is none yet, `say` gets the reason within 2 s. Raises OSError, and
-    ValueError for data that are not an answer.
+    """Return the answer to a request. If there is none yet, `say` gets the reason within 2 s. Raises OSError (of
+    which ConnectionResetError if the other end closes without an answer), and ValueError for data that are not an
+    answer.
     """
     begun_s = time.monotonic()
     with socket.socket(socket.AF_UNIX) as connection:
@@ -133,6 +134,8 @@ def exchange(
             answer = _line(connection, _LONGEST_ANSWER_BYTES)
         except TimeoutError as error:
             raise TimeoutError(_silence(_peer(connection)[0], patience_s)) from error
+    if not answer:
+        raise ConnectionResetError("the process has ended without an answer")
     try:
         fields: dict[str, Any] = json_of(answer, str(path), allow_nan=True)
     except InputError as error:

@@ -203,16 +203,21 @@ def _state_after(run: Path | None, command: Command, *, until: str = "") -> Stat
 
 def _state_of_starting(run: Path | None, command: Command, alarm: Callable[[str], None], none: NoRun) -> State:
     """Send a command to the only session that is starting, or to the one that resumes this run or reads this plan;
-    return its state. Raises InputError: `none` if there is no such session."""
-    from coupole.acquisition.starting import ask_starting, starting
+    return its state. One that does not say what it starts counts as the one that is meant, if no other is. Raises
+    InputError: `none` if there is no such session."""
+    from coupole.acquisition.starting import ask_starting, name_of, starting
 
-    wanted = str(run.resolve()) if run else ""
-    sessions = [(path, state) for path, state in starting() if not run or wanted in (state["run"], state["plan"])]
+    found = list(starting())
+    sessions = found
+    if run is not None:
+        named = str(run.resolve())
+        sessions = [(path, state) for path, state in found if named in (state["run"], state["plan"])]
+        sessions = sessions or [(path, state) for path, state in found if state["state"] == "silent"]
     if not sessions:
         raise none
     if len(sessions) > 1:
-        plans = "\n".join(f"  {state['run'] or state['plan']}" for _, state in sessions)
-        raise InputError(f"several sessions are starting; name one of\n{plans}")
+        names = "\n".join(f"  {name_of(state)}" for _, state in sessions)
+        raise InputError(f"several sessions are starting; name one of\n{names}")
     return ask_starting(*sessions[0], command, alarm)
 
 

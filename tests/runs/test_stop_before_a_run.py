@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import signal
+import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -13,7 +16,7 @@ import pytest
 from cells import CellFolder
 
 from coupole.acquisition import runtime_folder
-from coupole.acquisition.starting import starting
+from coupole.acquisition.starting import ask_starting, starting
 
 PREFLIGHT, OPENING = "views, shots, frames", "opening the devices"
 
@@ -115,6 +118,37 @@ def test_a_session_that_is_starting_has_nothing_to_pause(apart: Path) -> None:
         assert paused.code == 2
         assert "the run has not begun; `coupole stop` ends it" in " ".join((paused.out + paused.err).split())
         assert process.poll() is None
+
+
+def test_a_session_that_is_slow_to_answer_is_not_overlooked(apart: Path) -> None:
+    plan = apart / "plan.yaml"
+    with _starts(plan) as process:
+        process.send_signal(signal.SIGSTOP)
+        timer = threading.Timer(7.0, process.send_signal, [signal.SIGCONT])  # later than a look waits
+        timer.start()
+        stopped = cells.here("stop", plan)
+        timer.join()
+        assert stopped.code == 0, stopped.err
+        assert f"process {process.pid} is stopped" in " ".join((stopped.out + stopped.err).split())
+        assert process.poll() is not None
+
+
+def test_a_session_that_ends_before_its_answer_was_sent_is_stopped(apart: Path) -> None:
+    path = runtime_folder.runtime_folder() / "1.start"
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(str(path))
+        listening.listen()
+
+        def closes() -> None:
+            connection, _ = listening.accept()
+            connection.recv(1000)
+            connection.close()
+
+        closing = threading.Thread(target=closes)
+        closing.start()
+        state = {"run": "", "plan": "plan.yaml", "pid": 1}
+        assert ask_starting(path, state, "stop", print)["state"] == "stopping"
+        closing.join()
 
 
 def test_of_several_sessions_that_are_starting_one_must_be_named(apart: Path) -> None:

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -97,9 +98,10 @@ def _starts(plan: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 @pytest.fixture
-def apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(runtime_folder, "_BASE", tmp_path)
-    return tmp_path
+def apart(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="apart-") as folder:  # short: the path of a socket has 107 bytes
+        monkeypatch.setattr(runtime_folder, "_BASE", Path(folder))
+        yield Path(folder)
 
 
 def test_the_only_session_that_is_starting_needs_no_name(apart: Path) -> None:

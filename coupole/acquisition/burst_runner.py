@@ -39,10 +39,6 @@ _LAST_STRETCH_S = 0.3
 _BOX_JITTER_US = 20.0
 
 
-def unknown() -> None:
-    """The burst after one whose next burst is not known while it is fired."""
-
-
 @dataclass
 class _RunningBurst:
     """A running burst: data from box and camera so far."""
@@ -51,7 +47,7 @@ class _RunningBurst:
     grabber: FrameGrabber
     arm_before: ArmState
     following: Callable[[], Burst | None] | None
-    """The burst after this one, once it is known; None after its upload has begun."""
+    """Gives the burst after this one, once it is known; None if nobody knows it, or if its upload has begun."""
     arm_after: ArmState | None = None
     """Measured after the last frame; None while the burst runs, and if the arm was not still."""
     log: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, STEP_RECORD_DTYPE))
@@ -133,10 +129,11 @@ class BurstRunner:
                 upload, self._upload = self._upload, None
                 upload.result()
 
-    def fire(self, burst: Burst, following: Callable[[], Burst | None] = unknown) -> Verdict:
+    def fire(self, burst: Burst, following: Callable[[], Burst | None] | None = None) -> Verdict:
         """Run one burst and prove its frames; dose and figures are recorded even if this raises.
 
-        The table of the `following` burst is uploaded meanwhile, as soon as it is not None. Raises ArmMovedError.
+        `following` gives the burst after this one, as soon as it is known. Its table is uploaded meanwhile. Raises
+        ArmMovedError.
         """
         frame_format = self._cell.camera.configure(self.exposure(burst))
         if not burst.hardware:
@@ -157,7 +154,7 @@ class BurstRunner:
         self._buffers = max(self._buffers, buffers)
         return self._by_cable(burst, following, self._buffers)
 
-    def _by_cable(self, burst: Burst, following: Callable[[], Burst | None], buffers: int) -> Verdict:
+    def _by_cable(self, burst: Burst, following: Callable[[], Burst | None] | None, buffers: int) -> Verdict:
         box, camera, clock = table_box(self._cell.ledbox), self._cell.camera, self._cell.clock
         grabber = FrameGrabber(camera, lambda frame: self._recorder.store(frame, burst.timing.exposure_us))
         running = _RunningBurst(burst, grabber, self._cell.robot.measured(), following)

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor, SettledPose
-from coupole.acquisition.burst_runner import BurstRunner, CameraSettings, unknown
+from coupole.acquisition.burst_runner import BurstRunner, CameraSettings
 from coupole.acquisition.bursts_of_views import BurstsOfViews
 from coupole.acquisition.collector import collected_when_asked
 from coupole.acquisition.dose import DoseMeter
@@ -239,7 +239,7 @@ class Sequencer:
                 self.outcome.reshot += len(shots)
                 self._recorder.note(ReshootBegun(view=burst.view, attempt=attempt, shots=shots))
             try:
-                verdict = self._burst_runner.fire(todo, following if todo is burst else unknown)
+                verdict = self._burst_runner.fire(todo, following if todo is burst else None)
                 attempt += 1
             except ArmMovedError as moved:
                 self._cell.ledbox.lights_off()

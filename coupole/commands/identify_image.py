@@ -89,8 +89,10 @@ def _read_mask(path: Path, cube: Cube) -> NDArray[Any]:
     import numpy as np
     from PIL import Image
 
+    from coupole.intake.regular_file import open_regular
+
     try:
-        with Image.open(path) as picture:
+        with open_regular(path) as file, Image.open(file) as picture:
             mask = np.asarray(picture.convert("L")) > 0
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: expected a picture: {reason(error)}") from error

@@ -112,7 +112,7 @@ def _await_end_before_the_run(reply: State, *, as_json: bool) -> None:
             os.close(process)
     if as_json:
         print(json.dumps(reply))
-    words = f"stopped before the run began: {reply['plan']}; the process {reply['pid']} has ended"
+    words = f"stopped while it was starting: {reply['plan']}; its process {reply['pid']} has ended"
     make_console(quiet=as_json).print(words, markup=False)
 
 

@@ -69,10 +69,9 @@ def acquire(
 
     Ctrl-C stops safely (lights off, arm still). Resume the run with `acquire --resume RUN`, which uses the run's
     own copies of plan and rig. Or name the plan again; only its comments and the object's budget of light may have
-    changed. On a terminal the key p
-    pauses between bursts and continues, q stops. From elsewhere use `coupole pause`, `go-on` and `stop`. If a
-    console owns the cell (`coupole serve`), the command acquires in the console's name, if nothing runs or waits
-    there.
+    changed. On a terminal the key p pauses between bursts and continues, q stops. From elsewhere use `coupole
+    pause`, `go-on` and `stop`. If a console owns the cell (`coupole serve`), the command acquires in the console's
+    name, if nothing runs or waits there.
     """
     from coupole.acquisition.session import SessionRequest, rehearse
     from coupole.preflight.job import read_job

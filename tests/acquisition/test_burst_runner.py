@@ -16,7 +16,7 @@ from coupole.acquisition import burst_runner
 from coupole.acquisition.arm_supervisor import ArmMovedError
 from coupole.acquisition.frame_matching import Match, match
 from coupole.devices import CameraStatistics, Frame
-from coupole.errors import DeviceError, DeviceTimeout
+from coupole.errors import DeviceError, DeviceTimeout, StorageError
 
 BURST = whole_burst(40)
 """0.5 s: ten rounds of the loop."""
@@ -217,6 +217,17 @@ def test_a_burst_that_becomes_known_in_the_middle_is_uploaded_before_the_end() -
     cell.runner.fire(BURST, known)
     assert MIDDLE_S < asked_s[-1] < BURST.duration_s, "and not asked for again"
     wait_until(lambda: cell.box.uploads[-1] == len(following.table), "its upload")
+
+
+def test_a_choice_that_the_disk_refuses_ends_the_burst_and_the_cell_is_made_safe_first() -> None:
+    def refused() -> None:
+        raise StorageError("the journal: no space left")
+
+    cell = Cell(BURST, take(BURST))
+    with pytest.raises(StorageError):
+        cell.runner.fire(BURST, refused)
+    assert cell.done[cell.done.index("started") + 1] == "made safe"
+    assert cell.counted, "its light is counted"
 
 
 def test_the_last_records_are_asked_for_as_soon_as_the_table_is_over() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from pathlib import Path
 
@@ -210,3 +211,9 @@ def test_a_cube_without_its_binary_file_or_header_is_refused(tmp_path: Path) -> 
     with pytest.raises(InputError, match="No such file"):
         open_cube(tmp_path / "none.hdr")
     assert not is_cube(tmp_path / "spot.csv")
+
+
+def test_a_pipe_in_the_place_of_a_header_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "cube.hdr")
+    with pytest.raises(InputError, match="a pipe or a device"):
+        open_cube(tmp_path / "cube.hdr")

@@ -145,6 +145,8 @@ def test_a_run_stopped_by_the_stricter_budget_of_its_plan_goes_on_with_the_raise
     assert resumed.code == 0, resumed.err
     cells.assert_each_shot_proven_once(run)
     assert cells.here("verify", run).code == 0
+    told = cells.here("status", run, "--json").document["dose_budget_lux_h"]
+    assert told == pytest.approx(9.0 * foreseen), "the one that holds, not the first one"
 
 
 def test_the_first_budget_of_a_plan_holds_for_the_plans_that_follow(real: CellFolder) -> None:

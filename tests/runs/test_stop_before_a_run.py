@@ -42,7 +42,7 @@ def test_a_session_that_is_starting_is_stopped_and_does_nothing(tmp_path: Path, 
         _until(process, words)
         stopped = cells.here("stop", cell.plan)
         assert stopped.code == 0, stopped.err
-        assert f"stopped before the run began: {cell.plan}" in " ".join((stopped.out + stopped.err).split())
+        assert f"stopped while it was starting: {cell.plan}" in " ".join((stopped.out + stopped.err).split())
         assert process.poll() is not None, "it has ended when the answer is given"
         assert cells.finish(process).code == 130
         state = world.ask("state")

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from coupole.appearance.spectra.grid import Array
 from coupole.appearance.spectra.measured import decode_text
 from coupole.errors import InputError, Problem, reason
+from coupole.intake.regular_file import open_regular
 
 HEADER = ".hdr"
 WavelengthUnit: TypeAlias = Literal["nm", "um"]
@@ -191,7 +192,7 @@ def _data_beside(header: Path) -> Path:
 
 def _header_text(header: Path) -> str:
     try:
-        with header.open("rb") as file:
+        with open_regular(header) as file:
             raw = file.read(_LONGEST_HEADER + 1)
     except OSError as error:
         raise InputError(f"{header}: {reason(error)}") from error

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -364,8 +364,6 @@ def named_classes(finding: PigmentFinding) -> set[str]:
 
 
 def _with_number(finding: PigmentFinding, place: int) -> PigmentFinding:
-    from dataclasses import replace
-
     return replace(finding, name=f"region {place}")
 
 

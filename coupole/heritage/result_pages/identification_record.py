@@ -20,7 +20,7 @@ import coupole
 from coupole.errors import InputError, StorageError, reason
 from coupole.heritage.analysis.identification import PigmentFinding
 from coupole.heritage.analysis.references import Rate
-from coupole.intake.plain_data import json_of
+from coupole.intake.plain_data import read_json
 from coupole.storage.durable import sha256, write_synced
 
 RECORD = "identification.json"
@@ -131,7 +131,7 @@ def check_record(folder: Path) -> RecordCheck:
     """
     path = folder / RECORD
     try:
-        whole = json_of(path.read_bytes(), str(path))
+        whole = read_json(path)
     except OSError as error:
         raise InputError(f"{path}: {reason(error)}") from error
     if not isinstance(whole, dict) or whole.get("kind") != _KIND or not isinstance(whole.get("files"), dict):

@@ -22,18 +22,15 @@ LIMITS = (
     "The answer is a class of colouring matter, not a product, a maker or a date.",
     "A class that the library does not have cannot be found. The verdict unknown is then the right answer, and is "
     "not always given.",
-    "A reflectance spectrum shows the uppermost layers. Varnish, dirt, retouching, thin glazes and "
-    "fluorescence change "
-    "it; spectra with varnish, dirt or thin glazes were not tested.",
-    "Whites, blacks, and pigments whose bands lie in the ultraviolet or the near infrared may not be told "
-    "apart by "
-    "visible light.",
-    "Paints of other makers than those of the library were matched in 27 of 74 tested cases and matched "
-    "wrongly in 3. "
-    "The first class was right in 57 of them.",
-    "Probabilities hold among the classes of this library and for spectra like those in it. Confirm the "
-    "finding by "
-    "another method (such as X-ray fluorescence or Raman spectroscopy) before a treatment depends on it.",
+    "A reflectance spectrum shows the uppermost layers. Varnish, dirt, retouching, thin glazes and fluorescence "
+    "change it; spectra with varnish, dirt or thin glazes were not tested.",
+    "Whites, blacks, and pigments whose bands lie in the ultraviolet or the near infrared may not be told apart "
+    "by visible light.",
+    "With Kremer's library of historical pigments, paints of other makers were matched in 27 of 74 tested cases "
+    "and matched wrongly in 3. The first class was right in 57 of them. Other libraries were not tested "
+    "in this way.",
+    "Probabilities hold among the classes of this library and for spectra like those in it. Confirm the finding "
+    "by another method (such as X-ray fluorescence or Raman spectroscopy) before a treatment depends on it.",
 )
 
 

@@ -2,9 +2,8 @@
 
 It reads lines of JSON from its input. The first names plan, rig and result; the process answers with the `reasons`
 against a result. The next names the run's folder, the result's folder, and the module that makes pages to relight.
-From then on the process follows the
-run's journal, and reports its progress in lines on its output. It ends when its input ends: then its parent has
-died, or does not need it any more.
+From then on the process follows the run's journal, and reports its progress in lines on its output. It ends when
+its input ends: then its parent has died, or does not need it any more.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ import math
 import os
 import re
 import stat
+import tempfile
 import time
 import uuid
 from collections.abc import Iterator
@@ -28,6 +29,7 @@ from coupole.errors import InputError, StorageError
 from coupole.intake.regular_file import NO_FILE
 from coupole.plan.base_model import Name
 from coupole.plan.cell import Cell
+from coupole.storage.disk_errors import disk_error
 from coupole.storage.ledger_lines import (
     Asked,
     BudgetSet,
@@ -46,6 +48,8 @@ from coupole.storage.line_file import LineFile
 LOCK_S = 10.0
 """Longest wait for the lock. Other writers hold it for one line each."""
 _NAP_S = 0.01
+_ROOM_BYTES = 2**18
+"""Room for the lines of about 700 bursts."""
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 
 
@@ -147,9 +151,18 @@ class Ledger:
             )
 
     def prove_writable(self) -> None:
-        """Raise StorageError now if lines could not be appended later."""
+        """Raise StorageError now if lines could not be appended later, and DiskFull if the disk has no room for
+        them."""
         with self._open_locked():
-            pass
+            try:
+                with tempfile.TemporaryFile(dir=self.folder) as file:
+                    file.write(bytes(_ROOM_BYTES))
+                    file.flush()
+                    os.fsync(file.fileno())
+            except PermissionError:  # the ledger itself can be written, so it is enough
+                return
+            except OSError as error:
+                raise disk_error(self.folder, error) from error
 
     def _former_lines(self, texts: list[bytes]) -> list[bytes]:
         """Return lines of the former place that are not also in the present one."""

@@ -14,14 +14,14 @@ from preflight_cases import RIG, checked, only_refusal, plan_of, rig_of
 
 from coupole.plan.marks import MARKS
 from coupole.preflight.checking import storage_of
-from coupole.preflight.preflight import StorageFacts
+from coupole.preflight.preflight import StorageFacts, room_bytes
 from coupole.storage.run import Occupied
 from coupole.storage.write_speed import measure_write_speed
 
 
 def test_a_run_that_does_not_fit_on_the_disk_is_refused() -> None:
     assert RIG is not None
-    need = (1080 + 2 + MARKS) * RIG.frame_bytes + RIG.storage.reserve_bytes
+    need = room_bytes(1080 + 2 + MARKS, 1, RIG.frame_bytes) + RIG.storage.reserve_bytes
     assert checked(plan_of(), storage=StorageFacts(free_bytes=need)).refusals == []
     refusal = only_refusal(checked(plan_of(), storage=StorageFacts(free_bytes=need - 1)))
     assert "must stay free" in refusal
@@ -34,7 +34,7 @@ def test_the_folder_of_the_run_is_named_not_that_of_the_rig() -> None:
 
 def test_what_a_resumed_run_has_allocated_is_not_asked_for_again() -> None:
     assert RIG is not None
-    need = (1080 + 2 + MARKS) * RIG.frame_bytes + RIG.storage.reserve_bytes
+    need = room_bytes(1080 + 2 + MARKS, 1, RIG.frame_bytes) + RIG.storage.reserve_bytes
     facts = StorageFacts(need - 10**6, occupied_space=Occupied({"top": 10**6}))
     assert checked(plan_of(), storage=facts).refusals == []
     assert (

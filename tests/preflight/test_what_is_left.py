@@ -12,7 +12,8 @@ from rich.console import Console
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.checking import check_job
 from coupole.preflight.job import Job, read_job
-from coupole.preflight.preflight import Report, StorageFacts
+from coupole.preflight.preflight import Report, StorageFacts, room_bytes
+from coupole.storage.frame_file import SPARE_SLOTS
 from coupole.storage.run import Occupied
 from coupole.viewing.preflight_table import show_preflight
 
@@ -86,8 +87,9 @@ def test_what_is_left_and_the_whole_are_both_shown(demo: Job) -> None:
 def test_the_same_bytes_are_not_asked_for_twice(demo: Job, tmp_path: Path) -> None:
     """Two views' files are on the disk, with all that they will ever need."""
     frame_bytes, reserve = demo.cell.rig.frame_bytes, demo.cell.rig.storage.reserve_bytes
-    a_view = 1092 * frame_bytes
-    for free_bytes, refused in ((a_view + reserve, False), (a_view + reserve - 1, True)):
+    a_view = (1092 + SPARE_SLOTS) * frame_bytes
+    need = room_bytes(3276, 3, frame_bytes) - 2 * a_view + reserve
+    for free_bytes, refused in ((need, False), (need - 1, True)):
         facts = StorageFacts(free_bytes, 4e9, tmp_path, Occupied({"top": 2 * a_view}))
         _, report = check_job(demo, facts, paths=False, proven=proven_of(demo, 1, 500))
         assert bool(report.refusals) == refused

@@ -16,10 +16,12 @@ from cells import SIDE, TOP, CellFolder
 from view_files import FORMAT, METADATA, SLOTS, frame
 
 from coupole.errors import DiskFull, StorageError
+from coupole.preflight.preflight import room_bytes
 from coupole.storage import journal
 from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FaultNoted, SessionStarted, SessionStopped
+from coupole.storage.ledger import Ledger
 from coupole.storage.run import Run
 from coupole.storage.run_inputs import Inputs
 from coupole.storage.view_writer import ViewWriter
@@ -52,6 +54,16 @@ def _filled(disk: Path) -> bool:
     except OSError:
         return False
     return True
+
+
+def test_a_ledger_on_a_full_disk_is_told_before_any_light_is_given(small_disk: Path) -> None:
+    ledger = Ledger(small_disk, "shroud")
+    ledger.plan("one", 1.0, None)
+    ledger.prove_writable()
+    fill(small_disk, 0)
+    with pytest.raises(DiskFull, match="the disk is full"):
+        ledger.prove_writable()
+    assert ledger.read_history().total_lux_h == 1.0
 
 
 def test_a_view_for_which_there_is_no_room_is_refused_and_leaves_no_file(small_disk: Path) -> None:
@@ -157,3 +169,11 @@ def test_a_session_whose_disk_filled_up_claims_no_frame_that_the_run_does_not_ha
     (small_disk / "ballast").unlink()
     assert cells.here("acquire", "--resume", run, "--yes", "--json").code == 0
     cells.assert_each_shot_proven_once(run)
+    _assert_no_more_room_than_counted(run, frame_bytes=128 * 96 * 2)
+
+
+def _assert_no_more_room_than_counted(run: Path, frame_bytes: int) -> None:
+    """Frames of 25 kB: records and reports have a large share."""
+    expected = cells.about(run)["expected"]
+    taken_bytes = sum(path.stat().st_size for path in run.rglob("*") if path.is_file())
+    assert taken_bytes <= room_bytes(expected["frames"], 2, frame_bytes)

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -218,7 +219,7 @@ def extract(
         extract_runs(request, out, scheduler=scheduler, say=say)
         return {"views": RunResult(out).summaries}
 
-    _do(step, as_json=as_json)
+    _do(step, as_json=as_json, done=f"samples {out}\nnext: coupole reflectance fit {quote(str(out))}")
 
 
 @reflectance_app.command()
@@ -237,7 +238,7 @@ def fit(
         fit_result(result, workers.memory_bytes, scheduler=workers.scheduler, say=say)
         return {"fits": list(FITS)}
 
-    _do(step, as_json=as_json)
+    _do(step, as_json=as_json, done=f"all fits {result}\nnext: coupole reflectance check {quote(str(result))}")
 
 
 @reflectance_app.command()
@@ -311,8 +312,9 @@ def cluster(
     _do(step, as_json=as_json)
 
 
-def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool) -> None:
-    """Run one step with progress bars, and print its result for `--json`."""
+def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool, done: str = "") -> None:
+    """Run one step with progress bars. Print its result for `--json`, and otherwise its report or the words
+    `done`."""
     from coupole.viewing.terminal import make_console, step_bars
 
     try:
@@ -323,8 +325,8 @@ def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool) -> None:
         raise
     if as_json:
         print(json.dumps(document))
-    elif "report" in document:
-        print(f"report {document['report']}")
+    else:
+        print(f"report {document['report']}" if "report" in document else done)
 
 
 reflectance_app.command()(choose)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -229,6 +230,14 @@ def test_runs_of_one_object_are_fitted_together(made: Made, tmp_path: Path) -> N
     )
     assert ended.code == 2
     assert "shows another object, or the object in another place" in ended.err
+
+
+def test_a_step_without_a_report_says_what_is_there_and_what_comes_next(made: Made, tmp_path: Path) -> None:
+    out = tmp_path / "my result"
+    shutil.copytree(made[1], out)
+    ended = cells.here("reflectance", "fit", out)
+    assert (ended.code, ended.out) == (0, f"all fits {out}\nnext: coupole reflectance check '{out}'\n")
+    assert cells.here(*shlex.split(ended.out.splitlines()[1])[2:]).code == 0
 
 
 def test_a_mesh_whose_normals_are_off_is_mended(made: Made, tmp_path: Path) -> None:

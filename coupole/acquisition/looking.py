@@ -29,7 +29,7 @@ from coupole.acquisition.sequencer import Sequencer
 from coupole.acquisition.signals import Act, obeyed_by
 from coupole.acquisition.single_shots import SingleShots
 from coupole.bounded import NOW, refuse_overdue, run_bounded
-from coupole.errors import CoupoleError, InputError, PreflightRefused
+from coupole.errors import CoupoleError, DeviceError, InputError, PreflightRefused
 from coupole.geometry import apply
 from coupole.plan.cell import Cell
 from coupole.plan.light_selection import leds_of_plan
@@ -94,7 +94,8 @@ def metered(
     sequencer = run_bounded(
         partial(Sequencer, small, cell, recorder, observer=observer, control=control, can_stand=False)
     )
-    run_bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
+    with control.explains(DeviceError):
+        run_bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
     return exposure_advice.advise(recorder.views, request, longest_us=longest_exposure_us(small.cell.rig))
 
 

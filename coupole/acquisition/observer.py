@@ -6,7 +6,8 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
@@ -164,6 +165,21 @@ class Control:
         now_s = time.monotonic()
         late = now_s - self.pulse_s > ASKS_FROM_S or now_s - self.stood_at_s < HEARD_WITHIN_S
         return late and not self.hold_pending.is_set()
+
+    @contextmanager
+    def explains(self, *errors: type[Exception]) -> Iterator[None]:
+        """Raise Interrupted in place of these errors if the session was told to stop: this is why its devices
+        fail."""
+        try:
+            yield
+        except errors as error:
+            self.await_word()
+            stopped = next(
+                (control for control in (self.session, self) if control and control.stop.is_set()), None
+            )
+            if stopped is not None:
+                raise stopped.interruption() from error
+            raise
 
     def go_on(self) -> None:
         """Raise Interrupted if the session must stop, or Held if it must stand. Call it before each command that

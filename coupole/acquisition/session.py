@@ -41,6 +41,7 @@ from coupole.acquisition.session_failure import (
 from coupole.acquisition.signals import obeyed_by
 from coupole.bounded import left_behind, on_disk, run_bounded
 from coupole.errors import (
+    DeviceError,
     Interrupted,
     PreflightRefused,
     StorageError,
@@ -366,7 +367,11 @@ def rehearse(job: Job, console: Console, *, speed: float, figures: dict[str, Any
         outcome = sequencer.outcome
         started_s = time.monotonic()
         try:
-            with obeyed_by(control, cell.halt), observer.showing(job.schedule.frames, job.schedule.view_count):
+            with (
+                obeyed_by(control, cell.halt),
+                observer.showing(job.schedule.frames, job.schedule.view_count),
+                control.explains(DeviceError),
+            ):
                 run_bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
         finally:
             machine_s = time.monotonic() - started_s

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cells import Ended, here
+from cells import Ended, finish, here, start
 from commissioned_cells import ABOVE_THE_BALL_DEG, Eye, Wrapped, ball_cell, board_cell, opened_bench, with_devices
 from places import REPO
 
@@ -295,3 +296,47 @@ def test_a_device_that_failed_because_the_program_stood_still_is_not_blamed(
     bench = replace(wrong, control=Control())
     with pytest.raises(Interrupted, match="the program did not run for 3"):
         session._run_step("watchdog", bench, bench.cell, "A. Person")
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        DeviceTimeout(
+            "led box", expected="time for INIT", happened="the lights were switched off", remedy="See why."
+        ),
+        StepFailedError("the arm did not reach its target"),
+        None,
+    ],
+    ids=["a device fails", "the step fails", "a figure is wrong"],
+)
+def test_a_step_that_the_person_stops_has_no_result(
+    wrong: Bench, monkeypatch: pytest.MonkeyPatch, spoilt: Exception | None
+) -> None:
+    def act(bench: Bench) -> None:
+        bench.control.stop_by(signal.SIGTERM)
+        bench.findings.at_most("LED 3: steps in which it drew no current", 1, 0, "")
+        if spoilt is not None:
+            raise spoilt
+
+    monkeypatch.setitem(session.ACTS, "lamps", act)
+    bench = replace(wrong, control=Control())
+    with pytest.raises(Interrupted) as interruption:
+        session._run_step("lamps", bench, bench.cell, "A. Person")
+    assert interruption.value.exit_code == 128 + signal.SIGTERM
+
+
+def test_a_stop_in_a_motion_keeps_the_earlier_result_and_notes_no_fault_of_the_arm(
+    right: tuple[Path, Ended],
+) -> None:
+    rig, ended = right
+    record = Path(ended.document["record"])
+    before = record.read_text()
+    process = start("commission", rig, "--name", "B", "--yes", "--only", "axes")
+    assert process.stderr is not None
+    assert any("A1 turns by" in line for line in process.stderr)
+    time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    stopped = finish(process)
+    assert stopped.code == 130, stopped.err
+    assert record.read_text() == before
+    assert here("arm", rig, "home", "--yes").code == 0

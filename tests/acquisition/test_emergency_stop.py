@@ -44,7 +44,10 @@ class ScriptedArm:
     """Whether it accepts a motion after the emergency stop."""
     creeps_deg_s: float = 0.0
     """Speed at which its axis sinks after the emergency stop."""
+    tells_after_s: float = 0.0
+    """Time from the press until its fault is told."""
     coasts_deg: float = 0.5
+    coasts_deg_s: float = SPEED_DEG_S
     a1_deg: float = 0.0
     target_deg: float = 0.0
     since_s: float = 0.0
@@ -53,7 +56,11 @@ class ScriptedArm:
     def _angle_deg(self) -> float:
         elapsed_s = self.clock.now_s - self.since_s
         if self.pressed_at is not None:
-            return self.pressed_at + min(self.coasts_deg, SPEED_DEG_S * elapsed_s) + self.creeps_deg_s * elapsed_s
+            return (
+                self.pressed_at
+                + min(self.coasts_deg, self.coasts_deg_s * elapsed_s)
+                + self.creeps_deg_s * elapsed_s
+            )
         way = self.target_deg - self.a1_deg
         return self.a1_deg + float(np.sign(way)) * min(abs(way), SPEED_DEG_S * elapsed_s)
 
@@ -65,8 +72,10 @@ class ScriptedArm:
         if self.pressed_at is None:
             moving = abs(angle_deg - self.target_deg) > 1e-9
         else:
-            moving = SPEED_DEG_S * (self.clock.now_s - self.since_s) < self.coasts_deg
-        fault = "emergency stop" if self.pressed_at is not None and self.tells else ""
+            coasting_s = max(self.tells_after_s, self.coasts_deg / self.coasts_deg_s)
+            moving = self.clock.now_s - self.since_s < coasting_s
+        is_told = self.tells and self.clock.now_s >= self.since_s + self.tells_after_s
+        fault = "emergency stop" if self.pressed_at is not None and is_told else ""
         return ArmState((angle_deg, 0, 0, 0, 0, 0), np.eye(4), self.clock.now_ns(), moving, fault)
 
     def move_to(self, joints_deg: Any, speed: float = 1.0) -> None:
@@ -122,7 +131,39 @@ def test_an_arm_that_can_be_driven_on_does_not_pass() -> None:
 def test_an_arm_that_turns_farther_than_promised_does_not_pass() -> None:
     bench = bench_of(ScriptedArm(Clock(), coasts_deg=3.0))
     emergency_stop(bench)
-    assert missed(bench) == ["turn after the fault was seen, beyond the promise"]
+    assert missed(bench) == ["turn after the press, beyond the promise"]
+
+
+def test_the_turn_is_measured_from_the_braking_also_if_the_fault_is_told_late() -> None:
+    bench = bench_of(ScriptedArm(Clock(), coasts_deg=3.0, coasts_deg_s=2.0, tells_after_s=2.0))
+    emergency_stop(bench)
+    assert missed(bench) == ["turn after the press, beyond the promise"]
+
+
+def test_an_arm_that_stands_when_the_stop_is_pressed_does_not_pass() -> None:
+    """The person presses as soon as the step has begun: no motion was stopped."""
+    bench = bench_of(arm := ScriptedArm(Clock()))
+    bench.person.is_ready = lambda _: arm.press() or True  # type: ignore[method-assign, func-returns-value]
+    with pytest.raises(StepFailedError, match="while the arm was not at speed"):
+        emergency_stop(bench)
+
+
+@pytest.mark.parametrize("at_s", [0.0, 2.9, 3.01])
+def test_a_press_before_at_or_after_the_end_of_a_motion_does_not_pass(at_s: float) -> None:
+    """A motion takes 3 s. Near its target the arm brakes anyway."""
+    arm = ScriptedArm(Clock())
+    bench = bench_of(arm)
+    sleep = arm.clock.sleep
+
+    def press_in_time(seconds: float, at_most_s: float = math.inf) -> None:
+        sleep(seconds, at_most_s)
+        if arm.pressed_at is None and arm.clock.now_s - arm.since_s >= at_s and arm.target_deg:
+            arm.press()
+
+    bench.person.press = lambda: None  # type: ignore[attr-defined]
+    arm.clock.sleep = press_in_time  # type: ignore[method-assign]
+    with pytest.raises(StepFailedError, match="while the arm was not at speed"):
+        emergency_stop(bench)
 
 
 def test_an_arm_that_sinks_at_rest_does_not_pass() -> None:

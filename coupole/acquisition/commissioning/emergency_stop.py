@@ -4,8 +4,10 @@ move it on."""
 from __future__ import annotations
 
 import contextlib
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coupole.acquisition.commissioning.bench import Bench, StepFailedError
 from coupole.clock import Deadline
@@ -18,6 +20,16 @@ _PRESSED_WITHIN_S = 90.0
 _POLL_S = 0.01
 _WATCHED_S = 2.0
 _STILL_DEG = 0.02
+_SPEED_OVER_S = 0.05
+_FAST_SHARE = 0.5
+"""Share of the axis's greatest speed in this session that it must have had."""
+_STEADY_SHARE = 0.95
+"""Share of the greatest speed in the motion; the arm brakes when it is slower."""
+_PRESSED_AT_REST = (
+    "the arm's fault ({}) came while the arm was not at speed, so nothing was measured: release the emergency "
+    "stop, acknowledge it, start the robot program again, confirm the fault (`coupole confirm`), and repeat the "
+    "step; press while the arm turns"
+)
 
 
 def emergency_stop(bench: Bench) -> None:
@@ -33,13 +45,13 @@ def emergency_stop(bench: Bench) -> None:
         "release it before you are asked."
     )
     promised_deg = robot.stopping_deg()
-    at_press_deg = _moved_until_pressed(bench)
-    rested_deg = _last_known_deg(bench, at_press_deg)
-    turned_deg = float(np.max(np.abs(rested_deg - at_press_deg) - promised_deg))
-    findings.at_most("turn after the fault was seen, beyond the promise", max(turned_deg, 0.0), 0.0, "deg")
+    press = _moved_until_pressed(bench)
+    rested_deg = _last_known_deg(bench, press.joints_deg)
+    turned_deg = float(np.max(np.abs(rested_deg - press.joints_deg) - press.unsure_deg - promised_deg))
+    findings.at_most("turn after the press, beyond the promise", max(turned_deg, 0.0), 0.0, "deg")
     is_accepted = True
     try:
-        robot.move_to(at_press_deg)
+        robot.move_to(press.joints_deg)
     except DeviceError as error:
         is_accepted = False
         findings.remarks.append(f"a motion was refused: {error}")
@@ -51,28 +63,31 @@ def emergency_stop(bench: Bench) -> None:
     bench.person.tell("Release the emergency stop, acknowledge it, reset the robot program, start it again.")
 
 
-def _moved_until_pressed(bench: Bench) -> np.ndarray:
-    """Return the axes [6] when the fault was first seen. Raises StepFailedError if no fault is seen."""
+def _moved_until_pressed(bench: Bench) -> _Press:
+    """Return where the arm was when it began to brake. Raises StepFailedError if no fault is seen, or if the arm
+    was not at speed before it."""
     robot, clock = bench.opened.robot, bench.opened.clock
     home_deg = bench.joints_deg()
     change_deg = np.zeros(6)
     change_deg[0] = _PACE_S * bench.velocity_deg_s[0]
     change_deg = bench.clear_change(change_deg)
+    fast_deg_s = _FAST_SHARE * float(bench.velocity_deg_s[0])
     deadline, out = Deadline(clock, _PRESSED_WITHIN_S), False
     is_asked = False
     while not deadline.has_expired:
         out = not out
         bench.pause(_POLL_S)
+        way = _Way(home_deg + change_deg if out else home_deg)
         try:
-            robot.move_to(home_deg + change_deg if out else home_deg)
+            robot.move_to(way.target_deg)
         except DeviceFault as error:  # pressed since the last look at the arm
-            bench.findings.remarks.append(f"the arm's fault: {error.happened}")
-            return bench.joints_deg()
+            raise StepFailedError(_PRESSED_AT_REST.format(error.happened)) from error
         while (state := robot.measured()).moving or state.fault:
+            way.add(state)
             if state.fault:
                 bench.findings.remarks.append(f"the arm's fault: {state.fault}")
-                return np.array(state.joints_deg)
-            if not is_asked:
+                return way.press(fast_deg_s, robot.stopping_deg(), state.fault)
+            if not is_asked and way.speed_deg_s() >= fast_deg_s:
                 bench.person.press_emergency_stop()
                 is_asked = True
             bench.pause(_POLL_S)
@@ -81,6 +96,56 @@ def _moved_until_pressed(bench: Bench) -> np.ndarray:
         f"no fault of the arm was seen within {_PRESSED_WITHIN_S:g} s: if the emergency stop was pressed, the "
         "controller does not report it; otherwise repeat the step"
     )
+
+
+@dataclass(frozen=True)
+class _Press:
+    """Where the arm was when the emergency stop began to brake it."""
+
+    joints_deg: NDArray[np.float64]
+    """[6] last reported axes before it slowed down."""
+    unsure_deg: NDArray[np.float64]
+    """[6] turn of the axes until the next report: the arm may have begun to brake anywhere in between."""
+
+
+@dataclass
+class _Way:
+    """One motion so far."""
+
+    target_deg: NDArray[np.float64]
+    """[6]"""
+    reports: list[tuple[int, NDArray[np.float64]]] = field(default_factory=list)
+    """Times, ns, and axes [6]."""
+
+    def add(self, state: ArmState) -> None:
+        """Add a report, unless it is the last one again."""
+        if not self.reports or state.t_ns > self.reports[-1][0]:
+            self.reports.append((state.t_ns, np.array(state.joints_deg)))
+
+    def speed_deg_s(self, index: int = -1) -> float:
+        """Return the speed of the fastest axis over the `_SPEED_OVER_S` before a report; 0 if there is no earlier
+        one."""
+        now_ns, now_deg = self.reports[index]
+        before = [report for report in self.reports if now_ns - report[0] >= _SPEED_OVER_S * 1e9]
+        if not before:
+            return 0.0
+        then_ns, then_deg = before[-1]
+        return float(np.abs(now_deg - then_deg).max()) / ((now_ns - then_ns) * 1e-9)
+
+    def press(self, fast_deg_s: float, stopping_deg: NDArray[np.float64], fault: str) -> _Press:
+        """Return where the arm began to brake before this fault was seen. Raises StepFailedError if it was not as
+        fast as this, or so near its target that it would have braked anyway."""
+        speeds_deg_s = [self.speed_deg_s(index) for index in range(len(self.reports))]
+        if max(speeds_deg_s) < fast_deg_s:
+            raise StepFailedError(_PRESSED_AT_REST.format(fault))
+        at_speed = [
+            index for index, speed in enumerate(speeds_deg_s) if speed >= _STEADY_SHARE * max(speeds_deg_s)
+        ]
+        last = at_speed[-1]
+        joints_deg = self.reports[last][1]
+        if np.all(np.abs(self.target_deg - joints_deg) <= stopping_deg):
+            raise StepFailedError(_PRESSED_AT_REST.format(fault))
+        return _Press(joints_deg, np.abs(self.reports[min(last + 1, len(self.reports) - 1)][1] - joints_deg))
 
 
 def _last_known_deg(bench: Bench, before_deg: np.ndarray) -> np.ndarray:

@@ -171,19 +171,19 @@ def _due(cell: Cell, record: CommissioningRecord, opened_cell: OpenedCell) -> li
 
 
 def _run_step(step: Step, bench: Bench, cell: Cell, name: str) -> tuple[StepResult, DeviceError | None]:
-    """Do one step. Returns its result, and the device's error if one ended the step. Raises Interrupted if this
-    process did not run for a while, or was suspended."""
+    """Do one step. Returns its result, and the device's error if one ended the step. Raises Interrupted if the
+    person stopped the step, or if this process did not run for a while: this is no result."""
     findings = bench.findings = Findings()
     failure, error = "", None
     try:
-        ACTS[step](bench)
+        with bench.control.explains(DeviceError, StepFailedError):
+            ACTS[step](bench)
     except StepFailedError as shortcoming:
         failure = str(shortcoming)
     except DeviceError as raised:
-        bench.control.await_word()
-        if bench.control.held_because:  # the device did what a hold asked of it
-            raise bench.control.interruption() from raised
         failure, error = str(raised), raised
+    if not findings.has_passed:
+        bench.control.go_on()  # the stop may have spoilt the figures
     result = StepResult(
         step=step,
         person=name,

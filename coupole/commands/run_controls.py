@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +18,7 @@ from coupole.errors import DeviceError, InputError, unsafe_end
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from coupole.acquisition.run_control import Command, NoRun, State
+    from coupole.acquisition.run_control import Command, State
     from coupole.storage.run import Run
 
 RunningRun = Annotated[
@@ -34,6 +34,9 @@ _ENDS_WITHIN_S = 600.0
 """Longest wait for the end of a process, s: longer than a session in which every call hangs (`coupole.bounded`),
 and than a slow report."""
 _PLAIN_LINE_EVERY_S = 5.0
+_SESSION_PATIENCE_S = (0.5, 5.0, 0.5)
+"""Longest waits for the answer of a session without a run. A frozen one must not delay the stop of another one; a
+session that loads its modules on a busy machine answers late. After each wait the run may have begun."""
 
 
 def pause(run: RunningRun = None, as_json: JsonOption = False) -> None:
@@ -57,12 +60,13 @@ def go_on(run: RunningRun = None, as_json: JsonOption = False) -> None:
 def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     """Stop a running acquisition now: lights off, arm still, camera disarmed. It can be resumed.
 
-    Ends when its process has ended; exit code 4 if the journal says that the cell may not be safe. This is no
+    While nothing is acquired, it stops a commissioning, metering, live view, bench or drive of the arm. Ends when
+    the process has ended; exit code 4 if the journal says that the cell may not be safe. This is no
     emergency stop: that is the button at the cell.
     """
     reply = _state_after(run, "stop")  # sent before the imports, which only the outcome needs
     if "plan" in reply:
-        _await_end_before_the_run(reply, as_json=as_json)
+        _await_end_without_run(reply, as_json=as_json)
         return
 
     from coupole.storage.run import Run
@@ -91,11 +95,12 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     make_console(quiet=as_json).print("lights are off, the arm is at rest, the camera is disarmed")
 
 
-def _await_end_before_the_run(reply: State, *, as_json: bool) -> None:
-    """Wait until a session has ended that was stopped while it was starting. Raises DeviceError."""
+def _await_end_without_run(reply: State, *, as_json: bool) -> None:
+    """Wait until a session without a run has ended, which was stopped. Raises DeviceError."""
     import os
     import select
 
+    from coupole.acquisition.sessions_without_run import ACQUIRE
     from coupole.viewing.terminal import make_console
 
     with contextlib.suppress(ProcessLookupError):
@@ -105,14 +110,15 @@ def _await_end_before_the_run(reply: State, *, as_json: bool) -> None:
                 raise DeviceError(
                     "cell",
                     expected=f"the process {reply['pid']} to end within {_ENDS_WITHIN_S:g} s of its stop",
-                    happened="it is still there; its run had not begun when it was stopped",
+                    happened="it is still there",
                     remedy="Look at the cell, then end the process (`kill -9`).",
                 )
         finally:
             os.close(process)
     if as_json:
         print(json.dumps(reply))
-    words = f"stopped while it was starting: {reply['plan']}; its process {reply['pid']} has ended"
+    when = "stopped while it was starting: " if reply["doing"] == ACQUIRE else f"stopped: {reply['doing']} "
+    words = f"{when}{reply['plan']}; its process {reply['pid']} has ended"
     make_console(quiet=as_json).print(words, markup=False)
 
 
@@ -180,7 +186,22 @@ def running_run(run: Path | None) -> State:
 def _state_after(run: Path | None, command: Command, *, until: str = "") -> State:
     """Send a command; return the state after it, or the state in which it is `until`. Raises InputError if the run
     is not being acquired, or has ended."""
+    from coupole.acquisition.run_control import ask
+
+    state = _answer_to(run, command)
+    while until and state["state"] != until:
+        time.sleep(_LOOK_EVERY_S)
+        state = ask(run or Path(state["run"]), "state")
+        if state["state"] in ("running", "stopping"):
+            break
+    return state
+
+
+def _answer_to(run: Path | None, command: Command) -> State:
+    """Send a command to the given run, or to the only one that is being acquired; without a run, to the session
+    that has none (`_session_of`). Return the state after it. Raises InputError."""
     from coupole.acquisition.run_control import NoRun, ask
+    from coupole.acquisition.sessions_without_run import SessionEnded, ask_session, sessions_without_run
 
     def alarm(message: str) -> None:
         """Print a warning: a run does not answer."""
@@ -188,37 +209,34 @@ def _state_after(run: Path | None, command: Command, *, until: str = "") -> Stat
 
         terminal.alarm(message)
 
-    try:
-        folder = run or Path(running_run(run)["run"])
-        state = ask(folder, command, alarm)
-    except NoRun as none:
-        return _state_of_starting(run, command, alarm, none)
-    while until and state["state"] != until:
-        time.sleep(_LOOK_EVERY_S)
-        state = ask(folder, "state")
-        if state["state"] in ("running", "stopping"):
-            break
-    return state
+    silent: dict[Path, State] = {}
+    for patience_s in _SESSION_PATIENCE_S:
+        try:
+            return ask(run or Path(running_run(run)["run"]), command, alarm)
+        except NoRun as none:
+            nobody = none
+        with contextlib.suppress(SessionEnded):  # its run may have begun
+            found = dict(sessions_without_run(patience_s))
+            silent = {path: state for path, state in found.items() if state["state"] == "silent"}
+            answering = {path: state for path, state in found.items() if path not in silent}
+            if session := _session_of(run, answering):
+                return ask_session(*session, command, alarm)
+    if session := _session_of(None, silent):
+        return ask_session(*session, command, alarm)
+    raise nobody
 
 
-def _state_of_starting(run: Path | None, command: Command, alarm: Callable[[str], None], none: NoRun) -> State:
-    """Send a command to the only session that is starting, or to the one that resumes this run or reads this plan;
-    return its state. One that does not say what it starts counts as the one that is meant, if no other is. Raises
-    InputError: `none` if there is no such session."""
-    from coupole.acquisition.starting import ask_starting, name_of, starting
+def _session_of(run: Path | None, sessions: Mapping[Path, State]) -> tuple[Path, State] | None:
+    """Return the socket and state of the only session, or of the one that resumes this run, or has this plan or
+    rig; None if there is none. Raises InputError if there are several."""
+    from coupole.acquisition.sessions_without_run import name_of
 
-    found = list(starting())
-    sessions = found
-    if run is not None:
-        named = str(run.resolve())
-        sessions = [(path, state) for path, state in found if named in (state["run"], state["plan"])]
-        sessions = sessions or [(path, state) for path, state in found if state["state"] == "silent"]
-    if not sessions:
-        raise none
-    if len(sessions) > 1:
-        names = "\n".join(f"  {name_of(state)}" for _, state in sessions)
-        raise InputError(f"several sessions are starting; name one of\n{names}")
-    return ask_starting(*sessions[0], command, alarm)
+    named = run and str(run.resolve())
+    meant = [(path, state) for path, state in sessions.items() if named in (None, state["run"], state["plan"])]
+    if len(meant) > 1:
+        names = "\n".join(f"  {name_of(state)}" for _, state in meant)
+        raise InputError(f"several sessions have no run; name the run, plan or rig of one of\n{names}")
+    return meant[0] if meant else None
 
 
 def _say(state: State, *, as_json: bool) -> None:

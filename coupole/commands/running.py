@@ -122,11 +122,11 @@ def _acquire_here(
 ) -> None:
     """Acquire in this process. `asked_result` is the folder of the result, and whether one is asked for."""
     from coupole.acquisition.session import acquire_plan
-    from coupole.acquisition.starting import StartingSession
+    from coupole.acquisition.sessions_without_run import ACQUIRE, SessionWithoutRun
     from coupole.preflight.job import read_job
 
     resume, (result, is_asked) = wanted_session.resume, asked_result
-    with StartingSession(plan, resume) as starting:
+    with SessionWithoutRun(ACQUIRE, plan, resume) as starting:
         job = read_job(plan, rig)
         with _beside(job, console, resume, result, summary, is_asked=is_asked) as beside:
             acquire_plan(job, console, replace(wanted_session, beside=beside, when_served=starting.end), summary)

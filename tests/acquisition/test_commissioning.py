@@ -340,3 +340,15 @@ def test_a_stop_in_a_motion_keeps_the_earlier_result_and_notes_no_fault_of_the_a
     assert stopped.code == 130, stopped.err
     assert record.read_text() == before
     assert here("arm", rig, "home", "--yes").code == 0
+
+
+def test_coupole_stop_ends_a_commissioning_in_its_motion(right: tuple[Path, Ended]) -> None:
+    rig, _ = right
+    process = start("commission", rig, "--name", "B", "--yes", "--only", "axes")
+    assert process.stderr is not None
+    assert any("A1 turns by" in line for line in process.stderr)
+    stopped = here("stop", rig)
+    assert stopped.code == 0, stopped.err
+    assert process.poll() is not None, "it has ended when the answer is given"
+    assert f"stopped: commission, B {rig}; its process {process.pid} has ended" in " ".join(stopped.err.split())
+    assert finish(process).code == 130

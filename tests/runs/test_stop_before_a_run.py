@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -17,8 +18,10 @@ import pytest
 from cells import CellFolder
 
 from coupole.acquisition import runtime_folder
-from coupole.acquisition.starting import ask_starting, starting
+from coupole.acquisition.sessions_without_run import SessionEnded, ask_session, sessions_without_run
 
+PATIENT_S = 5.0
+"""Time that a stop waits for the answer of a session that may be the one that is meant."""
 PREFLIGHT, OPENING = "views, shots, frames", "opening the devices"
 
 
@@ -49,7 +52,7 @@ def test_a_session_that_is_starting_is_stopped_and_does_nothing(tmp_path: Path, 
         assert not state["shining"]
         assert not state["arm_moving"]
         assert _moves_and_lights(cell) == []
-        assert str(cell.plan) not in [state["plan"] for _, state in starting()]
+        assert str(cell.plan) not in [state["plan"] for _, state in sessions_without_run(PATIENT_S)]
 
 
 def test_a_run_that_is_being_resumed_is_stopped_by_its_folder(tmp_path: Path) -> None:
@@ -76,9 +79,9 @@ _STARTING = """
 import sys, time
 from pathlib import Path
 from coupole.acquisition import runtime_folder
-from coupole.acquisition.starting import StartingSession
+from coupole.acquisition.sessions_without_run import SessionWithoutRun
 runtime_folder._BASE = Path(sys.argv[1])
-with StartingSession(Path(sys.argv[2]), None):
+with SessionWithoutRun("acquire", Path(sys.argv[2])):
     print("serves", flush=True)
     time.sleep(60)
 """
@@ -126,7 +129,7 @@ def test_a_session_that_is_slow_to_answer_is_not_overlooked(apart: Path) -> None
     plan = apart / "plan.yaml"
     with _starts(plan) as process:
         process.send_signal(signal.SIGSTOP)
-        timer = threading.Timer(7.0, process.send_signal, [signal.SIGCONT])  # later than a look waits
+        timer = threading.Timer(10.0, process.send_signal, [signal.SIGCONT])  # later than all looks wait
         timer.start()
         stopped = cells.here("stop", plan)
         timer.join()
@@ -148,9 +151,25 @@ def test_a_session_that_ends_before_its_answer_was_sent_is_stopped(apart: Path) 
 
         closing = threading.Thread(target=closes)
         closing.start()
-        state = {"run": "", "plan": "plan.yaml", "pid": 1}
-        assert ask_starting(path, state, "stop", print)["state"] == "stopping"
+        state = {"run": "", "plan": "plan.yaml", "doing": "acquire", "pid": 1}
+        assert ask_session(path, state, "stop", print)["state"] == "stopping"
         closing.join()
+
+
+def test_a_session_whose_socket_has_gone_is_not_said_to_give_no_answer(apart: Path) -> None:
+    state = {"run": "", "plan": "rig.yaml", "doing": "meter bust", "pid": 1}
+    with pytest.raises(SessionEnded, match=r"meter bust rig\.yaml: it has just ended"):
+        ask_session(runtime_folder.runtime_folder() / "1.start", state, "stop", print)
+
+
+def test_a_frozen_session_does_not_delay_the_stop_of_another_one(apart: Path) -> None:
+    with _starts(apart / "frozen.yaml") as frozen, _starts(apart / "plan.yaml") as process:
+        frozen.send_signal(signal.SIGSTOP)
+        begun_s = time.monotonic()
+        assert cells.here("stop", apart / "plan.yaml").code == 0
+        assert process.poll() is not None
+        assert time.monotonic() - begun_s < PATIENT_S
+        assert frozen.poll() is None
 
 
 def test_of_several_sessions_that_are_starting_one_must_be_named(apart: Path) -> None:

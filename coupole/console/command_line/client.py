@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from coupole.acquisition.runtime_folder import named_after
+from coupole.acquisition.sessions_without_run import SessionWithoutRun
 from coupole.acquisition.user_socket import peer_pid
 from coupole.console.command_line.owner import owner_of
 from coupole.console.people.still_wanted import begins_nothing
@@ -210,7 +211,14 @@ def is_served(cell: Cell) -> bool:
 @contextlib.contextmanager
 def borrowed_cell(cell: Cell, purpose: str) -> Iterator[None]:
     """Borrow the cell from its console for the `purpose` of this process; without a console, the cell needs no
-    loan. Raises InputError if a run is being acquired, or if another person is in control or has the cell."""
+    loan. Meanwhile `coupole stop` ends this process as Ctrl-C does. Raises InputError if a run is being acquired,
+    or if another person is in control or has the cell."""
+    with SessionWithoutRun(purpose, cell.document.path), _loan(cell, purpose):
+        yield
+
+
+@contextlib.contextmanager
+def _loan(cell: Cell, purpose: str) -> Iterator[None]:
     try:
         call(cell, "POST", "/api/v1/cell/lease", {"what": purpose})
     except NotServed:

@@ -72,8 +72,7 @@ class ScriptedArm:
         if self.pressed_at is None:
             moving = abs(angle_deg - self.target_deg) > 1e-9
         else:
-            coasting_s = max(self.tells_after_s, self.coasts_deg / self.coasts_deg_s)
-            moving = self.clock.now_s - self.since_s < coasting_s
+            moving = self.clock.now_s - self.since_s < self.coasts_deg / self.coasts_deg_s
         is_told = self.tells and self.clock.now_s >= self.since_s + self.tells_after_s
         fault = "emergency stop" if self.pressed_at is not None and is_told else ""
         return ArmState((angle_deg, 0, 0, 0, 0, 0), np.eye(4), self.clock.now_ns(), moving, fault)
@@ -135,9 +134,10 @@ def test_an_arm_that_turns_farther_than_promised_does_not_pass() -> None:
 
 
 def test_the_turn_is_measured_from_the_braking_also_if_the_fault_is_told_late() -> None:
-    bench = bench_of(ScriptedArm(Clock(), coasts_deg=3.0, coasts_deg_s=2.0, tells_after_s=2.0))
-    emergency_stop(bench)
-    assert missed(bench) == ["turn after the press, beyond the promise"]
+    for coasts_deg, failures in ((0.5, []), (3.0, ["turn after the press, beyond the promise"])):
+        bench = bench_of(ScriptedArm(Clock(), coasts_deg=coasts_deg, coasts_deg_s=2.0, tells_after_s=2.0))
+        emergency_stop(bench)
+        assert missed(bench) == failures
 
 
 def test_an_arm_that_stands_when_the_stop_is_pressed_does_not_pass() -> None:

@@ -4,6 +4,8 @@ move it on."""
 from __future__ import annotations
 
 import contextlib
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +22,9 @@ _PRESSED_WITHIN_S = 90.0
 _POLL_S = 0.01
 _WATCHED_S = 2.0
 _STILL_DEG = 0.02
+_ARRIVED_DEG = 0.1
+_TOLD_WITHIN_S = 3.0
+"""Time within which an arm that stopped on its way tells its fault."""
 _SPEED_OVER_S = 0.05
 _FAST_SHARE = 0.5
 """Share of the axis's greatest speed in this session that it must have had."""
@@ -73,7 +78,7 @@ def _moved_until_pressed(bench: Bench) -> _Press:
     change_deg = bench.clear_change(change_deg)
     fast_deg_s = _FAST_SHARE * float(bench.velocity_deg_s[0])
     deadline, out = Deadline(clock, _PRESSED_WITHIN_S), False
-    is_asked = False
+    ask = functools.cache(bench.person.press_emergency_stop)  # once
     while not deadline.has_expired:
         out = not out
         bench.pause(_POLL_S)
@@ -82,20 +87,32 @@ def _moved_until_pressed(bench: Bench) -> _Press:
             robot.move_to(way.target_deg)
         except DeviceFault as error:  # pressed since the last look at the arm
             raise StepFailedError(_PRESSED_AT_REST.format(error.happened)) from error
-        while (state := robot.measured()).moving or state.fault:
-            way.add(state)
-            if state.fault:
-                bench.findings.remarks.append(f"the arm's fault: {state.fault}")
-                return way.press(fast_deg_s, robot.stopping_deg(), state.fault)
-            if not is_asked and way.speed_deg_s() >= fast_deg_s:
-                bench.person.press_emergency_stop()
-                is_asked = True
-            bench.pause(_POLL_S)
+        if fault := _followed(bench, way, lambda way=way: way.speed_deg_s() >= fast_deg_s and ask()):
+            bench.findings.remarks.append(f"the arm's fault: {fault}")
+            return way.press(fast_deg_s, robot.stopping_deg(), fault)
     robot.stop()
     raise StepFailedError(
         f"no fault of the arm was seen within {_PRESSED_WITHIN_S:g} s: if the emergency stop was pressed, the "
         "controller does not report it; otherwise repeat the step"
     )
+
+
+def _followed(bench: Bench, way: _Way, meanwhile: Callable[[], object]) -> str:
+    """Follow a motion until the arm has arrived; return its fault if there is one. An arm that stopped on its way
+    may tell the reason later."""
+    robot, clock = bench.opened.robot, bench.opened.clock
+    told = Deadline(clock, _TOLD_WITHIN_S)
+    while True:
+        state = robot.measured()
+        way.add(state)
+        if state.fault:
+            return state.fault
+        if state.moving:
+            told = Deadline(clock, _TOLD_WITHIN_S)
+        elif way.has_arrived or told.has_expired:
+            return ""
+        meanwhile()
+        bench.pause(_POLL_S)
 
 
 @dataclass(frozen=True)
@@ -121,6 +138,11 @@ class _Way:
         """Add a report, unless it is the last one again."""
         if not self.reports or state.t_ns > self.reports[-1][0]:
             self.reports.append((state.t_ns, np.array(state.joints_deg)))
+
+    @property
+    def has_arrived(self) -> bool:
+        """True if the arm is at the target."""
+        return bool(np.abs(self.reports[-1][1] - self.target_deg).max() <= _ARRIVED_DEG)
 
     def speed_deg_s(self, index: int = -1) -> float:
         """Return the speed of the fastest axis over the `_SPEED_OVER_S` before a report; 0 if there is no earlier

@@ -32,8 +32,7 @@ _STEADY_SHARE = 0.95
 """Share of the greatest speed in the motion; the arm brakes when it is slower."""
 _PRESSED_AT_REST = (
     "the arm's fault ({}) came while the arm was not at speed, so nothing was measured: release the emergency "
-    "stop, acknowledge it, start the robot program again, confirm the fault (`coupole confirm`), and repeat the "
-    "step; press while the arm turns"
+    "stop, acknowledge it, start the robot program again, and repeat the step; press while the arm turns"
 )
 
 

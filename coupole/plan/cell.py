@@ -8,6 +8,7 @@ from pathlib import Path
 
 from coupole.errors import InputError, Problem, reason
 from coupole.intake.input_files import InputFiles
+from coupole.intake.user_home import user_home
 from coupole.plan import yamlfile
 from coupole.plan.arm_description import arm_named
 from coupole.plan.led_table import LedTable, read_led_table
@@ -80,9 +81,9 @@ def users_ledger_folder() -> Path:
 
 def users_data_folder() -> Path:
     """Return Coupole's folder in the user's data folder. It follows the XDG Base Directory Specification, which
-    ignores a relative path."""
+    ignores a relative path. Raises InputError if the user has no home folder."""
     folder = Path(os.environ.get("XDG_DATA_HOME", ""))
-    return (folder if folder.is_absolute() else Path.home() / ".local/share") / "coupole"
+    return (folder if folder.is_absolute() else user_home() / ".local/share") / "coupole"
 
 
 def read_cell(path: Path, files: InputFiles | None = None) -> Cell:

@@ -6,7 +6,6 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,6 +16,7 @@ from coupole.errors import CoupoleError, DeviceError, InputError, Interrupted
 
 if TYPE_CHECKING:
     from coupole.acquisition.observer import Control
+    from coupole.plan.cell import Cell
 
 _LOOK_EVERY_S = 0.1
 Asked = Callable[..., dict[str, Any]]
@@ -74,9 +74,8 @@ def arm(
     """Drive the arm to home, park or a plan's view on a collision-free path, which is shown first.
 
     Without a plan the support is assumed to be empty. If a bench holds the cell, the command uses it; otherwise it
-    opens and closes the devices.
+    opens and closes the devices. If a console is served, the command needs control of the cell either way.
     """
-    from coupole.acquisition.cell_bench.bench_client import ask_bench
     from coupole.acquisition.cell_bench.bench_service import bench_of
     from coupole.acquisition.cell_marks import is_in_use
     from coupole.acquisition.observer import Control
@@ -92,7 +91,7 @@ def arm(
     try:
         cell = read_cell(rig)
         if is_in_use(cell):
-            answer = _drive(partial(ask_bench, cell, say=_say), goal, control, yes=yes)
+            answer = _drive(_asker(cell, f"arm to {view or to}"), goal, control, yes=yes)
         else:
             lies = object_of or plan
             job_or_cell = read_job(lies, rig) if lies else cell
@@ -106,12 +105,31 @@ def arm(
         print(json.dumps(answer))
 
 
+def _asker(cell: Cell, action: str) -> Asked:
+    """Return a function that asks the open bench. Each request that shows or begins the motion first asks the
+    cell's console for permission, because control may change while a person answers a question. A refusal is an
+    answer."""
+    from coupole.acquisition.cell_bench.bench_client import ask_bench
+    from coupole.console.command_line.client import ask_permission
+
+    def send_request(command: str, **fields: Any) -> dict[str, Any]:
+        if command in ("plan_path", "drive"):
+            try:
+                ask_permission(cell, action)
+            except InputError as refusal:
+                return {"error": str(refusal), "exit_code": refusal.exit_code}
+        return ask_bench(cell, command, say=_say, **fields)
+
+    return send_request
+
+
 def _say(words: str) -> None:
     print(words, file=sys.stderr, flush=True)
 
 
 def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> dict[str, Any]:
-    """Plan a path, show it, ask, and drive the arm. Return the figures of the motion when the arm has arrived."""
+    """Plan a path, show it, ask, and drive the arm. Return the figures of the motion when the arm has arrived. A
+    drive that is refused ends nothing: another motion may be under way."""
     from coupole.acquisition.cell_bench.bench_client import checked_answer
     from coupole.viewing.questions import ask
 
@@ -123,17 +141,18 @@ def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> di
     control.go_on()
     if not agrees:
         raise Interrupted("the arm was not driven: answer the question, or give `--yes`")
+    is_refused = False
     try:
-        work = checked_answer(send_request("drive", path=path["path"]))
+        answer = send_request("drive", path=path["path"])
+        is_refused = "error" in answer
+        work = checked_answer(answer)
         while work["state"] == "running":
             control.go_on()
             time.sleep(_LOOK_EVERY_S)
             work = checked_answer(send_request("state"))["work"]
     except BaseException:
-        try:
-            send_request("stop")
-        except InputError as silent:
-            _say(str(silent))
+        if not is_refused:
+            _stop(send_request)
         raise
     if work["state"] != "done":
         control.go_on()  # this raises if the session was asked to stop, which also ends the motion
@@ -141,3 +160,10 @@ def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> di
             "robot", expected=f"the arm to arrive at {work['to']}", happened=work["why"], remedy="See its state."
         )
     return {**work, "duration_s": path["duration_s"], "waypoints_deg": path["waypoints_deg"]}
+
+
+def _stop(send_request: Asked) -> None:
+    try:
+        send_request("stop")
+    except InputError as silent:
+        _say(str(silent))

@@ -10,7 +10,9 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchemaHandler
 
+from coupole.errors import InputError
 from coupole.geometry import Transform, transform
+from coupole.intake.user_home import expanded
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
@@ -35,8 +37,8 @@ def possible_path(path: Path) -> Path:
         raise ValueError("a path without NUL characters")
     if str(path).startswith("~"):
         try:
-            path.expanduser()
-        except RuntimeError as error:
+            expanded(path)
+        except InputError as error:
             raise ValueError(f"a path in the home folder of a known user: {error}") from error
     return path
 

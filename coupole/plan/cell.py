@@ -8,12 +8,14 @@ from pathlib import Path
 
 from coupole.errors import InputError, Problem, reason
 from coupole.intake.input_files import InputFiles
+from coupole.intake.user_home import user_home
 from coupole.plan import yamlfile
 from coupole.plan.arm_description import arm_named
 from coupole.plan.led_table import LedTable, read_led_table
 from coupole.plan.link_meshes import missing_link_meshes
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import described_arm, driver_problems, renamed_drivers
+from coupole.plan.rig_units import doubt_of_dome, doubts_of
 from coupole.plan.shipped_files import file_of, place_to_write
 from coupole.plan.yamlfile import Document
 
@@ -80,9 +82,9 @@ def users_ledger_folder() -> Path:
 
 def users_data_folder() -> Path:
     """Return Coupole's folder in the user's data folder. It follows the XDG Base Directory Specification, which
-    ignores a relative path."""
+    ignores a relative path. Raises InputError if the user has no home folder."""
     folder = Path(os.environ.get("XDG_DATA_HOME", ""))
-    return (folder if folder.is_absolute() else Path.home() / ".local/share") / "coupole"
+    return (folder if folder.is_absolute() else user_home() / ".local/share") / "coupole"
 
 
 def read_cell(path: Path, files: InputFiles | None = None) -> Cell:
@@ -97,7 +99,7 @@ def read_cell(path: Path, files: InputFiles | None = None) -> Cell:
     if problems:
         raise InputError(problems)
     rig = rig.model_copy(update={"arm": arm})
-    problems = driver_problems(document, rig)
+    doubts, problems = doubts_of(rig), driver_problems(document, rig)
     leds: LedTable | None = None
     leds_path = document.resolve(rig.dome.leds)
     if not files.there(leds_path):
@@ -105,16 +107,19 @@ def read_cell(path: Path, files: InputFiles | None = None) -> Cell:
     else:
         try:
             leds = read_led_table(leds_path, files)
+            doubts += doubt_of_dome(leds)
         except InputError as error:
             problems += error.problems
     if rig.storage.pixels == "packed12" and (rig.sensor.bit_depth > 12 or rig.sensor.width_px % 2):
         why = f"expected an even width and 12 bits at most, found {rig.sensor.width_px} and {rig.sensor.bit_depth}"
         problems.append(document.problem(("storage", "pixels"), f"frames cannot be packed: {why}"))
+    problems += [document.problem(doubt.at, doubt.message) for doubt in doubts if doubt.is_refused]
     led_w_per_lm = _damage_w_per_lm(document, "spectrum", rig.dome.spectrum, files, problems)
     panel_w_per_lm = _damage_w_per_lm(document, "panel_spectrum", rig.dome.panel_spectrum, files, problems)
     if problems or leds is None:
         raise InputError(problems)
-    cell = Cell(rig, document, leds, tuple(renamed_drivers(document)), led_w_per_lm, panel_w_per_lm, files)
+    remarks = [str(document.problem(doubt.at, doubt.message)) for doubt in doubts]
+    cell = Cell(rig, document, leds, (*renamed_drivers(document), *remarks), led_w_per_lm, panel_w_per_lm, files)
     if cell.link_meshes is not None and (missing := missing_link_meshes(cell.link_meshes, files)):
         at = ("link_meshes",) if rig.link_meshes else ("arm",)
         raise InputError([document.problem(at, f"expected the links' meshes; there is no {missing[0]}")])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import pwd
 from pathlib import Path
 from typing import Any
 
@@ -179,6 +180,38 @@ def test_the_rig_names_the_place_or_else_it_is_in_the_users_data_folder(
     monkeypatch.setenv("XDG_DATA_HOME", "relative/is/ignored")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert users_ledger_folder() == tmp_path / ".local/share/coupole/ledger"
+
+
+@pytest.mark.parametrize("home", ["", "rel", None])
+def test_a_home_that_is_no_absolute_path_is_ignored_for_that_of_passwd(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, home: str | None
+) -> None:
+    cell = CellFolder(tmp_path, write_now=False)
+    monkeypatch.delenv("XDG_DATA_HOME", raising=False)
+    if home is None:
+        monkeypatch.delenv("HOME")
+    else:
+        monkeypatch.setenv("HOME", home)
+    at_home = Path(pwd.getpwuid(os.getuid()).pw_dir)
+    assert users_ledger_folder() == at_home / ".local/share/coupole/ledger"
+    cell.rig_data["ledger"] = "~/of-all-rigs"
+    cell.write()
+    assert read_cell(cell.rig).ledger_folder == (at_home / "of-all-rigs").resolve()
+
+
+def test_without_any_home_the_ledger_has_no_place_which_is_bad_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unknown(_: int) -> None:
+        raise KeyError
+
+    monkeypatch.setattr(pwd, "getpwuid", unknown)  # as a user of a container that its passwd does not list
+    monkeypatch.setenv("HOME", "rel")
+    monkeypatch.delenv("XDG_DATA_HOME", raising=False)
+    with pytest.raises(InputError, match="HOME: expected the absolute path of a folder, found 'rel'"):
+        users_ledger_folder()
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    assert users_ledger_folder() == tmp_path / "coupole/ledger"
 
 
 @pytest.mark.parametrize("name", ["my bunny", "../escape", "", ".hidden", "a/b", "x" * 65, "a\0b", "a\n"])

@@ -75,7 +75,9 @@ class BenchArm:
         }
 
     def plan_path(self, request: PathAsked) -> dict[str, Any]:
-        """Plan a path from where the arm is. Raises InputError if the arm moves, or if there is no path."""
+        """Plan a path from where the arm is. Raises InputError if the arm moves, if other work is under way (a
+        motion by hand rests between its steps), or if there is no path."""
+        self._works.refuse_beside()
         state = self._opened.robot.measured()
         if state.moving:
             raise InputError("the arm is moving; a path is planned only from an arm at rest")

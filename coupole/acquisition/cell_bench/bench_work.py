@@ -85,10 +85,14 @@ class Works:
         with self._lock:
             if self.stops != stops:
                 raise InputError(f"{work.kind}: it was stopped before it began")
-            if self.last is not None and self.last.is_running:
-                raise InputError(f"{self.last.kind} is under way; stop it or let it end")
+            self.refuse_beside()
             self.last = work
             work.begin(asking_pid)
+
+    def refuse_beside(self) -> None:
+        """Raise InputError if work is under way."""
+        if (work := self.running) is not None:
+            raise InputError(f"{work.kind} is under way; stop it or let it end")
 
     def stop(self) -> None:
         """Stop the work. Returns at once. Work that was requested before and has not begun never begins."""
@@ -99,4 +103,5 @@ class Works:
 
     @property
     def running(self) -> Work | None:
-        return self.last if self.last is not None and self.last.is_running else None
+        last = self.last
+        return last if last is not None and last.is_running else None

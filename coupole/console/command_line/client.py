@@ -208,6 +208,14 @@ def is_served(cell: Cell) -> bool:
     return True
 
 
+def ask_permission(cell: Cell, action: str) -> None:
+    """Ask the cell's console whether this process may act with devices that are open already; without a console,
+    no permission is needed. Raises InputError if another person is in control, or if the console does not
+    answer."""
+    with contextlib.suppress(NotServed):
+        call(cell, "POST", "/api/v1/bench/permission", {"what": action})
+
+
 @contextlib.contextmanager
 def borrowed_cell(cell: Cell, purpose: str) -> Iterator[None]:
     """Borrow the cell from its console for the `purpose` of this process; without a console, the cell needs no

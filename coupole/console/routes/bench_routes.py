@@ -8,14 +8,15 @@ import secrets
 from typing import Any
 
 from anyio import to_thread
-from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
+from fastapi import FastAPI, Request, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import FileResponse
 
 from coupole.console.people.accounts import Account, Role
+from coupole.console.people.asking import REFUSALS, Who
 from coupole.console.people.guard import account_here, address_of, is_of_this_machine, session_of
 from coupole.console.people.permission import NotAllowed, allow
 from coupole.console.people.still_wanted import HELD_STOOD_STILL_S
-from coupole.console.routes.messages import Text
+from coupole.console.routes.messages import Permission, Text
 from coupole.console.service_parts import Service
 from coupole.errors import CoupoleError, InputError
 from coupole.intake.plain_data import json_of
@@ -48,6 +49,14 @@ def add_bench_routes(app: FastAPI, service: Service) -> None:
         if not path.is_file():
             raise InputError(f"{name}: this picture is gone")
         return FileResponse(path)
+
+    @app.post("/api/v1/bench/permission", responses=REFUSALS)
+    def permit(action: Permission, person: Who, request: Request) -> dict[str, str]:
+        """Tell a command whether it may act with the devices that the bench holds: nobody else is in control. The
+        command then asks the bench itself, which ends the motion when that process ends."""
+        request.state.about = action.what
+        allow(service, person, Role.OPERATOR, action.what, acts=True)
+        return {"in_control": service.control.now.name}
 
     @app.websocket(HOLD)
     async def hold(socket: WebSocket) -> None:

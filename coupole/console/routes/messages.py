@@ -86,6 +86,13 @@ class Lease(Asked):
     """Purpose of the loan, in words."""
 
 
+class Permission(Asked):
+    """Question of a command whether it may act with devices that are open already."""
+
+    what: Annotated[Line, Field(min_length=1, max_length=200)]
+    """The action, in words."""
+
+
 class Light(Asked):
     """Light that an object was given elsewhere."""
 

@@ -17,10 +17,12 @@ from typing import Any
 import cells
 import numpy as np
 import pytest
+from at_a_terminal import at_a_terminal
 from cells import CellFolder
 from served import BORROWER, Browser, Served, served
 
 from coupole.acquisition import runtime_folder
+from coupole.acquisition.cell_bench.bench_client import ask_bench
 from coupole.console.command_line.client import borrowed_cell, call, is_served
 from coupole.errors import InputError
 from coupole.plan.cell import read_cell
@@ -218,6 +220,39 @@ def test_who_is_in_control_at_the_page_is_not_overruled_unasked(standing: Standi
     assert standing.state()["in_control"] == ""
     assert cells.here("queue", rig, "--go-on").code == 0
     assert standing.state()["in_control"] == "", "a command is over when it is answered"
+
+
+def test_the_arm_of_an_open_bench_is_not_driven_while_another_is_in_control(standing: Standing) -> None:
+    rig, plan, world = standing.cell.rig, standing.cell.plan, standing.world
+    bench = cells.start("bench", rig, "--object", plan, "--yes", "--json", stderr=subprocess.DEVNULL)
+    assert bench.stdout is not None
+    assert bench.stdout.readline()
+
+    def stops() -> int:
+        return int(ask_bench(read_cell(rig), "state")["stops"])
+
+    standing.engineer.post("/api/v1/control/take")
+    before_deg = np.array(world.ask("state")["joints_deg"])
+    refused = cells.here("arm", rig, "home", "--yes")
+    assert (refused.code, "first engineer is in control" in refused.err) == (2, True), refused
+    assert np.array_equal(before_deg, world.ask("state")["joints_deg"])
+    standing.engineer.post("/api/v1/control/give", {})
+    with at_a_terminal("arm", rig, "view", plan, "top") as typist:
+        typist.waits_for("Drive the arm along this path? [y/N]")
+        standing.engineer.post("/api/v1/control/take")
+        typist.types("y\n")
+        assert typist.process.wait(cells.PATIENCE_S) == 2, "control was taken while the question was open"
+        assert b"first engineer is in control" in typist.shown
+    assert stops() == 0, "what is refused does not stop the motion of the person in control"
+    standing.engineer.post("/api/v1/control/give", {})
+    assert cells.here("arm", rig, "home", "--yes").code == 0
+    bench.send_signal(signal.SIGINT)
+    assert cells.finish(bench).code == 0
+    lines = (standing.cell.folder / "storage/state/console/audit.jsonl").read_text().splitlines()
+    asked = [line for line in map(json.loads, lines) if line["asked"] == "POST /api/v1/bench/permission"]
+    assert {line["about"] for line in asked} == {"arm to home", "arm to top"}
+    assert all(line["name"].endswith("(command line)") for line in asked)
+    assert {line["status"] for line in asked} == {409, 200}
 
 
 def test_the_queue_refuses_with_the_code_that_the_check_has(standing: Standing) -> None:

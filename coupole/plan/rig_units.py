@@ -1,0 +1,90 @@
+"""Values of a rig that look as if they were in another unit than expected, such as m where mm are expected.
+
+What no cell can have is refused: with a clearance of 0.05 mm instead of 50 mm the arm may hit the object, and with
+a panel of 0.18 lux instead of 180 lux the light on the object is counted a thousand times too low. What a cell
+might have, but hardly has, is a warning of preflight. 0 stands for "none" where a rig may have it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from coupole.plan.led_table import LedTable
+from coupole.plan.rig import KeepOut, KeepOutSphere, Rig
+from coupole.plan.validation_messages import KeyPath
+
+_LEAST_SPREAD_MM = 5.0
+"""Least extent of a dome, if it has more than one LED."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """A value that is impossible (`is_refused`) or improbable, and a sentence about it."""
+
+    at: KeyPath
+    message: str
+    is_refused: bool
+
+
+@dataclass(frozen=True)
+class _Least:
+    """A value that is 0, or as large as in all cells (`possible`) and in nearly all (`usual`)."""
+
+    at: KeyPath
+    value: float
+    unit: str
+    possible: float
+    usual: float
+    hint: str = ""
+    """Unit of the file's value, if it is not `unit`."""
+    may_be_zero: bool = False
+
+    def doubts(self) -> Iterator[Doubt]:
+        asks = f"is it in {self.hint or self.unit}?"
+        if 0 < self.value < self.possible:
+            expected = f"expected {'0 or ' * self.may_be_zero}at least {self.possible:g} {self.unit}"
+            yield Doubt(self.at, f"{expected}, found {self.value:.3g}; {asks}", True)
+        elif 0 < self.value < self.usual:
+            yield Doubt(self.at, f"{self.value:.3g} {self.unit} is unusually little; {asks}", False)
+
+
+def doubts_of(rig: Rig) -> list[Doubt]:
+    """Return all values of a rig that are improbably small in their unit."""
+    return [doubt for least in _leasts(rig) for doubt in least.doubts()]
+
+
+def doubt_of_dome(leds: LedTable) -> list[Doubt]:
+    """Return a doubt if all LEDs are at nearly the same place."""
+    spread_mm = float(np.ptp(leds.positions_mm, axis=0).max())
+    if len(leds.ids) == 1 or spread_mm >= _LEAST_SPREAD_MM:
+        return []
+    expected = f"expected LEDs at least {_LEAST_SPREAD_MM:g} mm apart"
+    return [Doubt(("dome", "leds"), f"{expected}, found {spread_mm:.3g} mm at most; is it in mm?", True)]
+
+
+def _leasts(rig: Rig) -> Iterator[_Least]:
+    for key, clearance_mm in rig.clearances:
+        yield _Least(("clearances", key), clearance_mm, "mm", 0.5, 2.0, may_be_zero=True)
+    for number, body in enumerate(rig.tool):
+        yield _Least(("tool", number, "radius_mm"), body.radius_mm, "mm", 0.5, 5.0)
+    for number, kept_out in enumerate(rig.keep_out):
+        yield _Least(("keep_out", number), _volume_mm3(kept_out), "mm3", 1.0, 1000.0, hint="mm")
+    yield _Least(("lens", "focal_length_mm"), rig.lens.focal_length_mm, "mm", 0.5, 2.0)
+    yield _Least(("sensor", "pixel_pitch_um"), rig.sensor.pixel_pitch_um, "um", 0.1, 0.5)
+    yield _Least(("support", "diameter_mm"), rig.support.diameter_mm, "mm", 3.0, 20.0)
+    yield _Least(("dome", "panel_lux"), rig.dome.panel_lux, "lux", 1.0, 10.0, may_be_zero=True)
+    yield _Least(("led_limits", "rise_us"), rig.led_limits.rise_us, "us", 0.0, 10.0)
+    yield _Least(("motion", "acceleration_deg_s2"), rig.motion.acceleration_deg_s2, "deg/s2", 0.0, 10.0)
+    yield _Least(("motion", "jerk_deg_s3"), rig.motion.jerk_deg_s3, "deg/s3", 0.0, 100.0)
+    camera_mm = math.hypot(*rig.flange_from_camera.translation_mm)
+    yield _Least(("flange_from_camera", "translation_mm"), camera_mm, "mm", 0.0, 5.0)
+
+
+def _volume_mm3(kept_out: KeepOut) -> float:
+    if isinstance(kept_out, KeepOutSphere):
+        return 4.0 / 3.0 * math.pi * kept_out.radius_mm**3
+    return math.prod(high - low for low, high in zip(kept_out.min_mm, kept_out.max_mm, strict=True))

@@ -114,8 +114,8 @@ def refusals_of_discarding(job: Job) -> list[str]:
     messages = []
     if job.plan.chooses_lights:
         messages.append(
-            "expected LEDs that are known beforehand: which of them are kept for the check is known after the "
-            "last view alone with `lights: {kind: adaptive}`, so no frame could be discarded"
+            "expected LEDs that are known beforehand: with `lights: {kind: adaptive}` the LEDs that are kept for "
+            "the check are known only after the last view, so no frame could be discarded"
         )
     elif isinstance(job.plan.exposure, AutoExposure) and any(view.lights for view in job.plan.view_entries):
         messages.append(

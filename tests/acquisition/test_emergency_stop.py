@@ -122,7 +122,7 @@ def test_an_arm_that_can_be_driven_on_does_not_pass() -> None:
 def test_an_arm_that_turns_farther_than_promised_does_not_pass() -> None:
     bench = bench_of(ScriptedArm(Clock(), coasts_deg=3.0))
     emergency_stop(bench)
-    assert missed(bench) == ["turn after the fault was seen, beyond the promise"]
+    assert missed(bench) == ["turn after the fault was seen, in excess of the promised angle"]
 
 
 def test_an_arm_that_sinks_at_rest_does_not_pass() -> None:

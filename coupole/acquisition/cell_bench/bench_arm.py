@@ -138,7 +138,8 @@ class BenchArm:
         if asking_pid != hold.asking_pid:
             hold.let_go("another process renewed it")
             raise InputError(
-                f"hold: {request.hold} is of another process, and only that one may renew it; it was ended"
+                f"hold: {request.hold} is held by another process, and only this process may renew it; the hold "
+                f"was ended"
             )
         if (request.axis, request.direction) == (hold.asked.axis, hold.asked.direction):
             hold.renew()

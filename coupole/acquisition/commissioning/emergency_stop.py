@@ -29,14 +29,15 @@ def emergency_stop(bench: Bench) -> None:
     )
     bench.ask_before(
         "Step emergency-stop: the arm turns slowly to and fro. Press the emergency stop while it moves, and do "
-        "not "
-        "release it before you are asked."
+        "not release it before you are asked."
     )
     promised_deg = robot.stopping_deg()
     at_press_deg = _moved_until_pressed(bench)
     rested_deg = _last_known_deg(bench, at_press_deg)
     turned_deg = float(np.max(np.abs(rested_deg - at_press_deg) - promised_deg))
-    findings.at_most("turn after the fault was seen, beyond the promise", max(turned_deg, 0.0), 0.0, "deg")
+    findings.at_most(
+        "turn after the fault was seen, in excess of the promised angle", max(turned_deg, 0.0), 0.0, "deg"
+    )
     is_accepted = True
     try:
         robot.move_to(at_press_deg)

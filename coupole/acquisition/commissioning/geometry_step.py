@@ -81,7 +81,7 @@ def _measure_bodies(bench: Bench) -> None:
         "(camera, lens, cables)",
     )
     said_mm = _lowest_mm(rig, forward(arm_of(rig), bench.joints_deg()))
-    findings.at_most("room above the disk, rig beyond ruler", said_mm - over_mm, MOST_TOO_NEAR_MM, "mm")
+    findings.at_most("room above the disk: rig minus ruler", said_mm - over_mm, MOST_TOO_NEAR_MM, "mm")
     reach_mm, width_mm = _extent_mm(rig)
     for name, question, rig_mm in (
         (
@@ -99,12 +99,12 @@ def _measure_bodies(bench: Bench) -> None:
         findings.at_most(f"{name}: beyond the bodies of `tool`", sticks_out_mm, MOST_BEYOND_MM, "mm")
     diameter_mm = bench.measured_mm("support_diameter_mm", "diameter of the disk")
     findings.at_most(
-        "diameter of the disk, beyond that in the rig", diameter_mm - rig.support.diameter_mm, MOST_ROUGH_MM, "mm"
+        "diameter of the disk: ruler minus rig", diameter_mm - rig.support.diameter_mm, MOST_ROUGH_MM, "mm"
     )
     centre_mm = rig.support.base_from_support.matrix()[:3, 3]
     radius_mm = float(np.linalg.norm(bench.cell.leds.positions_mm - centre_mm, axis=1).min())
     nearest_mm = bench.measured_mm("dome_radius_mm", "from the disk's centre to the LED that is nearest to it")
-    findings.at_most("room inside the dome, rig beyond ruler", radius_mm - nearest_mm, MOST_ROUGH_MM, "mm")
+    findings.at_most("room inside the dome: rig minus ruler", radius_mm - nearest_mm, MOST_ROUGH_MM, "mm")
 
 
 def _ask_for_volumes(bench: Bench) -> None:

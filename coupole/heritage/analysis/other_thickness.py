@@ -60,7 +60,7 @@ def films_at(
     measured."""
     grounds = {film.ground_name: film for film in films if film.ground is not None}
     if thicknesses_mm and not grounds:
-        raise InputError("expected a film over a ground, whose thickness is known; found opaque ones only")
+        raise InputError("expected a film of known thickness over a ground; found opaque films only")
     return [
         film_at(coefficients, films, face, thickness_mm, ground)
         for thickness_mm in thicknesses_mm

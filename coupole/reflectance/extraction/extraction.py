@@ -302,7 +302,11 @@ def _begin_samples(file: h5py.File, work: ViewPass) -> dict[str, h5py.Dataset]:
         "codes": (np.uint8, (count, leds), f"of a triangle and an LED: {codes}"),
     }
     if "glare" in work.measured_run.records:
-        kinds[GLARE] = (np.float16, (count, leds, channels), "veil of glare that was taken off, over what is left")
+        kinds[GLARE] = (
+            np.float16,
+            (count, leds, channels),
+            "veil of glare that was subtracted, divided by the remaining value",
+        )
     data = {}
     for name, (kind, shape, description) in kinds.items():
         chunks = (min(BLOCK, count), min(work.together, leds), channels)[: len(shape)]

@@ -79,7 +79,7 @@ def farthest_stop_deg(
 
 @dataclass(frozen=True)
 class StateReader(Generic[State]):
-    """A driver's way to read its arm's state, and its words for it."""
+    """How a driver reads the state of its arm, and the words with which it describes this state."""
 
     read_state: Callable[[], State]
     pause: Callable[[], None]

@@ -112,8 +112,9 @@ class BurstsOfViews:
         return _frames(self.bound(number))
 
     def think_ahead(self, number: int) -> None:
-        """Begin to choose, in another thread, what follows the last chosen bursts of a view, which are about to be
-        fired."""
+        """Begin to choose, in another thread, the bursts that follow the last chosen bursts of a view; these are
+        about to be fired.
+        """
         if (
             self._chooser is None
             or self._choice_ahead is not None

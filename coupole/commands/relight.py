@@ -124,7 +124,9 @@ WhiteOption = Annotated[
 
 @dataclass(frozen=True)
 class Lighting:
-    """Options of the lights, whose pictures are summed, and number of rays to each light with a size."""
+    """Options of the lights, and the number of rays to each light with a size. The pictures under all lights are
+    summed.
+    """
 
     direction: DirectionOption = None
     led: LedOption = None

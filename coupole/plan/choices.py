@@ -172,8 +172,9 @@ def next_choice(
     chooser: Chooser, view: OpenView, choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
 ) -> Choice:
     """Return a view's next choice after these, all of which were fired; `samples` has their proven frames. It is
-    the same one that `choose_ahead` gave, or would have given, while the last of them was fired. So it does not
-    depend on when a run was interrupted."""
+    the same choice that `choose_ahead` gave, or would have given, while the last of these was fired. So it does
+    not depend on when a run was interrupted.
+    """
     ahead = chooser.choose_ahead(view, choices, before_last(choices, samples)) if choices else None
     return ahead or chooser.choose(view, choices, samples)
 

@@ -88,9 +88,9 @@ def first_lights(ids: NDArray[np.int64], leds: LedTable, most: int) -> NDArray[n
 
 
 def sentinels_among(lit: Sequence[Sequence[Led] | Panel], leds: LedTable) -> tuple[int, ...]:
-    """Return the ids of a view's sentinels. They are spread over the LEDs in the middle half of the `lit` ones by
-    height: low LEDs graze, and the highest ones are alike. There are none if too few LEDs are lit to place
-    sentinels between them.
+    """Return the ids of a view's sentinels. They are spread over the middle half of the `lit` LEDs, by height.
+    The light of low LEDs is grazing, and the highest LEDs are alike. There are none if too few LEDs are lit to
+    place sentinels between them.
     """
     ids = np.array([led.id for lights in lit if not isinstance(lights, Panel) for led in lights], np.int64)
     if len(ids) < FEWEST_WATCHED:

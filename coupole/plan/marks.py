@@ -36,7 +36,8 @@ def with_marks(
     kind: Marks, steps: NDArray[np.void], labels: Sequence[L], mark_labels: Sequence[L], dark: NDArray[np.void]
 ) -> tuple[NDArray[np.void], list[L]]:
     """Add marks before and after a burst's steps (STEP_DTYPE [n]). Each mark is the `dark` step ([1]) with the
-    period of the other steps; a coded mark is longer. Returns table and labels."""
+    period of the other steps; the period of a coded mark is longer. Returns table and labels.
+    """
     count_start, count_end = MARKS_AT_ENDS[kind]
     inner = steps.copy()
     inner["period_us"] = dark["period_us"]

@@ -39,7 +39,7 @@ _FIRST_KS = 0.02
 _TO_CHOOSE = 256
 """Approximate number of samples from which the best start is chosen."""
 LEAST_KD = 1e-6
-"""kd of black, 1/sr, where a share of kd is needed."""
+"""kd that a black surface is given, 1/sr, where a share of kd is needed."""
 _CHOSEN, _SETTLED = 1e-4, 1e-5
 """A fit ends when a step lowers the cost by less than this share: for each start, and for the best one."""
 HELD = 1e9

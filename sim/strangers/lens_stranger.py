@@ -51,7 +51,7 @@ class LensStranger(BaseModel):
         return replace(lens, focal_px=lens.focal_px * (1.0 + self.breathing * (1.0 - down)))
 
     def coma_shift_px(self, pixels: NDArray[np.float64], size_px: tuple[int, int]) -> NDArray[np.float64]:
-        """[..., 2] from a spot's bright end at pixels [..., 2] to its faint end."""
+        """Return vectors [..., 2] from the bright end of a spot, at pixels [..., 2], to its faint end."""
         middle = 0.5 * (np.array(size_px) - 1.0)
         share = np.sum((pixels - middle) ** 2, axis=-1, keepdims=True) / (middle @ middle)
         direction = np.radians(self.coma_deg)

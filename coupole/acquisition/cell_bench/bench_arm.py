@@ -212,7 +212,9 @@ class _Hold:
         self._renewed_s = time.monotonic()
 
     def renew(self) -> None:
-        """Hold on, unless the hold has lapsed: what reaches a bench late, after a freeze, revives nothing."""
+        """Hold on, unless the hold has lapsed: a request that reaches the bench late, after a freeze, must not
+        begin a motion again.
+        """
         self._note_lapse()
         self._renewed_s = time.monotonic()
 

@@ -101,7 +101,7 @@ class FrameAsked(_Request):
     """Exposure time of each picture."""
     gain_db: Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)] = 0.0
     region: _Region | None = None
-    """Region of the picture that gets figures of its own."""
+    """Region of the picture for which separate figures are computed."""
     width_px: Annotated[int, Field(ge=16, le=8192)] = 960
     """Greatest width of the JPEG."""
     marks: list[Literal["saturation", "focus"]] = []

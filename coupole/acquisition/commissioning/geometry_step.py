@@ -32,8 +32,9 @@ MOST_HEIGHT_MM, MOST_SIDEWAYS_MM, MOST_TILT_DEG, MOST_DISAGREEMENT_MM = 15.0, 20
 """Greatest deviations of the board as the camera sees it. The lens is known only within 2 % here, which is 7 mm at
 335 mm, and the board is laid down by hand."""
 MOST_TOO_NEAR_MM, MOST_BEYOND_MM, MOST_ROUGH_MM = 5.0, 2.0, 10.0
-"""Greatest deviations by ruler: of free room that is less than in the rig; of parts that stick out of the rig's
-bodies; of large lengths."""
+"""Greatest deviations measured by ruler: missing free room, parts that stick out of the rig's bodies, and errors
+of large lengths.
+"""
 _TILTS_DEG = (12.0, 9.0, 6.0)
 """Tilts of the camera about the board. The first tilt at which the arm has room for all sights is used."""
 _MOST_TURN_DEG = 30.0

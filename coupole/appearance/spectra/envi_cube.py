@@ -66,7 +66,7 @@ class Cube:
     left_out: tuple[int, ...]
     """Bands, from 1, that the header's list `bbl` names as bad."""
     _bands: NDArray[np.intp]
-    """[bands used] in the file's order of the wavelengths above."""
+    """[bands used] places, among the bands of the file, of the wavelengths above."""
     _all_bands: int
     _dtype: np.dtype[Any]
     _interleave: str

@@ -178,7 +178,7 @@ def _merge(normals, neighbours, chart, axes):  # type: ignore[no-untyped-def]
 
 @kernel
 def _numbered_parts(neighbours, chart):  # type: ignore[no-untyped-def]
-    """[n] charts from 0, in which each connected part of a chart is a chart."""
+    """Return numbers [n] of charts, from 0, after each connected part of a chart was made a separate chart."""
     parts = np.full(len(chart), -1, np.int32)
     queue = np.empty(len(chart), np.int32)
     count = 0

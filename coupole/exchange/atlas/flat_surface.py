@@ -202,7 +202,7 @@ def _fill(surface: MeasuredSurface, rows: NDArray[np.int64], atlas: Atlas, known
 
 @dataclass(frozen=True)
 class _Values:
-    """Materials of texels; a roughness of 0 means that there is none."""
+    """Materials of texels; a roughness of 0 means that there is no material."""
 
     normals: Singles
     kd: Singles
@@ -231,7 +231,9 @@ class _Known:
         self._has_material = _has_certain_material(surface) if views else surface.has_material
 
     def look_up(self, atlas: Atlas, texels: NDArray[np.int64], values: _Values) -> None:
-        """Fill the values of texels: from the views' pixels or, if there are none, from their triangles."""
+        """Fill the values of texels from the views' pixels. If a texel has no pixel, its triangle gives the
+        values.
+        """
         surface, triangle = self._surface, self._rows[atlas.triangle_of_texel.reshape(-1)[texels]]
         has_material = self._has_material[triangle]
         of_triangles = triangle[has_material]

@@ -208,8 +208,9 @@ def _of_result(points_mm: Floats, colours: Colours, places_mm: Floats) -> Floats
 
 
 def _normals(state: State) -> Floats:
-    """[n, 3] normals from the triangles. Without triangles the normals come from neighbouring points, and their
-    sign is unknown."""
+    """[n, 3] normals from the triangles. If a state has no triangles, its normals come from neighbouring points,
+    and their sign is unknown.
+    """
     if state.outward is not None and _has_outward(state):
         return state.outward
     cloud = thinned_cloud(state.points_mm, state.spacing_mm, Viewpoint("none"), state.outward)

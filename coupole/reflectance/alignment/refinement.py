@@ -85,8 +85,9 @@ class Refined:
 
     @property
     def determined_count(self) -> float:
-        """Number of unknowns that the pictures determine. Each unknown counts by the share of its information that
-        the pictures give."""
+        """Number of unknowns that the pictures determine. Each unknown is counted with the share of its
+        information that comes from the pictures.
+        """
         return self.unknowns.count - float(np.trace(np.linalg.solve(self.unknowns.covariance, self.covariance)))
 
 

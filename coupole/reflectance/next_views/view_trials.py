@@ -1,4 +1,6 @@
-"""Computes what each candidate view would show and tell about the object, once before a run."""
+"""Computes, once before a run, which parts of the object each candidate view would show, and how much information
+it would add.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ from coupole.reflectance.triangle_fit import FEWEST
 Floats = NDArray[np.float64]
 
 _MOST_LEDS = 240
-"""Number of LEDs, spread over those of the plan, that stand for all of them."""
+"""Number of LEDs that represent all LEDs of the plan; they are spread over them."""
 _MESH_NOISE_UM = 30.0
 """Usual standard uncertainty of the mesh's vertices."""
 

@@ -73,8 +73,9 @@ class Fitted:
         )
 
     def settle(self, view: ViewSamples, centres: Centres, triangle: NDArray[np.int32]) -> Singles:
-        """Take the neighbours into account, and add the uncertainty from inter-reflection. It comes from the
-        `triangle` [h, w] of each texel. Return the normals [fitted, 3] of the fitted texels."""
+        """Take the neighbours into account, and add the uncertainty from inter-reflection. It is taken from the
+        `triangle` [h, w] of each texel. Return the normals [fitted, 3] of the fitted texels.
+        """
         is_fitted = self.is_fitted
         before = self.deviation[is_fitted][:, :2]
         settle(self.deviation, self.covariance, is_fitted, centres.covariance)

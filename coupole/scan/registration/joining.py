@@ -1,8 +1,8 @@
 """Joins scans to groups by the motions between pairs, and rejects a motion that others contradict.
 
-As in Kruskal's spanning tree, the strongest motion comes first, but there is a vote: all motions between two
-groups are compared, and the position of one group in the other with the most support is used. It is accepted only
-if no scan of one group then lies in the space that a scanner of the other saw through.
+As in Kruskal's spanning tree, the strongest motion comes first. But there is a vote: all motions between two
+groups are compared, and the position that most motions support is used. It is accepted only if no scan of one
+group then lies in the space that a scanner of the other saw through.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The invariant of every answer, whichever packets came in:
 
-    From one answer to the next, the place to which the corrections lead moves by at most the highest speed times
-    the cycle. If the commanded axes advance, this step differs from the previous one by at most the highest
-    acceleration times the cycle squared. The only other allowed change is to no step at all.
+From one answer to the next, the target of the corrections moves by at most the highest speed times the cycle. If
+the commanded axes advance, this step differs from the previous one by at most the highest acceleration times the
+cycle squared. The only other allowed change is to no step at all.
 
 A place is the axes, or the flange's pose. The trajectory obeys this by construction. Here it is checked again on
 the answer that is about to be sent, from the sent numbers alone. So no earlier mistake can reach the arm. Limits

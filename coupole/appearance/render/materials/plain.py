@@ -78,8 +78,9 @@ class Lacquer(Model):
 
     kind: Literal["lacquer"]
     body: Reflectance = Constant(kind="constant", value=0.006)
-    """Reflectance inside the lacquer. A measured one was measured through the lacquer, unless the sample was
-    bare."""
+    """Reflectance inside the lacquer. A measured reflectance was measured through the lacquer, unless the sample
+    was bare.
+    """
     index: Refraction = indices.URUSHI
     roughness: Roughness = 0.04
 
@@ -138,7 +139,9 @@ class Films(Model):
 
 
 class Glass(Model):
-    """A transparent and smooth material. A closed body of it refracts light, and absorbs it along its path."""
+    """A transparent and smooth material. A closed body of this material refracts light, and absorbs it along its
+    path.
+    """
 
     kind: Literal["glass"]
     index: Index = indices.BINDER

@@ -79,7 +79,7 @@ def farthest_stop_deg(
 
 @dataclass(frozen=True)
 class StateReader(Generic[State]):
-    """How a driver reads the state of its arm, and the words with which it describes this state."""
+    """A function of a driver that reads the state of its arm, and the words that describe this state."""
 
     read_state: Callable[[], State]
     pause: Callable[[], None]

@@ -77,8 +77,7 @@ class Settings(BaseModel):
 
     def longest_light_s(self, on_us: int) -> float:
         """Longest time for which the box leaves a light of `on_us` on if the host dies, which is its own limit.
-        (If `on` has no `{on_ms}`, the box has no limit. The box then leaves the light on until the next command.)
-        """
+        (If `on` has no `{on_ms}`, the box has no limit, and leaves the light on until the next command.)"""
         return _box_bound_ms(on_us) * 1e-3
 
     def host_needs(self) -> list[HostNeed]:

@@ -117,9 +117,7 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
         "places": f"{0.5e3 * step_mm:.2g} um in each coordinate"
     }
     if choice.with_samples:
-        errors["samples"] = (
-            "2.3 % of the value, and 2.3 % of the distance from the value to each end of its interval"
-        )
+        errors["samples"] = "2.3 % of the value, and of its distance to each end of its interval"
         samples = samples_of_result(result, support_from_base, source_about["scan_noise_um"], say)
         about["samples"], later = samples[0], later + samples[1]
     if growing := so_far.words(source_about):

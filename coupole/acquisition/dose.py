@@ -49,7 +49,7 @@ class _Planned:
 
     at_most: LuxHours
     w_per_lm: float | None
-    """Its damaging power, if known."""
+    """Damaging power of the light, if known."""
     plan_id: str
 
 

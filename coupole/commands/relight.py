@@ -340,7 +340,7 @@ def _write(
 class Companions:
     """Pictures that belong to the picture of `--to`, such as its uncertainty.
 
-    Old files of their names are removed before that picture is written, and they are written after it. So an
+    Old companions are removed before the picture is written, and new ones are written after it. So an
     interrupted call never leaves a picture beside the uncertainty of another one.
     """
 

@@ -149,7 +149,9 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
         super().__init__(name)
 
     async def next_plan(self) -> Plan:
-        """Return the plan of the next flight, by the signals. Raises InputError if the plan has no such view."""
+        """Return the plan of the next flight, as the signals `view` and `leds` set it. Raises InputError if the
+        plan has no such view.
+        """
         name, leds = await self.view.get_value(), await self.leds.get_value()
         views = {view.name: view for view in self.views()}
         if name not in views:

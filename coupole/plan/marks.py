@@ -2,7 +2,7 @@
 
 *Coded* marks enclose a burst that the box runs: their periods identify the burst's beginning and end
 (`coupole.acquisition.frame_matching`). *Plain* marks enclose a burst that the host fires, because the box has no
-log. They must be dark; otherwise a lamp is on that should be off.
+log. Marks must be dark; otherwise a lamp is on that should be off.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ START_MARK_EXTRA = (5, 1, 4, 2, 3)
 """Additional period of each start mark, in sixteenths of the burst's period. Counted back from the first light,
 the marks have the phases 13, 11, 7, 6, 1 of 16. The phases are all different, and never on the lights' grid."""
 END_MARK_EXTRA = (2, 5, 1, 3, 1)
-"""The same for the end marks except the last one, counted from the last light. Their phases are 2, 7, 8, 11, 12
-after the grid."""
+"""The same for the end marks except the last one, counted from the last light. The phases of the end marks are 2,
+7, 8, 11, 12 after the grid.
+"""
 MARKS = len(START_MARK_EXTRA) + len(END_MARK_EXTRA)
 MARKS_AT_ENDS: dict[Marks, tuple[int, int]] = {
     "coded": (len(START_MARK_EXTRA), len(END_MARK_EXTRA)),

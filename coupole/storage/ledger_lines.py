@@ -59,7 +59,7 @@ class LightGiven(_Light):
 
 
 class WarningSet(_Line):
-    """There is a warning above this total from now on; None: no warning."""
+    """Total light of the object above which there is a warning from now on; None: no warning."""
 
     event: Literal["warn_above"] = "warn_above"
     dose_lux_h: Amount | None

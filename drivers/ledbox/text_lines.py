@@ -36,7 +36,7 @@ _BOX_PATIENCE = 1.5
 _LOOK_S = 0.001
 """Machine time between two readings of the rig's clock during a flash."""
 _ENDED_AT_ONCE = 5
-"""Threads that may switch the lights off at the same time. Each ends the exchanges of the others."""
+"""Threads that may switch the lights off at the same time. Each thread ends the exchanges of the others."""
 _ENDINGS = {"lf": "\n", "crlf": "\r\n", "cr": "\r"}
 _FIELDS: dict[str, tuple[frozenset[str], frozenset[str]]] = {
     "on": (frozenset({"led"}), frozenset({"led", "on_ms"})),

@@ -38,7 +38,7 @@ class LensStranger(BaseModel):
     """Length at the image's corners of the one-sided blur, which grows with the square of the distance from the
     centre."""
     coma_deg: float = 0.0
-    """Its direction in the image, the same everywhere: from x towards y."""
+    """Direction of the coma in the image, from x towards y. It is the same everywhere in the image."""
 
     def disturbed_lens(self, lens: Lens, focus_distance_mm: float) -> Lens:
         """The lens with these terms, when the camera looks straight down."""

@@ -163,8 +163,9 @@ def _is_certain(u_kd: NDArray[np.floating], kd: NDArray[np.floating], most_u: fl
 def _seen_there(
     surface: MeasuredSurface, views: list[TexelView], places_mm: Floats
 ) -> tuple[Gathered, NDArray[np.bool_]]:
-    """Materials that views show at places [k, 3] of the support frame, where they are certain. Their normals are
-    in the base frame."""
+    """Materials that views show at places [k, 3] of the support frame, where they are certain. The normals of
+    these materials are in the base frame.
+    """
     gathered_there = gather(views, apply(surface.result.base_from_support, places_mm))
     u_kd = np.sqrt(gathered_there.covariance[:, VARIANCES[2]])
     is_certain = (gathered_there.materials.alpha > 0.0) & _is_certain(u_kd, gathered_there.materials.kd, _MOST_U)

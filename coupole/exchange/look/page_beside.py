@@ -1,6 +1,6 @@
 """Makes the page to relight of a result of the views so far: `python -m coupole.exchange.look.page_beside PARENT
-RESULT PAGE`. Its parent is the process beside an acquisition. It has the low priority of this parent, and ends
-when the parent ends.
+RESULT PAGE`. Its parent is the process beside an acquisition. This process has the low priority of its parent,
+and ends when the parent ends.
 """
 
 from __future__ import annotations

@@ -67,8 +67,9 @@ class Refined:
 
     @property
     def chi2_of_steps(self) -> float:
-        """Square of the steps over the records' covariance. It is near `determined_count` if records and scan
-        state their uncertainties well."""
+        """Square of the steps over the records' covariance. The value is near `determined_count` if records and
+        scan state their uncertainties well.
+        """
         return float(self.steps @ np.linalg.solve(self.unknowns.covariance, self.steps))
 
     def vertex_u_mm(self, vertex_numbers: NDArray[np.int64] | slice = slice(None)) -> Floats:

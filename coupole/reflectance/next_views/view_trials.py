@@ -52,7 +52,7 @@ class Knowledge:
     """Knowledge about the parts, from some views."""
 
     information: tuple[Information, ...]
-    """Sums over their samples, for each supposed material."""
+    """Sums over the samples of the parts, for each supposed material."""
     decreases: Floats
     """[materials, parts] half the decrease of the logarithm of the covariance's determinant by these views."""
     samples: Floats
@@ -86,8 +86,9 @@ class Trials:
 
     def value(self, knowledge: Knowledge) -> float:
         """Return the decrease of the logarithm of the uncertainty, for each of a material's unknowns: the mean
-        over the surface and the supposed materials. A fit needs `FEWEST` samples, so a part with fewer counts by
-        their share."""
+        over the surface and the supposed materials. A fit needs `FEWEST` samples. A part with fewer samples
+        counts in proportion to their number.
+        """
         usable_shares = np.minimum(knowledge.samples / FEWEST, 1.0) * self.shares
         return float(np.mean(knowledge.decreases @ usable_shares)) / UNKNOWNS
 

@@ -137,8 +137,9 @@ def view_texels(places: NDArray[np.integer], normals: Singles, logs: Floats, cov
 
 
 def _with_colours(logs: Floats, colours: Singles, channel: NDArray[np.int8]) -> Floats:
-    """Return logarithms of kd [n, channels]. The pixel's own `channel` [n] stays; the other channels differ from
-    it as in `colours`."""
+    """Return logarithms of kd [n, channels]. The values of the pixels' own `channel` [n] stay; the other channels
+    differ from these values as in `colours`.
+    """
     column = channel[:, None].astype(np.int64)
     own_logs, own_colour = np.take_along_axis(logs, column, 1), np.take_along_axis(colours, column, 1)
     return np.asarray(own_logs + colours - own_colour)

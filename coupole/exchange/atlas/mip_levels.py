@@ -45,7 +45,7 @@ COLOUR = Meaning(linear_from_srgb(_CODES).astype(np.float32), srgb)
 SHARE = Meaning(_CODES.astype(np.float32), lambda values: values)
 """Values from 0 to 1."""
 DIRECTION = Meaning((2.0 * _CODES - 1.0).astype(np.float32), _unit_codes)
-"""(n + 1) / 2 of unit vectors; averages are made unit again."""
+"""Directions as (n + 1) / 2 of unit vectors n. Averages are made unit vectors again."""
 
 
 def mip_levels(codes: Codes, is_known: NDArray[np.bool_], meaning: Meaning) -> Iterator[Codes]:

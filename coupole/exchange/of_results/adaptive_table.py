@@ -123,7 +123,7 @@ def encode_adaptive(material: Material, most_error: float, description: str = ""
     table, errors = _smallest(material, most_error, pairs)
     text = (
         f"{material.name}; differs from the fit by {errors[0]:.1e} in the median and {errors[1]:.1e} at 95 % of "
-        f"all directions, by {errors[2]:.1e} and {errors[3]:.1e} of those in its lobe; {description}"
+        f"all directions, and by {errors[2]:.1e} and {errors[3]:.1e} of the directions in its lobe; {description}"
     )
     return table.encode(text)
 

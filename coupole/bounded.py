@@ -116,8 +116,9 @@ def waited_for() -> Iterator[None]:
 
 
 def overdue(since_s: float, stopped_s: float = math.inf) -> Call | None:
-    """Return a call that began since then and is to be given up. Time in which this process stood still does not
-    count."""
+    """Return a call that began since then and is to be given up. The time in which this process stood still is
+    not counted.
+    """
     now_s = time.monotonic()
     looked_s = _looked_s[-1]
     _looked_s.append(now_s)

@@ -344,8 +344,9 @@ class Robot(Protocol):
     """The arm that carries the camera.
 
     A motion must be watched (`coupole.supervision`). The thread that called `move_to` calls `measured` at least
-    every 0.1 s of the machine's time until the arm is at rest. Or it waits in `wait_settled`, which does the same.
-    Otherwise the axes brake on their path, even if this process hangs or has ended. No fault is latched then.
+    every 0.1 s of the machine's time until the arm is at rest. Instead, the thread may wait in `wait_settled`,
+    which does the same. Otherwise the axes brake on their path, even if this process hangs or has ended. No fault
+    is latched then.
     """
 
     def identify(self) -> Identity: ...

@@ -65,9 +65,10 @@ def kernel(function: Callable[..., Any] | None = None, /, **options: Any) -> Any
 
 @functools.cache
 def digest_of(file: Path) -> str:
-    """The content that the code of a module's kernels belongs to, as 32 hexadecimal digits: the module's file, the
-    files of all modules of ours that it imports at its top, and of those that they import; the versions of
-    `LIBRARIES`; the Python. The place of the files does not count."""
+    """Digest of the content on which the code of a module's kernels depends, as 32 hexadecimal digits. The
+    content is the module's file, the files of all modules of ours that it imports at its top (directly or through
+    other modules), the versions of `LIBRARIES`, and the version of Python. The place of the files does not count.
+    """
     scripts = None if _is_ours(file) else str(file.parent)
     contents = {file.name if scripts else str(file.relative_to(_ROOT)): _content(str(file))}
     waiting = [*contents.values()]
@@ -82,7 +83,7 @@ def digest_of(file: Path) -> str:
 
 
 def imported_names(source: str) -> Iterator[str]:
-    """Dotted names of what a module imports at its top: modules, and what is imported from them."""
+    """Dotted names of the modules that a module imports at its top, and of the names that it imports from them."""
     for module, names, modules in _IMPORT.findall(source):
         name_list = names.strip("()") or modules
         for name in (_COMMENT.sub("", name_list) if "#" in name_list else name_list).split(","):
@@ -110,8 +111,9 @@ def _content(file: str) -> _Content:
 
 @functools.cache
 def _files_of(name: str, scripts: str | None) -> tuple[tuple[str, str], ...]:
-    """The files that Python runs to import a dotted name, if it is one of ours or of the folder `scripts`: their
-    names without the folder, and their paths."""
+    """The files that Python runs to import a dotted name, if the name is one of ours or of the folder `scripts`.
+    Each has its name without the folder, and its path.
+    """
     if name.partition(".")[0] in PACKAGES:
         folder = str(_ROOT)
     elif scripts is None:
@@ -133,10 +135,11 @@ def _is_ours(file: Path) -> bool:
 
 @functools.cache
 def kept_in() -> Path:
-    """The folder of compiled code: that of NUMBA_CACHE_DIR, or `coupole/kernels` in the user's cache, or a folder
-    of this user among the temporary files, if there is no home that can be written. Code is loaded from it, so a
-    folder that others can write, or that somebody else has made, is not used; then it is a new one, for this
-    process alone."""
+    """The folder of compiled code: that of NUMBA_CACHE_DIR; otherwise `coupole/kernels` in the user's cache; or,
+    if no home can be written, a folder of this user among the temporary files. Code is loaded from this folder.
+    Therefore a folder that others can write, or that somebody else has made, is not used. A new folder is then
+    made for this process alone.
+    """
     if folder := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(folder)
     xdg_cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
@@ -148,7 +151,7 @@ def kept_in() -> Path:
 
 
 def _is_own(place: Path) -> bool:
-    """Tell whether a folder, which is made if it is not there, belongs to this user alone and can be written."""
+    """Make the folder if it is missing; tell whether it belongs to this user alone and can be written."""
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         place.mkdir(mode=0o700, exist_ok=True)

@@ -79,7 +79,7 @@ def farthest_stop_deg(
 
 @dataclass(frozen=True)
 class StateReader(Generic[State]):
-    """A driver's way to read its arm's state, and its words for it."""
+    """A function of a driver that reads the state of its arm, and the words that describe this state."""
 
     read_state: Callable[[], State]
     pause: Callable[[], None]

@@ -147,8 +147,8 @@ class ArmSupervisor:
             raise ArmUnattended(arm.unattended_s)
 
     def _stand_after(self, error: Exception) -> None:
-        """Bring the arm to rest after a motion was braked or must be; then wait for a person unless the lapse was
-        short. Other errors are raised.
+        """Bring the arm to rest if a motion was braked or must be braked. Then wait for a person, except after a
+        short lapse. Other errors are raised.
         """
         lapse_s = error.silent_s if isinstance(error, ArmUnattended) else 0.0
         if self._control.stop.is_set() or not (self.was_held(error) or lapse_s):

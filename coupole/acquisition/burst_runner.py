@@ -132,8 +132,8 @@ class BurstRunner:
     def fire(self, burst: Burst, following: Callable[[], Burst | None] | None = None) -> Verdict:
         """Run one burst and prove its frames; dose and figures are recorded even if this raises.
 
-        `following` gives the burst after this one, as soon as it is known. Its table is uploaded meanwhile. Raises
-        ArmMovedError.
+        `following` gives the burst after this one, as soon as it is known. The table of the next burst is
+        uploaded meanwhile. Raises ArmMovedError.
         """
         frame_format = self._cell.camera.configure(self.exposure(burst))
         if not burst.hardware:

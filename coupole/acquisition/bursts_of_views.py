@@ -89,7 +89,7 @@ class BurstsOfViews:
         return chosen_bursts(self._open_view(number), self._choices_of(number))
 
     def bursts_left(self, number: int) -> list[Burst]:
-        """Return the bursts with unproven frames. Each contains only these frames."""
+        """Return the bursts with unproven frames. The bursts contain only unproven frames."""
         return schedule.bursts_left(self.bursts(number), self._recorder.proven())
 
     def may_want_more(self, number: int) -> bool:
@@ -112,8 +112,9 @@ class BurstsOfViews:
         return _frames(self.bound(number))
 
     def think_ahead(self, number: int) -> None:
-        """Begin to choose, in another thread, what follows the last chosen bursts of a view, which are about to be
-        fired."""
+        """Begin to choose, in another thread, the bursts that follow the last chosen bursts of a view; these are
+        about to be fired.
+        """
         if (
             self._chooser is None
             or self._choice_ahead is not None
@@ -128,8 +129,10 @@ class BurstsOfViews:
             self._choice_ahead = self._thinker.submit(self._next_ahead, view, choices, samples)
 
     def following(self, number: int) -> Burst | None:
-        """Return the first burst of the choice that `think_ahead` has begun, once it is made. The choice is on the
-        disk when this returns. None if it is not made yet, or is made only after the last chosen bursts."""
+        """Return the first burst of the choice that `think_ahead` has begun, once it is made. The choice is on
+        the disk when this returns. None if the choice is not made yet, or can only be made after the last chosen
+        bursts.
+        """
         if self._choice_ahead is not None and self._choice_ahead.done() and self._choice_ahead.exception() is None:
             following, self._choice_ahead = self._choice_ahead.result(), None
             self._ahead = self._note(number, following) if following else []

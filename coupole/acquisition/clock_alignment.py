@@ -18,7 +18,7 @@ PENDING = -2
 UNDECIDABLE = -3
 """Two steps lie within the tolerance of one frame."""
 DOUBTFUL = -4
-"""The others fit one line only if this frame is left out, or this frame is one that can be left out for it."""
+"""The frames fit one line only if this frame is left out, or if it may be this frame that is left out."""
 
 
 @kernel

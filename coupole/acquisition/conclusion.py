@@ -29,8 +29,9 @@ def open_for_session(run: Run) -> None:
 
 
 def complete_views(run: Run) -> list[str]:
-    """Return the files of the views whose frames are all proven, relative to the run. Nothing writes into them any
-    more. If the plan discards frames, a view counts only when its frames are discarded."""
+    """Return the files of the views whose frames are all proven, relative to the run. Nothing writes into these
+    files any more. If the plan discards frames, a view counts only when its frames are discarded.
+    """
     views, gone_views = run.complete_views(), discarded_views(run)
     files = (run.view_path(view) for view in views if view in gone_views or not run.discards)
     return [str(path.relative_to(run.folder)) for path in files if path.is_file()]

@@ -49,7 +49,7 @@ class _Planned:
 
     at_most: LuxHours
     w_per_lm: float | None
-    """Its damaging power, if known."""
+    """Damaging power of the light, if known."""
     plan_id: str
 
 
@@ -186,7 +186,7 @@ class LightOnObject:
 
 
 def _ask_ledger(ledger: Ledger, do: Callable[[], T]) -> T:
-    """Note the call, since the ledger's disk may hang. The ledger waits for other writers by itself."""
+    """Note the call of the ledger, because its disk may hang. The ledger waits for other writers by itself."""
     with under_way(DISK, str(ledger.path), LOCK_S):
         return do()
 

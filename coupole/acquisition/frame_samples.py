@@ -28,7 +28,7 @@ def frame_sample(pixels: NDArray[np.uint16], black_dn: int, white_dn: int) -> Fr
 
 class FrameSamples:
     """Samples of one view's frames, by slot, and by shot once the shot is proven. Several threads may call
-    `of_frame` and `keep`; only one thread may call all else."""
+    `of_frame` and `keep`; all other methods are called by only one thread."""
 
     def __init__(self) -> None:
         self.is_wanted = False

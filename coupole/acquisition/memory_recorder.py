@@ -1,4 +1,6 @@
-"""Recorders that write nothing: for a dry run, which judges pictures, and for metering, which samples them."""
+"""Recorders that write nothing: for a dry run, which judges the exposure of pictures, and for metering, which
+takes samples of pictures.
+"""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ from coupole.viewing.terminal import alarm, step_bars
 _PROGRAM = "coupole.reflectance.beside.process"
 _PAGE_PROGRAM = "coupole.exchange.look.page_beside"
 _READY_WITHIN_S = 120.0
-"""Longer than its imports take on a busy machine."""
+"""Longest wait for the first answer: the process needs less time for its imports, even on a busy machine."""
 _TOLD_AFTER_S = 1.0
 _SILENT_S, _LEAST_CPU_S = 120.0, 1.0
 """A process hangs if, with all frames there, it reports nothing and computes nothing for this time."""

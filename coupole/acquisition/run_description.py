@@ -1,5 +1,6 @@
-"""Description of a run in run.json, and of the cell in every view's file. With it the run can be used without rig
-and plan."""
+"""Description of a run in run.json, and of the cell in every view's file. With this description, the run can be
+used without its rig and plan.
+"""
 
 from __future__ import annotations
 

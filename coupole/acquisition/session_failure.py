@@ -26,8 +26,9 @@ def statistics(cell: OpenedCell) -> dict[str, float]:
 
 
 def note_failure(error: BaseException, cell: OpenedCell, run: Run, recorder: RunRecorder) -> None:
-    """Note the failure in the journal. For an unexpected error, also write its trace to the run's folder, and tell
-    this."""
+    """Note the failure in the journal. For an unexpected error, also write its trace to the run's folder, and say
+    so.
+    """
     device = error.device if isinstance(error, DeviceError) else ""
     recorder.note(FaultNoted(kind=type(error).__name__, message=str(error), device=device))
     if isinstance(error, CoupoleError):

@@ -36,7 +36,7 @@ _heard_s = deque([-math.inf], maxlen=1)
 
 _PULSE_S, _TOLD_WITHIN_S = 0.25, 0.1
 _LEAVES_WITHIN_S = 300.0
-"""Longer than the closing of hanging devices and the writing of a report take."""
+"""The closing of hanging devices and the writing of a report take less time."""
 _STOPS_WITHIN_S = 0.1
 """A process that stops itself may run on for a moment. This allows for it, so that the time of the stop does not
 count as a freeze."""

@@ -25,12 +25,13 @@ class NextVisit:
     """A view that the arm goes to next."""
 
     number: int
-    """Its number in the job's schedule."""
+    """Number of the view in the job's schedule."""
     place: int
     """Number of the views before it in the run."""
     visit: Visit
     bursts: list[Burst]
-    """Its bursts that are known and not complete. For a view that has not begun, there may be none yet."""
+    """Bursts of the view that are known and not complete. A view that has not begun may have no known bursts yet.
+    """
     following: tuple[tuple[int, Visit], ...]
     """Numbers and visits of the views after it, as far as they are known."""
 

@@ -87,7 +87,7 @@ def _refuse_doubtful(out: Path, all_doubts: tuple[str, ...], console: Console) -
 
 
 def _refuse_out(out: Path) -> None:
-    """Raise InputError if the name is not that of a page, or if the file exists."""
+    """Raise InputError if the name does not end in .html, or if the file exists."""
     if out.suffix != ".html":
         raise InputError(f"--out {out}: expected the name of a page, such as certificate.html")
     for path in (out, out.with_suffix(".json")):

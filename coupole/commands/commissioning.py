@@ -104,7 +104,7 @@ def _refuse_without_person(rig: Path, *, yes: bool) -> None:
     if not is_asked_at_a_terminal():
         raise InputError(
             f"{rig} is a real cell, where a person must see and answer: type the command at a terminal; its "
-            "standard input is none"
+            f"standard input is not a terminal"
         )
 
 

@@ -64,7 +64,7 @@ def identify_cube(
 
 
 def _mask_of(cube: Cube, options: ImageOptions) -> NDArray[Any] | None:
-    """[rows, columns] True where the cube is looked at; None for all of it. Raises InputError."""
+    """[rows, columns] True for pixels that are identified; None if all pixels are. Raises InputError."""
     import numpy as np
 
     looks = np.ones((cube.rows, cube.columns), bool)

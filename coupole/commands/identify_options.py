@@ -1,4 +1,4 @@
-"""Options of `coupole identify`: of image cubes, and of the report."""
+"""Options of `coupole identify` for image cubes and for the report."""
 
 from __future__ import annotations
 

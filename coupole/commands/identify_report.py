@@ -20,8 +20,9 @@ def origin_of(
     references: References,
     header_fields: Mapping[str, object] | None = None,
 ) -> Origin:
-    """Gather what is known about inputs and library. Options precede what the files say. Of an image cube,
-    `header_fields` are those of its header. Raises InputError."""
+    """Gather what is known about inputs and library. Options precede what the files say. For an image cube,
+    `header_fields` are the fields of its header. Raises InputError.
+    """
     from coupole.appearance.spectra.spectra_library import library_files
     from coupole.heritage.pigment_maps import spectra_origin
     from coupole.heritage.result_pages.identification_record import LibraryFacts, Origin, signature_of

@@ -69,8 +69,9 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Read a run back: every frame, and every file that the manifest lists. Check that the run is complete, that
-    all checksums are right, and that light, exposure and pose of each frame agree with the run's plan. Of a report
-    of `coupole identify`: tell whether anything was changed after it was written."""
+    all checksums are right, and that light, exposure and pose of each frame agree with the run's plan. For a
+    report of `coupole identify`: tell whether anything was changed after it was written.
+    """
     from coupole.heritage.result_pages.identification_record import is_record
 
     if is_record(run):
@@ -149,9 +150,8 @@ def _verify_report(folder: Path, *, as_json: bool) -> None:
         raise ChecksumMismatch(f"{folder}: the report ({words}) is not as it was written: {len(check.problems)} "
                                "differences (above)")  # fmt: skip
     console.print(
-        f"ok: record and {check.files} files are as they were written; {words}. The checksums tell of "
-        "changes, not "
-        "who signed",
+        f"ok: record and {check.files} files are as they were written; {words}. The checksums tell of changes, "
+        "not who signed",
         markup=False,
     )
 
@@ -193,7 +193,7 @@ def _show_discarded(console: Console, verification: Verification) -> None:
         ": its samples are unchanged since they were read back before frames were discarded, or since they were "
         "replaced later"
         if not verification.bad
-        else " (what is wrong is said above)"
+        else " (the faults are listed above)"
     )
     for result in verification.results:
         console.print(f"  {result}{samples}", markup=False, soft_wrap=True)

@@ -14,7 +14,7 @@ R = TypeVar("R")
 def flatten_options(command: Callable[..., R]) -> Callable[..., R]:
     """Return the command with each dataclass parameter replaced by its fields, as typer reads them.
 
-    The fields have typer's annotations and defaults. Their names are unique in the command.
+    The fields have typer's annotations and defaults. The names of the fields are unique in the command.
     """
     signature = inspect.signature(command, eval_str=True)
     groups: dict[str, Any] = {

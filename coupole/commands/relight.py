@@ -124,7 +124,9 @@ WhiteOption = Annotated[
 
 @dataclass(frozen=True)
 class Lighting:
-    """Options of the lights, whose pictures are summed, and number of rays to each light with a size."""
+    """Options of the lights, and the number of rays to each light with a size. The pictures under all lights are
+    summed.
+    """
 
     direction: DirectionOption = None
     led: LedOption = None
@@ -338,7 +340,7 @@ def _write(
 class Companions:
     """Pictures that belong to the picture of `--to`, such as its uncertainty.
 
-    Old files of their names are removed before that picture is written, and they are written after it. So an
+    Old companions are removed before the picture is written, and new ones are written after it. So an
     interrupted call never leaves a picture beside the uncertainty of another one.
     """
 

@@ -142,8 +142,9 @@ def _beside(
     *,
     is_asked: bool,
 ) -> Iterator[ProcessingBeside | None]:
-    """The processing during an acquisition, if the command or the resumed run asks for it. Its outcome is in
-    `summary` afterwards."""
+    """The processing during an acquisition, if the command or the resumed run asks for it. The outcome of the
+    processing is in `summary` afterwards.
+    """
     from coupole.storage.run import Run
 
     if resume is not None:

@@ -16,7 +16,7 @@ _NO_THREAD = "can't start new thread"
 
 
 def shortage_behind(error: BaseException) -> ResourceShortage | StorageError | None:
-    """Return what ran short, in words, if that is behind an error; None if it is not known to be a shortage."""
+    """Return in words what ran short, if a shortage caused an error; None if it is not known to be the cause."""
     for link in _chain(error):
         words = _shortage(link)
         if words is not None:

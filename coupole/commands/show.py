@@ -235,4 +235,4 @@ def _look_of_scene(path: Path) -> Look:
 
 def _refuse(options: dict[str, object], because: str) -> None:
     if option_names := [name for name, value in options.items() if value]:
-        raise InputError(f"{', '.join(option_names)}: would do nothing, as {because}; leave it out")
+        raise InputError(f"{', '.join(option_names)}: has no effect, because {because}; leave it out")

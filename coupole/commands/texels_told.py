@@ -39,7 +39,7 @@ def lines_of(forecast: TexelForecast, machine_bytes: int) -> Iterator[str]:
     )
     if forecast.memory_bytes > machine_bytes:
         yield (
-            f"this machine has {bytes_text(machine_bytes)} of memory: the work may be ended for want of it; "
+            f"this machine has {bytes_text(machine_bytes)} of memory: the work may end because memory is short; "
             "larger texels (--texels MM) and a smaller --memory need less"
         )
     if size_mm is not None and size_mm > forecast.edge_mm:

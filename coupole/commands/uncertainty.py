@@ -167,7 +167,7 @@ def _propagate(
     emission: str,
     coverages: Sequence[float],
 ) -> _Result:
-    """Compute the budget by our own records, and the table that compares them with those of `beside`."""
+    """Compute the budget from our own records, and a table that compares these records with those of `beside`."""
     from coupole.calibration.budget.accuracy import Case, accuracies
     from coupole.calibration.budget.budget import budget_of
     from coupole.calibration.budget.records import doubts, known_from, read_records, traces
@@ -236,7 +236,7 @@ def _spread_over_dome(figures: Known) -> Spread:
 
 
 def _refuse_target(out: Path) -> None:
-    """Raise InputError if the name is not that of a PNG, or a file exists already."""
+    """Raise InputError if the name does not end in .png, or if the file exists already."""
     if out.suffix != ".png":
         raise InputError(f"--out {out}: expected the name of a PNG, as budget.png")
     for path in (out, out.with_suffix(".html"), out.with_suffix(".json")):

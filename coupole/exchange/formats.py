@@ -118,7 +118,9 @@ def formats_of(source: Source, writer: Writer | None = None) -> list[str]:
 
 
 def format_named(name: str, source: Source, writer: Writer | None = None) -> Format:
-    """Return the format of this name. Raises InputError if there is none for the source (and the writer)."""
+    """Return the format of this name. Raises InputError if there is no such format for the source (and the
+    writer).
+    """
     names = formats_of(source, writer)
     if name not in names:
         sources = [kind.value for kind in FORMATS[name].sources] if name in FORMATS else []

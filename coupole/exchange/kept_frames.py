@@ -10,7 +10,7 @@ from coupole.storage.discarding import discarded_views, place_of_result
 from coupole.storage.run import Run
 
 Remedy = Callable[[Sequence[ShotId]], str]
-"""Function of the shots whose frames are kept; returns a sentence about what can be exported instead."""
+"""Function of the shots whose frames are kept. It returns a sentence that says what can be exported instead."""
 
 
 def refuse_discarded(run: Run, shots: Collection[ShotId], remedy: Remedy) -> None:

@@ -84,7 +84,9 @@ def write_crate(
     origin = _source_facts(source)
     licence = facts.licence or origin.get("licence")
     if not licence:
-        raise InputError("--licence: RO-Crate demands one and the plan names none; give its URL, or words")
+        raise InputError(
+            "--licence: RO-Crate requires a licence, and the plan names none; give its URL or its text"
+        )
     if not facts.authors:
         raise InputError(
             "--author: expected at least one, 'NAME <https://orcid.org/...> at INSTITUTION' or a name"

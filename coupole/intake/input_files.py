@@ -52,7 +52,9 @@ class InputFiles:
         return self._read[key]
 
     def changes(self) -> list[str]:
-        """List what happened on the disk to files since they were read, one sentence each; each is told once."""
+        """List in one sentence each what happened on the disk to files since they were read; each change is
+        listed once.
+        """
         sentences = [f"{path} {how}" for path, state in self._read.items() if (how := _change(path, state))]
         new = [sentence for sentence in sentences if sentence not in self._told]
         self._told |= set(new)
@@ -74,7 +76,7 @@ def _stamp(about: os.stat_result) -> tuple[int, ...]:
 
 
 def _change(path: Path, earlier_read: _Read) -> str:
-    """Return what is different now; empty if nothing is, or only the file's times are."""
+    """Return what is different now; empty if nothing is different, or only the file's times."""
     try:
         about = path.stat()
         if _stamp(about) == earlier_read.stamp:

@@ -1,8 +1,8 @@
 """JSON, and YAML that is no plan or rig, as plain data: the one place where others' files and messages are parsed.
 
-Every text gives data or an InputError with file, line and column. This holds also for text that is not UTF-8,
-lists in lists in lists, numbers of thousands of digits, NaN, and aliases that multiply each other, which would end
-in Python's own errors, or in a traceback elsewhere, much later. Plans and rigs are read by
+Every text gives data or an InputError with file, line and column. This also holds for text that is not UTF-8,
+deeply nested lists, numbers of thousands of digits, NaN, and aliases that multiply each other. Otherwise these
+would end in Python's own errors, or much later in a traceback elsewhere. Plans and rigs are read by
 `coupole.plan.yamlfile`, which knows the place of each key; pydantic's own reader of JSON has such limits already.
 """
 
@@ -41,7 +41,7 @@ class _Refused(Exception):
 
 
 def read_json(path: Path, *, allow_nan: bool = False) -> Any:
-    """A file's JSON. Raises OSError if it cannot be read, else as `json_of`."""
+    """A file's JSON. Raises OSError if the file cannot be read; otherwise the same errors as `json_of`."""
     if (size_bytes := path.stat().st_size) > MOST_BYTES:
         raise InputError(
             [Problem(str(path), 0, 0, "", f"expected at most {MOST_BYTES} bytes, found {size_bytes}")]
@@ -52,7 +52,7 @@ def read_json(path: Path, *, allow_nan: bool = False) -> Any:
 
 
 def json_of(raw: bytes | str, name: str, *, line: int = 1, allow_nan: bool = False) -> Any:
-    """The JSON in a text that begins at this line of what is called `name`; a byte order mark is skipped.
+    """The JSON in a text that begins at this line of the input `name`; a byte order mark is skipped.
 
     Raises NotDataError if it is no JSON, InputError if a value in it is refused: NaN and infinity unless they are
     allowed, whole numbers of more than MAX_DIGITS digits, more than MAX_DEPTH levels.

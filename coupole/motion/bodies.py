@@ -79,8 +79,7 @@ def bodies_of_capsules(capsules: Sequence[Capsule]) -> list[Body]:
 def bodies_of_meshes(folder: Path, arm: ArmDescription, files: InputFiles | None = None) -> list[Body]:
     """Return the base and the six links from `base_link.stl` and `link_1.stl` to `link_6.stl`, in the links'
     frames, in
-        metres or mm, with the names of the arm's description. Raises InputError if one of them cannot
-    be read."""
+        metres or mm, with the names of the arm's description. Raises InputError if a file cannot be read."""
     names = {link.link: link.name for link in arm.links}
     bodies = []
     for link in range(LINKS):

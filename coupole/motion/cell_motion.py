@@ -70,8 +70,9 @@ class CellMotion:
         return plan_itinerary(views, rig, None, rig.motion.home_joints_deg, self._order)
 
     def itinerary(self, views: Sequence[ViewPose], start_deg: Sequence[float]) -> Itinerary:
-        """Return collision-free paths to views from the arm's posture. They are cached: if the arm is at home,
-        preflight's paths from home are used again."""
+        """Return collision-free paths to views from the arm's posture. Paths are cached: if the arm is at home,
+        preflight's paths from home are used again.
+        """
         names = tuple(view.name for view in views)
         for planned_names, planned_deg, itinerary in self._planned:
             if planned_names == names and np.allclose(planned_deg, start_deg, rtol=0, atol=_SAME_PLACE_DEG):

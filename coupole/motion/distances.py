@@ -39,8 +39,9 @@ class Model(NamedTuple):
     trees: NDArray[np.int64]
     """The `SphereTrees` of all shapes."""
     numbers: NDArray[np.int64]
-    """[pairs, 6] a tree and its link; the kind of obstacle; for SHAPE, the other tree and its link; the link
-    relative to which the tree moves (0 if the obstacle is fixed)."""
+    """[pairs, 6] number of a tree, and of its link; the kind of obstacle; for SHAPE, number of the other tree,
+    and of its link; the link relative to which the tree moves (0 if the obstacle is fixed).
+    """
     figures: NDArray[np.float64]
     """[pairs, 13] 0: clearance, mm; 1 to 6: largest relative motion of the two per radian of each axis, mm; 7 on:
     DISK radius; DOME radius, sine and cosine of the opening's elevation; SPHERE centre, radius; BOX lowest and

@@ -310,8 +310,9 @@ def segment_distance_mm(p, q, a, b):  # type: ignore[no-untyped-def]
 @kernel
 def _first_met(starts, ends, axes, radii, is_asked, center, reach, capsule_numbers):  # type: ignore[no-untyped-def]
     """Fill `capsule_numbers` [n, m]. All segments to an end lie within `reach` of the segment that starts at
-    `center`.
-    If this segment misses a capsule by more than `reach`, the capsule is not tested for the single starts."""
+    `center`. If this segment misses a capsule by more than `reach`, the capsule is not tested for the single
+    starts of segments.
+    """
     near = np.empty(len(radii), np.int64)
     for j in range(len(ends)):
         count = 0

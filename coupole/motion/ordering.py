@@ -2,9 +2,9 @@
 
 Order and choice of postures are one problem: a travelling salesman visits one place of each group (a generalised
 TSP; Noon, Bean 1993), on an open tour from the arm's posture. The true time of a leg is expensive to compute. The
-time of the straight motion is cheap and a lower bound. So a tour is optimised with straight times. Then its legs
-are checked, blocked legs are planned, and their true times replace the straight ones. This is repeated until the
-best tour consists of known legs.
+time of the straight motion is cheap and a lower bound. So a tour is optimised with the times of straight motions.
+Then its legs are checked, blocked legs are planned, and their true times replace the straight ones. This is
+repeated until the best tour consists of known legs.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class PacketMesh:
 
     corners_mm: NDArray[Any]
     compact: bool = True
-    """True for a smaller tree, in which rays take 1.2 to 1.7 times as long."""
+    """True for a tree that needs less memory, but in which rays take 1.2 to 1.7 times as long."""
     scene: np.uint64 = field(init=False)
     """Scene in the form that `blocked16` takes in compiled code."""
 

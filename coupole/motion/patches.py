@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 PATCHES = 400
 _PIECE_EDGE, _LEAST_EDGE = 0.5, 1e-3
-"""Longest edge of the pieces of patches, as a share of a patch's width; and its lower bound, as a share of the
-object's size. Without the bound, slivers of a mesh would be split without end."""
+"""Longest edge of the pieces of patches, as a share of a patch's width; and a lower bound of this edge, as a
+share of the object's size. Without the bound, slivers of a mesh would be split without end.
+"""
 _TURN_WIDTHS = 2.0
 """Weight of normals in clustering: a difference of 1 in the normals counts like this many patch widths."""
 

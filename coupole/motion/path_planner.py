@@ -52,8 +52,9 @@ class PathPlanner:
         self._from_via: dict[tuple[int, bytes], list[Joints] | None] = {}
 
     def straight_s(self, places_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return times [n, n] of straight motions between postures [n, 6], clear or not. They are lower bounds of
-        the legs' times."""
+        """Return times [n, n] of straight motions between postures [n, 6], clear or not. These times are lower
+        bounds of the legs' times.
+        """
         from coupole.motion.straight_times import pairwise_s
 
         arm = self._arm

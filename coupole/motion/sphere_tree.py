@@ -66,7 +66,7 @@ def surface_points(corners_mm: Floats, step_mm: float = MESH_STEP_MM) -> Floats:
     `step_mm` from one of them.
 
     Each triangle is divided into similar ones with edges of at most e. Then each of their points is at most e /
-    sqrt(3) from a corner. Of the corners in a cubic cell of edge c, one is kept; it is at most c sqrt(3) from the
+    sqrt(3) from a corner. In each cubic cell of edge c, one corner is kept; it is at most c sqrt(3) from the
     others.
     """
     edge_mm = 0.6 * step_mm

@@ -69,7 +69,7 @@ class WaysFromHome:
         return self._visits[view.name]
 
     def _find(self, view: ViewPose) -> Visit | str:
-        """Return the visit, in the posture that is reached first; or the reason why there is none."""
+        """Return the visit in the posture that is reached soonest, or the reason why there is no visit."""
         postures, why_not = postures_of(view, self._rig, self._bodies)
         if why_not:
             return f"view {view.name}: {why_not}"

@@ -142,14 +142,16 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
             self.run_folder, self._set_run_folder = soft_signal_r_and_setter(str)
             """Folder of the last flight's run."""
             self.proof, self._set_proof = soft_signal_r_and_setter(str)
-            """Basis of the identity of its frames, in the words of run.json."""
+            """How the identity of its frames was proven, in the words of run.json."""
         self.proven, self._set_proven = soft_signal_r_and_setter(int)
         """Number of frames that the present flight has proven."""
         self.frames = ProvenFrames()
         super().__init__(name)
 
     async def next_plan(self) -> Plan:
-        """Return the plan of the next flight, by the signals. Raises InputError if the plan has no such view."""
+        """Return the plan of the next flight, as the signals `view` and `leds` set it. Raises InputError if the
+        plan has no such view.
+        """
         name, leds = await self.view.get_value(), await self.leds.get_value()
         views = {view.name: view for view in self.views()}
         if name not in views:

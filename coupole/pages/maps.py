@@ -14,7 +14,7 @@ from coupole.pages import palettes
 from coupole.pages.page_parts import Map, Picture
 
 WIDTH_PX = 480
-"""Largest width of a map. Of a wider map every second pixel is shown, or fewer."""
+"""Largest width of a map. If a map is wider, only every second pixel is shown, or fewer."""
 GAMMA = 2.2
 BRIGHTEST = 0.999
 """Quantile of a picture that is shown as white."""

@@ -48,8 +48,9 @@ class JointDescription(Model):
     limits_deg: Range
     """Lowest and highest angle, from the data sheet."""
     posture_limits_deg: Range | None = None
-    """Limits for planned postures. They are narrower where links come near each other, or where cables would
-    twist."""
+    """Limits for planned postures. These limits are narrower than the joint's own limits if links would come near
+    each other, or if cables would twist.
+    """
     speed_deg_s: Positive
     """Greatest speed, from the data sheet."""
     acceleration_deg_s2: Positive
@@ -92,8 +93,9 @@ class KeptApart(Model):
         Field(min_length=6, max_length=6),
     ] = None
     """Angles of each joint. A part of `body` that is near `other` in all combinations of these angles is always
-    near it, because of the joint between them, or because their capsules are too large. This part is not
-    checked."""
+    near it, because of the joint between them, or because their capsules are too large. This part of `body` is
+    not checked.
+    """
 
     @model_validator(mode="after")
     def _few_combinations(self) -> KeptApart:

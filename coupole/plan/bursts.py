@@ -169,9 +169,10 @@ def bursts_of_exposure(
 
 
 def with_sentinels(lit: Sequence[Led], sentinels: Sequence[int], every: int) -> list[Led | Sentinel]:
-    """Return the LEDs with `sentinels` among them. All sentinels are at the begin and at the end; between, there
-    is one of them in turn after each `every` LEDs. They keep a distance from the shots of the same LEDs, so that
-    the LEDs cool."""
+    """Return the LEDs with `sentinels` among them. All sentinels are lit at the begin and at the end. Between,
+    one sentinel follows after every `every` LEDs, each sentinel in turn. They keep a distance from the shots of
+    the same LEDs, so that the LEDs cool.
+    """
     if not sentinels:
         return list(lit)
     between = range(every, len(lit) - every // 2, every)

@@ -94,8 +94,9 @@ class OpenView:
     target_mm: tuple[float, float, float] | None
     """The point in the picture's middle, in the support frame; None if the plan gives joints."""
     bursts: tuple[Burst, ...]
-    """Bursts from which the shots are chosen. There is one for each exposure and repeat, with all LEDs of the
-    view."""
+    """Bursts from which the shots are chosen. There is one burst for each exposure and repeat, with all LEDs of
+    the view.
+    """
     bound: tuple[Burst, ...]
     """Bursts with at least as much light and time as any choice."""
 
@@ -172,8 +173,9 @@ def next_choice(
     chooser: Chooser, view: OpenView, choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
 ) -> Choice:
     """Return a view's next choice after these, all of which were fired; `samples` has their proven frames. It is
-    the same one that `choose_ahead` gave, or would have given, while the last of them was fired. So it does not
-    depend on when a run was interrupted."""
+    the same choice that `choose_ahead` gave, or would have given, while the last of these was fired. So it does
+    not depend on when a run was interrupted.
+    """
     ahead = chooser.choose_ahead(view, choices, before_last(choices, samples)) if choices else None
     return ahead or chooser.choose(view, choices, samples)
 
@@ -226,8 +228,9 @@ def bound_of_lights(whole: Burst, sizes: Iterable[int]) -> tuple[Burst, ...]:
 
 def refuse_beyond(bound: Sequence[Burst], bursts: Sequence[Burst]) -> None:
     """Raise RuntimeError if `bursts`, all chosen bursts of a view, exceed its bound, which preflight has checked.
-    They must not have more bursts, more frames, or LEDs that are lit for longer. The LEDs are compared in the
-    order of their times."""
+    The chosen bursts must not be more, have more frames, or light LEDs for longer than the bound. The LEDs are
+    compared in the order of their times.
+    """
     allowed_us = sorted(_on_us(bound).values(), reverse=True)
     asked_us = sorted(_on_us(bursts).items(), key=lambda item: -item[1])
     allowed_us += [0] * (len(asked_us) - len(allowed_us))

@@ -70,8 +70,9 @@ def _by_address(cell: Cell) -> Path:
 
 
 def _address(model: type[BaseModel], settings: dict[str, object]) -> tuple[str, str]:
-    """Return the address at which a driver with these settings finds its controller, and the name of that setting.
-    Without an address, return an empty text and `unknown`."""
+    """Return the address at which a driver with these settings finds its controller, and the name of the setting
+    that has this address. Without an address, return an empty text and `unknown`.
+    """
     for name in _ADDRESSES:
         field = model.model_fields.get(name)
         address = settings.get(name, field.default if field is not None else "")

@@ -74,8 +74,9 @@ class AutoExposure(Model):
     most_exposures: Annotated[int, Field(ge=2, le=4)] = 3
     """Greatest number of exposures of one LED in one view."""
     first_lights: Annotated[int, Field(ge=4, le=200)] = 24
-    """LEDs of the first pass, spread over the dome. They are at most an eighth of the view's LEDs, but at least
-    six."""
+    """LEDs of the first pass, spread over the dome. Number of LEDs: at most an eighth of the view's LEDs, but at
+    least six.
+    """
 
     @model_validator(mode="after")
     def _a_range(self) -> AutoExposure:

@@ -81,16 +81,17 @@ FEWEST_FIRST_LIGHTS, FIRST_SHARE = 6, 8
 
 
 def first_lights(ids: NDArray[np.int64], leds: LedTable, most: int) -> NDArray[np.int64]:
-    """Return ids of LEDs among `ids` [n] for a first pass, spread over the dome. They are `most` LEDs, but at most
-    an eighth of `ids`, and at least six."""
+    """Return ids of LEDs among `ids` [n] for a first pass, spread over the dome. Their number is `most`, but at
+    most an eighth of `ids`, and at least six.
+    """
     count = min(len(ids), most, max(FEWEST_FIRST_LIGHTS, len(ids) // FIRST_SHARE))
     return ids[spread_rows(leds.positions_mm[leds.rows(ids)], count)] if len(ids) else ids
 
 
 def sentinels_among(lit: Sequence[Sequence[Led] | Panel], leds: LedTable) -> tuple[int, ...]:
-    """Return the ids of a view's sentinels. They are spread over the LEDs in the middle half of the `lit` ones by
-    height: low LEDs graze, and the highest ones are alike. There are none if too few LEDs are lit to place
-    sentinels between them.
+    """Return the ids of a view's sentinels. They are spread over the middle half of the `lit` LEDs, by height.
+    The light of low LEDs is grazing, and the highest LEDs are alike. No sentinels are returned if too few LEDs
+    are lit to place sentinels between them.
     """
     ids = np.array([led.id for lights in lit if not isinstance(lights, Panel) for led in lights], np.int64)
     if len(ids) < FEWEST_WATCHED:

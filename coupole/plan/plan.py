@@ -167,8 +167,9 @@ class Plan(Model):
     repeats: Annotated[int, Field(ge=1, le=1000)] = 1
     """Frames of each light at each exposure."""
     hidden_lights: Literal["mark", "skip"] = "mark"
-    """LEDs that arm, camera or object hide from everything that a view shows. They are taken and marked (`mark`),
-    or left out (`skip`)."""
+    """LEDs that arm, camera or object hide from everything that a view shows. Frames of these LEDs are taken and
+    marked (`mark`), or left out (`skip`).
+    """
     exposure: Exposures
     """Exposure of the frames: one time, or several."""
     gain_db: Annotated[float, Field(ge=0, le=42)] = 0.0

@@ -110,11 +110,11 @@ class Dome(Model):
     """Relative spectral power of the LEDs (CSV: nm, power). It is used for the radiant exposure weighted by
     damage."""
     panel_spectrum: FilePath | None = None
-    """Relative spectral power of the panels, in the same form."""
+    """Relative spectral power of the panels, in the form of `spectrum`."""
 
 
 class BoardThermal(Model):
-    """First-order thermal model of an LED board. Each joule heats it; it cools with one time constant."""
+    """First-order thermal model of an LED board. Each joule heats the board; it cools with one time constant."""
 
     led_power_w: Annotated[float, Field(gt=0, le=10_000)] = 15.0
     """Heat of a lit LED."""
@@ -268,7 +268,9 @@ class Consoles(Model):
 
 
 class WorldSection(Model):
-    """The stand-ins. They are started with the rig (or only for dry runs), or joined if they already run."""
+    """The stand-ins. Stand-ins are started with the rig (or only for dry runs); stand-ins that already run are
+    used.
+    """
 
     serves: Literal["always", "dry_run"] = "always"
     """Sessions that use the stand-ins: all, or only dry runs."""
@@ -329,8 +331,9 @@ class Rig(Model):
     """Folder of the objects' dose ledgers. It must be the same for all rigs on which the objects are measured.
     Default: `coupole/ledger` in the user's data folder (XDG)."""
     controllers: FilePath | None = None
-    """Folder of facts about controllers of arms, such as standing faults and commissioning. They do not depend on
-    the rig that names the controller. Default: `coupole/controllers` in the user's data folder (XDG)."""
+    """Folder of facts about controllers of arms, such as standing faults and commissioning. These facts do not
+    depend on the rig that names the controller. Default: `coupole/controllers` in the user's data folder (XDG).
+    """
     calibrations: Literal["none"] | tuple[FilePath, ...] = "none"
     """Records that must be in force for plans that list no records."""
     console: Consoles = Consoles()

@@ -218,9 +218,10 @@ def driver_problems(document: Document, rig: Rig) -> list[Problem]:
 
 
 def _unlike_stand_in(document: Document, rig: Rig) -> list[Problem]:
-    """Refuse, in a rig of stand-ins, an arm other than the one that the stand-in moves. Poses would then be those
-    of the arm, but pictures those of the stand-in. (A UR's stand-in moves the driver's `model`, or its settings
-    are refused.)"""
+    """Refuse, in a rig of stand-ins, an arm other than the one that the stand-in moves. Otherwise the poses would
+    be those of the arm, but the pictures those of the stand-in. (A UR's stand-in moves the driver's `model`, or
+    its settings are refused.)
+    """
     moved_arm, arm = ARMS_OF_DRIVERS.get(rig.robot.driver), described_arm(rig)
     if moved_arm is None or arm is None or not in_world(rig, dry_run=False):
         return []

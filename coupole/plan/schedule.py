@@ -19,7 +19,7 @@ from coupole.plan.shot_id import MAX_CHARACTERS, Led, Panel, PanelMark, Sentinel
 from coupole.plan.watch import SENTINELS
 
 MOST_VIEWS, MOST_FRAMES = 2000, 5_000_000
-"""Largest numbers of views and frames of one plan. This number fits into memory."""
+"""Largest numbers of views and frames of one plan. So many frames fit into memory."""
 MOST_CANDIDATES = 400
 """Largest number of views among which a run chooses."""
 TAKEN_TWICE = 4

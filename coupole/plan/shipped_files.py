@@ -1,8 +1,8 @@
 """Files that come with Coupole: rigs, plans, domes, arms, objects and records of the simulated cells.
 
 They are in `configs` of a checkout, and in `coupole/configs` of an installed package (pyproject.toml puts them
-there). Only this module knows which of the two is used. The name of a shipped rig or plan may replace its path:
-`sim` is `configs/rigs/sim.yaml`.
+there). Only this module knows which of the two folders is used. The name of a shipped rig or plan may replace its
+path: `sim` is `configs/rigs/sim.yaml`.
 """
 
 from __future__ import annotations

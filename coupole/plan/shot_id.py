@@ -1,4 +1,4 @@
-"""Shot ids: view, light or dark, exposure. Only this module writes and reads them.
+"""Shot ids: view, light or dark, exposure. Only this module writes and reads shot ids.
 
 ::
 

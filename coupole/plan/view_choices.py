@@ -40,7 +40,7 @@ def problem_of_views(schedule: Schedule, chosen_views: Sequence[ChosenView]) -> 
     if not chosen_views:
         return ""
     if schedule.most_views is None:
-        return f"a choice of {names[0] if names else 'no more views'}, where the plan chooses no views"
+        return f"a choice of {names[0] if names else 'no more views'}, but the plan chooses no views"
     if unknown := set(names) - {view.name for view in schedule.views}:
         return f"{min(unknown)} is not among the plan's candidates"
     if len(names) > len(set(names)):
@@ -48,5 +48,5 @@ def problem_of_views(schedule: Schedule, chosen_views: Sequence[ChosenView]) -> 
     if len(names) > schedule.view_count:
         return f"{len(names)} views are chosen, where the plan allows {schedule.view_count}"
     if not all(choice.view for choice in chosen_views[:-1]) or not names:
-        return "it needs no more views, and no view was chosen, or others were chosen later"
+        return "the choice was ended before a view was chosen, or views were chosen after its end"
     return ""

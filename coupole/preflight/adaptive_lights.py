@@ -3,7 +3,7 @@
 The first burst is spread over the dome. For each further burst `next_lights` gives the expected error of pictures
 for the LEDs not yet lit, and the LEDs that would add most information. The second burst follows from the frames of
 the first. Each later burst is chosen while the one before it is fired, from the frames before that one, so that
-the box does not wait. Only the end of a view is told from all frames. Pixels are divided by the illuminance that
+the box does not wait. Only the decision to end a view uses all frames. Pixels are divided by the illuminance that
 the LED table gives at the view's target. Mesh and records are not needed: only the frames are used.
 """
 

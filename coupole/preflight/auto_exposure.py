@@ -150,8 +150,8 @@ class AutoExposureChooser(Chooser):
         """Return the limits for groups of LEDs, from the limits of the first pass, and the group [leds] of each
         LED.
 
-        All LEDs of a group have the same limits: they clip from the same time on, and their dim pixels reach the
-        ratio from the same time on.
+        All LEDs of a group have the same two limits: the exposure time from which they clip, and the time from
+        which their dim pixels reach the ratio.
         """
         judgements = [evidence.judge(led) for led in evidence.first_leds]
         lux = np.array([lux_of_led[led] for led in view.leds.tolist()])

@@ -26,7 +26,7 @@ GEOMETRY: tuple[Step, ...] = ("geometry",)
 LAMPS: tuple[Step, ...] = ("lamps", "trigger", "watchdog")
 
 HARMLESS: Mapping[str, str] = {
-    "schema_version": "of the format; a file has no other",
+    "schema_version": "version of the file's format; there is only one",
     "arm.schema_version": "of the format",
     "name": "stands in reports only",
     "arm.name": "stands in messages only",

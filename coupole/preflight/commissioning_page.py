@@ -29,8 +29,7 @@ def page(record: CommissioningRecord) -> Page:
         title=f"{record.rig}: commissioned, {'passed' if record.has_passed else 'not passed'}",
         pictures=_limits(results),
         summary=f"{sum(result is not None for result in results.values())} of {len(STEPS)} steps of the "
-        "commissioning "
-        f"of {record.rig} were done.",
+        f"commissioning of {record.rig} were done.",
         quality=_quality(record, results),
         next_step=_next_step(record, open_steps),
         remark="Simulated: no real cell." if record.simulated else "",
@@ -57,7 +56,9 @@ def _limits(results: dict[Step, StepResult | None]) -> list[Plot]:
         if limit.limit > 0
     ]
     nearest = sorted(shares, key=lambda share: -share[1])[:_MOST_BARS]
-    return [bars("The figures nearest to their limits, as shares of them", nearest, "limit")] if nearest else []
+    return (
+        [bars("The figures nearest to their limits, as shares of the limits", nearest, "limit")] if nearest else []
+    )
 
 
 def _quality(record: CommissioningRecord, results: dict[Step, StepResult | None]) -> Inline:

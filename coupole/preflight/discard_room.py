@@ -32,7 +32,7 @@ _PICTURES = 12
 _FIT_BYTES, _MATERIAL_BYTES = 1250, 360
 """Bytes of the fits: first of a view's triangle for each channel, then of a triangle of the mesh."""
 _SMALL_BYTES = 4_000_000
-"""Bytes of reports and of other data that belong to no triangle. Those of a view are less."""
+"""Bytes of reports and of other data that belong to no triangle. The reports of a view need less."""
 _LEAST_COSINE = -0.05
 """Least cosine of a triangle's direction to the camera. A triangle below it cannot be seen, even if the pose is a
 little off."""
@@ -114,8 +114,8 @@ def refusals_of_discarding(job: Job) -> list[str]:
     messages = []
     if job.plan.chooses_lights:
         messages.append(
-            "expected LEDs that are known beforehand: which of them are kept for the check is known after the "
-            "last view alone with `lights: {kind: adaptive}`, so no frame could be discarded"
+            "expected LEDs that are known beforehand: with `lights: {kind: adaptive}` the LEDs that are kept for "
+            "the check are known only after the last view, so no frame could be discarded"
         )
     elif isinstance(job.plan.exposure, AutoExposure) and any(view.lights for view in job.plan.view_entries):
         messages.append(

@@ -23,7 +23,9 @@ FULL = 0.95
 QUANTILES = 48
 """Number of rates that represent the rates of all pixels in an LED's light."""
 _JUDGED_MARGIN, _HELP_MARGIN = 1.03, 1.05
-"""Factors on the required ratio, by which frames are judged: a pixel's ratio is computed from noisy pixels."""
+"""Factors by which the required ratio is multiplied when frames are judged, because a pixel's ratio is computed
+from noisy pixels.
+"""
 _SOME_PIXELS = 1000
 _LIT = 0.1
 """A pixel is lit by an LED if its rate is at least this share of its reference."""

@@ -262,8 +262,8 @@ def _judged_views(
     if partly:
         least = min(partly, key=lambda entry: entry.in_field)
         warnings.append(
-            f"object {name}: {_count(partly, framings)} part of it out of the field; view {least.view} has "
-            f"{least.in_field:.0%} of what it could see"
+            f"object {name}: {_count(partly, framings)} part of it out of the field; in view {least.view}, "
+            f"{least.in_field:.0%} of the visible surface is in the field"
         )
     if blurred_framings:
         least = min(blurred_framings, key=lambda entry: entry.in_focus)

@@ -1,4 +1,4 @@
-"""The job: a plan with all files that it names, and its schedule. The commands work on jobs.
+"""The job: a plan with all files that it names, and its schedule. Commands take jobs as their input.
 
 ::
 

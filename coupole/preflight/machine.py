@@ -1,4 +1,6 @@
-"""The cell's needs of the machine that runs it. They are found without the cell's devices (`coupole doctor`)."""
+"""The cell's needs of the machine that runs it. These needs are checked without the cell's devices (`coupole
+doctor`).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The lights that add most to the lights taken so far, as the pictures under those show.
+"""The lights that add the most information to the lights taken so far, judged by the pictures under these.
 
 Pictures between lights are interpolated from the pictures taken, by radial basis functions with a linear tail
 (seed 003, 5.2). Each light taken is left out in turn and predicted from the others; Rippa (1999) gives all these
@@ -24,7 +24,9 @@ from coupole.geometry import farthest_first
 Floats = NDArray[np.float64]
 
 FEWEST_TAKEN = 6
-"""Fewest lights for which the errors of left-out lights mean anything: the linear tail alone has four unknowns."""
+"""Fewest lights for which the errors of left-out lights are meaningful, because the linear tail alone has four
+unknowns.
+"""
 _RANGE_RAD = np.radians(60.0)
 """Angle over which errors are similar. An angle of 25 degrees gives about the same choices."""
 _NUGGET = 1e-6

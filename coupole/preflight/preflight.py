@@ -153,7 +153,7 @@ class ObjectLight:
     dose_before_lux_h: float = 0.0
     """Light that it has received before, by its ledger."""
     dose_budget_lux_h: float | None = None
-    """Its own budget, by its ledger; a plan's budget can be stricter."""
+    """Budget of the object, as its ledger has it; a plan's budget can be stricter."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ _TOLD = {
     "kd": "of the clusters, 1/sr, by channel",
     "ks": "of the clusters, by channel; f = kd + ks D V",
     "alpha": "of the clusters, GGX's roughness",
-    "residual": "of the clusters: weighted rms of the square roots that are left, as a share of sqrt(kd)",
+    "residual": "of the clusters: weighted rms residual of the square roots, as a share of sqrt(kd)",
     "harmonics": "[clusters, functions, channels] of pairs of directions, 1/sr",
     "members": "number of triangles from which a cluster was formed",
 }

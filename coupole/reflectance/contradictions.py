@@ -1,5 +1,5 @@
-"""Samples that are shaded by a thing which nobody described, for example a cable. They contradict the samples
-beside them.
+"""Samples that are shaded by a thing which nobody described, for example a cable. Such samples contradict the
+samples of neighbouring LEDs.
 
 A cable's full shadow is too dark to give samples. At the shadow's edge a triangle is partly lit, and its sample
 can be too low by any amount. A contradicted sample is darker than the triangle's material in all channels, by more

@@ -1,4 +1,4 @@
-"""Prediction of a picture, and quantities, known beforehand, from which its error is predicted.
+"""Prediction of a picture, and quantities that are known beforehand and predict its error.
 
 Each column is one number for each pixel and channel. Brightness, incidence, highlight, material and nearness to
 edges come from the prediction and the materials; the differences among kernels and near pictures, and the kernel's

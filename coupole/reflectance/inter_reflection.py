@@ -255,7 +255,7 @@ def _lowered(
     indirect: _Indirect, rows: slice, values: dict[str, NDArray[np.float16]]
 ) -> tuple[NDArray[np.float32], dict[str, NDArray[np.float32]]]:
     """Return the share [rows, leds, channels] of f that is subtracted from rows of a view, NaN where no sample
-    remains; and the new `values`. Those of uncertainty are relative, so they grow. Small parts of the rows are
+    remains; and the new `values`. Values of uncertainty are relative, so they grow. Small parts of the rows are
     worked on in threads: this takes less memory, and no value depends on other rows."""
     share = np.empty(values["f"].shape, np.float32)
     new_values = {name: np.empty_like(share) for name in values}

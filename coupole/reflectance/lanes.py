@@ -24,8 +24,9 @@ _NUMBERS = {types.float32: ir.FloatType(), types.float64: ir.DoubleType()}
 
 
 class _Lanes(types.Type):
-    """Its name has the content of this module: numba takes kept code by the types of arguments, also that of a
-    kernel whose module does not import this one."""
+    """The name of the type contains a digest of this module. numba chooses kept code by the types of arguments,
+    even for a kernel whose module does not import this one.
+    """
 
     def __init__(self, number: Any) -> None:
         super().__init__(f"Lanes({number}, {digest_of(Path(__file__).resolve())[:8]})")

@@ -129,7 +129,7 @@ def solve_by_samples(rows, penalty, values, memory, factor, right):  # type: ign
 
 @kernel
 def left_out(rows, values, coefficients, factor, step, off):  # type: ignore[no-untyped-def]
-    """Fill `off` [m, ...] with the amount by which each `step`-th sample is missed by the fit to all the others.
+    """Fill `off` [m, ...] with the error of the fit to all other samples, for each `step`-th sample.
 
     `rows` [n, samples], `coefficients` [m, n] and `factor` belong to a solution. With fewer samples than rows,
     `values` [m, samples] are those that `solve_by_samples` left, else the samples. The amount is the residual of

@@ -1,5 +1,5 @@
-"""Paths of light from LEDs to an object, and from one part of the object to another. They are found by rays in its
-mesh and need no frame.
+"""Paths of light from LEDs to an object, and from one part of the object to another. These paths are found by
+rays in the object's mesh; no frame is needed.
 
 The object is cut into patches. A few triangles represent each patch. Rays from them find the share of the half
 space that other patches fill, and the light that comes directly from LEDs.

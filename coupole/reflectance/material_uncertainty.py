@@ -6,7 +6,7 @@ variance (Huber 1967). M comes from the residuals, which are summed by groups of
 squared (Liang and Zeger 1986). Within a group, the errors of the material's form, of an LED's power and of a
 shadow's edge are alike. So M contains noise, each LED's own power, and the error of the model. Two parts are
 added: the scanner's noise, for normals that are held to the mesh; and the spread of the prior, where only the
-usual roughness and ks hold them. The uncertainty that all LEDs share is a factor of kd and ks, and is kept
+usual roughness and ks determine them. The uncertainty that all LEDs share is a factor of kd and ks, and is kept
 separately.
 """
 

@@ -5,7 +5,7 @@ form is wrong, or the surface reflects light onto itself, the two sides of the d
 spreads are used. The fit's own covariance by groups (`material_uncertainty.add_scores`: Huber 1967, Liang and
 Zeger 1986) distinguishes the pixels, but is far too small. The jackknife over the same groups of the plain robust
 normal (`normal_fit.rank_normals`) has about the size of the fit's error; its 95 % quantile is taken in strata of
-the first spread. Both are added in quadrature.
+the first spread. Both spreads are added in quadrature.
 """
 
 from __future__ import annotations

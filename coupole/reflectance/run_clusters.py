@@ -35,8 +35,9 @@ ABOUT_CLUSTERS = "clusters.json"
 FEWEST_TO_BORROW = 4
 """Least number of samples that determine the cluster of a triangle."""
 USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS = 400, 16, 1000
-"""Number of members of a cluster, and bounds on the number of clusters, if that number is not given. They are
-those of the paper; small objects have at least some clusters."""
+"""Number of members of a cluster, and bounds on the number of clusters, if that number is not given. The numbers
+are those of the paper, but small objects have at least `FEWEST_CLUSTERS` clusters.
+"""
 _FROM = GGX_NORMAL.name
 _WAYS = ("own", "clustered", "harmonics", "borrowed")
 """Ways to predict the values of a triangle; each is compared separately."""

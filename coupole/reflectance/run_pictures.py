@@ -30,8 +30,9 @@ class CheckFrames:
     -1."""
 
     def pairs(self, rows: slice, channel: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Return, for the blocks whose pixel sees a triangle in some rows of the view's file, the triangle's place
-        among these rows [blocks], and `share` [blocks, leds]."""
+        """Return two arrays for the blocks whose pixel sees a triangle in `rows` of the view's file: the
+        triangle's place among these rows [blocks], and `share` [blocks, leds].
+        """
         order, places = self._blocks_by_place[channel]
         first, end = np.searchsorted(places, [rows.start, rows.stop])
         leds, height, width, channels = self.share.shape

@@ -95,8 +95,9 @@ def percentiles(low: Floats, high: Floats) -> dict[str, Any]:
 def known_samples(
     result: RunResult, view: ViewSamples, channel: int, scan_noise_um: float, *, most: int, of_triangles: int
 ) -> ChannelSamples:
-    """Return at most `most` samples that have a value. They are of about `of_triangles` triangles, and of LEDs,
-    spread over the view."""
+    """Return at most `most` samples that have a value. The samples are of about `of_triangles` triangles and of
+    several LEDs, spread over the view.
+    """
     rows = np.arange(0, len(view.triangles), max(1, len(view.triangles) // of_triangles))
     leds = np.arange(0, len(view.leds), -(-len(view.leds) // _LEDS))
     some = channel_samples(result, view, rows, leds, channel, scan_noise_um)

@@ -61,10 +61,11 @@ def channel_samples(
     scan_noise_um: float,
     beside: Beside | None = None,
 ) -> ChannelSamples:
-    """Return the samples of some rows of a view's file, in rising order, and some of its LEDs. Without a channel
-    they are those of the channels' mean, as if the errors of all channels had the same sign. `beside` has the
-    `triangles_beside` of the rows, if they were found before. Raises InputError for a file that an earlier version
-    made."""
+    """Return the samples of some rows of a view's file, in rising order, and some of its LEDs. If no channel is
+    named, they are the uncertainties of the channels' mean, as if the errors of all channels had the same sign.
+    `beside` has the `triangles_beside` of the rows, if they were found before. Raises InputError for a file that
+    an earlier version made.
+    """
     beside = beside or triangles_beside(result, view, rows)
     with h5py.File(view.path, "r") as file:
         lateral_u_mm, led_u_mm = float(file.attrs["lateral_u_mm"]), float(file.attrs["led_u_mm"])

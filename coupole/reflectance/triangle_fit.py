@@ -1,9 +1,9 @@
 """GGX materials of triangles from the samples of all views, with the mesh's normal and with a fitted one.
 
 The normal of the mesh is the prior of the fitted normal. Its variance comes from noise of the scanner's vertices.
-For a triangle of area A it is about that of an equilateral one: 2 s^2 / a^2 with a^2 = 4 A / sqrt 3 (a plane
-through three points, each with an error s). The fit is that of `coupole.reflectance.normal_fit`, computed by
-`coupole.reflectance.ggx_fit`.
+For a triangle of area A this variance is about that of an equilateral triangle: 2 s^2 / a^2 with a^2 = 4 A / sqrt
+3 (a plane through three points, each with an error s). The fit is that of `coupole.reflectance.normal_fit`,
+computed by `coupole.reflectance.ggx_fit`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _FIRST_KS = 0.02
 _TO_CHOOSE = 256
 """Approximate number of samples from which the best start is chosen."""
 LEAST_KD = 1e-6
-"""kd of black, 1/sr, where a share of kd is needed."""
+"""kd that a black surface is given, 1/sr, where a share of kd is needed."""
 _CHOSEN, _SETTLED = 1e-4, 1e-5
 """A fit ends when a step lowers the cost by less than this share: for each start, and for the best one."""
 HELD = 1e9

@@ -149,9 +149,10 @@ def register(
     """Find the poses of two or more scans from their overlaps, like `coupole register`.
 
     `scans` are files: PLY, STL, OBJ, PTX, PTS, E57, or text with x y z. Their `unit` is mm, cm, m, um or in; E57
-    is always in m. `targets` is a table of the targets in the scans, and `control` one of targets whose positions
-    are known. `seen_from` tells where the scanner was in each scan's frame: origin, +x, -x, +y, -y, +z, -z or
-    none; by default it is found. With `trust_poses` the search starts from the poses that PTX and E57 state.
+    is always in m. `targets` is a table of the targets in the scans, and `control` is a table of targets whose
+    positions are known. `seen_from` tells where the scanner was in each scan's frame: origin, +x, -x, +y, -y, +z,
+    -z or none; by default it is found. With `trust_poses` the search starts from the poses that PTX and E57
+    state.
 
     Raises InputError if no two scans overlap; ExtraMissing.
     """

@@ -228,8 +228,9 @@ class PicturesResult:
         self, lights: Sequence[AnyLight] = (), *, direction: Vector | None = None, samples: int = SAMPLES
     ) -> NDArray[np.float32]:
         """[height, width, 3] linear picture under the sum of the lights. `direction` is a short form of a distant
-        light (x right, y up, z to the camera). Raises InputError if there is no light, or if pictures cannot have
-        it."""
+        light (x right, y up, z to the camera). Raises InputError if there is no light, or a light of a kind that
+        pictures cannot have.
+        """
         scene = relit_result.open_result(self.folder, None, None, None, samples, uncertain=False)
         return scene.picture(_lights(lights, direction, None), _say_nothing)
 

@@ -161,8 +161,9 @@ class Run(Mapping[str, RunView]):
 
     @property
     def views(self) -> tuple[str, ...]:
-        """Names of the views, in the order of the plan; where views are chosen in the run, in that of the
-        choices."""
+        """Names of the views, in the order of the plan, or in the order of the choices if views are chosen in the
+        run.
+        """
         return tuple(self._views)
 
     @property
@@ -177,7 +178,7 @@ class Run(Mapping[str, RunView]):
 
     @property
     def proof(self) -> str:
-        """Basis of the identity of the run's frames, in the words of run.json."""
+        """How the identity of the run's frames was proven, in the words of run.json."""
         return self._run.proof
 
     @property

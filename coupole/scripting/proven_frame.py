@@ -40,7 +40,7 @@ class Frame:
     taken_utc: str
     """Time when it was proven, UTC, ISO 8601."""
     proof: str
-    """Evidence of the frame's identity, in the words of run.json: what relates box and camera."""
+    """How the frame's identity was proven, in the words of run.json."""
     xxh3: str
     """Checksum of its pixels, xxh3-64, 16 hexadecimal digits."""
     _file: ViewFile = field(repr=False)

@@ -221,8 +221,9 @@ def _read_direct(path: Path, layout: Layout, slot: int, pixels: NDArray[np.uint1
 
 
 def pixels_of(frame_bytes: bytes | mmap.mmap, layout: Layout) -> NDArray[np.uint16]:
-    """Return the pixels [H, W] of a frame, DN, from its bytes in a file that is not archived. They are copied only
-    if the frame is packed."""
+    """Return the pixels [H, W] of a frame, DN, from its bytes in a file that is not archived. The pixels are
+    copied only if the frame is packed.
+    """
     if layout.is_packed:
         from coupole.storage.packing import unpack12
 

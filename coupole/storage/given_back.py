@@ -43,8 +43,9 @@ def is_blank(fd: int, parts: Iterable[tuple[int, int]]) -> bool:
 
 
 def _next_data(fd: int, offset: int) -> int:
-    """Return the place of the next byte of a file that is not in a hole. If there is none, the place is beyond
-    every file."""
+    """Return the place of the next byte of a file that is not in a hole. If there is no such place, a place
+    beyond the end of every file is returned.
+    """
     try:
         return os.lseek(fd, offset, os.SEEK_DATA)
     except OSError as error:

@@ -193,7 +193,7 @@ class BurstEnded(JournalEvent):
     joints_before_deg: Joints | None = None
     """[6] measured angles before the burst, degrees."""
     joints_after_deg: Joints | None = None
-    """[6] the same after it; None if the arm was not at rest."""
+    """[6] measured angles after the burst, degrees; None if the arm was not at rest."""
     frames: int
     """Number of frames that came from the camera."""
     table_s: float | None = None
@@ -278,8 +278,9 @@ class FramesDiscarded(JournalEvent):
     samples: InnerPath
     """The file with the samples, relative to that folder."""
     digest: str
-    """SHA-256 digest of the arrays in that file. It was the same when they were written and when they were read
-    back."""
+    """SHA-256 digest of the arrays in that file. The digest was the same when the arrays were written and when
+    they were read back.
+    """
 
 
 class FaultNoted(JournalEvent):

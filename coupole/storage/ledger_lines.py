@@ -59,7 +59,7 @@ class LightGiven(_Light):
 
 
 class WarningSet(_Line):
-    """There is a warning above this total from now on; None: no warning."""
+    """Total light of the object above which there is a warning from now on; None: no warning."""
 
     event: Literal["warn_above"] = "warn_above"
     dose_lux_h: Amount | None
@@ -119,7 +119,7 @@ class History:
 
     @property
     def is_empty(self) -> bool:
-        """True if nothing was ever entered. The object is then new, or its file was moved away."""
+        """True if nothing was ever entered. Then the object is new, or its file was moved away."""
         return not self.entries and not self.budgets and self.warn_above_lux_h is None and not self.unreadable
 
     @property
@@ -150,7 +150,7 @@ class History:
 
     @property
     def unsettled_lux_h(self) -> float:
-        """Planned light, if nobody can say any more how much of it was given."""
+        """Planned light, if it can no longer be found out how much of it was given."""
         return sum(entry.dose_lux_h for entry in self.entries if not entry.is_settled)
 
     def planned_lux_h(self, plan_id: str) -> float:

@@ -75,7 +75,9 @@ class Run:
         """Open an existing run. Raises InputError if there is no run, or if its run.json is wrong."""
         self.folder = folder.resolve()
         self.is_lost = False
-        """True if its folder or journal was removed or replaced. Nothing more is then written at its path."""
+        """True if the run's folder or journal was removed or replaced. Then nothing more is written at the run's
+        path.
+        """
         self.about = read_description(folder)
 
     @staticmethod

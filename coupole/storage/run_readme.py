@@ -54,8 +54,8 @@ The pose of each picture is the row `pose` of `entry/instrument/robot/poses`. LE
 the lens in `entry/instrument/lens`.
 """
 _DISCARDED = """\
-Pictures may have been discarded when the samples of reflectance that were taken from them were safe, as the plan
-said. Their rows in `frames` have state 3 and their pixels read as 0; lines "discard" of journal.jsonl name them,
+As the plan says, pictures may have been discarded after samples of reflectance were taken from them and were
+safe. Their rows in `frames` have state 3 and their pixels read as 0; lines "discard" of journal.jsonl name them,
 with the folder of the samples, which is not this one.
 """
 

@@ -171,8 +171,8 @@ class Status:
 
 
 def status(run: Run, *, in_use: bool | None = None) -> Status:
-    """Return the progress of a run, even while it is running. A caller that knows about its lock may say whether
-    it is `in_use`.
+    """Return the progress of a run, even while it is running. A caller that knows about the run's lock may say
+    whether the run is `in_use`.
     """
     status = Status(proof=run.proof)
     shots = list(run.expected_shots())

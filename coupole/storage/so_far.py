@@ -5,8 +5,8 @@
     RESULT/so-far           link to the newest of them, until the result is whole
     RESULT/beside/RUN-2-of-3-views-1a2b3c4d/
 
-Each is a complete result, which any command opens. It is put in its place when it is complete. The one before it
-stays, because somebody may be reading it; older ones are removed.
+Each of these folders is a complete result, which any command opens. It is put in its place when it is complete.
+The one before it stays, because somebody may be reading it; older ones are removed.
 """
 
 from __future__ import annotations

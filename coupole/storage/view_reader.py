@@ -110,7 +110,9 @@ def refuse_lost(folder: Path, frames: Iterable[FrameProven]) -> None:
 
 
 def read_view(path: Path, frames: Iterable[FrameProven]) -> View:
-    """Return the file that holds these frames. Raises StorageError if it is damaged, or lacks one of them."""
+    """Return the file that holds these frames. Raises StorageError if the file is damaged, or lacks one of the
+    frames.
+    """
     layout, records = frame_file.read_layout(path), frame_file.read_frames(path)
     poses, attributes = frame_file.read_poses_and_attributes(path)
     for frame in frames:

@@ -51,7 +51,9 @@ LEFT_BY_SFNC: Mapping[str, Left] = {
     "blue is amplified": (("BalanceRatioSelector", "Blue"), ("BalanceRatio", 2.0)),
     "another pixel format": (("PixelFormat", "Mono8"),),
 }
-"""Features and values, in the order in which a program sets them. The key names their effect on frames."""
+"""Features and values, in the order in which a program sets them. The key names the effect of these settings on
+frames.
+"""
 
 
 class ForeignStateWorld(CameraWorld, Protocol):

@@ -14,7 +14,9 @@ _LOOK_EVERY_MS = 50
 
 
 def _forget_typing() -> None:
-    """Drop what was typed at the terminal before a question: it was no answer to it."""
+    """Drop the text that was typed at the terminal before a question, because it is not an answer to the
+    question.
+    """
     with contextlib.suppress(OSError, ValueError, AttributeError, termios.error):  # no terminal
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
 

@@ -19,7 +19,7 @@ _BEYOND_NOISE = 5.0
 """Multiple of the standard error of a frame's mean product of gradients. Below it, noise may have caused the
 value."""
 _CLIPPED = 0.001
-"""Share of a region's pixels at full scale. Above it, the region says nothing about the white point."""
+"""Share of a region's pixels at full scale. Above this share, the region cannot give the white point."""
 _DARK = 0.02
 """Share of full scale. Below it, an edge is noise."""
 

@@ -31,7 +31,7 @@ _MOST_LINES = 30
 """Greatest number of lines of trouble. The other lines are only counted."""
 _STOPPED_IN_0_1 = "Interrupted"
 _CLOCK_SET_S = 5.0
-"""Differences of the machine's clock below this are ordinary corrections of it."""
+"""Smaller differences of the machine's clock are ordinary corrections of the clock."""
 
 
 def sign_of(state: str) -> Literal["ok", "stopped", "bad"]:

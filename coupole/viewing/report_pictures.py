@@ -24,7 +24,7 @@ _MOST_FIRST = 3
 
 
 def first_pictures(views: Iterable[SampledView]) -> list[Picture]:
-    """Return the first views. Each is the mean of its pictures, as if many lights were on together."""
+    """Return the first views. A view is shown as the mean of its pictures, as if many lights were on together."""
     with_pictures = [view for view in views if view.pictures][:_MOST_FIRST]
     return [
         Picture(f"{view.name}: mean of {len(view.pictures)} pictures, each under one LED", _mean(view), "jpeg")
@@ -86,10 +86,9 @@ def exposures(views: Sequence[SampledView], scaling: str) -> Section:
         notes=[
             "Brightest: the highest 99.9 % quantile of a picture, as a share of full scale above black. "
             "Saturated: the largest share of a picture's pixels at full scale, and the shot that has it. "
-            "Over-exposed: "
-            f"more than {OVER_EXPOSED:.1%} saturated; under-exposed: the brightest of half of the pictures is "
-            "below "
-            f"{UNDER_EXPOSED:.0%}. Histograms: pixels (logarithmic) from 0 to full scale, {lines}; dashed: black."
+            f"Over-exposed: more than {OVER_EXPOSED:.1%} saturated; under-exposed: the brightest of half of the "
+            f"pictures is below {UNDER_EXPOSED:.0%}. Histograms: pixels (logarithmic) from 0 to full scale, "
+            f"{lines}; dashed: black."
         ],
     )
 

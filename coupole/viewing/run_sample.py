@@ -29,7 +29,7 @@ class SampledExposure:
 
     exposure_us: int
     frames: int
-    """Number of proven shots. The sample has `sample.pictures` of them."""
+    """Number of proven shots. The sample has `sample.pictures` of these shots."""
     sample: ViewExposure = field(default_factory=ViewExposure)
     worst: str = ""
     """The sampled shot with the largest share of saturated pixels; empty if no pixel is saturated."""

@@ -57,7 +57,9 @@ class Outlet:
             self.queue.append(text)
 
     def collect(self) -> bool:
-        """Put the text of libraries and children into the queue. Return whether any of them can write more."""
+        """Put the text of libraries and children into the queue. Return whether any library or child can still
+        write.
+        """
         with self._order, contextlib.suppress(BlockingIOError):
             while text := os.read(self._pipe, 65536):
                 self.queue.append(text)

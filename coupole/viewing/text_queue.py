@@ -18,7 +18,7 @@ class Unread:
     lost_bytes: int
     waiting_bytes: int
     stalled_s: float
-    """Time for which the reader has taken nothing though something waits."""
+    """Time for which the reader has taken nothing, although text waits."""
 
     def __bool__(self) -> bool:
         return bool(self.lost_bytes or self.waiting_bytes)

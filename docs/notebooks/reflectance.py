@@ -38,11 +38,12 @@ print("roughness, median:", np.nanmedian(materials.alpha).round(3))
 #
 # The covariance of a triangle has five rows: two tilts of the normal (rad), and the logarithms of
 # kd, ks and alpha. The square root of the diagonal is a standard uncertainty: the true value is
-# within it in 68 % of the cases. What all triangles share, such as the strength of the reference
-# lamp, is not in it.
+# within it in 68 % of the cases. Errors that all triangles share, such as an error of the reference
+# lamp's strength, are not included.
 #
 # This relief is matt, and 54 lights are few. So its normals and its colour are known, but hardly
-# its highlights: for `ks` and `alpha` an uncertainty of more than 100 % says that they are not.
+# its highlights: an uncertainty of more than 100 % for `ks` and `alpha` says that
+# they are not known.
 
 # %%
 u = np.sqrt(np.diagonal(result.covariances(), axis1=1, axis2=2))

@@ -2,7 +2,7 @@
 # # Your own LED box
 #
 # A dome whose LEDs are switched by a microcontroller with lines of text (`LED 5 ON`) needs no
-# driver in Python: its words stand in the rig. This notebook describes such a dome, lights one LED,
+# driver in Python: the rig lists its commands. This notebook describes such a dome, lights one LED,
 # and acquires with it, all on a simulated microcontroller. [A dome you built
 # yourself](../how-to/home-built-dome.md) has the wiring and the sketch for an Arduino.
 

@@ -33,8 +33,9 @@ _POLL_S, _POLL_OVERHEAD_BYTES = 0.055, 130
 _MAX_RECORDS_PER_POLL = 512
 _UNDEFINED_HEADER, _HARDWARE_MISSING, _FIRST_PROTOCOL = "-113", "-241", "1.0"
 _CLEARS_AT_ONCE = 5
-"""Number of threads that may switch the lights off at the same time. Each clears the box, and ends the messages of
-the others."""
+"""Number of threads that may switch the lights off at the same time. Each of these threads clears the box, which
+ends the messages of the others.
+"""
 _SHORTEST_PERIOD_US = 100
 _FLASH_MARGIN_S = 5.0
 """A flash that lasts longer than requested by this time counts as not ended."""

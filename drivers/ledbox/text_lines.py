@@ -36,7 +36,7 @@ _BOX_PATIENCE = 1.5
 _LOOK_S = 0.001
 """Machine time between two readings of the rig's clock during a flash."""
 _ENDED_AT_ONCE = 5
-"""Threads that may switch the lights off at the same time. Each ends the exchanges of the others."""
+"""Threads that may switch the lights off at the same time. Each thread ends the exchanges of the others."""
 _ENDINGS = {"lf": "\n", "crlf": "\r\n", "cr": "\r"}
 _FIELDS: dict[str, tuple[frozenset[str], frozenset[str]]] = {
     "on": (frozenset({"led"}), frozenset({"led", "on_ms"})),
@@ -77,7 +77,7 @@ class Settings(BaseModel):
 
     def longest_light_s(self, on_us: int) -> float:
         """Longest time for which the box leaves a light of `on_us` on if the host dies, which is its own limit.
-        (If `on` has no `{on_ms}`, the box has no limit. It then leaves the light on until the next command.)"""
+        (If `on` has no `{on_ms}`, the box has no limit, and leaves the light on until the next command.)"""
         return _box_bound_ms(on_us) * 1e-3
 
     def host_needs(self) -> list[HostNeed]:

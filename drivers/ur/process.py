@@ -16,7 +16,7 @@ from drivers.ur import messages
 from drivers.ur.messages import Ask, Config, Failure, State
 
 _LEAVE_S = 4.0
-"""Longer than the process takes to bring the arm to rest and end."""
+"""The process needs less time to bring the arm to rest and to end."""
 _WATCHDOG_MARGIN_S = 0.3
 """Margin for the controller's watchdog: a sign of life reaches the watchdog later than it was sent."""
 _FAILURES: dict[str, type[DeviceError]] = {"refused": DeviceRefused, "fault": DeviceFault, "lost": DeviceLost}

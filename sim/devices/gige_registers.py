@@ -197,7 +197,7 @@ WRITABLE: dict[int, Writable] = {
     BALANCE_RATIO: _RATIO,
     BALANCE_RATIO + 8: _RATIO,
 }
-"""Limits as in gige.xml, which tells them to clients that ask."""
+"""Limits as in gige.xml, which clients can read."""
 
 
 def refusal(registers: Registers, address: int, data: bytes) -> int:

@@ -34,7 +34,7 @@ class Axes:
         self.stops = 0
         """Number of times that the axes have come to rest."""
         self.came_from_deg: Axes6 = settings.start_joints_deg
-        """The commanded axes at the stop before the last."""
+        """The commanded axes at the last stop but one."""
         self._stood_at_deg: Axes6 = settings.start_joints_deg
         self.brakes_closed = False
         self._settings = settings

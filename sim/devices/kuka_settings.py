@@ -82,7 +82,9 @@ class Settings(_Model):
 
     lock_step: bool = True
     answer_limit_s: float = Field(default=2.0, gt=0)
-    """Longest pause of the world for an answer in lock-step, in machine time. Then the client counts as gone."""
+    """Longest pause of the world for an answer in lock-step, in machine time. After this pause the client counts
+    as gone.
+    """
     delay_limit: int = Field(default=100, ge=1)
     """Number of late answers at which RSI stops with KSS29002."""
     delay_counts: Literal["cumulative", "consecutive"] = "cumulative"

@@ -50,7 +50,7 @@ def check_table(table: NDArray[np.void], led_count: int, edge_width_us: int) -> 
     edge_end_us = np.where(edge, delay_us + edge_width_us, 0)
     rules = (
         (lit & (led >= led_count), f"led must be below {led_count}, or {NO_LIGHT} for none", led),
-        (flags & ~np.uint16(FLAG_NO_TRIGGER) != 0, "flags has bits that mean nothing", flags),
+        (flags & ~np.uint16(FLAG_NO_TRIGGER) != 0, "flags has bits without a meaning", flags),
         (
             (lit & (on_us < MIN_ON_US)) | (on_us > MAX_ON_US),
             f"on_us must be {MIN_ON_US} to {MAX_ON_US}",

@@ -1,4 +1,5 @@
-"""Refusals of a stand-in, which are told to a person, because an outside client would otherwise see only silence.
+"""Refusals of a stand-in. Refusals are shown to a person, because an outside client would otherwise see only
+silence.
 
 A mistake of a client occurs in every cycle. So the same reason is told again only after a while, with its count.
 """

@@ -25,7 +25,9 @@ ROPE_MM = 2.0
 HEAD = (0.5, 8.5, 14.5)
 """Middle of the head, and its unit (`sim.objects.carved_head`), mm."""
 HEAD_DEPTH, HEAD_SINKS = 0.82, -0.30
-"""Factor of the head's depth, as in a relief, and the part of the head's depth that lies in the field."""
+"""Factor by which the head is flattened, as in a relief, and the part of the head's depth that lies inside the
+field.
+"""
 NIMBUS = (0.5, 11.0, 21.0)
 """Middle and radius, mm."""
 LACQUER_MM, CLOTH_MM = (-49.2, -33.2, -25.2, 35.2), (35.0, 47.6, -23.0, 36.0)

@@ -146,8 +146,9 @@ def _layers_between(sigma, more, variances):  # type: ignore[no-untyped-def]
 
 @kernel
 def _mix(pixels, layer, sigma, more, before, variance):  # type: ignore[no-untyped-def]
-    """Bring pixels towards a layer of `variance`, as far as their own variance needs. So far they have at most the
-    variance `before` (below 0: none)."""
+    """Bring pixels towards a layer of `variance`, as far as their own variance needs. These pixels now have at
+    most the variance `before` (below 0: no blur yet).
+    """
     for k in range(len(pixels)):
         share = np.float32(1.0)
         if before >= 0.0:

@@ -50,7 +50,7 @@ class Glare(BaseModel):
         return self
 
     def over(self, mean_e: Electrons, channels: NDArray[np.int64]) -> Electrons:
-        """Return [h, w] electrons with their glare. `channels` [2, 2] are those of `SensorModel.channels`."""
+        """Return [h, w] electrons with the glare added. `channels` [2, 2] are those of `SensorModel.channels`."""
         out = mean_e.copy()
         for channel in np.unique(channels):
             veil = self.share[channel] * self.scattered_light(mean_e, channels == channel)

@@ -26,8 +26,9 @@ class SensorModel:
     """Standard deviation of one pixel's readout."""
     seed: int = 1
     adc_share: float = 0.96
-    """Fraction of the full well that fills the ADC at gain 1. Below 1 the ADC clips first, as makers set it. At 1,
-    read noise would leave half of all saturated pixels below `white_dn`."""
+    """Fraction of the full well that fills the ADC at gain 1. Below 1 the ADC clips first, as makers set it. With
+    a value of 1, read noise would leave half of all saturated pixels below `white_dn`.
+    """
     row_noise_e: float = 1.0
     """Standard deviation of the offset common to all pixels of a row in one frame."""
     prnu: float = 0.01

@@ -1,8 +1,8 @@
 """The view from one camera pose: the surface at each pixel, and the sites at which the light on it is computed.
 
 With `flat` shading, the sites are the centroids of the visible triangles, so each triangle has one radiance. With
-shading by `pixel`, each pixel has its own sites. For each triangle that its rays meet, the site is the mean of the
-points where they meet it.
+shading by `pixel`, each pixel has its own sites. Each triangle that the pixel's rays meet gives one site: the
+mean of the points where the rays meet this triangle.
 """
 
 from __future__ import annotations

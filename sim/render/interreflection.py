@@ -255,9 +255,10 @@ def _place(corners, chosen_triangles, points, normals):  # type: ignore[no-untyp
 
 @kernel(parallel=True)
 def _aim(points, normals, first, rays, origins, ways):  # type: ignore[no-untyped-def]
-    """Make rays from points, which are numbered from `first` on, in a cosine distribution. They are spread evenly
-    over a disk, and projected up onto the hemisphere. The points of a side share a Fibonacci spiral, which is
-    turned by an angle of its own."""
+    """Make rays from points, which are numbered from `first` on, in a cosine distribution. Points are spread
+    evenly over a disk, and projected up onto the hemisphere. The points of a side share a Fibonacci spiral, which
+    is turned by an angle of its own.
+    """
     total, golden = rays * POINTS, np.pi * (3.0 - np.sqrt(5.0))
     for p in numba.prange(len(points)):
         nx, ny, nz = np.float64(normals[p, 0]), np.float64(normals[p, 1]), np.float64(normals[p, 2])

@@ -69,8 +69,9 @@ class Lens:
 
     @property
     def terms(self) -> NDArray[np.float64]:
-        """Terms for `bend` and `distorted_points`: those of the distortion, and for a lens with more than Brown's
-        also its centre."""
+        """Terms for `bend` and `distorted_points`: those of the distortion. A lens with more terms than Brown's
+        model also has the centre of distortion.
+        """
         if len(self.distortion) == 5 and not any(self.off_axis):
             return np.array(self.distortion)
         more = (0.0,) * (12 - len(self.distortion))

@@ -29,8 +29,9 @@ _CHUNK = 16384
 _WIDE = 32
 """Number of columns above which it is faster to find first the part of a row that is between the edges."""
 _SMALL = 8
-"""Size limit of small triangles (columns and rows). With distortion their corners are moved; for larger ones, each
-pixel's ray is moved."""
+"""Size limit of small triangles (columns and rows). If the lens distorts, the corners of small triangles are
+moved; for larger triangles, each pixel's ray is moved.
+"""
 _STRIDE = 8
 """Stride in which bands are processed, so that every thread's part is spread over the image."""
 
@@ -104,8 +105,9 @@ def _to_camera(corners, t, m, v):  # type: ignore[no-untyped-def]
 
 @kernel
 def _box(v, lens, width, height):  # type: ignore[no-untyped-def]
-    """Return first and last column and row of the distorted image that a triangle may reach. Its corners are in
-    the camera frame."""
+    """Return first and last column and row of the distorted image that a triangle may reach. The triangle's
+    corners are in the camera frame.
+    """
     x0, x1, y0, y1 = np.inf, -np.inf, np.inf, -np.inf
     for k in range(3):
         n = (k + 1) % 3

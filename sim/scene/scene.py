@@ -70,8 +70,8 @@ def load_surface(
     """Any mesh that trimesh reads (PLY, STL, OBJ, ...), in mm; no vertex is merged or dropped.
 
     Colours of vertices or faces, or a texture (at triangles' centroids), become the tint; they are sRGB. Without
-    `material` a coloured mesh reflects diffusely by its colours, any other is of `STONE`. `detail` is added to it.
-    Raises InputError.
+    `material`, a coloured mesh reflects diffusely by its colours, and any other mesh has the material `STONE`.
+    `detail` is added to it. Raises InputError.
     """
     import trimesh
     from trimesh.resolvers import FilePathResolver

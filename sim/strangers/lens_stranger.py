@@ -38,7 +38,7 @@ class LensStranger(BaseModel):
     """Length at the image's corners of the one-sided blur, which grows with the square of the distance from the
     centre."""
     coma_deg: float = 0.0
-    """Its direction in the image, the same everywhere: from x towards y."""
+    """Direction of the coma in the image, from x towards y. It is the same everywhere in the image."""
 
     def disturbed_lens(self, lens: Lens, focus_distance_mm: float) -> Lens:
         """The lens with these terms, when the camera looks straight down."""
@@ -51,7 +51,7 @@ class LensStranger(BaseModel):
         return replace(lens, focal_px=lens.focal_px * (1.0 + self.breathing * (1.0 - down)))
 
     def coma_shift_px(self, pixels: NDArray[np.float64], size_px: tuple[int, int]) -> NDArray[np.float64]:
-        """[..., 2] from a spot's bright end at pixels [..., 2] to its faint end."""
+        """Return vectors [..., 2] from the bright end of a spot, at pixels [..., 2], to its faint end."""
         middle = 0.5 * (np.array(size_px) - 1.0)
         share = np.sum((pixels - middle) ** 2, axis=-1, keepdims=True) / (middle @ middle)
         direction = np.radians(self.coma_deg)

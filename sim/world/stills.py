@@ -34,8 +34,9 @@ class Stills:
         exposure_s: float,
         gain: float = 1.0,
     ) -> NDArray[np.uint16]:
-        """Return a RAW frame [h, w], DN. LEDs and panels are lit throughout. Only the tool of the arm is
-        present."""
+        """Return a RAW frame [h, w], DN. The given LEDs and panels are lit for the whole exposure. Only the tool
+        of the arm is present.
+        """
         pixels = np.empty(self._shape, np.uint16)
         shining = dict.fromkeys(leds, exposure_s)
         tool = tool_capsules(base_from_flange, self._tool) if self._arm_shadows else NONE

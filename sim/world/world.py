@@ -43,7 +43,9 @@ _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class World:
-    """The stand-ins and their connections: the trigger cable, the light, the arm that carries the camera."""
+    """The stand-ins and the connections between them: the trigger cable, the light, and the arm that carries the
+    camera.
+    """
 
     def __init__(self, config: Config, folder: Path) -> None:
         settings = config.settings

@@ -130,11 +130,11 @@ def test_an_arm_that_can_be_driven_on_does_not_pass() -> None:
 def test_an_arm_that_turns_farther_than_promised_does_not_pass() -> None:
     bench = bench_of(ScriptedArm(Clock(), coasts_deg=3.0))
     emergency_stop(bench)
-    assert missed(bench) == ["turn after the press, beyond the promise"]
+    assert missed(bench) == ["turn after the press, in excess of the promised angle"]
 
 
 def test_the_turn_is_measured_from_the_braking_also_if_the_fault_is_told_late() -> None:
-    for coasts_deg, failures in ((0.5, []), (3.0, ["turn after the press, beyond the promise"])):
+    for coasts_deg, failures in ((0.5, []), (3.0, ["turn after the press, in excess of the promised angle"])):
         bench = bench_of(ScriptedArm(Clock(), coasts_deg=coasts_deg, coasts_deg_s=2.0, tells_after_s=2.0))
         emergency_stop(bench)
         assert missed(bench) == failures

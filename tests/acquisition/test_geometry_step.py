@@ -87,7 +87,7 @@ def test_a_rig_whose_support_is_too_high_is_refused_by_the_camera_and_the_cause_
 def test_a_rig_whose_support_is_too_low_is_refused_by_the_ruler_and_the_arm_does_not_move(bench: Bench) -> None:
     wrong = with_rig(bench, support=LOWER)
     geometry_step.geometry(wrong)
-    assert "room above the disk, rig beyond ruler" in missed(wrong)
+    assert "room above the disk: rig minus ruler" in missed(wrong)
     assert not [one for one in wrong.person.heard if "Stand back" in one]  # type: ignore[attr-defined]
 
 
@@ -102,8 +102,8 @@ def test_a_rig_whose_camera_is_too_short_is_refused_and_the_cause_is_named(bench
     ("change", "what"),
     [
         ({"tool": []}, "tool_reach_mm: beyond the bodies of `tool`"),
-        ({"dome": {"radius": 1.0}}, "room inside the dome, rig beyond ruler"),
-        ({"support": {"diameter_mm": 1400}}, "diameter of the disk, beyond that in the rig"),
+        ({"dome": {"radius": 1.0}}, "room inside the dome: rig minus ruler"),
+        ({"support": {"diameter_mm": 1400}}, "diameter of the disk: ruler minus rig"),
     ],
 )
 def test_what_the_ruler_finds_outside_the_rigs_bodies_is_refused(
@@ -157,7 +157,7 @@ def test_the_command_refuses_a_cell_whose_support_is_higher_than_its_rig_says(tm
         cell.write()
         ended = here("commission", cell.rig, *command)
         assert ended.code == 3, ended.err
-        assert "room above the disk, rig beyond ruler" in ended.err
+        assert "room above the disk: rig minus ruler" in ended.err
         assert ended.document["steps"] == {"geometry": False}
         cell.rig_data["support"] |= built["support"]
         cell.write()

@@ -186,7 +186,7 @@ def test_a_controller_named_in_the_rig_is_the_only_client_let_in(tmp_path: Path)
     with closing(EkiCell(tmp_path, controller_is="client")) as cell:
         with a_stranger_knocks(cell.settings.address), pytest.raises(DeviceLost) as raised:
             cell.open(controller=IPv4Address("127.0.0.2"), connect_timeout_s=0.5)
-        assert "connections of other addresses than 127.0.0.2 were turned away" in raised.value.happened
+        assert "connections from other addresses than 127.0.0.2 were turned away" in raised.value.happened
         with a_stranger_knocks(cell.settings.address):
             robot = cell.open(controller=IPv4Address("127.0.0.1"))
         robot.move_to(AWAY_DEG)

@@ -86,7 +86,7 @@ PLANE = "schema_version: 1\nrules:\n  - {kind: plane, part: left, point_mm: [0, 
 @pytest.mark.parametrize(
     ("rules", "said"),
     [
-        (PLANE, "parts.yaml:3:3: rules: 16 of 32 triangles have no part; name the part of them as `rest`"),
+        (PLANE, "parts.yaml:3:3: rules: 16 of 32 triangles have no part; name a part for them as `rest`"),
         (PLANE.replace("[-1, 0, 0]}", "[0, -1, 0]}") + "  - {kind: box, part: far, low_mm: [90, 0, 0], "
          "high_mm: [91, 1, 1]}\n", "parts.yaml:4:5: rules[1]: the part 'far' has no triangle"),
         (PLANE + "rest: left\n" + "extra: 1\n", "parts.yaml:5:1: extra: "),

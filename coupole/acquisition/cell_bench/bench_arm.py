@@ -140,7 +140,8 @@ class BenchArm:
         if asking_pid != hold.asking_pid:
             hold.let_go("another process renewed it")
             raise InputError(
-                f"hold: {request.hold} is of another process, and only that one may renew it; it was ended"
+                f"hold: {request.hold} is held by another process, and only this process may renew it; the hold "
+                f"was ended"
             )
         if (request.axis, request.direction) == (hold.asked.axis, hold.asked.direction):
             hold.renew()
@@ -213,7 +214,9 @@ class _Hold:
         self._renewed_s = time.monotonic()
 
     def renew(self) -> None:
-        """Hold on, unless the hold has lapsed: what reaches a bench late, after a freeze, revives nothing."""
+        """Hold on, unless the hold has lapsed: a request that reaches the bench late, after a freeze, must not
+        begin a motion again.
+        """
         self._note_lapse()
         self._renewed_s = time.monotonic()
 

@@ -96,12 +96,12 @@ class FrameAsked(_Request):
     lights: Annotated[list[int], Field(max_length=16)] = []
     """Ids of LEDs. Each LED gives a picture, and the pictures are added up."""
     panels: Annotated[list[int], Field(max_length=4)] = []
-    """Numbers of panels, from 1; in the same way."""
+    """Numbers of panels, from 1. Each panel gives a picture, and the pictures are added up."""
     exposure_us: Annotated[int, Field(ge=10)]
     """Exposure time of each picture."""
     gain_db: Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)] = 0.0
     region: _Region | None = None
-    """Region of the picture that gets figures of its own."""
+    """Region of the picture for which separate figures are computed."""
     width_px: Annotated[int, Field(ge=16, le=8192)] = 960
     """Greatest width of the JPEG."""
     marks: list[Literal["saturation", "focus"]] = []

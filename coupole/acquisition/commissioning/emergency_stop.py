@@ -45,14 +45,13 @@ def emergency_stop(bench: Bench) -> None:
     )
     bench.ask_before(
         "Step emergency-stop: the arm turns slowly to and fro. Press the emergency stop while it moves, and do "
-        "not "
-        "release it before you are asked."
+        "not release it before you are asked."
     )
     promised_deg = robot.stopping_deg()
     press = _moved_until_pressed(bench)
     rested_deg = _last_known_deg(bench, press.joints_deg)
     turned_deg = float(np.max(np.abs(rested_deg - press.joints_deg) - press.unsure_deg - promised_deg))
-    findings.at_most("turn after the press, beyond the promise", max(turned_deg, 0.0), 0.0, "deg")
+    findings.at_most("turn after the press, in excess of the promised angle", max(turned_deg, 0.0), 0.0, "deg")
     is_accepted = True
     try:
         robot.move_to(press.joints_deg)

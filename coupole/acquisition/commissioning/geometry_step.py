@@ -32,8 +32,9 @@ MOST_HEIGHT_MM, MOST_SIDEWAYS_MM, MOST_TILT_DEG, MOST_DISAGREEMENT_MM = 15.0, 20
 """Greatest deviations of the board as the camera sees it. The lens is known only within 2 % here, which is 7 mm at
 335 mm, and the board is laid down by hand."""
 MOST_TOO_NEAR_MM, MOST_BEYOND_MM, MOST_ROUGH_MM = 5.0, 2.0, 10.0
-"""Greatest deviations by ruler: of free room that is less than in the rig; of parts that stick out of the rig's
-bodies; of large lengths."""
+"""Greatest deviations measured by ruler: missing free room, parts that stick out of the rig's bodies, and errors
+of large lengths.
+"""
 _TILTS_DEG = (12.0, 9.0, 6.0)
 """Tilts of the camera about the board. The first tilt at which the arm has room for all sights is used."""
 _MOST_TURN_DEG = 30.0
@@ -81,7 +82,7 @@ def _measure_bodies(bench: Bench) -> None:
         "(camera, lens, cables)",
     )
     said_mm = _lowest_mm(rig, forward(arm_of(rig), bench.joints_deg()))
-    findings.at_most("room above the disk, rig beyond ruler", said_mm - over_mm, MOST_TOO_NEAR_MM, "mm")
+    findings.at_most("room above the disk: rig minus ruler", said_mm - over_mm, MOST_TOO_NEAR_MM, "mm")
     reach_mm, width_mm = _extent_mm(rig)
     for name, question, rig_mm in (
         (
@@ -99,12 +100,12 @@ def _measure_bodies(bench: Bench) -> None:
         findings.at_most(f"{name}: beyond the bodies of `tool`", sticks_out_mm, MOST_BEYOND_MM, "mm")
     diameter_mm = bench.measured_mm("support_diameter_mm", "diameter of the disk")
     findings.at_most(
-        "diameter of the disk, beyond that in the rig", diameter_mm - rig.support.diameter_mm, MOST_ROUGH_MM, "mm"
+        "diameter of the disk: ruler minus rig", diameter_mm - rig.support.diameter_mm, MOST_ROUGH_MM, "mm"
     )
     centre_mm = rig.support.base_from_support.matrix()[:3, 3]
     radius_mm = float(np.linalg.norm(bench.cell.leds.positions_mm - centre_mm, axis=1).min())
     nearest_mm = bench.measured_mm("dome_radius_mm", "from the disk's centre to the LED that is nearest to it")
-    findings.at_most("room inside the dome, rig beyond ruler", radius_mm - nearest_mm, MOST_ROUGH_MM, "mm")
+    findings.at_most("room inside the dome: rig minus ruler", radius_mm - nearest_mm, MOST_ROUGH_MM, "mm")
 
 
 def _ask_for_volumes(bench: Bench) -> None:

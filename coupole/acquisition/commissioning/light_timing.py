@@ -48,8 +48,7 @@ def trigger(bench: Bench) -> None:
     findings = bench.findings
     findings.remedy = (
         "Check the cable, the polarity and the input filter of the camera's trigger, and its trigger delay; the "
-        "LEDs "
-        f"outlast the nominal exposure by {EXPOSURE_MARGIN_US} us only."
+        f"LEDs outlast the nominal exposure by {EXPOSURE_MARGIN_US} us only."
     )
     if not bench.opened.ledbox.runs_tables:
         findings.remarks.append("the box has no trigger output: the host triggers the camera, nothing was timed")
@@ -188,7 +187,8 @@ def _last_light_s(bench: Bench, led: int, exposure_us: int, watchdog_s: float) -
 
 def _lasting_table(bench: Bench, led: int, seconds: float) -> NDArray[np.void]:
     """Return a table that lights LEDs in turn, without edges, so that each LED can rest. The given LED is one of
-    them."""
+    these LEDs.
+    """
     limits, ids = bench.cell.rig.led_limits, bench.cell.leds.ids
     at = int(np.flatnonzero(ids == led)[0])
     turn = np.roll(ids, -at)[: int(np.ceil(limits.cooldown_ratio)) + 2]

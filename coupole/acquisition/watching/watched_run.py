@@ -36,7 +36,7 @@ _MOST_PICTURES = 200
 """Greatest number of pictures of one session. In a long run the findings of many bursts look alike."""
 
 _FIRST_UNKEPT = 1_000_000
-"""Number of the first mark that is not kept. It is beyond the numbers of all kept marks."""
+"""Number from which marks that are not kept are counted. It is higher than the numbers of all kept marks."""
 
 
 def judge_of(job: Job, grid: LookGrid, view: ViewPose, first: FirstFrames) -> BurstJudge:

@@ -1,7 +1,8 @@
 """An isotropic BRDF as a table of RGL's format, which a renderer reads natively.
 
 Angles of incidence and half vectors are those of the format. `ndf` has the reflectance back to the light, by the
-half vector's elevation. So the values in the table, which are divided by it, change little within a lobe.
+half vector's elevation. The values in the table are divided by this reflectance, so they change little within a
+lobe.
 """
 
 from __future__ import annotations

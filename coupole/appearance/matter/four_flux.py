@@ -71,8 +71,8 @@ def reflectances(layer: Layer, background: Background) -> tuple[Array, Array]:
 
 
 def response(layer: Layer) -> tuple[Array, Array, Array, Array, Array]:
-    """Return values of the layer alone: rho and tau (diffuse light), R_b and T_cd (directional to diffuse, up and
-    down), Tr.
+    """Return five values of the layer alone: rho and tau for diffuse light; R_b and T_cd from directional to
+    diffuse light, up and down; and Tr.
 
     Tr = exp(-mu h) is the share of directional light that passes.
     """

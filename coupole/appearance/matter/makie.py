@@ -91,7 +91,7 @@ def _three_lacquers(t: Array, m: Array, c: Array, region: str) -> Array:
     if not positive.any():
         raise InputError(
             "makie: expected a metal that has some of a lacquer's colour, found weights "
-            f"{m_in.round(3).tolist()}; see to the sample colours"
+            f"{m_in.round(3).tolist()}; check the sample colours"
         )
     return np.asarray((t_in[..., positive] / m_in[positive]).min(axis=-1))
 
@@ -99,5 +99,5 @@ def _three_lacquers(t: Array, m: Array, c: Array, region: str) -> Array:
 def _few_lacquers(t: Array, m: Array, c: Array) -> Array:
     basis = np.vstack([m, c])
     if np.linalg.matrix_rank(basis, tol=1e-6 * np.abs(basis).max()) < len(basis):
-        raise InputError("makie: expected a metal of another colour than the lacquers; see to the sample colours")
+        raise InputError("makie: expected a metal of another colour than the lacquers; check the sample colours")
     return np.asarray(t @ np.linalg.pinv(basis)[:, 0])

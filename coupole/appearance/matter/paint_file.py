@@ -10,7 +10,7 @@ The head is YAML in lines that begin with `#`. Below it are comma-separated colu
     400,3.127,21.04,0.11,0.52
 
 `unit` is `per mm`, `per layer` (the thickness was not known) or `relative` (to the scattering of a white). `u_K`
-and `u_S` are standard uncertainties, and may be left out, as may all other columns.
+and `u_S` are standard uncertainties. They may be left out, and so may all other columns.
 """
 
 from __future__ import annotations

@@ -125,7 +125,7 @@ class RglTable:
     @cached_property
     def _cumulative(self) -> tuple[Array, Array, Array]:
         """Density [slices, h, w] of each slice, its integral along columns, and the integral of the rows' totals
-        [slices, h]. They are normalised to a whole of 1, in units of the nodes' distances."""
+        [slices, h]. All are normalised to a whole of 1, in units of the nodes' distances."""
         density = self.vndf.reshape(-1, *self.vndf.shape[2:])
         along = np.zeros_like(density)
         along[..., 1:] = np.cumsum(0.5 * (density[..., 1:] + density[..., :-1]), axis=2)

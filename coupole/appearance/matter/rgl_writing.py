@@ -74,9 +74,10 @@ def nodes_for_linear_reading(values: NDArray[np.float32], theta_i: NDArray[np.fl
 
 
 def drawn_by(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[1, theta_i, rows, columns] `luminance`, by which renderers draw directions. It is the light that a step of
-    rows and columns reflects, from `values` f cos(theta_o). The solid angle of its outgoing directions is in
-    proportion to (wi m) u sin(theta_m)."""
+    """[1, theta_i, rows, columns] `luminance`, by which renderers draw directions. The `luminance` of a cell is
+    the light that this step of rows and columns reflects; it is computed from `values`, which are f cos(theta_o).
+    The solid angle of its outgoing directions is in proportion to (wi m) u sin(theta_m).
+    """
     half = half_vectors(values.shape[-1])
     u = np.linspace(0.0, 1.0, values.shape[-1])
     lights = np.stack([way_in(float(theta)) for theta in theta_i])

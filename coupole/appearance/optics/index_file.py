@@ -42,7 +42,7 @@ def read_index(path: Path) -> Complex:
         raise InputError(
             f"{path}: expected n and k below {_HIGHEST:g}; found n "
             f"{index.real.min():g} to {index.real.max():g}, "
-            f"k {index.imag.min():g} to {index.imag.max():g}; see the order of the columns"
+            f"k {index.imag.min():g} to {index.imag.max():g}; check the order of the columns"
         )
     return index
 

@@ -31,7 +31,7 @@ Description = dict[str, Any]
 StepNm = Literal[5, 10, 20, 40]
 QUARTERS = 4
 _RAMP_NM = 0.01
-"""Width of the transition between two bands. With bands of 5 nm, one path in 500 has a wavelength there."""
+"""Width of the transition between two bands. With bands of 5 nm, the wavelength of one path in 500 is there."""
 
 
 @dataclass(frozen=True)

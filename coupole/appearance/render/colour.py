@@ -36,7 +36,7 @@ class Eye:
         """Return XYZ [..., 3] in cd/m^2 of radiance [..., bands].
 
         They are scaled so that Y of the light itself is its luminance. Without this, Y of the 10-degree observer
-        is no luminance (under D65 it is 10 % higher).
+        is not a luminance (under D65 it is 10 % higher).
         """
         return np.asarray(np.asarray(radiance, dtype=float) @ self.weights[:3].T)
 

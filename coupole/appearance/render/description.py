@@ -142,8 +142,8 @@ def _integrator(parts: Description, *, is_polarised: bool) -> str:
         return "volpath" if has_panes else "path"
     if is_polarised:
         raise InputError(
-            "polarisation: expected no absorbing body (glass with absorption, nashiji), through which Mitsuba "
-            "has no Stokes vectors; leave out either"
+            "polarisation: expected no absorbing body (glass with absorption, nashiji), because Mitsuba computes "
+            "no Stokes vectors through it; leave out one of the two"
         )
     return "volpathmis"
 

@@ -62,7 +62,9 @@ class Camera(Model):
         return float(np.degrees(2.0 * np.arctan(half_mm / self.optics.focal_length_mm)))
 
     def narrowed_to(self, width_px: int) -> Camera:
-        """Return the same view with fewer pixels; a camera that is not wider stays as it is."""
+        """Return the same camera with fewer pixels, at most `width_px` wide. A camera that is not wider stays as
+        it is.
+        """
         if width_px >= self.width_px:
             return self
         optics = FieldOfView(kind="field", degrees=self.field_deg())
@@ -164,7 +166,7 @@ class Scene(Model):
     """Largest number of surfaces that a path meets."""
     seed: Annotated[int, Field(ge=0, le=2**31)] = 1
     polarisation: bool = False
-    """True for Stokes vectors of every band. This is four times the work, and slower."""
+    """True for Stokes vectors of every band. Stokes vectors need four times the work."""
     display: Display = Display()
     outputs: Outputs = Outputs()
     caustic: Caustic | None = None

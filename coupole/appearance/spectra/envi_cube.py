@@ -66,7 +66,7 @@ class Cube:
     left_out: tuple[int, ...]
     """Bands, from 1, that the header's list `bbl` names as bad."""
     _bands: NDArray[np.intp]
-    """[bands used] in the file's order of the wavelengths above."""
+    """[bands used] places, among the bands of the file, of the wavelengths above."""
     _all_bands: int
     _dtype: np.dtype[Any]
     _interleave: str
@@ -239,7 +239,7 @@ class _Fields:
     def word(self, name: str) -> str:
         """The text of a field that must be there."""
         if name not in self.values:
-            raise self.wrong(name, "expected this field, found none; see the program that wrote the cube")
+            raise self.wrong(name, "expected this field, found none; check the program that wrote the cube")
         return str(self.values[name]).strip()
 
     def number(self, name: str, default: float) -> float:
@@ -320,7 +320,7 @@ class _Fields:
         if not np.all((nm >= _NM[0]) & (nm <= _NM[1])):
             raise self.wrong(
                 "wavelength",
-                f"expected {_NM[0]:g} to {_NM[1]:g} nm, found {np.min(nm):g} to {np.max(nm):g}; see the unit",
+                f"expected {_NM[0]:g} to {_NM[1]:g} nm, found {np.min(nm):g} to {np.max(nm):g}; check the unit",
             )
         return nm
 

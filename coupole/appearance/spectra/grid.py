@@ -18,8 +18,7 @@ WAVELENGTHS_NM.setflags(write=False)
 
 
 def within(name: str, values: ArrayLike, low: float, high: float) -> Array:
-    """Return `values` as float64. Raises InputError if one of them is outside `low` to `high` or is not a
-    number."""
+    """Return `values` as float64. Raises InputError if a value is outside `low` to `high` or is not a number."""
     array = np.asarray(values, dtype=float)
     if not np.all((array >= low) & (array <= high)):
         worst = array[~((array >= low) & (array <= high))].flat[0]

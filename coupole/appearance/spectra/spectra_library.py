@@ -115,7 +115,7 @@ def _spectrum(path: Path, nm: Array, values: Array, line: int, name: str) -> Lib
     k, s = values[: len(nm)][order], values[len(nm) :][order]
     is_known = (k >= 0.0) & (s > 0.0)
     if not is_known.any():
-        raise _wrong(str(path), line, f"{name}: expected K and S that are positive, found none; see the export")
+        raise _wrong(str(path), line, f"{name}: expected K and S that are positive, found none; check the export")
     reflectance = np.full(len(nm), np.nan)
     reflectance[is_known] = kubelka_munk.opaque(k[is_known] / s[is_known])
     return LibrarySpectrum(name, str(path), line, nm[order], reflectance, k, s)

@@ -114,7 +114,7 @@ class Acquisitions:
         return end_of_file(output_path, _MOST_SAID_BYTES), _last_document(figures)
 
     def _had_by(self) -> str:
-        """Return what has the cell; empty if nothing has it."""
+        """Return what uses the cell; empty if nothing uses it."""
         if self._queue.running is not None:
             return f"{self._queue.running.words} is being acquired"
         if self.state is not None:

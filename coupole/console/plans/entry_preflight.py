@@ -56,8 +56,9 @@ class EntryPreflight:
 
     @property
     def words(self) -> str:
-        """Text about the present check: of what, for whom, since when, and how far it is; empty if there is
-        none."""
+        """Text about the present check: its plan, the person who entered it, its begin and its progress; empty if
+        there is no check.
+        """
         if not (subject := self._for):
             return ""
         return f"{subject}: {self._process.step or 'it begins'}"

@@ -89,7 +89,9 @@ class WarmProcess:
             if self._pool is not pool:
                 raise InputError(f"the process that {self._what} was ended") from error
             self.end()
-            raise InputError(f"the process that {self._what} died of this one: is its mesh too large?") from error
+            raise InputError(
+                f"the process that {self._what} died while it worked on this plan: is the mesh too large?"
+            ) from error
 
     def _submit(
         self, niceness: int, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs

@@ -74,7 +74,7 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
 
 
 def add_routes_so_far(app: FastAPI, service: Service) -> None:
-    """Add the routes to what can be looked at while a run is processed during its acquisition."""
+    """Add the routes to pictures and pages of a run that is processed during its acquisition."""
 
     @app.get("/api/v1/runs/{run}/pictures-so-far")
     def pictures_so_far(run: Text) -> Growing:

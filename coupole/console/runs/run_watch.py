@@ -29,7 +29,9 @@ from coupole.viewing.terminal import duration_text
 
 _NO_OFTENER_S = 0.4
 SILENT_S = 120.0
-"""Time without a sign of life after which it is said. A process with the lowest priority may wait for long."""
+"""Time without a sign of life after which a message says so. A process with the lowest priority may wait for
+long.
+"""
 _EVENTS_KEPT = 200
 
 

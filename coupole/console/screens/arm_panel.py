@@ -144,10 +144,10 @@ class ArmPanel:
 
 def _condition(arm: dict[str, Any]) -> dict[str, str]:
     def flag_text(value: bool | None, yes: str, no: str) -> str:
-        return "not told by this controller" if value is None else yes if value else no
+        return "not reported by this controller" if value is None else yes if value else no
 
     rows = {
-        "mode": str(arm["mode"] or "not told by this controller"),
+        "mode": str(arm["mode"] or "not reported by this controller"),
         "emergency stop": flag_text(arm["emergency_stop"], "PRESSED", "not pressed"),
         "protective stop": flag_text(arm["protective_stop"], "STOPPED", "no"),
         "brakes": flag_text(arm["brakes_released"], "released", "closed"),

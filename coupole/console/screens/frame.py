@@ -150,7 +150,9 @@ def can_be_stopped(now: StateNow) -> bool:
 
 
 def light_words(now: StateNow) -> str:
-    """Return the header's text about light. It says that no light is given only if nothing can give light."""
+    """Return the header's text about light. The text says that no light is given, but only if nothing can give
+    light.
+    """
     if now.run:
         budget = f" of {now.dose_budget:g}" if now.dose_budget else ""
         return f"light on {now.object or 'the object'}: {now.dose_before + now.dose:.3f} lux h{budget}"

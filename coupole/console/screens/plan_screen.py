@@ -205,7 +205,7 @@ class _Screen:
         )
 
     def _take_field(self) -> None:
-        """Take the value of a field that the person has left into the text."""
+        """Write the value of a field into the text when the person has left the field."""
         if self._filling or not self._name:
             return
         try:

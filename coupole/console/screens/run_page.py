@@ -128,8 +128,9 @@ class _Page:
             TaskList(self._visit, lambda task: task.words.endswith(f" {self._name}"), empty="", most=4)
 
     async def show_growing(self) -> None:
-        """Show what the processing beside a run has left that was stopped or killed. While the run goes on, the
-        screen of the run shows it."""
+        """Show the pictures that the processing beside a stopped or killed run has made. While the run goes on,
+        the screen of the run shows it.
+        """
         if self._known.growing.of_views and self._known.status.state not in (RUNNING, PAUSED):
             await self._growing.show(self._name, self._known.status.processing, self._known.growing)
 

@@ -10,7 +10,7 @@ _KEPT = 120
 
 
 class Sharpness:
-    """Comparable values: of the same region under the same light."""
+    """Values that can be compared, because they are of the same region under the same light."""
 
     def __init__(self) -> None:
         self._values: list[float] = []

@@ -68,8 +68,8 @@ class Visit:
     def watch(self) -> None:
         """Begin to call the followers; called once when the screen is built.
 
-        The visit has its own loop, because the library's timers stop if the machine's clock is set back, and a
-        person must not take an old state for a new one.
+        The visit has its own loop. The library's timers stop if the machine's clock is set back, and then a
+        person would take an old state for a new one.
         """
         before, over = "", False
 

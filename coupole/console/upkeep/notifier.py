@@ -73,7 +73,7 @@ class Occurrences:
         free_bytes = shutil.disk_usage(folder).free
         if free_bytes < self._low_bytes and not self._disk_was_low:
             self._disk_was_low = True
-            words = f"{free_bytes / 1e9:.1f} GB are free; it is said below {self._low_bytes / 1e9:g} GB."
+            words = f"{free_bytes / 1e9:.1f} GB are free, less than the limit of {self._low_bytes / 1e9:g} GB."
             yield self._message("disk-low", f"little room left in {folder}", words)
         elif free_bytes > _RELIEF * self._low_bytes:
             self._disk_was_low = False

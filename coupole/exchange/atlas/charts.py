@@ -24,12 +24,15 @@ _MOST_TURN = math.cos(math.radians(40.0))
 _LEAST_FACING = math.cos(math.radians(70.0))
 _LEAST_FACING_MERGED = math.cos(math.radians(86.0))
 """Cosines of three greatest angles. First: between mean directions within a chart. Second: between a single
-triangle and the plane of its chart, while the chart grows. Third: the same, when small charts are merged into
-their neighbours."""
+triangle and the plane of its chart, while the chart grows. Third: as the second, while small charts are merged
+into their neighbours.
+"""
 _LEAST_TRIANGLES = 64
 """Fewest triangles of a chart; smaller ones are merged into their neighbours."""
 _MOST_SHARE = 1 / 100
-"""Largest share of all triangles in a chart. It keeps charts round, so that their rectangles are well filled."""
+"""Largest share of all triangles in a chart. This limit keeps charts round, so that their rectangles are well
+filled.
+"""
 _MERGE_PASSES, _ROUNDINGS = 6, 3
 
 
@@ -178,7 +181,7 @@ def _merge(normals, neighbours, chart, axes):  # type: ignore[no-untyped-def]
 
 @kernel
 def _numbered_parts(neighbours, chart):  # type: ignore[no-untyped-def]
-    """[n] charts from 0, in which each connected part of a chart is a chart."""
+    """Return numbers [n] of charts, from 0, after each connected part of a chart was made a separate chart."""
     parts = np.full(len(chart), -1, np.int32)
     queue = np.empty(len(chart), np.int32)
     count = 0

@@ -163,8 +163,9 @@ def _is_certain(u_kd: NDArray[np.floating], kd: NDArray[np.floating], most_u: fl
 def _seen_there(
     surface: MeasuredSurface, views: list[TexelView], places_mm: Floats
 ) -> tuple[Gathered, NDArray[np.bool_]]:
-    """Materials that views show at places [k, 3] of the support frame, where they are certain. Their normals are
-    in the base frame."""
+    """Materials that views show at places [k, 3] of the support frame, where they are certain. The normals of
+    these materials are in the base frame.
+    """
     gathered_there = gather(views, apply(surface.result.base_from_support, places_mm))
     u_kd = np.sqrt(gathered_there.covariance[:, VARIANCES[2]])
     is_certain = (gathered_there.materials.alpha > 0.0) & _is_certain(u_kd, gathered_there.materials.kd, _MOST_U)
@@ -202,7 +203,7 @@ def _fill(surface: MeasuredSurface, rows: NDArray[np.int64], atlas: Atlas, known
 
 @dataclass(frozen=True)
 class _Values:
-    """Materials of texels; a roughness of 0 means that there is none."""
+    """Materials of texels; a roughness of 0 means that there is no material."""
 
     normals: Singles
     kd: Singles
@@ -231,7 +232,9 @@ class _Known:
         self._has_material = _has_certain_material(surface) if views else surface.has_material
 
     def look_up(self, atlas: Atlas, texels: NDArray[np.int64], values: _Values) -> None:
-        """Fill the values of texels: from the views' pixels or, if there are none, from their triangles."""
+        """Fill the values of texels from the views' pixels. If a texel has no pixel, its triangle gives the
+        values.
+        """
         surface, triangle = self._surface, self._rows[atlas.triangle_of_texel.reshape(-1)[texels]]
         has_material = self._has_material[triangle]
         of_triangles = triangle[has_material]

@@ -1,9 +1,9 @@
 """Smaller and smaller levels of a map, as textures are stored for viewers that show a surface from afar.
 
-A level has half the width and height of the one before, rounded down, to 1 x 1. Its texels are averages of what
-the texels stand for: linear light for colours, directions for normals. Each texel counts by its area, also where a
-side is odd. Texels between the charts count nothing, and get what the next smaller level has there, so that no
-level shows black at a seam.
+A level has half the width and height of the one before, rounded down, to 1 x 1. Its texels are averages of the
+quantities that the codes represent: linear light for colours, directions for normals. Each texel counts by its
+area, also where a side is odd. Texels between the charts have no weight, and get the values of the next smaller
+level, so that no level shows black at a seam.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _CODES = np.arange(256) / 255.0
 
 @dataclass(frozen=True)
 class Meaning:
-    """Meaning of a map's codes: what their averages are averages of."""
+    """Meaning of a map's codes: the quantity that is averaged."""
 
     value_of_code: Singles
     """[256] value of each code."""
@@ -45,7 +45,7 @@ COLOUR = Meaning(linear_from_srgb(_CODES).astype(np.float32), srgb)
 SHARE = Meaning(_CODES.astype(np.float32), lambda values: values)
 """Values from 0 to 1."""
 DIRECTION = Meaning((2.0 * _CODES - 1.0).astype(np.float32), _unit_codes)
-"""(n + 1) / 2 of unit vectors; averages are made unit again."""
+"""Directions as (n + 1) / 2 of unit vectors n. Averages are made unit vectors again."""
 
 
 def mip_levels(codes: Codes, is_known: NDArray[np.bool_], meaning: Meaning) -> Iterator[Codes]:
@@ -96,7 +96,7 @@ def _means(sums: Singles, shares: Singles) -> tuple[Singles, Singles]:
 
 
 def _halved_along(values: Singles, axis: int) -> Singles:
-    """Means of areas along an axis of n texels, of which n // 2 remain; of n = 1, that one."""
+    """Means of areas along an axis of n texels, of which n // 2 remain; for n = 1, the one texel remains."""
     along = np.moveaxis(values, axis, 0)
     half = len(along) // 2
     if half == 0:
@@ -111,7 +111,7 @@ def _halved_along(values: Singles, axis: int) -> Singles:
 
 
 def _fill(values: NDArray[Any], is_known: NDArray[np.bool_], smaller: NDArray[Any]) -> None:
-    """Put the texel of the smaller level where nothing is known."""
+    """Fill places where nothing is known with the texel of the smaller level."""
     rows, columns = np.nonzero(~is_known)
     height, width = smaller.shape[:2]
     values[rows, columns] = smaller[np.minimum(rows // 2, height - 1), np.minimum(columns // 2, width - 1)]

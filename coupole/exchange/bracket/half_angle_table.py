@@ -6,8 +6,8 @@ samples fill one layer of the table, and values between two photographs are thos
 coordinates about the mirror direction, the samples of a photograph would be oblique, and a peak between two
 photographs would be lost.
 
-The azimuth goes only from 0 to 90 degrees. Exchange of the directions and mirror symmetry map the rest to this
-range, so the table is always reciprocal.
+The azimuth goes only from 0 to 90 degrees. Exchange of the directions and mirror symmetry map all other
+directions to this range, so the table is always reciprocal.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _NODES = (
     0.5 * np.pi * np.linspace(0.0, 1.0, _PHIS),
 )
 _BENDS = ((0, 1.0), (1, 10.0), (2, 10.0))
-"""Axes, and the cost of a second difference along each."""
+"""Axes of the table, and for each axis the cost of a second difference along it."""
 _MIXED = 30.0
 """Cost of a change with theta_h of the dependence on theta_d, because within a lobe only Fresnel's factor depends
 on theta_d."""

@@ -117,7 +117,7 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
         "places": f"{0.5e3 * step_mm:.2g} um in each coordinate"
     }
     if choice.with_samples:
-        errors["samples"] = "2.3 % of their value, and of the distance from it to each end of its interval"
+        errors["samples"] = "2.3 % of the value, and of its distance to each end of its interval"
         samples = samples_of_result(result, support_from_base, source_about["scan_noise_um"], say)
         about["samples"], later = samples[0], later + samples[1]
     if growing := so_far.words(source_about):
@@ -151,7 +151,7 @@ def _texels_of(
     if choice.fit not in (None, TEXELS) or (choice.fit is None and (choice.planes or not has_texels(result))):
         return None
     if choice.planes:
-        raise InputError("--residual-planes: a residual is what triangles leave; texels have none")
+        raise InputError("--residual-planes: a residual belongs to triangles; texels have none")
     options = ExportChoice(map_px=choice.map_px, say=say)
     flat = flatten(read_surface(result.folder, TEXELS, options, takes_texels=True))
     if turn is not None:

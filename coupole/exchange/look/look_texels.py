@@ -1,5 +1,6 @@
-"""Maps of texels for a page: square tiles that it reads one after the other, and means that its triangles show
-until then."""
+"""Maps of texels for a page: square tiles that the page reads one after the other, and means that its triangles
+show until their tiles are there.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 """Makes the page to relight of a result of the views so far: `python -m coupole.exchange.look.page_beside PARENT
-RESULT PAGE`. It ends with its parent, the process beside an acquisition, whose low priority it has."""
+RESULT PAGE`. Its parent is the process beside an acquisition. This process has the low priority of its parent,
+and ends when the parent ends.
+"""
 
 from __future__ import annotations
 

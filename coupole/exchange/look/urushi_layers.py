@@ -1,11 +1,11 @@
 """Urushi on a page: the mean over many grains or flakes, which does not flicker, however small they are.
 
-Makie has the drawing's share of metal on each triangle. Nashiji has two layers: the lacquer's face over the
-ground, and the lobe of its flakes. Seen from air, a flake's tilt turns its mirror image n times as far as without
-the lacquer (Snell, for small angles). So the roughness of the lobe is n times that of tilts and facets together.
-Its strength contains both passages of the face, the metal's reflectance inside, and the mean of the Beer-Lambert
-law over depths. Flakes hide each other only through their covered share, and no single flake sparkles; `coupole
-render` shows sparkles.
+Makie has, for each triangle, the share of its area that the drawing covers with metal. Nashiji has two layers:
+the lacquer's face over the ground, and the lobe of its flakes. Seen from air, a flake's tilt turns its mirror
+image n times as far as without the lacquer (Snell, for small angles). So the roughness of the lobe is n times
+that of tilts and facets together. Its strength contains both passages of the face, the metal's reflectance
+inside, and the mean of the Beer-Lambert law over depths. Flakes hide each other only through their covered share,
+and no single flake sparkles; `coupole render` shows sparkles.
 """
 
 from __future__ import annotations

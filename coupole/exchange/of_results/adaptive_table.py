@@ -122,8 +122,8 @@ def encode_adaptive(material: Material, most_error: float, description: str = ""
     pairs = tuple(_pairs(material))
     table, errors = _smallest(material, most_error, pairs)
     text = (
-        f"{material.name}; misses the fit by {errors[0]:.1e} in the median and {errors[1]:.1e} at 95 % of all "
-        f"directions, by {errors[2]:.1e} and {errors[3]:.1e} of those in its lobe; {description}"
+        f"{material.name}; differs from the fit by {errors[0]:.1e} in the median and {errors[1]:.1e} at 95 % of "
+        f"all directions, and by {errors[2]:.1e} and {errors[3]:.1e} of the directions in its lobe; {description}"
     )
     return table.encode(text)
 

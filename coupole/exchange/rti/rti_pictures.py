@@ -18,7 +18,8 @@ from coupole.storage.durable import write_synced
 from coupole.storage.run import Run
 
 LINEAR = "linear"
-"""Folder of the pictures of 16 bits, with lights, intensities and mask; `--pictures` makes a result from it."""
+"""Folder of the 16-bit pictures with lights, intensities and mask; `--pictures` makes a result from this folder.
+"""
 _JPEG_QUALITY = 95
 
 

@@ -26,7 +26,7 @@ _Single = NDArray[np.float32]
 _Any = TypeVar("_Any", Array, _Single)
 _NOISE = 0.4
 _HARDLY = 0.05
-"""Variance among references, in that of noise, below which a direction counts as noise."""
+"""Variance among references, as a multiple of the variance of noise, below which a direction counts as noise."""
 _MOST_KNOWN = 0.05
 """Share of the references that may count as known when their class is left out."""
 _LEAST_KNOWN = 0.6
@@ -86,8 +86,9 @@ class ClassModel:
 
     @cached_property
     def _main_directions(self) -> tuple[_Single, Array, Array]:
-        """Features of the references; eigenvectors of their kernel; what each takes from the precision of
-        noise."""
+        """Features of the references; eigenvectors of their kernel; the amount by which each eigenvector lowers
+        the precision of noise.
+        """
         precisions, vectors = np.linalg.eigh(self._precision)
         is_main = precisions < 1.0 / (_NOISE * (1.0 + _HARDLY))
         return self._rows.astype(np.float32), vectors[:, is_main], 1.0 / _NOISE - precisions[is_main]

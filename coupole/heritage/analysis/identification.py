@@ -64,7 +64,7 @@ class Evidence:
     best: Array
     """[n] reflectance of the nearest reference of the first class, with K/S scaled by the best factor."""
     runner_up: Array
-    """[n] the same for the second class."""
+    """[n] reflectance of the nearest reference of the second class, scaled in the same way."""
     fit: Array
     """[n] reflectance of the answer: that of the nearest reference, or of the mixture's two references
     together."""
@@ -157,8 +157,7 @@ def _judge(
     if mixture is not None and mixture.is_settled and not _lacks_siblings(of_bands, mixture):
         return "mixture", (
             f"two references leave {mixture.residual:.1%} of K/S; one alone is worse by {mixture.gain:.0f} and "
-            f"two of "
-            f"other classes by {mixture.lead:.0f} in Schwarz's criterion"
+            f"two of other classes by {mixture.lead:.0f} in Schwarz's criterion"
         )
     if not model.is_known(probabilities)[0]:
         return "unknown", (

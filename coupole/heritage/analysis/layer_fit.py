@@ -66,7 +66,8 @@ class Coefficients:
     """[n], squared residuals divided by their variances. The expected value is the number of spectra minus 2."""
     unlike: Array
     """[n], squared differences of the spectra from their mean, or from their grounds if that is less, divided by
-    the noise's variance. They are near 0 for films that hide their ground, and for nearly invisible films."""
+    the noise's variance. The values are near 0 for films that hide their ground, and for nearly invisible films.
+    """
     spectra: int
 
     @property

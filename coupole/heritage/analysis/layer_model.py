@@ -69,8 +69,8 @@ def deserved_model(coefficients: Coefficients, films: list[Film], face: Face, no
         direct_share = max(direct_share, float(direct[sure].max()))
         through = max(through, float((leaving * direct * ground * tau / (1.0 - rho * ground))[sure].max()))
     because = (
-        f"of directional light {100.0 * direct_share:.2g} % reaches the ground unscattered, and adds up to "
-        f"{through:.3f} to what is seen; twice the noise is {2.0 * noise:.3f}"
+        f"{100.0 * direct_share:.2g} % of directional light reaches the ground unscattered, and adds up to "
+        f"{through:.3f} to the reflectance that is seen; twice the noise is {2.0 * noise:.3f}"
     )
     model: Model = "two fluxes" if through <= 2.0 * noise else "four fluxes"
     return Deserved(model, because, difference, direct_share)

@@ -25,9 +25,9 @@ def expect_paint_name(path: Path) -> None:
 def write_mixture(path: Path, recipe: Recipe, palette: Sequence[Paint], binder_index: float, colour: str) -> None:
     """Write K and S of a recipe's mixture, sums by share (Duncan 1949), in the bands that all its paints have.
 
-    The uncertainties are those of the paints' K and S. The uncertainties of the shares are in the head. They are
-    correlated, so that together they change K and S less than each alone. Raises InputError if the paints share
-    too few bands, StorageError.
+    The uncertainties are those of the paints' K and S. The uncertainties of the shares are in the head. The
+    shares are correlated, so that together they change K and S less than each share alone. Raises InputError if
+    the paints share too few bands, StorageError.
     """
     paints = {paint.name: paint for paint in palette if paint.name in recipe.shares}
     unit: Unit = "per mm" if next(iter(paints.values())).unit == "per mm" else "relative"

@@ -60,7 +60,7 @@ def films_at(
     measured."""
     grounds = {film.ground_name: film for film in films if film.ground is not None}
     if thicknesses_mm and not grounds:
-        raise InputError("expected a film over a ground, whose thickness is known; found opaque ones only")
+        raise InputError("expected a film of known thickness over a ground; found opaque films only")
     return [
         film_at(coefficients, films, face, thickness_mm, ground)
         for thickness_mm in thicknesses_mm
@@ -113,7 +113,7 @@ def _matching_depths(
     """Return the optical depths [n] of absorption and of scattering of the layer that reflects rho and transmits
     tau.
 
-    Newton's steps begin at K = 2 k and S = 3/4 s (1 - mean cosine), which hold for thick layers.
+    Newton's steps begin at K = 2 k and S = 3/4 s (1 - mean cosine). These values are right for thick layers.
     """
     k, s = two_fluxes
     start = np.stack([0.5 * k * thickness_mm, 4.0 / 3.0 * s * thickness_mm / (1.0 - mean_cosine)])

@@ -76,8 +76,9 @@ class Found:
     be preferred."""
 
     def told_within(self, name: str) -> float:
-        """Return the bound within which a share of the best recipe is known, by its 95 % interval, and by the
-        shares in its rivals."""
+        """Return the bound within which a share of the best recipe is known. It follows from the share's 95 %
+        interval, and from the shares in rival recipes.
+        """
         share = self.best.shares[name]
         apart = [abs(rival.get(name, 0.0) - share) for rival in self.rivals]
         return max(self.best.half_widths[name], *apart, 0.0)

@@ -44,7 +44,7 @@ class Unmixed:
     shares: tuple[float, float]
     """Shares of the mixture's K/S, mean over the bands; they sum to 1."""
     share_interval: tuple[float, float]
-    """Interval of 95 % of the larger share, from 0 to 1. That of the other share is 1 minus it."""
+    """Interval of 95 % of the larger share, from 0 to 1. The interval of the other share is 1 minus this one."""
     residual: float
     """Relative residual of K/S, rms."""
     gain: float

@@ -76,13 +76,13 @@ class Comparison:
     moved_points: NDArray[np.bool_]
     """[n] True where the distance is significant."""
     noise_factor: float
-    """Factor by which all uncertainties of distances were enlarged, from the scatter."""
+    """Factor by which all uncertainties of distances were enlarged, as the scatter requires."""
     de00: Floats | None
     """[n] CIEDE2000 differences under D65."""
     recoloured_points: NDArray[np.bool_] | None
     """[n] True where the colour differs significantly; None without colours."""
     colour_factor: float
-    """Factor by which all uncertainties of colours were enlarged, from the scatter."""
+    """Factor by which all uncertainties of colours were enlarged, as the scatter requires."""
     shape_regions: tuple[Region, ...]
     """Regions of `moved_points`, the largest first."""
     colour_regions: tuple[Region, ...]
@@ -208,8 +208,9 @@ def _of_result(points_mm: Floats, colours: Colours, places_mm: Floats) -> Floats
 
 
 def _normals(state: State) -> Floats:
-    """[n, 3] normals from the triangles. Without triangles the normals come from neighbouring points, and their
-    sign is unknown."""
+    """[n, 3] normals from the triangles. If a state has no triangles, its normals come from neighbouring points,
+    and their sign is unknown.
+    """
     if state.outward is not None and _has_outward(state):
         return state.outward
     cloud = thinned_cloud(state.points_mm, state.spacing_mm, Viewpoint("none"), state.outward)

@@ -1,8 +1,8 @@
 """Classes of pigments in an image cube: regions of like spectra first, then the full identification of each
 region's mean, then each pixel by itself.
 
-The map has the region's answer. What each pixel's own spectrum says about this answer is its confidence: the
-probability that the pixel's spectrum gives to it. A pixel that is like no region has no answer.
+The map has the region's answer. Each pixel has a confidence: the probability that the pixel's own spectrum gives
+to this answer. A pixel that is like no region has no answer.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class _Mean:
     draws_alike: float
     of_bands: OfBands
     answer_columns: tuple[int, ...]
-    """Columns of the probabilities that are the region's answer; -1 is none of the classes."""
+    """Columns of the probabilities that belong to the region's answer; -1 means none of the classes."""
 
     @property
     def label(self) -> str:

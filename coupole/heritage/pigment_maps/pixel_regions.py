@@ -20,7 +20,9 @@ _LEAST_NOISE = 2e-4
 _ABOVE_NOISE = 1.5
 _MOST_COMPONENTS = 30
 _WIDER_THAN_NOISE = 4.0
-"""Variance along the widest direction of a group, in that of noise, above which the group is split."""
+"""Variance along the widest direction of a group, as a multiple of the variance of noise, above which the group
+is split.
+"""
 _SHADING = 0.05
 """Relative standard deviation of light and relief in a group, which is no reason to split it."""
 _LEAST_PIXELS = 10

@@ -46,7 +46,9 @@ def file_facts(path: Path) -> tuple[dict[str, str], bool]:
 
 
 def header_facts(fields: Mapping[str, object]) -> tuple[dict[str, str], bool]:
-    """Return the same of an ENVI header's fields, with its description as object if it names none."""
+    """Return the same from the fields of an ENVI header. If the header names no object, its description is used
+    as the object.
+    """
     facts: dict[str, str] = {}
     for name, words in fields.items():
         text = " ".join(str(words).split())

@@ -44,7 +44,7 @@ def for_png(texts: Mapping[str, str]) -> dict[str, str]:
 
 
 def for_exr(texts: Mapping[str, str]) -> dict[str, str]:
-    """Return the same texts, with names of EXR attributes."""
+    """Return texts under the names that EXR attributes may have."""
     return {keyword.lower(): words for keyword, words in texts.items()}
 
 

@@ -105,7 +105,7 @@ def _with_rest(
             names.append(parts_file.rest)
         return np.where(none, names.index(parts_file.rest), labels).astype(np.int16)
     if none.any() and not problems:
-        message = f"{int(none.sum())} of {len(labels)} triangles have no part; name the part of them as `rest`"
+        message = f"{int(none.sum())} of {len(labels)} triangles have no part; name a part for them as `rest`"
         problems.append(document.problem(("rules",), message))
     return labels
 

@@ -1,4 +1,4 @@
-"""`identification.json`: what was compared with what, the findings, and who signed them, with checksums.
+"""`identification.json`: the spectra, the library, the findings, and who signed them, with checksums.
 
 `content_sha256` is the SHA-256 of the canonical content: JSON with sorted keys, without blanks, without the keys
 `files`, `content_sha256` and `sha256`. The page prints it. `files` has the checksum of each file beside the
@@ -116,7 +116,7 @@ class RecordCheck:
     files: int
     """Number of files that were compared."""
     problems: tuple[str, ...]
-    """Changes, as sentences; none if all is as it was written."""
+    """Changes, as sentences; none if everything is as it was written."""
 
 
 def is_record(folder: Path) -> bool:

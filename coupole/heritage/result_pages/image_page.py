@@ -72,9 +72,8 @@ def _page(finding: ImageFinding, cube: Cube, origin: Origin, record: dict[str, A
         title=f"{cube.header.stem}: map of pigments",
         pictures=[picture, classes],
         summary=[
-            f"{finding.looked_at:,} pixels were put into {len(finding.regions)} regions of like spectra, "
-            "whose means "
-            "were compared with the library ",
+            f"{finding.looked_at:,} pixels were put into {len(finding.regions)} regions of like spectra, whose "
+            "means were compared with the library ",
             Code(origin.library.name),
             ".",
         ],
@@ -106,10 +105,11 @@ def _quality(finding: ImageFinding) -> str:
     )
     unknown, ambiguous, unlike = (finding.pixels_of(code) / total for code in (UNKNOWN, AMBIGUOUS, UNLIKE))
     return (
-        f"A class or mixture is stated for {stated_pixels / total:.1%} of the pixels; {unknown:.1%} are not "
+        f"A class or mixture is stated for {stated_pixels / total:.1%} of the pixels. Of all pixels, "
+        f"{unknown:.1%} are not "
         "in the "
-        f"library, {ambiguous:.1%} not decided, {unlike:.1%} like no region. The spectra of {agree:.1%} of the "
-        "pixels agree by themselves with their region's answer."
+        f"library, {ambiguous:.1%} are not decided, and {unlike:.1%} are like no region. For {agree:.1%} of the "
+        "pixels, the pixel's own spectrum agrees with the answer of its region."
     )
 
 
@@ -127,10 +127,8 @@ def _shares(finding: ImageFinding) -> Section:
         tables=[Table("Shares of classes", ("class", "colour", "pixels", "share"), rows)],
         notes=[
             "Shares are of pixels, not of pigment. Not in the library: the verdict of the region's mean is "
-            "unknown. Not "
-            "decided: several classes remain, which the table of regions names. Like no region: the pixel's "
-            "spectrum "
-            "is far from all regions; such pixels were not identified."
+            "unknown. Not decided: several classes remain, which the table of regions names. Like no region: the "
+            "pixel's spectrum is far from all regions; such pixels were not identified."
         ],
     )
 
@@ -140,10 +138,9 @@ def _confidence(finding: ImageFinding) -> Section:
         "confidence",
         "Confidence of the pixels",
         words=[
-            "The value is the probability that the pixel's own spectrum gives to the answer of its region: "
-            "to the class "
-            "or one of the classes, or to none of the library. Noise outside the image's main components was "
-            "removed."
+            "The value is the probability that the pixel's own spectrum gives to the answer of its region: to "
+            "the class or one of the classes, or to none of the library. Noise outside the image's main "
+            "components was removed."
         ],
         figures=[
             value_map("Probability of the map's answer by the pixel's own spectrum", finding.confidence, "", 1.0)
@@ -182,10 +179,9 @@ def _regions(finding: ImageFinding) -> Section:
 def _steadiness(finding: ImageFinding) -> str:
     """Return a sentence about the effect of the means' noise on the answers."""
     words = (
-        "The mean of each region was drawn 200 times with its standard error, which follows from the scatter "
-        "of the "
-        "pixels; errors that all pixels share, such as those of the white, are not in it. The first class, or the "
-        "verdict unknown, stayed in "
+        "The mean of each region was drawn 200 times with its standard error, which follows from the scatter of "
+        "the pixels. Errors that all pixels share, such as those of the white, are not included. The first "
+        "class, or the verdict unknown, stayed in "
     )
     unsteady_regions = [region for region in finding.regions if region.draws_alike < _STEADY]
     if not unsteady_regions:

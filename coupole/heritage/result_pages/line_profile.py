@@ -82,7 +82,7 @@ class LineProfile:
         return with_legend(picture, entries)
 
     def _nearest(self) -> NDArray[np.intp]:
-        """[columns] numbers of the nearest points."""
+        """[columns of the picture] number of the point that is nearest to each column."""
         distances = self.points.distances_mm
         at = (np.arange(_WIDTH_PX) + 0.5) / _WIDTH_PX * distances[-1]
         nearest: NDArray[np.intp] = np.searchsorted((distances[1:] + distances[:-1]) / 2, at)

@@ -35,7 +35,9 @@ LIMITS = (
 
 
 def facts_of(origin: Origin) -> dict[str, Inline]:
-    """Facts at the top of a report: object, sample, instrument, person; what is not known is said."""
+    """Facts at the top of a report: object, sample, instrument, person. The report says which of them are not
+    known.
+    """
     facts: dict[str, Inline] = {name: origin.facts.get(name, "not stated") for name in FACTS}
     return facts | {name: words for name, words in origin.facts.items() if name not in FACTS}
 
@@ -73,7 +75,7 @@ def confusions_of(finding: PigmentFinding) -> str:
 
 
 def fit_plots(finding: PigmentFinding) -> list[Plot]:
-    """The spectrum with what was fitted to it, and the difference of the two."""
+    """The measured spectrum with the fitted spectrum, and the difference of the two."""
     evidence = finding.evidence
     parts = " and ".join(part.name for part in finding.parts) or finding.candidates[0].name
     difference = 100.0 * (evidence.reflectance - evidence.fit)
@@ -115,7 +117,9 @@ def limits_section() -> Section:
 
 
 def signature_section(origin: Origin, record: Mapping[str, object]) -> Section:
-    """The place for a signature, filled if the report is signed already, and how a change is told."""
+    """The place for a signature (filled if the report is signed already), and a text that says how a change is
+    detected.
+    """
     signature = origin.signature
     stamp: Sequence[Inline] = (LINE,) if signature is None else (Moment(signature.time_utc), " UTC")
     facts: dict[str, Inline] = {

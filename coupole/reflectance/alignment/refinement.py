@@ -67,8 +67,9 @@ class Refined:
 
     @property
     def chi2_of_steps(self) -> float:
-        """Square of the steps over the records' covariance. It is near `determined_count` if records and scan
-        state their uncertainties well."""
+        """Square of the steps over the records' covariance. The value is near `determined_count` if records and
+        scan state their uncertainties well.
+        """
         return float(self.steps @ np.linalg.solve(self.unknowns.covariance, self.steps))
 
     def vertex_u_mm(self, vertex_numbers: NDArray[np.int64] | slice = slice(None)) -> Floats:
@@ -85,8 +86,9 @@ class Refined:
 
     @property
     def determined_count(self) -> float:
-        """Number of unknowns that the pictures determine. Each unknown counts by the share of its information that
-        the pictures give."""
+        """Number of unknowns that the pictures determine. Each unknown is counted with the share of its
+        information that comes from the pictures.
+        """
         return self.unknowns.count - float(np.trace(np.linalg.solve(self.unknowns.covariance, self.covariance)))
 
 

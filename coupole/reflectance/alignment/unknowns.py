@@ -30,8 +30,9 @@ MOST_CONTROLS = 600
 _TOGETHER = 1 << 16
 """Number of vertices that are processed together."""
 _NUGGET = 1e-6
-"""Share of a control point's variance that it shares with no other point: it keeps the covariance's inverse
-exact."""
+"""Part of a control point's variance that is not correlated with other points. It keeps the covariance's inverse
+exact.
+"""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
-"""Reasons why a result cannot be made beside an acquisition. They are found in plan, rig and records before
-anything moves."""
+"""Reasons why a result cannot be made beside an acquisition. These reasons are found in plan, rig and records
+before anything moves.
+"""
 
 from __future__ import annotations
 
@@ -35,9 +36,10 @@ _CHECKED: tuple[Kind, ...] = ("dark", "response", "flat-field", "glare")
 
 
 def reasons_against(plan: Path, rig: Path | None, result: Path | None, run: Path | None) -> list[str]:
-    """List the reasons why `coupole reflectance RUN` could not make a result of this plan's run. Each has the
-    place in the plan and the remedy. `result` is the folder, if one is named; `run` is the run's folder, if the
-    run is resumed."""
+    """List the reasons why `coupole reflectance RUN` could not make a result of this plan's run. Each reason has
+    the place in the plan and the remedy. `result` is the folder, if one is named; `run` is the run's folder, if
+    the run is resumed.
+    """
     try:
         files = read_plan(plan, rig)
         return [*_of_folder(result, run), *_of_mesh(files), *_of_records(files)]

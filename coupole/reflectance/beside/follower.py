@@ -35,7 +35,7 @@ AtTheEnd = Callable[[Callable[[], None]], None]
 
 def process_run(folder: Path, result: Path, say: Say, at_the_end: AtTheEnd, page_program: str = "") -> bool:
     """Process a run into its result, during its acquisition and after it; True if the result is complete. `say`
-    receives the progress, and `times` at the end. `at_the_end` calls what is to be done when all frames are there.
+    receives the progress, and `times` at the end. `at_the_end` runs a function when all frames are there.
     `page_program` is the module that makes pages to relight. Failures are reported, and existing results stay."""
     teller = _Teller(result, say)
     try:
@@ -206,8 +206,9 @@ class _Follower:
     def _grow(self) -> bool:
         """Make a result of the views so far, if it has more views than the newest one; False if there is nothing
         to do. None is made if LEDs are chosen in the run, because the left-out LEDs change with them. When the
-        next view is complete this result is given up, but not twice in turn: with short views none would ever be
-        made."""
+        next view is complete, this result is abandoned, but not twice in succession. Otherwise no result would
+        ever be made if views are short.
+        """
         if self._run.is_open:
             return False
         of = self._run.expected_views

@@ -1,4 +1,4 @@
-"""Computes what the samples of a view need besides its frames, while these still arrive."""
+"""Computes all inputs of a view's samples that do not depend on its frames, while the frames still arrive."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ from coupole.reflectance.run_job import RunRequest, forget, prepare_run
 def look_ahead(
     run: Path, view_name: str, ahead: Ahead = NOTHING_AHEAD, is_wanted: Callable[[], bool] = lambda: True
 ) -> None:
-    """Compute what the samples of a view need besides its frames, while these still arrive, if it has a frame
-    already: the surface that it sees, where the object hides LEDs from it, and the paths of light to it, which
-    `ahead` keeps. It ends early if `is_wanted` says so. Raises as `reflectance_of`."""
+    """Compute all inputs of a view's samples that do not depend on its frames, while the frames still arrive. The
+    view must have a frame already. The inputs are the surface that it sees, the places where the object hides
+    LEDs, and the paths of light, which `ahead` keeps. It ends early if `is_wanted` says so. Raises as
+    `reflectance_of`.
+    """
     request = RunRequest((run,))
     try:
         measured_run, geometry, _ = prepare_run(uuid4().hex, run.resolve(), request.sources)

@@ -1,4 +1,4 @@
-"""Has the page to relight made of the newest result of the views so far, by a program of its own.
+"""Begins a separate program that makes the page to relight from the newest result of the views so far.
 
 The program has the priority of this process, and ends with it. It runs while samples of the next view are taken.
 """
@@ -32,7 +32,7 @@ class PageMaker:
     views: int
     """Views of the plan."""
     _next_source: tuple[Path, int] | None = None
-    """Result, and the number of its views, of which the next page is made."""
+    """Result from which the next page is made, and the number of its views."""
     _page: PageSoFar | None = None
     """Page that the process makes."""
     _process: subprocess.Popen[bytes] | None = None

@@ -1,8 +1,8 @@
 """Draws normals and materials, with their uncertainty, while a run goes on.
 
-Of a view whose samples have just been taken there is a first look: a quick fit to some of its triangles and LEDs.
+A view whose samples have just been taken gets a first look: a quick fit to some of its triangles and LEDs.
 It is not part of the result. It uses one view alone, and its samples still contain light that was reflected by
-other surfaces. When the result of the views so far is there, its maps take the place of the first looks.
+other surfaces. When the result of the views so far is complete, its maps replace the first looks.
 """
 
 from __future__ import annotations

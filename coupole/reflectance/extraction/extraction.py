@@ -177,8 +177,9 @@ def find_codes_ahead(
     leds: NDArray[np.int64],
     is_wanted: Callable[[], bool],
 ) -> None:
-    """Find where the object hides LEDs from what a view sees, for `extract_view`. This needs no frame of them. It
-    ends when `is_wanted` says so; what was found remains."""
+    """Find where the object hides LEDs from what a view sees, for `extract_view`. No frame of these LEDs is
+    needed. It ends when `is_wanted` says so; what was found remains.
+    """
     threads = len(os.sched_getaffinity(0))
     facets = geometry.of(surface_of(measured_run, geometry, view, threads).triangles)
     _newest_codes.begin(_sight_of(measured_run, view))
@@ -302,7 +303,11 @@ def _begin_samples(file: h5py.File, work: ViewPass) -> dict[str, h5py.Dataset]:
         "codes": (np.uint8, (count, leds), f"of a triangle and an LED: {codes}"),
     }
     if "glare" in work.measured_run.records:
-        kinds[GLARE] = (np.float16, (count, leds, channels), "veil of glare that was taken off, over what is left")
+        kinds[GLARE] = (
+            np.float16,
+            (count, leds, channels),
+            "veil of glare that was subtracted, divided by the remaining value",
+        )
     data = {}
     for name, (kind, shape, description) in kinds.items():
         chunks = (min(BLOCK, count), min(work.together, leds), channels)[: len(shape)]

@@ -47,8 +47,9 @@ class Facets:
 
 
 class CodesAhead:
-    """Codes that were found before a view's frames were complete. Object, pose and LEDs alone decide them. Those
-    of one view are kept, up to a limit of memory."""
+    """Codes that were found before a view's frames were complete. The codes depend only on object, pose and LEDs.
+    The codes of one view are kept, up to a limit of memory.
+    """
 
     def __init__(self, most_bytes: int = 500_000_000) -> None:
         self._most_bytes = most_bytes

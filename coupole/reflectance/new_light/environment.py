@@ -55,7 +55,7 @@ class Environment:
 
     def sample(self, count: int) -> tuple[Floats, Floats, Floats]:
         """Return directions [count, 3] with a density in proportion to radiance, their radiances [count,
-        channels], and their number per steradian [count]. They are the same at each call.
+        channels], and their number per steradian [count]. Each call returns the same directions.
 
         Rows and columns are chosen by their cumulative light, with a lattice of golden sections.
         """

@@ -104,9 +104,10 @@ def _mirror(  # type: ignore[no-untyped-def]
 
 @kernel(error_model="numpy")
 def _asking(triangle_of_pixel, places_mm, camera_mm, coats, near, axes, centre_mm, density, lobe_rays, asking):  # type: ignore[no-untyped-def]
-    """Mark the pixels for which rays are drawn. None are drawn for an area that is at most as large as the lobe.
-    This is so if the largest solid angle of the area at its distance, times the largest density of the lobe's
-    rays, is at most 1."""
+    """Mark the pixels for which rays are drawn. No rays are drawn if the area is at most as large as the lobe:
+    the largest solid angle of the area at its distance, times the largest density of the lobe's rays, is then at
+    most 1.
+    """
     for row in range(triangle_of_pixel.shape[0]):
         for column in range(triangle_of_pixel.shape[1]):
             coat, place = coats[max(triangle_of_pixel[row, column], 0)], places_mm[row, column]

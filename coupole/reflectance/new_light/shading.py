@@ -249,7 +249,7 @@ def _add_beam(  # type: ignore[no-untyped-def]
 
 @kernel(error_model="numpy")
 def _reach_from(near, place, axis, exponent, x, y, z):  # type: ignore[no-untyped-def]
-    """Do the same as `_reach` for one beam, from eight places."""
+    """Do the same as `_reach`, for one beam and eight places at once."""
     if not near:
         return lanes(place[0]), lanes(place[1]), lanes(place[2]), lanes(np.float32(1.0))
     dx, dy, dz = place[0] - x, place[1] - y, place[2] - z

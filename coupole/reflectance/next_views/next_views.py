@@ -137,7 +137,7 @@ class NextViews:
 
     def _no_gain(self, best_gain: float) -> str:
         if best_gain <= 0.0:
-            return "no further candidate tells anything about the object"
+            return "no further candidate shows anything new of the object"
         assert self._until.gain is not None
         return (
             f"enough by `gain`: the best further view would lower the uncertainty by {best_gain:.2%}, less than "

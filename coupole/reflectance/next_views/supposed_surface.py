@@ -1,8 +1,8 @@
 """The object's surface as views of a run are judged on it, without calibration records.
 
-Views are compared with each other before a result exists. So only the geometry is exact here: what a view shows,
-what lights it, and at which angles. Power of the LEDs, exposure and noise are usual values: the exposure suits a
-white surface.
+Views are compared with each other before a result exists. So only the geometry is exact here: which parts a view
+shows, which LEDs light them, and at which angles. Power of the LEDs, exposure and noise are usual values: the
+exposure suits a white surface.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Computes what each candidate view would show and tell about the object, once before a run."""
+"""Computes, once before a run, which parts of the object each candidate view would show, and how much information
+it would add.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ from coupole.reflectance.triangle_fit import FEWEST
 Floats = NDArray[np.float64]
 
 _MOST_LEDS = 240
-"""Number of LEDs, spread over those of the plan, that stand for all of them."""
+"""Number of LEDs that represent all LEDs of the plan; they are spread over them."""
 _MESH_NOISE_UM = 30.0
 """Usual standard uncertainty of the mesh's vertices."""
 
@@ -50,7 +52,7 @@ class Knowledge:
     """Knowledge about the parts, from some views."""
 
     information: tuple[Information, ...]
-    """Sums over their samples, for each supposed material."""
+    """Sums over the samples of the parts, for each supposed material."""
     decreases: Floats
     """[materials, parts] half the decrease of the logarithm of the covariance's determinant by these views."""
     samples: Floats
@@ -84,8 +86,9 @@ class Trials:
 
     def value(self, knowledge: Knowledge) -> float:
         """Return the decrease of the logarithm of the uncertainty, for each of a material's unknowns: the mean
-        over the surface and the supposed materials. A fit needs `FEWEST` samples, so a part with fewer counts by
-        their share."""
+        over the surface and the supposed materials. A fit needs `FEWEST` samples. A part with fewer samples
+        counts in proportion to their number.
+        """
         usable_shares = np.minimum(knowledge.samples / FEWEST, 1.0) * self.shares
         return float(np.mean(knowledge.decreases @ usable_shares)) / UNKNOWNS
 

@@ -36,8 +36,8 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
     """Yield remarks for the user who made the result, one sentence each."""
     if run := about.get("uncalibrated_run"):
         yield (
-            f"of the run {run} without calibrations: values are relative, and lights stand where rig and LED "
-            "table have them as seen from one point; normals and materials are of single pixels"
+            f"of the run {run} without calibrations: values are relative, and the lights have the directions "
+            f"that rig and LED table give from one point; normals and materials are of single pixels"
         )
     yield (
         f"{about['pixels']} pixels under {about['lights'] - len(about['left_out'])} lights; residual of the "
@@ -125,9 +125,8 @@ def _materials(result: PictureResult, fields: dict[str, NDArray[Any]]) -> Sectio
             value_map("roughness alpha", _on_the_picture(result, seen_alpha), "", 1.0),
         ]
         notes.append(
-            f"A lobe is drawn where it adds at least {lobes_told.LEAST_HIGHLIGHT:.0%} to the diffuse part in "
-            "the mirror "
-            f"direction: in {share:.0%} of the pixels."
+            f"A lobe is drawn where it adds at least {lobes_told.LEAST_HIGHLIGHT:.0%} to the diffuse part in the "
+            f"mirror direction: in {share:.0%} of the pixels."
         )
     else:
         reason = f"they add less than {lobes_told.LEAST_HIGHLIGHT:.0%} to the diffuse part"

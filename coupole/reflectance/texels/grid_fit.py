@@ -2,7 +2,7 @@
 
 Normal, lightness, ks and roughness are fitted to the mean of the channels. The prior is the material of the
 triangle that most of a texel's pixels see. Neighbouring texels are taken into account as neighbouring pixels are.
-All channels of a texel are measured; together with those of the texels beside it they give its colour.
+All channels of a texel are measured. They give its colour, together with the channels of neighbouring texels.
 """
 
 from __future__ import annotations

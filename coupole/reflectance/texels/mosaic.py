@@ -24,8 +24,10 @@ _MOST_CHANGE = 1.0
 
 
 def all_channels(deviation: Singles, certainty: Singles, channel: NDArray[np.int8], channels: int) -> Singles:
-    """[h, w, channels] deviations of all channels, from deviations [h, w] of pixels in their own `channel` [h, w],
-    weighted by their `certainty` [h, w]. They are 0 where the certainty is 0, because nothing is fitted there."""
+    """[h, w, channels] deviations of all channels, from deviations [h, w] of pixels in their own `channel` [h,
+    w], weighted by their `certainty` [h, w]. The deviations are 0 where the certainty is 0, because nothing is
+    fitted there.
+    """
     is_fitted = certainty > 0.0
     if channels == 1:
         return np.where(is_fitted, deviation, np.float32(0.0))[..., None]

@@ -5,7 +5,7 @@ In a window the spread of materials comes from the surface and from the fits. Th
 do not explain is the surface's (empirical Bayes: Morris, Parametric empirical Bayes inference, 1983). Where the
 surface is plain, this part is small, and pixels take the material of their triangle. Where the surface has detail,
 pixels stay as they were fitted. The same is done for ks and roughness of triangles, which are uncertain with few
-samples near a highlight; kd and normal follow by their covariance with these.
+samples near a highlight; kd and the normal then change with them, by their covariance.
 """
 
 from __future__ import annotations

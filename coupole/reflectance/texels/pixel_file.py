@@ -22,7 +22,7 @@ Singles = NDArray[np.float32]
 _TOLD = {
     "pixels": "places in the picture, row by row, rising",
     "normals": "unit, base frame",
-    "kd": "1/sr, by channel; a pixel's own was fitted, the others are from pixels around it",
+    "kd": "1/sr, by channel; the pixel's own channel was fitted, the other channels are from pixels around it",
     "ks": "by channel; f = kd + ks D V",
     "alpha": "GGX's roughness",
     "covariance": "lower half, row by row, of tilts (rad) along two tangents of the normal and of the logarithms "

@@ -26,7 +26,9 @@ Floats = NDArray[np.float64]
 
 TILT, LOG_KS, LOG_ALPHA = math.radians(20.0), 1.5, 0.7
 """Standard deviations of a pixel's normal (each of two tilts) and of the logarithms of ks and alpha from those of
-its triangle. They are wider than any that was seen, so that they decide only where the samples say nothing."""
+its triangle. They are larger than all spreads that were seen, so that they have an effect only where the samples
+give no information.
+"""
 FEWEST_OF_PIXEL = 8
 """Least number of samples of a pixel. Its triangle's material adds the missing information, and its uncertainty
 shows how much."""

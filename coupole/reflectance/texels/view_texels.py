@@ -73,8 +73,9 @@ class Fitted:
         )
 
     def settle(self, view: ViewSamples, centres: Centres, triangle: NDArray[np.int32]) -> Singles:
-        """Take the neighbours into account, and add the uncertainty from inter-reflection. It comes from the
-        `triangle` [h, w] of each texel. Return the normals [fitted, 3] of the fitted texels."""
+        """Take the neighbours into account, and add the uncertainty from inter-reflection. It is taken from the
+        `triangle` [h, w] of each texel. Return the normals [fitted, 3] of the fitted texels.
+        """
         is_fitted = self.is_fitted
         before = self.deviation[is_fitted][:, :2]
         settle(self.deviation, self.covariance, is_fitted, centres.covariance)
@@ -136,8 +137,9 @@ def view_texels(places: NDArray[np.integer], normals: Singles, logs: Floats, cov
 
 
 def _with_colours(logs: Floats, colours: Singles, channel: NDArray[np.int8]) -> Floats:
-    """Return logarithms of kd [n, channels]. The pixel's own `channel` [n] stays; the other channels differ from
-    it as in `colours`."""
+    """Return logarithms of kd [n, channels]. The values of the pixels' own `channel` [n] stay; the other channels
+    differ from these values as in `colours`.
+    """
     column = channel[:, None].astype(np.int64)
     own_logs, own_colour = np.take_along_axis(logs, column, 1), np.take_along_axis(colours, column, 1)
     return np.asarray(own_logs + colours - own_colour)

@@ -1,8 +1,8 @@
 """Joins scans to groups by the motions between pairs, and rejects a motion that others contradict.
 
-As in Kruskal's spanning tree, the strongest motion comes first, but there is a vote: all motions between two
-groups are compared, and the position of one group in the other with the most support is used. It is accepted only
-if no scan of one group then lies in the space that a scanner of the other saw through.
+As in Kruskal's spanning tree, the strongest motion comes first. But there is a vote: all motions between two
+groups are compared, and the position that most motions support is used. It is accepted only if no scan of one
+group then lies in the space that a scanner of the other saw through.
 """
 
 from __future__ import annotations
@@ -103,7 +103,9 @@ def _merge(
 
 
 def _place(groups: Groups, group: int, motion: PairMotion) -> Floats:
-    """Return the pose of the other group in group `group` by a motion between scans of both."""
+    """Return the pose of the other group in the frame of group `group`, from a motion between a scan of each
+    group.
+    """
     first, second, first_from_second = motion.first, motion.second, motion.first_from_second
     if groups.group_of[first] != group:
         first, second, first_from_second = second, first, inverse_of(first_from_second)
@@ -121,7 +123,7 @@ def _between(groups: Groups, group: int, motion: PairMotion, one_from_other: Flo
 def _contradict(
     scans: Sequence[PreparedScan], groups: Groups, group: int, other_group: int, one_from_other: Floats
 ) -> bool:
-    """True if a scan of one group lies in the space that a scanner of the other saw through."""
+    """True if a scan of one group lies in space that a scanner of the other group found empty."""
     pairs = [(a, b) for a in groups.members[group] for b in groups.members[other_group]]
     if len(pairs) > _MOST_CROSS_CHECKS:
         picks = np.random.default_rng(0).choice(len(pairs), _MOST_CROSS_CHECKS, replace=False)

@@ -127,8 +127,9 @@ class _State:
         return step
 
     def inflation(self) -> float:
-        """Root mean ratio of the variances of the poses: from sums over cells, divided by those from independent
-        points."""
+        """Root of the mean ratio of two variances of the poses: the variance from sums over cells, divided by the
+        variance for independent points.
+        """
         if not self.overlaps:
             return 1.0
         points = self.normal - self.targets_normal

@@ -63,9 +63,9 @@ def with_loops(fit: JointFit, pairs: Sequence[PairAlone], count: int) -> tuple[J
     """Return the fit with a covariance that is not smaller than the loops show, and the factor for uncertainties
     from overlaps.
 
-    The factor is that of the median pair. Some pairs have an overlap that does not determine their motion, so that
-    they slide when adjusted separately. Such a pair shows nothing about the joint fit, in which other pairs hold
-    it.
+    The factor is that of the median pair. Some pairs have an overlap that does not determine their motion, so
+    that they slide when adjusted separately. Such a pair says nothing about the joint fit, because there the
+    other pairs keep it in place.
     """
     loops = len(pairs) - (count - 1)
     if loops < 1:

@@ -47,7 +47,7 @@ _LEAST_JOINT_OVERLAP = 0.04
 
 @dataclass(frozen=True)
 class Registration:
-    """Scans with their poses. Numbers of scans count them in the given order."""
+    """Scans with their poses. Scans are numbered in the given order."""
 
     names: tuple[str, ...]
     """Names of the scans."""
@@ -65,7 +65,7 @@ class Registration:
     unplaced_numbers: tuple[int, ...]
     """Numbers of the scans that overlap no other scan enough."""
     motions: tuple[PairMotion, ...]
-    """Motions between pairs on which the poses rest."""
+    """Motions between pairs from which the poses were found."""
     rejected_motions: tuple[PairMotion, ...]
     """Motions between pairs that contradict the others."""
     pairs: int

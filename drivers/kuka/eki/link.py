@@ -49,8 +49,8 @@ def connect(
                     if not strangers:
                         raise
                     raise TimeoutError(
-                        f"{len(strangers)} connections of other addresses than {controller} were turned away, the "
-                        f"last of {strangers[-1]}"
+                        f"{len(strangers)} connections from other addresses than {controller} were turned away, "
+                        f"the last of {strangers[-1]}"
                     ) from None
                 if controller in ("", caller):
                     break

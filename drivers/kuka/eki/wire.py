@@ -95,7 +95,7 @@ class Status:
     """The controller's own clock ($ROB_TIMER)."""
     override_percent: int
     t1: bool
-    """True in T1. There the controller slows every motion down."""
+    """True in the mode T1, in which the controller slows every motion down."""
     lapsed: int
     """Number of the last MOVE that ended because no command came; 0 if there was none."""
     model: str
@@ -142,7 +142,9 @@ class StatusReader:
 
 
 def _read_status(message: bytes) -> Status | None:
-    """None if the message is not XML, lacks an element, or an element is not a number."""
+    """Return the status in a message. None if the message is not XML, lacks an element, or has an element that is
+    not a number.
+    """
     try:
         values = {
             f"{child.tag}/@{name}": value

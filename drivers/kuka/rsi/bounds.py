@@ -1,8 +1,8 @@
 """The invariant of every answer, whichever packets came in:
 
-    From one answer to the next, the place to which the corrections lead moves by at most the highest speed times
-    the cycle. If the commanded axes advance, this step differs from the previous one by at most the highest
-    acceleration times the cycle squared. The only other allowed change is to no step at all.
+From one answer to the next, the target of the corrections moves by at most the highest speed times the cycle. If
+the commanded axes advance, this step differs from the previous one by at most the highest acceleration times the
+cycle squared. The only other allowed change is to no step at all.
 
 A place is the axes, or the flange's pose. The trajectory obeys this by construction. Here it is checked again on
 the answer that is about to be sent, from the sent numbers alone. So no earlier mistake can reach the arm. Limits
@@ -52,14 +52,14 @@ class StepBounds:
         """Return why an answer with this step must not be sent, or ""."""
         for number, (length, farthest) in enumerate(zip(step, self.farthest, strict=True), start=1):
             if not abs(length) <= farthest:
-                return f"correction {number} would step by {length:.4f} in one cycle, {farthest:.4f} is the limit"
+                return f"correction {number} would step by {length:.4f} in one cycle, the limit is {farthest:.4f}"
         if not advances:
             return ""
         last, self._last = self._last, step
         for number, (length, before, most) in enumerate(zip(step, last, self._change, strict=True), start=1):
             if not abs(length - before) <= most:
                 change = length - before
-                return f"the step of correction {number} would change by {change:.4f}, {most:.4f} is the limit"
+                return f"the step of correction {number} would change by {change:.4f}, the limit is {most:.4f}"
         return ""
 
 

@@ -1,8 +1,8 @@
 """The corrections in an answer: from the controller's present place to the commanded axes.
 
-Absolute corrections count from the start of the session. The controller sums relative corrections. So their
-reference is the sum of those that it has applied, as rounded on the wire. An increment that arrived too late is
-included in the next one, and rounding errors do not accumulate.
+Absolute corrections count from the start of the session. The controller sums relative corrections. So the
+reference of a relative correction is the sum of the corrections that the controller has applied, as rounded on
+the wire. An increment that arrived too late is included in the next one, and rounding errors do not accumulate.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 Every packet advances the commanded axes by one cycle of `cycle_ms`. If the controller runs at 4 ms and the driver
 is set to 12 ms, the arm therefore moves three times as fast as the driver computes. So the cycle is measured
 before the first motion, and as long as packets come. The arrival on the machine's clock decides. The IPOC is a
-second witness. On real controllers it counts the cycle in ms; in some simulators it counts 1, and says nothing. A
-simulated world that waits for answers, or runs at another speed than the machine's clock, declares its cycle
-instead.
+second witness. On real controllers the IPOC counts the cycle in ms. In some simulators it counts packets, and
+then says nothing about the cycle. A simulated world that waits for answers, or runs at another speed than the
+machine's clock, declares its cycle instead.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ _FASTEST, _SLOWEST = 0.85, 1.7
 """Allowed ratio of the measured cycle to the set one. If a machine is busy for 60 ms at the beginning of a window,
 a cycle of 4 ms seems 15 % shorter. 1.7 is midway between equal and threefold."""
 _WRONG_WINDOWS = 2
-"""Number of consecutive windows that prove a mismatch. So a single moment in which the machine was busy proves
-nothing."""
+"""Number of consecutive windows that prove a mismatch. So a single moment in which the machine was busy is not
+taken as proof.
+"""
 
 
 class CycleMeter:

@@ -71,8 +71,9 @@ def _too_far(settings: Settings, arm: Arm, start_deg: NDArray[np.float64], paths
 
 
 def _singular(settings: Settings, paths_deg: NDArray[np.float64]) -> str:
-    """Return why paths come too near to a singularity. There a pose does not determine the axes, or needs
-    unlimited axis speeds. Beyond it the controller may choose other axes than the planned ones."""
+    """Return why paths come too near to a singularity. At a singularity a pose does not determine the axes, or
+    needs unlimited axis speeds. Beyond it the controller may choose other axes than the planned ones.
+    """
     arm, margin_deg = settings.wrist, settings.singularity_margin_deg
     theta = arm.theta(paths_deg)
     upper, fore = theta[:, 1], theta[:, 1] + theta[:, 2]

@@ -303,8 +303,9 @@ class RsiSession:
         self.motion.stand_at(packet.joints_deg)
 
     def _new_witness(self, *, is_simulated: bool) -> ArmWitness:
-        """Return a new witness. `is_simulated` says that the world waits for answers or for its machine, so that
-        the clock says nothing about silences."""
+        """Return a new witness. `is_simulated` says that the simulated world waits for answers or for its
+        machine. The clock then cannot show for how long the controller was silent.
+        """
         config = self._config
         follow = follow_bounds(config.corrects, config.follow_deg, config.geometry)
         return ArmWitness(

@@ -47,11 +47,11 @@ class LagBounds:
     """Bounds of an answer's distance from the arm."""
 
     follow: Six
-    """Allowed distance of the arm from the places to which it was led."""
+    """Allowed distance of the arm from the places to which the answers led it."""
     step: Six
     """One cycle's step."""
     lag_s: float
-    """Time within which the arm comes to a place to which it was led."""
+    """Time within which the arm reaches a place to which the answers led it."""
 
 
 class ArmWitness:

@@ -40,7 +40,7 @@ class MeasuredMaterial(Model):
     cluster: Annotated[int, Field(ge=0)] | None = None
     """Cluster of a result; if not given, the mean of its triangles."""
     triangles: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] | None = None
-    """Triangles of a result's mesh; their mean is used."""
+    """Triangles of a result's mesh; the mean of their materials is used."""
 
     @model_validator(mode="after")
     def _one_region(self) -> MeasuredMaterial:

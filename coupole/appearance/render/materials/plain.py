@@ -65,8 +65,9 @@ class Paint(Model):
     the binder."""
     thickness_mm: Positive | None = None
     ground: Reflectance = Constant(kind="constant", value=0.0)
-    """Reflectance of the ground. A measured one is that under a face of the same index; others are inside the
-    binder."""
+    """Reflectance of the ground. A measured reflectance is that of the ground under a face of the same index;
+    other reflectances are inside the binder.
+    """
     scattering_per_mm: Positive = 30.0
     """Scattering of a pigment that is given by its reflectance; a paint file has its own."""
     index: Refraction = indices.BINDER
@@ -78,8 +79,9 @@ class Lacquer(Model):
 
     kind: Literal["lacquer"]
     body: Reflectance = Constant(kind="constant", value=0.006)
-    """Reflectance inside the lacquer. A measured one was measured through the lacquer, unless the sample was
-    bare."""
+    """Reflectance inside the lacquer. A measured reflectance was measured through the lacquer, unless the sample
+    was bare.
+    """
     index: Refraction = indices.URUSHI
     roughness: Roughness = 0.04
 
@@ -138,7 +140,9 @@ class Films(Model):
 
 
 class Glass(Model):
-    """A transparent and smooth material. A closed body of it refracts light, and absorbs it along its path."""
+    """A transparent and smooth material. A closed body of this material refracts light, and absorbs it along its
+    path.
+    """
 
     kind: Literal["glass"]
     index: Index = indices.BINDER

@@ -36,9 +36,9 @@ def little_address_space(pid: int = 0) -> str:
         return ""
     if limit_bytes == resource.RLIM_INFINITY or limit_bytes >= LEAST_ADDRESS_SPACE_BYTES:
         return ""
-    who = f"process {pid}" if pid else "this process"
+    process = f"process {pid}" if pid else "this process"
     return (
-        f"{who} may have {limit_bytes / 1e9:.2f} GB of address space; a plan needs "
+        f"{process} may have {limit_bytes / 1e9:.2f} GB of address space; a plan needs "
         f"{LEAST_ADDRESS_SPACE_BYTES / 1e9:.1f} GB, and large frames need more"
     )
 

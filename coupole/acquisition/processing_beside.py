@@ -26,6 +26,7 @@ from coupole.acquisition.signals import SignalReceived
 from coupole.errors import InputError
 from coupole.intake.plain_data import json_of
 from coupole.preflight.discard_room import DiscardRoom
+from coupole.preflight.machine import little_address_space
 from coupole.storage.journal_events import FramesDiscarded
 from coupole.storage.processing import Progress, default_result, go_on_command, tell
 from coupole.storage.run import Run
@@ -70,6 +71,8 @@ class ProcessingBeside:
         self._is_ending = False
         self._why = ""
         """Known reason why the result is not complete."""
+        self._shortage = ""
+        """Sentence on the limit of the process's memory, if it has ended under a limit that is too low."""
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
         self._process = subprocess.Popen(
             [sys.executable, "-m", _PROGRAM, str(os.getpid())],
@@ -112,6 +115,8 @@ class ProcessingBeside:
             self._console.print("reflectance: checking plan, mesh and records ...", markup=False)
         if not self._has_answered.wait(_READY_WITHIN_S):
             return [f"--reflectance: its process gave no answer within {_READY_WITHIN_S:g} s"]
+        if why := self._shortage or self._shortage_now():
+            return [f"--reflectance: {why}"]
         if self._reasons is None:
             return [f"--reflectance: its process ended: {self._last_words}"]
         return self._reasons
@@ -233,7 +238,9 @@ class ProcessingBeside:
 
     @property
     def _reason(self) -> str:
-        return self._why or self._progress.why or self._last_words
+        if self._why or not self._shortage:
+            return self._why or self._progress.why or self._last_words
+        return f"{self._shortage} ({self._progress.why})" if self._progress.why else self._shortage
 
     def _say_unfinished(self) -> None:
         assert self._run is not None
@@ -256,6 +263,7 @@ class ProcessingBeside:
             for line in lines:
                 with contextlib.suppress(InputError, ValueError):
                     self._hear(json_of(line, _PROGRAM))
+        self._shortage = self._shortage_now()
         self._process.wait()
         self._has_answered.set()
         self._has_ended.set()
@@ -293,6 +301,12 @@ class ProcessingBeside:
             f"reflectance failed: {self._reason}. The acquisition continues without it; "
             f"the samples of {self._views_text} are kept"
         )
+
+    def _shortage_now(self) -> str:
+        """Return that the process, which has not been waited for, may have too little memory; empty if it may have
+        enough."""
+        why = little_address_space(self._process.pid)
+        return f"memory did not suffice: {why}" if why else ""
 
     def _leave_word(self) -> None:
         """Write why the process has ended, for those who only see the folder of the result."""

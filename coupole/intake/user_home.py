@@ -22,7 +22,7 @@ def user_home() -> Path:
     )
 
 
-def expanded(path: Path) -> Path:
+def with_home(path: Path) -> Path:
     """Return a path whose first part may be `~` or `~user`, with the home folder in its place. Raises InputError
     if there is no such user, or no home."""
     if path.parts[:1] == ("~",):

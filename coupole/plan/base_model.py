@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchema
 
 from coupole.errors import InputError
 from coupole.geometry import Transform, transform
-from coupole.intake.user_home import expanded
+from coupole.intake.user_home import with_home
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
@@ -37,7 +37,7 @@ def possible_path(path: Path) -> Path:
         raise ValueError("a path without NUL characters")
     if str(path).startswith("~"):
         try:
-            expanded(path)
+            with_home(path)
         except InputError as error:
             raise ValueError(f"a path in the home folder of a known user: {error}") from error
     return path

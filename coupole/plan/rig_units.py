@@ -46,8 +46,8 @@ class _Least:
     def doubts(self) -> Iterator[Doubt]:
         asks = f"is it in {self.hint or self.unit}?"
         if 0 < self.value < self.possible:
-            expected = f"expected {'0 or ' * self.may_be_zero}at least {self.possible:g} {self.unit}"
-            yield Doubt(self.at, f"{expected}, found {self.value:.3g}; {asks}", True)
+            bound = f"{'0 or ' * self.may_be_zero}at least {self.possible:g} {self.unit}"
+            yield Doubt(self.at, f"expected {bound}, found {self.value:.3g}; {asks}", True)
         elif 0 < self.value < self.usual:
             yield Doubt(self.at, f"{self.value:.3g} {self.unit} is unusually little; {asks}", False)
 
@@ -62,8 +62,8 @@ def doubt_of_dome(leds: LedTable) -> list[Doubt]:
     spread_mm = float(np.ptp(leds.positions_mm, axis=0).max())
     if len(leds.ids) == 1 or spread_mm >= _LEAST_SPREAD_MM:
         return []
-    expected = f"expected LEDs at least {_LEAST_SPREAD_MM:g} mm apart"
-    return [Doubt(("dome", "leds"), f"{expected}, found {spread_mm:.3g} mm at most; is it in mm?", True)]
+    bound = f"expected LEDs at least {_LEAST_SPREAD_MM:g} mm apart"
+    return [Doubt(("dome", "leds"), f"{bound}, found {spread_mm:.3g} mm at most; is it in mm?", True)]
 
 
 def _leasts(rig: Rig) -> Iterator[_Least]:

@@ -27,7 +27,7 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from coupole.errors import InputError, Problem
 from coupole.intake.input_files import InputFiles
-from coupole.intake.user_home import expanded
+from coupole.intake.user_home import with_home
 from coupole.plan.validation_messages import KeyPath, Mistake, key_text, mistakes_of
 from coupole.plan.yaml_graph import graph
 
@@ -72,7 +72,7 @@ class Document:
         """Return `path` made absolute. A relative path is relative to this document's folder. Links are followed
         only once, so that they lead to the same place as long as the document is used."""
         if path not in self._resolved_paths:
-            self._resolved_paths[path] = (self.path.parent / expanded(path)).resolve()
+            self._resolved_paths[path] = (self.path.parent / with_home(path)).resolve()
         return self._resolved_paths[path]
 
     def problem(self, key_path: KeyPath, message: str) -> Problem:

@@ -25,13 +25,24 @@ libraries. Embree ends the process with a segmentation fault where it gets none.
 
 def refuse_little_address_space() -> None:
     """Raises ResourceShortage if this process is limited to less than LEAST_ADDRESS_SPACE_BYTES (`ulimit -v`)."""
-    limit_bytes, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if limit_bytes != resource.RLIM_INFINITY and limit_bytes < LEAST_ADDRESS_SPACE_BYTES:
-        raise ResourceShortage(
-            f"this process may have {limit_bytes / 1e9:.2f} GB of address space; a plan needs "
-            f"{LEAST_ADDRESS_SPACE_BYTES / 1e9:.1f} GB, and large frames need more. Raise the limit (`ulimit -v "
-            "unlimited`)."
-        )
+    if why := little_address_space():
+        raise ResourceShortage(f"{why}. Raise the limit (`ulimit -v unlimited`).")
+
+
+def little_address_space(pid: int = 0) -> str:
+    """Return why a process of this user (0: this one) has too little memory: it is limited to less than
+    LEAST_ADDRESS_SPACE_BYTES (`ulimit -v`, `prlimit --as`). Empty if it is not, or if there is no such process."""
+    try:
+        limit_bytes, _ = resource.prlimit(pid, resource.RLIMIT_AS)
+    except OSError:
+        return ""
+    if limit_bytes == resource.RLIM_INFINITY or limit_bytes >= LEAST_ADDRESS_SPACE_BYTES:
+        return ""
+    process = f"process {pid}" if pid else "this process"
+    return (
+        f"{process} may have {limit_bytes / 1e9:.2f} GB of address space; a plan needs "
+        f"{LEAST_ADDRESS_SPACE_BYTES / 1e9:.1f} GB, and large frames need more"
+    )
 
 
 def machine_needs(cell: Cell) -> list[tuple[str, HostNeed]]:

@@ -17,7 +17,7 @@ from pydantic import BaseModel, field_validator
 from ruamel.yaml import YAML
 
 from coupole.errors import InputError
-from coupole.intake.user_home import expanded
+from coupole.intake.user_home import with_home
 from coupole.plan import plan as plan_models
 from coupole.plan import rig as rig_models
 from coupole.plan import yamlfile
@@ -117,7 +117,7 @@ def _with_paths(value: Any, resolve: Callable[[Path], Path]) -> Any:
 
 
 def _from_here(path: Path) -> Path:
-    return (Path.cwd() / expanded(path)).resolve()
+    return (Path.cwd() / with_home(path)).resolve()
 
 
 def _is_shipped_rig(path: Path) -> bool:

@@ -6,8 +6,11 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import resource
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -19,11 +22,21 @@ from beside_runs import begun, cell_of_three_views, files, is_beside, result_of,
 from cells import CellFolder
 from PIL import Image
 
+from coupole.acquisition.processing_beside import ProcessingBeside
 from coupole.reflectance.beside.beforehand import reasons_against
 from coupole.storage.growing_pictures import PICTURES, file_so_far, read_growing
+from coupole.viewing.terminal import make_console
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("hurried")]
 NICE_OF_THE_END = 10
+LITTLE_BYTES = 300_000_000
+WORDS_UNDER_A_LIMIT = f"""
+import resource
+from coupole.reflectance.beside.follower import _words_on
+print(_words_on(TypeError("int()")))
+resource.setrlimit(resource.RLIMIT_AS, ({LITTLE_BYTES}, {LITTLE_BYTES}))
+print(_words_on(TypeError("int()")))
+"""
 
 
 def has_samples(cell: CellFolder) -> bool:
@@ -122,6 +135,38 @@ def test_a_run_does_not_wait_for_a_processing_that_is_stopped(tmp_path: Path) ->
     assert not said["is_whole"]
     assert "is stopped (SIGSTOP)" in said["why"]
     assert not cells.alive(worker)
+
+
+def test_a_processing_that_gets_no_more_memory_says_so_and_is_no_defect(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path)
+    process, worker = begun(cell)
+    cells.wait_until(result_of(cell).is_dir, "the folder in which the reason is left")
+    resource.prlimit(worker, resource.RLIMIT_AS, (LITTLE_BYTES, resource.RLIM_INFINITY))
+    ended = cells.finish(process)
+    said = frames_alone_count(ended)
+    assert not said["is_whole"]
+    assert f"memory did not suffice: process {worker} may have 0.30 GB of address space" in said["why"]
+    assert "defect" not in ended.err
+    assert status(cell.run_folder)["why"] == said["why"]
+
+
+def test_an_error_of_a_library_that_gets_no_memory_is_not_called_a_defect() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", WORDS_UNDER_A_LIMIT], capture_output=True, text=True, check=True, cwd=cells.REPO
+    )
+    assert ended.stdout.splitlines() == [
+        "TypeError: int(). This is a defect of Coupole: please report it",
+        "TypeError: int()",
+    ]
+
+
+def test_a_processing_with_too_little_memory_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path)
+    with ProcessingBeside(cell.plan, cell.rig, None, make_console(quiet=True)) as processing:
+        (worker,) = [child for child in cells.children(os.getpid()) if is_beside(child)]
+        resource.prlimit(worker, resource.RLIMIT_AS, (LITTLE_BYTES, resource.RLIM_INFINITY))
+        (refusal,) = processing.refusals()
+    assert refusal.startswith(f"--reflectance: memory did not suffice: process {worker} may have 0.30 GB")
 
 
 @pytest.mark.parametrize("stopped", [False, True])

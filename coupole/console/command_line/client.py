@@ -213,7 +213,7 @@ def ask_permission(cell: Cell, action: str) -> None:
     no permission is needed. Raises InputError if another person is in control, or if the console does not
     answer."""
     with contextlib.suppress(NotServed):
-        call(cell, "POST", "/api/v1/bench/permission", {"what": action})
+        call(cell, "POST", "/api/v1/bench/permission", {"action": action})
 
 
 @contextlib.contextmanager

@@ -51,11 +51,11 @@ def add_bench_routes(app: FastAPI, service: Service) -> None:
         return FileResponse(path)
 
     @app.post("/api/v1/bench/permission", responses=REFUSALS)
-    def permit(action: Permission, person: Who, request: Request) -> dict[str, str]:
+    def permit(question: Permission, person: Who, request: Request) -> dict[str, str]:
         """Tell a command whether it may act with the devices that the bench holds: nobody else is in control. The
         command then asks the bench itself, which ends the motion when that process ends."""
-        request.state.about = action.what
-        allow(service, person, Role.OPERATOR, action.what, acts=True)
+        request.state.about = question.action
+        allow(service, person, Role.OPERATOR, question.action, acts=True)
         return {"in_control": service.control.now.name}
 
     @app.websocket(HOLD)

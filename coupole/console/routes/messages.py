@@ -89,7 +89,7 @@ class Lease(Asked):
 class Permission(Asked):
     """Question of a command whether it may act with devices that are open already."""
 
-    what: Annotated[Line, Field(min_length=1, max_length=200)]
+    action: Annotated[Line, Field(min_length=1, max_length=200)]
     """The action, in words."""
 
 

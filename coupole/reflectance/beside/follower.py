@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from coupole.errors import CoupoleError, reason
+from coupole.preflight.machine import little_address_space
 from coupole.reflectance.beside.growing import Growth, fit_so_far
 from coupole.reflectance.beside.looking_ahead import look_ahead
 from coupole.reflectance.beside.page_maker import PageMaker
@@ -47,9 +48,16 @@ def process_run(folder: Path, result: Path, say: Say, at_the_end: AtTheEnd, page
         teller.fail(str(error) if isinstance(error, CoupoleError) else reason(error))
         return False
     except Exception as error:  # noqa: BLE001  a defect must not end without a word
-        teller.fail(f"{type(error).__name__}: {error}. This is a defect of Coupole: please report it")
+        teller.fail(_words_on(error))
         return False
     return True
+
+
+def _words_on(error: Exception) -> str:
+    """Return a sentence on an error that nobody expected. A library that gets no memory may raise any error: that
+    is no defect."""
+    words = f"{type(error).__name__}: {error}"
+    return words if little_address_space() else f"{words}. This is a defect of Coupole: please report it"
 
 
 class _ViewsCameError(Exception):

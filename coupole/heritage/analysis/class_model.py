@@ -119,9 +119,10 @@ class ClassModel:
 
     @cached_property
     def threshold(self) -> float:
-        """Least probability that the class is in the library, for it to count as known. If their class is left
-        out, only a share of 0.05 of the references reach it; references that a family (`pigment_classes`) excludes
-        count as not reaching it."""
+        """A spectrum counts as known from this probability on that its class is in the library. If the class of a
+        reference is left out of the library, only a share of 0.05 of the references reach this probability.
+        References that a family (`pigment_classes`) excludes count as not reaching it.
+        """
         probabilities = self.held_out.without_class
         known_probability = 1.0 - probabilities[:, -1]
         for row, number in enumerate(self._classes):

@@ -59,7 +59,7 @@ FIELDS = {
     "kd": "1/sr, by channel",
     "ks": "by channel; f = kd + ks D V",
     "alpha": "GGX's roughness",
-    "residual": "weighted rms residual of the square roots, as a share of sqrt(kd)",
+    "residual": "weighted rms of the residuals of the values' square roots, as a share of sqrt(kd)",
 }
 UNCERTAIN = {
     "covariance": "lower half, row by row, of tilts (rad) along two tangents of the normal and of the logarithms "

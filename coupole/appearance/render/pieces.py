@@ -19,8 +19,8 @@ class Piece:
     smooth: bool = False
     """True for smooth shading."""
     normals: Array | None = None
-    """[triangles, 3, 3] for smooth shading, one for each corner. The normals come from the body of which this
-    piece is a part.
+    """[triangles, 3, 3] normals for smooth shading, one for each corner. The normals come from the body of which
+    this piece is a part.
     """
 
 

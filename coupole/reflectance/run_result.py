@@ -303,8 +303,9 @@ class RunResult:
         return read_clusters(self.folder)
 
     def slices(self, name: str, view: ViewSamples, rows: slice = slice(None)) -> NDArray[np.float32]:
-        """[n, channels, coefficients] of rows of a view's file, by a fit's name in `SLICES`. Raises InputError for
-        a fit that an earlier version made."""
+        """[n, channels, coefficients] coefficients for rows of a view's file, by a fit's name in `SLICES`. Raises
+        InputError for a fit that an earlier version made.
+        """
         path = self.slices_path(name, view)
         with h5py.File(path, "r") as file:
             if file["coefficients"].shape[-1] != SLICES[name].coefficients:

@@ -34,7 +34,7 @@ class ChannelSamples:
     """Samples of one channel on a grid of triangles and LEDs of a view, flattened row by row."""
 
     rows: Integers
-    """[n] rows of the view's file."""
+    """[n] numbers of rows of the view's file."""
     leds: Integers
     """[n] places in the view's LEDs."""
     f: Floats

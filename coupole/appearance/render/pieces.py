@@ -14,7 +14,7 @@ class Piece:
     """Triangles of one material."""
 
     corners_mm: Array
-    """[triangles, 3, 3] in the scene's frame, counter-clockwise seen from outside."""
+    """[triangles, 3, 3] corners in the scene's frame, counter-clockwise seen from outside."""
     material: Material | Pane
     smooth: bool = False
     """True for smooth shading."""

@@ -39,9 +39,11 @@ class HeldOut:
     """Probabilities of the references, each computed as if it were not in the library."""
 
     probabilities: Array
-    """[n, classes + 1], without the reference itself; the last one is the probability of none."""
+    """[n, classes + 1] probabilities when the reference itself is left out. The last one is the probability that
+    no class is right.
+    """
     without_class: Array
-    """[n, classes + 1], without the reference's whole class."""
+    """[n, classes + 1] probabilities when the reference's whole class is left out."""
 
 
 class ClassModel:

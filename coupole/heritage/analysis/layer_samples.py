@@ -70,7 +70,7 @@ class Samples:
     """Films in the bands that all spectra cover."""
 
     wavelengths_nm: Array
-    """[n] of 380 to 780 by 5 nm."""
+    """[n] wavelengths from 380 to 780 nm that are multiples of 5 nm."""
     films: list[Film]
     directional: Directional | None
     face: Face

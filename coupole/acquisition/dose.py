@@ -35,7 +35,7 @@ from coupole.storage.ledger_lines import Asked, History
 from coupole.storage.run import user_name
 
 LuxHours = NDArray[np.float64]
-"""[points] at each of the object's dose points."""
+"""[points] light at each of the object's dose points."""
 _CLOCKS_PPM, _START_US = 1000, 1000
 """Allowances for steps that the box's log lacks: for the error of the box's clock, and for the time that the box
 needs to start a table."""

@@ -31,7 +31,7 @@ class _Result:
 
     parts: Makie
     metal_rgb: NDArray[np.float64]
-    """[3], linear, in the photograph's unit."""
+    """[3] colour of the metal, linear, in the photograph's unit."""
     lacquer_rgbs: list[NDArray[np.float64]]
     """List of [3], in the unit of `metal_rgb`."""
     unknown_share: float

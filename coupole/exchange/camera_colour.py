@@ -21,7 +21,7 @@ from coupole.errors import InputError, reason
 
 Floats = NDArray[np.float64]
 Neutral = Callable[[int | None], Floats]
-"""[3] of white under an LED, by the LED's id: values of the channels, the greatest of which is 1."""
+"""[3] values of the channels for white under an LED, by the LED's id. The greatest value is 1."""
 
 _NOISE = 0.02
 """Share of a table's greatest value by which a value may be below 0."""

@@ -113,7 +113,7 @@ class Occlusions:
     mesh: Any
     """The object's mesh, prepared for rays (`ray_mesh`)."""
     leds_mm: NDArray[np.float64]
-    """[leds, 3] in the support frame."""
+    """[leds, 3] places of the LEDs in the support frame."""
     object_codes: NDArray[np.uint8]
     """[patches, leds] REACHED, AWAY or BY_OBJECT, of the object alone."""
 

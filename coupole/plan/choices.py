@@ -189,9 +189,10 @@ def before_last(
 
 
 def bound_of(whole: Sequence[Burst], frames_of_light: int, again: Collection[int]) -> tuple[Burst, ...]:
-    """Return the bound of a view whose bursts are chosen from `whole` (shortest exposure first). It has the
-    longest `frames_of_light` bursts with all LEDs, and the longest two once more with the LEDs `again`. It also
-    has marks and dark frames for all further bursts that a view may have."""
+    """Return the bound of a view whose bursts are chosen from `whole` (shortest exposure first). The bound has
+    the `frames_of_light` longest bursts with all LEDs, and the two longest once more with the LEDs `again`. The
+    bound also has marks and dark frames for all further bursts that a view may have.
+    """
     in_first = [burst for burst in whole if burst.repeat == 0]
     longest = in_first[-1]
     bursts = in_first[-frames_of_light:]

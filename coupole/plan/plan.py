@@ -110,7 +110,8 @@ class AdaptiveViews(Model):
     def _plan_lights(cls, candidates: tuple[View, ...]) -> tuple[View, ...]:
         if names := [view.name for view in candidates if view.lights is not None]:
             raise ValueError(
-                f"candidates without `lights` of their own: all get the plan's; found some in {names}"
+                f"candidates without `lights` of their own, because all use the plan's lights; found `lights` in "
+                f"{names}"
             )
         return candidates
 

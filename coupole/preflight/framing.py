@@ -24,8 +24,9 @@ from coupole.plan.schedule import Schedule, ViewPose
 SHARP_PX = 2.0
 """One cell of the Bayer pattern."""
 RESTS_MM = 2.0
-"""An object counts as resting on the disk if its distance from the disk, above or below, is at most this. Meshes
-and poses are not known better before they are calibrated."""
+"""An object counts as resting on the disk if its distance from the disk, above or below, is at most this. Before
+a calibration, meshes and poses are not known better.
+"""
 _COLUMNS = 64
 """Number of rays in each row of the picture."""
 _SAMPLES = 2000

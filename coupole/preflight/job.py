@@ -113,8 +113,9 @@ def with_choices(
     job: Job, choices: Mapping[str, Sequence[Choice]], chosen_views: Sequence[ChosenView] = ()
 ) -> Job:
     """Return the same job for a run that has made these choices of bursts and views. If it needs no more views,
-    the others are left out. Raises StorageError for a choice that the plan does not allow, because the journal was
-    then changed."""
+    the others are left out. Raises StorageError for a choice that the plan does not allow: such a choice shows
+    that the journal was changed.
+    """
     try:
         if job.schedule.is_open:
             job = replace(job, schedule=job.schedule.with_choices(choices), choices=choices)

@@ -149,7 +149,7 @@ class ObjectLight:
     """The object, as far as light harms it."""
 
     points_support_mm: NDArray[np.float64]
-    """[n, 3] at which the dose is computed, support frame; the highest dose counts."""
+    """[n, 3] points at which the dose is computed, support frame. The highest dose counts."""
     dose_before_lux_h: float = 0.0
     """Light that it has received before, by its ledger."""
     dose_budget_lux_h: float | None = None

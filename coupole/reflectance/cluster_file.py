@@ -41,7 +41,7 @@ class Clusters:
     alpha: NDArray[np.float64]
     residual: NDArray[np.float64]
     harmonics: NDArray[np.float32]
-    """[clusters, functions, channels] of `pair_harmonics`, 1/sr."""
+    """[clusters, functions, channels] coefficients of `pair_harmonics`, 1/sr."""
 
     def at(
         self, own_materials: TriangleMaterials, mesh_normals: NDArray[np.float64], block: slice | NDArray[np.int64]

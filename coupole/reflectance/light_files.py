@@ -34,7 +34,7 @@ class LightFile:
     """Lights as a file describes them."""
 
     directions: Floats
-    """[n, 3] of any length, from the object to the light: x right, y up, z to the camera."""
+    """[n, 3] directions of any length, from the object to the light: x right, y up, z to the camera."""
     names: tuple[str, ...] = ()
     """Names of the pictures; empty if the file has none."""
     intensities: Floats | None = None

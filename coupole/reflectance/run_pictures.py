@@ -73,7 +73,7 @@ class HeldOut:
     rows: slice
     """Rows of the view's file."""
     places: NDArray[np.int64]
-    """[n] in the triangles of the fits."""
+    """[n] places of these triangles among the triangles of the fits."""
     samples: TriangleSamples
     share: NDArray[np.float64]
     """[n, leds, channels] share of the camera's range for f cos_i = 1."""

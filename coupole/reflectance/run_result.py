@@ -59,7 +59,7 @@ FIELDS = {
     "kd": "1/sr, by channel",
     "ks": "by channel; f = kd + ks D V",
     "alpha": "GGX's roughness",
-    "residual": "weighted rms residual of the square roots, as a share of sqrt(kd)",
+    "residual": "weighted rms of the residuals of the values' square roots, as a share of sqrt(kd)",
 }
 UNCERTAIN = {
     "covariance": "lower half, row by row, of tilts (rad) along two tangents of the normal and of the logarithms "
@@ -303,8 +303,9 @@ class RunResult:
         return read_clusters(self.folder)
 
     def slices(self, name: str, view: ViewSamples, rows: slice = slice(None)) -> NDArray[np.float32]:
-        """[n, channels, coefficients] of rows of a view's file, by a fit's name in `SLICES`. Raises InputError for
-        a fit that an earlier version made."""
+        """[n, channels, coefficients] coefficients for rows of a view's file, by a fit's name in `SLICES`. Raises
+        InputError for a fit that an earlier version made.
+        """
         path = self.slices_path(name, view)
         with h5py.File(path, "r") as file:
             if file["coefficients"].shape[-1] != SLICES[name].coefficients:

@@ -34,7 +34,7 @@ class ChannelSamples:
     """Samples of one channel on a grid of triangles and LEDs of a view, flattened row by row."""
 
     rows: Integers
-    """[n] rows of the view's file."""
+    """[n] numbers of rows of the view's file."""
     leds: Integers
     """[n] places in the view's LEDs."""
     f: Floats
@@ -155,9 +155,10 @@ def _centres(path: Path) -> tuple[Floats, Floats, cKDTree]:
 
 
 def triangles_beside(result: RunResult, view: ViewSamples, rows: Integers) -> Beside:
-    """Return triangles on all sides of `rows`, in the plane across the line of sight. Their distance is the likely
-    shift of a picture, or they are the nearest triangles. Raises InputError for a file that an earlier version
-    made."""
+    """Return triangles on all sides of `rows`, in the plane across the line of sight. They are at the distance of
+    the likely shift of a picture, or are the nearest triangles. Raises InputError for a file that an earlier
+    version made.
+    """
     with h5py.File(view.path, "r") as file:
         if "lateral_u_mm" not in file.attrs:
             raise InputError(f"{view.path}: an earlier version made it; make the result again")

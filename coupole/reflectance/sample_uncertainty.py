@@ -40,21 +40,21 @@ class Sources:
     u_noise: Floats
     """[n] relative."""
     u_response: Floats
-    """[n] relative, from the responses of the pixels that a triangle covers."""
+    """[n] relative uncertainty from the responses of the pixels that a triangle covers."""
     u_indirect: Floats
-    """[n] relative, from the subtracted inter-reflection."""
+    """[n] relative uncertainty from the subtracted inter-reflection."""
     u_place: Floats
-    """[n] relative, from the surface beside a triangle that pixels may see."""
+    """[n] relative uncertainty from the surface beside a triangle that pixels may see."""
     u_own: Floats
-    """[n] relative, from an LED's own power."""
+    """[n] relative uncertainty from an LED's own power."""
     u_shared: Floats
-    """[n] relative, from errors that all LEDs share."""
+    """[n] relative uncertainty from errors that all LEDs share."""
     vertex_um: Floats
     """[n] uncertainty of each coordinate of a vertex; coordinates are independent."""
     led_mm: Floats
     """[n] uncertainty of each coordinate of an LED."""
     u_glare: Floats
-    """[n] relative, from the subtracted veil."""
+    """[n] relative uncertainty from the subtracted veil."""
 
     @property
     def u_signal(self) -> Floats:

@@ -104,7 +104,7 @@ def recurrence(degrees: int) -> tuple[Floats, Floats]:
 
 
 def diagonal(degrees: int) -> Floats:
-    """[degrees] of P(m, m) over P(m - 1, m - 1)."""
+    """[degrees] ratios of P(m, m) to P(m - 1, m - 1)."""
     return np.array([1.0, *(math.sqrt((2.0 * m + 1.0) / (2.0 * m)) for m in range(1, degrees))])
 
 

@@ -32,7 +32,7 @@ class StratumFactors:
 
     log_quantile: float
     log_factors: dict[str, Floats]
-    """[`MOST_STRATA`] for each way to divide; 0 for a stratum without samples."""
+    """[`MOST_STRATA`] logarithms of factors for each way to divide; 0 for a stratum without samples."""
 
     def quantiles(self, labels: Labels) -> Floats:
         """Return the quantile [n] of each sample, from all its strata."""

@@ -62,7 +62,7 @@ class TriangleSamples:
     centres_mm: Floats
     """[b, 3]"""
     normals: Floats
-    """[b, 3] of the mesh."""
+    """[b, 3] normals of the mesh."""
     areas_mm2: Floats
     """[b]"""
 

@@ -25,7 +25,7 @@ class Mesh:
     vertices: NDArray[np.float32]
     """[n, 3], finite."""
     triangles: NDArray[np.uint32]
-    """[m, 3] rows of `vertices`."""
+    """[m, 3] for each triangle the rows of its corners in `vertices`."""
 
 
 def expect_records(
@@ -40,9 +40,8 @@ def expect_room(path: Path, record_name: str, count: int, least_bytes: int, size
     memory is allocated."""
     if count * least_bytes > size_bytes:
         raise InputError(
-            f"{path}: expected {count} of {record_name}, as its header says, of {least_bytes} bytes or more "
-            f"each; the "
-            f"file has {size_bytes} bytes: it was cut off, or its header is wrong"
+            f"{path}: expected {count} of {record_name}, as its header says, of {least_bytes} bytes or more each; "
+            f"the file has {size_bytes} bytes: it was cut off, or its header is wrong"
         )
 
 

@@ -77,17 +77,19 @@ class Result:
 
     @property
     def base_from_support(self) -> NDArray[np.float64]:
-        """[4, 4] from support to base coordinates, mm."""
+        """[4, 4] transform from support to base coordinates, mm."""
         return self._result.base_from_support
 
     @property
     def vertices_mm(self) -> NDArray[np.float32]:
-        """[vertices, 3] of the mesh, base frame, mm; corners with the same coordinates are one vertex."""
+        """[vertices, 3] vertices of the mesh, base frame, mm. Corners with the same coordinates are one vertex."""
         return self._mesh[0]
 
     @property
     def faces(self) -> NDArray[np.int64]:
-        """[faces, 3] rows of `vertices_mm`, in the order of the mesh's file."""
+        """[faces, 3] for each face the rows of its corners in `vertices_mm`. Faces are in the order of the mesh's
+        file.
+        """
         return self._mesh[1]
 
     @cached_property

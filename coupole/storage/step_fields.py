@@ -19,7 +19,7 @@ _UNKNOWN = 0
 
 
 def step_fields(record: StepRecord, t_trigger_ns: int) -> dict[str, int]:
-    """Return the columns of the frame that a step made. The step was triggered at `t_trigger_ns`."""
+    """Return the values of a step for the table of frames. The step was triggered at `t_trigger_ns`."""
     return {
         "t_trigger_ns": t_trigger_ns,
         "led": STORED_NO_LED if record.led == NO_LED else record.led,

@@ -207,8 +207,9 @@ def _camera(scene: Scene, stop: Stop) -> list[Any]:
 
 
 def _leds(scene: Scene, share: NDArray[np.float64], stop: Stop | None) -> Any:
-    """Draw the LEDs of the plan, coloured by the share that they reach. In a view, they have the causes of
-    occlusion."""
+    """Draw the LEDs of the plan, coloured by the share that they reach. In a view, the text at each LED has the
+    causes of occlusion.
+    """
     columns = [scene.led_ids, share]
     hover = "LED %{customdata[0]:.0f}: reaches %{customdata[1]:.0%} of the visible surface"
     if stop is not None and stop.shadow is not None:

@@ -90,7 +90,7 @@ class Scene:
     object_solid: Solid | None
     """The object."""
     patch_of_face: NDArray[np.int64]
-    """[faces] of the object, -1 for none."""
+    """[faces] number of the object's patch; -1 for none."""
     keep_out: tuple[Solid, ...]
     leds_mm: Points
     led_ids: NDArray[np.int64]

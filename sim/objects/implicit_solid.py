@@ -33,7 +33,7 @@ class Form:
     start: Point
     end: Point
     radii: tuple[float, float]
-    """Radii at both ends, of each axis before `stretch`."""
+    """Radii at both ends, before the axes are stretched by `stretch`."""
     blend: float = 0.0
     """Width of the transition to the forms before it; 0 for a sharp edge."""
     is_cut: bool = False

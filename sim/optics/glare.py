@@ -103,7 +103,7 @@ def _spectra(
 
 
 def _square_distances(shape: tuple[int, int]) -> Floats:
-    """[2 rows, 2 columns] from the first cell, around the edges."""
+    """[2 rows, 2 columns] squared distances from the first cell, around the edges."""
     rows, columns = (np.minimum(np.arange(2 * size), 2 * size - np.arange(2 * size)) for size in shape)
     return np.asarray(rows[:, None].astype(float) ** 2 + columns[None].astype(float) ** 2)
 

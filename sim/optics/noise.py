@@ -52,7 +52,8 @@ INVERSE_NORMAL = _inverse_normal()
 
 def _small_means() -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
     """Return the probability of fewer than n counts [128, 72] for means in steps of 1/8, in units of 2^-32. Also
-    return the count at which the search begins [128, 256], by a word's upper 8 bits."""
+    return a table [128, 256] of the counts at which the search begins, for each value of a word's upper 8 bits.
+    """
     means = np.arange(int(POISSON_EXACT_BELOW) * _MEANS_PER_ELECTRON)[:, None] / _MEANS_PER_ELECTRON
     factors = np.concatenate([np.exp(-means), means / np.arange(1, _COUNTS - 1)], axis=1)
     fewer = np.cumsum(np.cumprod(factors, axis=1), axis=1) * 2.0**32

@@ -77,7 +77,7 @@ class Look:
 
     @cached_property
     def albedo(self) -> NDArray[np.float32]:
-        """[sites, 3] for light from all directions."""
+        """[sites, 3] albedo for light from all directions."""
         return albedo(self.view, self.scene.materials)
 
 

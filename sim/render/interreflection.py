@@ -41,7 +41,7 @@ class Exchange:
     patch: NDArray[np.int32]
     """[triangles]."""
     points_mm: NDArray[np.float32]
-    """[2 patches * POINTS, 3], where light is computed."""
+    """[2 patches * POINTS, 3] points at which light is computed."""
     normals: NDArray[np.float32]
     """[2 patches * POINTS, 3] flat unit normals there."""
     albedo: NDArray[np.float32]

@@ -61,7 +61,9 @@ def led_radiance(
 
 
 def albedo(view: View, materials: NDArray[np.float64]) -> NDArray[np.float32]:
-    """[sites, 3] of light from all directions: diffuse reflectance and that along the normal."""
+    """[sites, 3] albedo for light from all directions: the diffuse reflectance plus the reflectance along the
+    normal.
+    """
     diffuse = view.diffuse[view.triangle]
     if view.fine is not None:
         diffuse *= view.fine.texture[:, None]

@@ -51,7 +51,7 @@ class Scene:
     """[materials, 8] red, green, blue diffuse reflectance; red, green, blue f0; roughness; row of `tables`
     or -1."""
     tables: NDArray[np.float32]
-    """[tables, theta_h, theta_d, phi_d, 3] of materials that have one (`sim.scene.brdf_table`)."""
+    """[tables, theta_h, theta_d, phi_d, 3] tables of the materials that have one (`sim.scene.brdf_table`)."""
     tint: NDArray[np.float32] | None
     """[triangles, 3] factor of the diffuse reflectance."""
     normals: NDArray[np.float32] | None

@@ -96,7 +96,7 @@ class Stickers(BaseModel):
         return stuck_on(surface, self._poses(surface)[: self.count], diameter_mm=self.diameter_mm)
 
     def poses_when_scanned(self, surface: Surface) -> Poses:
-        """[n, 4, 4] of the stickers that were scanned, in the thing's frame."""
+        """[n, 4, 4] poses of the stickers that were scanned, in the thing's frame."""
         return self._poses(surface)[self.new :]
 
     def _poses(self, surface: Surface) -> Poses:

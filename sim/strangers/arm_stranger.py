@@ -49,7 +49,7 @@ class ArmStranger(BaseModel):
         return np.asarray(short + ripple + sag)
 
     def torques_nm(self, origins_mm: Floats, axes: Floats) -> Floats:
-        """[6] of the weight of links and tool about each axis."""
+        """[6] torques of the weight of links and tool about each axis."""
         masses = np.array([*_LINK_KG, _TOOL_KG])
         weight = 9.81 * np.array(self.down) / np.linalg.norm(self.down)
         torques = np.zeros(6)

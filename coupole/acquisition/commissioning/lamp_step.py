@@ -37,7 +37,7 @@ class Pictures:
     noise_dn: float
     """Standard deviation of a picture's mean."""
     currents_ma: NDArray[np.float64]
-    """[leds]; NaN where the box does not measure them."""
+    """[leds] currents; NaN where the box does not measure them."""
     open_leds: list[int]
 
 

@@ -45,8 +45,10 @@ def ambient_light(
     limits: WatchLimits,
     exposure_us: int,
 ) -> Found | None:
-    """Find light that is in later dark frames but not in the first ones, by tiles of their median. None if it is
-    within the limit. The limit allows for noise, and for the dark current of a sensor that warms up."""
+    """Find light that is in later dark frames but not in the first ones, by tiles of their median. Return None if
+    this light is within the limit. The limit allows for noise, and for the dark current of a sensor that warms
+    up.
+    """
     if not later:
         return None
     now_dn = dark_level(later)

@@ -37,9 +37,9 @@ class Sheet:
     normal_reflectance: Array
     """[bands]."""
     internal_reflectance: Array
-    """[bands], for diffuse light from the body."""
+    """[bands] reflectance for diffuse light from the body."""
     internal_transmittance: Array
-    """[bands], to air, for diffuse light from the body; the sheet absorbs the rest."""
+    """[bands] transmittance to air for diffuse light from the body. The sheet absorbs the rest."""
 
 
 @dataclass(frozen=True)

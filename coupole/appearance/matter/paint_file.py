@@ -45,7 +45,7 @@ class PaintFile:
     unit: Unit
     binder_index: float
     wavelengths_nm: Array
-    """[n], in rising order."""
+    """[n] wavelengths in rising order."""
     absorption: Array
     scattering: Array
     u_absorption: Array

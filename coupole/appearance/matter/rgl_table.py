@@ -46,7 +46,7 @@ class RglTable:
     theta_i: Array
     """[T] elevations of incidence, rad, in rising order."""
     ndf: Array
-    """[h, w] with rows of azimuth and columns of elevation, as in all planes here."""
+    """[h, w] values; rows are azimuths and columns are elevations, as in all planes here."""
     sigma: Array
     vndf: Array
     """[P, T, h, w]"""

@@ -43,7 +43,7 @@ class Sun:
     """[3] unit direction in which light travels: into the opening, towards +y."""
     width_deg: float
     irradiance: Array
-    """[81], W/(m^2 nm) on a surface that faces it."""
+    """[81] irradiance, W/(m^2 nm), on a surface that faces the sun."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class Photons:
     bounces: NDArray[np.int64]
     """[n], number of reflections at gold."""
     started_power: Array
-    """[81], W/nm, of all photons together."""
+    """[81] power of all photons together, W/nm."""
     escaped_power: Array
-    """[81], W/nm, that left the niche again; the remainder was absorbed by gold."""
+    """[81] power that left the niche again, W/nm. Gold absorbed the remainder."""
 
 
 def photons(

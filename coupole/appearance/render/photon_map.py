@@ -53,7 +53,7 @@ class Hits:
     places_mm: Array
     """[n, 3]."""
     normals: Array
-    """[n, 3], on the side from which the ray came."""
+    """[n, 3] normals on the side from which the ray came."""
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ class Piece:
     """Triangles of one material."""
 
     corners_mm: Array
-    """[triangles, 3, 3] in the scene's frame, counter-clockwise seen from outside."""
+    """[triangles, 3, 3] corners in the scene's frame, counter-clockwise seen from outside."""
     material: Material | Pane
     smooth: bool = False
     """True for smooth shading."""
     normals: Array | None = None
-    """[triangles, 3, 3] for smooth shading, one for each corner. The normals come from the body of which this
-    piece is a part.
+    """[triangles, 3, 3] normals for smooth shading, one for each corner. The normals come from the body of which
+    this piece is a part.
     """
 
 

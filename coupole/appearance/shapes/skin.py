@@ -18,9 +18,9 @@ class Skin:
     points_mm: Array
     """[n, 3]."""
     faces: NDArray[np.int64]
-    """[m, 3], counter-clockwise seen from outside."""
+    """[m, 3] faces, counter-clockwise seen from outside."""
     normals: Array
-    """[n, 3], unit, outwards."""
+    """[n, 3] unit normals, outwards."""
 
     @property
     def corners_mm(self) -> Array:

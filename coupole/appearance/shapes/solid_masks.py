@@ -30,7 +30,7 @@ class Divided:
     corners_mm: Array
     """[n, 3, 3]"""
     normals: Array
-    """[n, 3, 3] of the corners."""
+    """[n, 3, 3] normals at the corners."""
     off: NDArray[np.bool_]
     """[n] True for triangles without the layer."""
 

@@ -58,7 +58,7 @@ class Cube:
     rows: int
     columns: int
     wavelengths_nm: Array
-    """[bands used] in rising order."""
+    """[bands used] wavelengths in rising order."""
     scale: float
     """Number in the file that is a reflectance of 1."""
     fields: dict[str, Any]
@@ -293,7 +293,7 @@ class _Fields:
                 raise self.wrong(name, "expected 0: files with gaps between rows are not read")
 
     def wavelengths_nm(self, bands: int, unit: WavelengthUnit | None) -> Array:
-        """[bands] in the file's order."""
+        """[bands] wavelengths in the file's order."""
         words = self.values.get("wavelength")
         if not isinstance(words, list):
             raise self.wrong("wavelength", "expected the wavelengths of the bands in braces, found none; without "

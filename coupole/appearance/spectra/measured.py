@@ -39,9 +39,9 @@ class Measured:
 
     name: str
     wavelengths_nm: Array
-    """[n], in rising order."""
+    """[n] wavelengths in rising order."""
     values: Array
-    """[n]; reflectance as a fraction, or power."""
+    """[n] values: reflectance as a fraction, or power."""
     remarks: tuple[str, ...]
 
 

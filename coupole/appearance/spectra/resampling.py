@@ -25,7 +25,7 @@ class OnGrid:
 
     name: str
     values: Array
-    """[81]; NaN where it was not measured."""
+    """[81] values; NaN where the spectrum was not measured."""
     error: float
     """Estimate of the largest error that resampling makes, in the unit of the values.
 
@@ -67,7 +67,7 @@ def resample(spectrum: Measured, bands_nm: Array, step_nm: float) -> tuple[Array
 
 
 def fill_missing(spectrum: OnGrid) -> Array:
-    """[81] with missing ends filled by the nearest measured value, and gaps by straight lines.
+    """[81] values, with missing ends filled by the nearest measured value, and gaps by straight lines.
 
     The filled values are guesses. Rendering needs them, identification does not.
     """

@@ -39,10 +39,11 @@ class LibrarySpectrum:
     line: int
     """Line in the file; 0 if the file holds only this spectrum."""
     wavelengths_nm: Array
-    """[n], in rising order."""
+    """[n] wavelengths in rising order."""
     reflectance: Array
-    """[n], fraction. For K and S it is the reflectance of an opaque layer; NaN where K is negative or S is not
-    positive."""
+    """[n] reflectance as a fraction. For K and S it is the reflectance of an opaque layer; NaN where K is
+    negative or S is not positive.
+    """
     absorption: Array | None = None
     """K [n] in the file's unit, which S has too; None if reflectance was measured."""
     scattering: Array | None = None

@@ -41,7 +41,7 @@ class TexturedMesh:
 
     path: Path
     corners: Floats
-    """[m, 3, 3] in the file's units and frame."""
+    """[m, 3, 3] corners in the file's units and frame."""
     places: Floats
     """[m, 3, 2] 0 to 1, to the right and down from the texture's top left corner."""
 

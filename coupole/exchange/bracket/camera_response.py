@@ -57,7 +57,7 @@ class Response:
     """ln of exposure as a function of the value, for red, green and blue; 0 at half of the largest value."""
 
     log_exposure: Array
-    """[NODES, 3] at evenly spaced values from 0 to 1."""
+    """[NODES, 3] ln of exposure at evenly spaced values from 0 to 1."""
     covariance: Array
     """[3, NODES, NODES] covariance of `log_exposure`."""
     is_shown: NDArray[np.bool_]

@@ -40,7 +40,7 @@ class Lobes:
     diffuse: Array
     """[3], reflectance of the body."""
     strengths: Array
-    """[2, 3], of the lobes, at normal incidence."""
+    """[2, 3] reflectance of the lobes at normal incidence."""
     rise: Array
     """[3] increase of the lobes at grazing incidence, as a share of their strength."""
     dip: Array

@@ -251,7 +251,7 @@ def _ways(places: Array, to_light: Array) -> tuple[Array, Array]:
 
 
 def _frames(normals: Array) -> Array:
-    """[n, 3, 3] whose rows are two tangents and the normal."""
+    """[n, 3, 3] frames, whose rows are two tangents and the normal."""
     least = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
     first = np.cross(least, normals)
     first /= np.linalg.norm(first, axis=1, keepdims=True)

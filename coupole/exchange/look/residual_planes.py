@@ -36,8 +36,9 @@ SIDE = 48
 _STEPS = 127
 _SHARE_STEPS = 254
 _LEARNT, _JUDGED = 20_000, 1500
-"""Numbers of triangles of a view: those from which planes are computed, and those on which their error is
-measured."""
+"""Number of a view's triangles from which planes are computed, and number of triangles on which the planes' error
+is measured.
+"""
 _BLOCK = 1 << 14
 _DIRECTIONS = 600
 """Number of lights in all directions for measuring the error of planes."""

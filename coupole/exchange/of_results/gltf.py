@@ -38,7 +38,7 @@ class _Contents:
     """Contents of a file: vertices, triangles and pictures."""
 
     attributes: dict[str, Floats]
-    """[v, k] of vertices, by glTF's names."""
+    """[v, k] values of vertices, by glTF's names."""
     triangles: NDArray[np.int64] | None
     """[m, 3] vertices of triangles; None if each three vertices are one triangle."""
     pictures: list[bytes]

@@ -68,7 +68,7 @@ class MeasuredSurface:
     vertices_mm: Floats
     """[v, 3]"""
     triangles: NDArray[np.int64]
-    """[n, 3] rows of the vertices; all triangles of the mesh."""
+    """[n, 3] for all triangles of the mesh the rows of their vertices."""
     normals: Floats
     """[n, 3] fitted normals; normals of the mesh where no material is known."""
     kd: Floats

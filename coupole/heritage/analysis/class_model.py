@@ -39,9 +39,11 @@ class HeldOut:
     """Probabilities of the references, each computed as if it were not in the library."""
 
     probabilities: Array
-    """[n, classes + 1], without the reference itself; the last one is the probability of none."""
+    """[n, classes + 1] probabilities when the reference itself is left out. The last one is the probability that
+    no class is right.
+    """
     without_class: Array
-    """[n, classes + 1], without the reference's whole class."""
+    """[n, classes + 1] probabilities when the reference's whole class is left out."""
 
 
 class ClassModel:
@@ -119,9 +121,10 @@ class ClassModel:
 
     @cached_property
     def threshold(self) -> float:
-        """Least probability that the class is in the library, for it to count as known. If their class is left
-        out, only a share of 0.05 of the references reach it; references that a family (`pigment_classes`) excludes
-        count as not reaching it."""
+        """A spectrum counts as known from this probability on that its class is in the library. If the class of a
+        reference is left out of the library, only a share of 0.05 of the references reach this probability.
+        References that a family (`pigment_classes`) excludes count as not reaching it.
+        """
         probabilities = self.held_out.without_class
         known_probability = 1.0 - probabilities[:, -1]
         for row, number in enumerate(self._classes):

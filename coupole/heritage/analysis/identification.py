@@ -60,7 +60,7 @@ class Evidence:
     wavelengths_nm: Array
     """[n]"""
     reflectance: Array
-    """[n] of the spectrum."""
+    """[n] reflectance of the spectrum."""
     best: Array
     """[n] reflectance of the nearest reference of the first class, with K/S scaled by the best factor."""
     runner_up: Array

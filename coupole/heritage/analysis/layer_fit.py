@@ -41,13 +41,13 @@ class Film:
     """One spectrum of a film."""
 
     reflectance: Array
-    """[n], in air."""
+    """[n] reflectance in air."""
     ground: Array | None
-    """[n], inside the binder; None for an opaque film."""
+    """[n] reflectance of the ground inside the binder; None for an opaque film."""
     ground_name: str = ""
     """Name of the ground; films over the same ground share its error."""
     u_ground: Array | float = 0.0
-    """[n], standard uncertainty inside the binder."""
+    """[n] standard uncertainty of the ground's reflectance inside the binder."""
     thickness_mm: float = 1.0
     """Thickness; 1 if it is not known, and K and S are then for the whole layer."""
     u_thickness_mm: float = 0.0
@@ -65,8 +65,9 @@ class Coefficients:
     chi2: Array
     """[n], squared residuals divided by their variances. The expected value is the number of spectra minus 2."""
     unlike: Array
-    """[n], squared differences of the spectra from their mean, or from their grounds if that is less, divided by
-    the noise's variance. The values are near 0 for films that hide their ground, and for nearly invisible films.
+    """[n] squared differences, divided by the noise's variance: of the spectra from their mean, or from their
+    grounds if these differences are smaller. The values are near 0 for films that hide their ground, and for
+    nearly invisible films.
     """
     spectra: int
 

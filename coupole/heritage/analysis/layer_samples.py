@@ -70,7 +70,7 @@ class Samples:
     """Films in the bands that all spectra cover."""
 
     wavelengths_nm: Array
-    """[n] of 380 to 780 by 5 nm."""
+    """[n] wavelengths from 380 to 780 nm that are multiples of 5 nm."""
     films: list[Film]
     directional: Directional | None
     face: Face
@@ -193,10 +193,9 @@ def _check_level(reflectance: Array, path: Path, nm: Array, binder_face: Face, n
     if len(wrong):
         at = wrong[0]
         raise InputError(
-            f"{path}: is {reflectance[at]:.3g} at {nm[at]:g} nm; a paint under this face is seen as "
-            f"{low[at]:.3g} to "
-            f"{high[at]:.3g}: check whether gloss is included, the binder's index, and whether values are "
-            "percent or fractions"
+            f"{path}: is {reflectance[at]:.3g} at {nm[at]:g} nm; a paint under this face can have a reflectance "
+            f"of {low[at]:.3g} to {high[at]:.3g}; check whether gloss is included, the binder's index, and "
+            "whether values are percent or fractions"
         )
 
 

@@ -41,7 +41,7 @@ class FilmAtThickness:
     thickness_mm: float
     ground_name: str
     reflectance: Array
-    """[n], as the instrument would measure it."""
+    """[n] reflectance as the instrument would measure it."""
     u_measured: Array
     """[n], standard uncertainty from noise, grounds and thicknesses of the measured films."""
     u_model: Array
@@ -133,7 +133,7 @@ def _matching_depths(
 
 
 def _newton_step(off: Callable[[Array], Array], logs: Array) -> Array:
-    """[2, n] step, at most a factor of e in each unknown."""
+    """[2, n] Newton's step, at most a factor of e in each unknown."""
     here = off(logs)
     slopes = np.stack([(off(logs + _STEP * unit) - here) / _STEP for unit in np.eye(2)[:, :, None]], axis=1)
     matrices = np.moveaxis(slopes, -1, 0)

@@ -67,7 +67,7 @@ class Found:
     chosen_index: int
     """Index in `recipes`."""
     target: Array
-    """[81], as measured."""
+    """[81] reflectance of the target, as measured."""
     bands: NDArray[np.bool_]
     noise: float
     rivals: tuple[dict[str, float], ...] = ()
@@ -101,11 +101,9 @@ class Found:
         kind = "lighter" if best.worst > 0.0 else "darker"
         lacks = "absorbs" if best.worst > 0.0 else "absorbs less, or scatters more,"
         return (
-            f"no mixture of this palette matches the target: the best one differs by {best.misfit:.1f} times "
-            "its uncertainty. "
-            f"The largest difference is near {best.worst_nm:g} nm, "
-            f"where the recipe is {abs(best.worst):.3f} {kind}. A paint is "
-            f"missing that {lacks} there"
+            f"no mixture of this palette matches the target: the best one differs by {best.misfit:.1f} times its "
+            f"uncertainty. The largest difference is near {best.worst_nm:g} nm, where the recipe is "
+            f"{abs(best.worst):.3f} {kind}. A paint is missing that {lacks} there"
         )
 
 

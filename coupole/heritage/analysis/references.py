@@ -128,7 +128,7 @@ class References:
     class_of: tuple[str, ...]
     """[n] class of each spectrum."""
     reflectance: Array
-    """[n, 221] at `BANDS_NM`; NaN where it was not measured."""
+    """[n, 221] reflectance at `BANDS_NM`; NaN where it was not measured."""
     remarks: tuple[str, ...]
     """Remarks on spectra that were left out, with the reasons."""
     _of_bands_cache: dict[bytes, OfBands] = field(default_factory=dict)

@@ -45,9 +45,9 @@ class Region:
 
     points: int
     middle_mm: Floats
-    """[3] in the frame of the first state."""
+    """[3] middle of the region, in the frame of the first state."""
     middle_in_after_mm: Floats
-    """[3] in the frame of the second state."""
+    """[3] middle of the region, in the frame of the second state."""
     across_mm: float
     """Largest extent of the region."""
     distance_mm: float

@@ -22,9 +22,11 @@ class Colours:
     """Colours of a state's points, in CIELAB under D65."""
 
     lab: Floats
-    """[n, 3]; NaN where a point has none."""
+    """[n, 3] colours; NaN where a point has none."""
     covariance: Floats | None = None
-    """[n, 3, 3]; None if it is not known. It is then estimated from the scatter between points."""
+    """[n, 3, 3] covariances of the points; None if they are not known. The covariance is then estimated from the
+    scatter between points.
+    """
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class State:
     points_mm: Floats
     """[n, 3]"""
     triangles: NDArray[np.int64]
-    """[m, 3]; empty for a cloud of points."""
+    """[m, 3] triangles; empty for a cloud of points."""
     outward: Floats | None
     """[n, 3] normals from the triangles."""
     colours: Colours | None

@@ -34,7 +34,7 @@ class Alignment:
 
     before_from_after: Floats
     covariance: Floats
-    """[6, 6] of a step (mm, rad) about `pivot_mm`."""
+    """[6, 6] covariance of a step (mm, rad) about `pivot_mm`."""
     pivot_mm: Floats
     noise_mm: float
     """Robust standard deviation of distances along normals."""

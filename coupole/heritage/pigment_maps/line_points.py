@@ -32,7 +32,7 @@ class LinePoints:
     distances_mm: Array
     """[n] along the line, from its first point; rising."""
     positions_mm: Array
-    """[n, axes] as in the table."""
+    """[n, axes] positions as in the table."""
     axes: tuple[str, ...]
 
 

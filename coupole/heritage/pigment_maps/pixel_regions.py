@@ -39,7 +39,7 @@ class Regions:
     noise: Array
     """[bands] standard deviation of a pixel's noise."""
     basis: Array
-    """[bands, components] orthonormal, of spectra divided by the noise."""
+    """[bands, components] orthonormal basis of spectra that were divided by the noise."""
     centres: Array
     """[regions, components]"""
     farthest: float

@@ -22,7 +22,7 @@ class Difference:
     """Difference between two pictures of one camera."""
 
     de00: NDArray[np.float64]
-    """[h, w], NaN where the object is not seen."""
+    """[h, w] colour differences; NaN where the object is not seen."""
     of_parts: dict[str, dict[str, Any]]
     """Figures of each visible part: `pixels`, `mean_de00` over them (noise increases it), and `de00_of_means`, the
     difference of the mean colours."""

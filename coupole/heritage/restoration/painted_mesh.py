@@ -26,7 +26,7 @@ class PaintedMesh:
     vertices_mm: Floats
     """[n, 3]"""
     triangles: NDArray[np.int64]
-    """[m, 3] rows of the vertices."""
+    """[m, 3] for each triangle the rows of its vertices."""
     srgb: NDArray[np.uint8] | None = None
     """[n, 3] colours of the vertices; None without them."""
     uv: Floats | None = None

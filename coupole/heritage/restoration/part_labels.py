@@ -42,7 +42,7 @@ class Parts:
 
     names: tuple[str, ...]
     labels: Labels
-    """[triangles] rows of `names`."""
+    """[triangles] for each triangle the row of its part in `names`."""
     remarks: tuple[str, ...] = ()
 
     def counts(self) -> dict[str, int]:

@@ -57,7 +57,7 @@ class Restoration:
 
     @cached_property
     def corners_mm(self) -> Floats:
-        """[triangles, 3, 3] in the scene's frame."""
+        """[triangles, 3, 3] corners in the scene's frame."""
         pose = self.restoration_file.object.scene_from_thing()
         return np.asarray(self.mesh.corners_mm @ pose[:3, :3].T + pose[:3, 3])
 
@@ -152,7 +152,7 @@ class Made:
     is_new: bool
 
     def xyz(self) -> NDArray[np.float32]:
-        """[h, w, 3] in cd/m^2. Raises StorageError."""
+        """[h, w, 3] X, Y, Z in cd/m^2. Raises StorageError."""
         import OpenEXR
 
         try:

@@ -38,7 +38,7 @@ class SeenParts:
         self._mesh = TriangleMesh(self._tree, corners.astype(np.float32))
 
     def part_of_pixel(self, camera: Camera) -> NDArray[np.int16]:
-        """[h, w] rows of parts; `NOTHING` where the object is not seen."""
+        """[h, w] number of the part that each pixel sees; `NOTHING` where the object is not seen."""
         ways = rays(camera).reshape(-1, 3)
         starts = np.broadcast_to(np.asarray(camera.position_mm, float), ways.shape)
         hit_rows = self._tree.run(starts.astype(np.float32), ways.astype(np.float32))

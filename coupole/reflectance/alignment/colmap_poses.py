@@ -43,7 +43,7 @@ class ColmapPoses:
     scale: float
     """Number of mm in one unit of the model."""
     steps_from_records: Floats
-    """[v, 6] from the records' poses to these poses: mm, and rad in the camera's frame."""
+    """[v, 6] steps from the records' poses to these poses: mm, and rad in the camera's frame."""
     over_u: Floats
     """[v, 2] shift and turn, divided by the records' standard uncertainty."""
 

@@ -48,7 +48,7 @@ class Given:
     vertices_mm: Floats
     """[n, 3] vertices that triangles use, base frame."""
     triangles: NDArray[np.uint32]
-    """[m, 3] as `renumbered_triangles` gives them."""
+    """[m, 3] triangles as `renumbered_triangles` gives them."""
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ class Matches:
     points_mm: Floats
     """[n, 3] place of the spot by the reference, on a plane through the mesh around it, base frame."""
     normals: Floats
-    """[n, 3] of these planes."""
+    """[n, 3] normals of these planes."""
     matched_blocks: Floats
     """[n, 2] block of the other view that shows the spot."""
     expected_blocks: Floats
@@ -64,7 +64,7 @@ class Matches:
     covariance: Floats
     """[n, 2, 2] covariance of `matched_blocks`, in squared blocks, from noise and texture."""
     shifts_mm: Floats
-    """[n, 3] from the spot's place by the reference to its place by the other view."""
+    """[n, 3] shifts from the spot's place by the reference to its place by the other view."""
 
     @property
     def apart_mm(self) -> Floats:

@@ -127,9 +127,9 @@ class MeasuredRun:
     views: tuple[MeasuredView, ...]
     lens: Intrinsics
     corners_mm: Floats
-    """[triangles, 3, 3] in the base frame."""
+    """[triangles, 3, 3] corners in the base frame."""
     triangles: NDArray[np.uint32]
-    """[triangles, 3] rows of the mesh's vertices."""
+    """[triangles, 3] for each triangle the rows of its vertices in the mesh."""
     leds: Positions
     powers: Powers
     emission: Emission

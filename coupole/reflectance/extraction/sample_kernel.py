@@ -106,9 +106,9 @@ def fill_pixels(  # type: ignore[no-untyped-def]
     `root_share` (float32) of this loss is added.
 
     The pixels are those of the lists from the `first_entry` on, up to `entry_ends` [b, channels] of each of b
-    triangles. `places_mm` [pixels, 3] are the places that they see, and `codes` [b, 8] say where light has reached
-    the triangle. `direct` [b, leds, channels] is the share of its light that came directly from the LED. For the
-    other arguments see `fill_samples`.
+    triangles. `places_mm` [pixels, 3] are the places that they see, and `codes` [b, 8] say where light has
+    reached the triangle. `direct` [b, leds, channels] is the share of a triangle's light that came directly from
+    the LED. For the other arguments see `fill_samples`.
     """
     bits, straight = np.empty(8, np.uint16), np.empty((1, 8), np.float32)
     pixel = first_entry

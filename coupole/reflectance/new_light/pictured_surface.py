@@ -53,7 +53,7 @@ class Surface:
     centres_mm: Floats
     """[triangles, 3]"""
     normals: Floats
-    """[triangles, 3] of the mesh."""
+    """[triangles, 3] normals of the mesh."""
 
     @cached_property
     def offsets_mm(self) -> Floats:

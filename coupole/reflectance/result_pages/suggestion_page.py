@@ -54,7 +54,11 @@ def _page(name: str, suggestion: Suggestion) -> Page:
         pictures=[_map_of_normals(suggestion, name, *side) for name, side in _SIDES.items()],
         summary=choice_line,
         quality=material_lines[0] if material_lines else share_line,
-        next_step=["Look at it and change what you want, then ", Code(f"coupole check {name}.yaml"), "."],
+        next_step=[
+            "Look at the plan and change what you want, then run ",
+            Code(f"coupole check {name}.yaml"),
+            ".",
+        ],
         remark="Expected, not measured.",
         sections=[
             Section(

@@ -156,8 +156,9 @@ def _look_up(  # type: ignore[no-untyped-def]
 
 @kernel(error_model="numpy")
 def _corners(pixel, place_mm, texel_of_pixel, seen_mm, reach_mm, texels, weights):  # type: ignore[no-untyped-def]
-    """Fill the texels [4] around a pixel's place and their weights, which sum to 1. Return whether enough of them
-    see the place."""
+    """Fill the texels [4] around a pixel's place and their weights, which sum to 1. Return whether enough of
+    these texels see the place.
+    """
     height, width = texel_of_pixel.shape
     x, y, total = pixel[0], pixel[1], 0.0
     if not (x > -1.0 and y > -1.0 and x < width and y < height):

@@ -20,7 +20,7 @@ FOLDER, ABOUT = "texels", "texels.json"
 Singles = NDArray[np.float32]
 
 _TOLD = {
-    "pixels": "places in the picture, row by row, rising",
+    "pixels": "numbers of the pixels in the picture, counted row by row, in rising order",
     "normals": "unit, base frame",
     "kd": "1/sr, by channel; the pixel's own channel was fitted, the other channels are from pixels around it",
     "ks": "by channel; f = kd + ks D V",

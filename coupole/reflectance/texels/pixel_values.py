@@ -37,7 +37,7 @@ class PixelBlock:
     pixels: NDArray[np.int32]
     """[n] places in a frame, row by row."""
     triangle: NDArray[np.int64]
-    """[n] rows of their triangles in the view's file of samples."""
+    """[n] rows of the pixels' triangles in the view's file of samples."""
     channel: NDArray[np.int64]
     """[n]"""
     places_mm: NDArray[np.float32]
@@ -61,7 +61,7 @@ class PixelReader:
     ) -> None:
         self._samples = samples
         self.triangle_of_pixel = surface.triangle_of_pixel
-        """[h, w] row, in the view's file, of the triangle that a pixel sees; -1 for none."""
+        """[h, w] for each pixel the row, in the view's file, of the triangle that it sees; -1 for none."""
         self.mesh_normals = surface.normals
         """[triangles, 3]"""
         self._places_mm = surface.places_mm.reshape(-1, 3)
@@ -113,11 +113,11 @@ class LitPixels:
 
     rows: slice
     places_mm: NDArray[np.float32]
-    """[pixels, 3] that they see."""
+    """[pixels, 3] places that the pixels see."""
     light: tuple[NDArray[np.uint8], NDArray[np.float32]]
     """Codes, and shares of direct light, of the rows under the LEDs (`light_of`)."""
     values: NDArray[np.uint16]
-    """[pixels, leds] to be filled."""
+    """[pixels, leds] values, which are to be filled."""
 
 
 def fill_rows(

@@ -25,7 +25,9 @@ class TexelGrid:
 
     side_px: int
     triangle: NDArray[np.int32]
-    """[rows, columns] row, in the view's file, of the triangle that most of a texel's pixels see; -1 for none."""
+    """[rows, columns] for each texel the row, in the view's file, of the triangle that most of its pixels see; -1
+    for none.
+    """
     texel_of_pixel: NDArray[np.int32]
     """[h, w] place of a pixel's texel in the grid, row by row; -1 for none."""
     places_mm: NDArray[np.float32]

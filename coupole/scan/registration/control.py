@@ -39,7 +39,7 @@ class Sighting:
     scan: int
     name: str
     point_mm: Floats
-    """[3] in the scan's frame."""
+    """[3] place in the scan's frame."""
     u_mm: float
     """Standard uncertainty of each coordinate."""
     left_mm: float = float("nan")

@@ -47,7 +47,7 @@ class JointFit:
     common_from_scan: list[Floats]
     """4x4 mm; the common frame is that of the fixed scan, or of the control points."""
     covariance: Floats
-    """[6 n, 6 n] of steps (mm, rad) about the pivots, in the common frame; zero for the fixed scan."""
+    """[6 n, 6 n] covariance of steps (mm, rad) about the pivots, in the common frame; zero for the fixed scan."""
     overlap_covariance: Floats
     """[6 n, 6 n] part of the covariance from errors of overlaps; the rest is from targets, control points and
     sizes of scans."""

@@ -117,7 +117,8 @@ class Gilt(Model):
     uncovered: Share = 0.0
     """Share of the surface left bare by cracks and large holes."""
     bole: Reflectance = Bole(kind="bole")
-    """Reflectance inside its binder of egg white; a measured one was measured in air."""
+    """Reflectance of the bole inside its binder of egg white. A measured reflectance is taken as measured in air.
+    """
     roughness: Roughness = 0.12
     bole_roughness: Roughness = 0.35
 

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from numba.core import entrypoints
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 
@@ -21,7 +22,9 @@ _compiling: set[Path] = set()
 
 
 def compile_each_kernel_once() -> None:
-    """In this process, and in those that it forks."""
+    """In this process, and in those that it forks. No kernel of ours wants other packages' extensions of numba
+    (awkward's, sparse's): they are not imported, which saves 0.2 s in each process."""
+    entrypoints._already_initialized = True
     compiles = Dispatcher.compile
 
     @functools.wraps(compiles)

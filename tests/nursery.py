@@ -22,7 +22,7 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
@@ -140,7 +140,7 @@ def serve(line: socket.socket, account: ForkAccount | None = None) -> None:
         importlib.import_module(module)
     signal.signal(signal.SIGCHLD, account.bury if account else signal.SIG_IGN)  # nobody waits for them here
     lessons, learnt = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    lines = [line]
+    lines, modules = [line], 0
     while True:
         for asking in select.select(lines, [], [])[0]:
             message, fds = received(asking)
@@ -154,8 +154,10 @@ def serve(line: socket.socket, account: ForkAccount | None = None) -> None:
                 continue
             arguments, folder, environment = pickle.loads(message)
             learn(lessons)
-            for module in COMMANDS_IMPORT if arguments else ():
-                importlib.import_module(module)
+            for name in COMMANDS_IMPORT if arguments else ():
+                importlib.import_module(name)
+            if len(sys.modules) != modules:
+                kernels, modules = kernels_of([*sys.modules]), len(sys.modules)
             gc.freeze()  # a fork that went through all of this would have to copy it
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             if pid := os.fork():
@@ -170,7 +172,7 @@ def serve(line: socket.socket, account: ForkAccount | None = None) -> None:
             for other in (*lines, ours):
                 other.close()
             ended = account.of_fork() if account else None
-            live(arguments, folder, environment, fds, Nursery(theirs), learnt, ended)
+            live(arguments, folder, environment, fds, Nursery(theirs), kernels, learnt, ended)
 
 
 def received(asking: socket.socket) -> tuple[bytes, list[int]]:
@@ -188,6 +190,7 @@ def live(
     environment: dict[str, str],
     fds: list[int],
     nursery: Nursery,
+    kernels: list[Kernel],
     learnt: socket.socket,
     ended: Callable[[], None] | None,
 ) -> NoReturn:
@@ -206,7 +209,7 @@ def live(
     sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace", closefd=False)
     from sim.world import world
 
-    known, imported = signatures(), set(sys.modules)
+    known, imported = signatures(kernels), set(sys.modules)
     leave = os._exit
 
     def tell_and_leave(status: int) -> NoReturn:
@@ -215,9 +218,10 @@ def live(
 
     os._exit = tell_and_leave  # a program that leaves a hung call behind ends by it
     code = exit_code(commanded(arguments, nursery) if arguments else world.main)
-    kernels, modules = signatures() - known, {*sys.modules} - imported
-    if kernels or modules:
-        learnt.send(pickle.dumps((sorted(filter(_by_need, modules)), kernels)))
+    modules = {*sys.modules} - imported
+    used = signatures([*kernels, *kernels_of(modules)]) - known
+    if used or modules:
+        learnt.send(pickle.dumps((sorted(filter(_by_need, modules)), used)))
     if ended:
         ended()
     tell_and_leave(code)
@@ -252,16 +256,25 @@ def exit_code(run: Callable[[], int | None]) -> int:
     return code
 
 
-def signatures() -> set[tuple[str, str, Any]]:
-    """Module, name and types of the arguments of all our kernels that are compiled here."""
-    return {
-        (module, name, signature)
-        for module, content in list(sys.modules.items())
+Kernel = tuple[str, str, Dispatcher]
+"""Module, name and function."""
+
+
+def kernels_of(modules: Iterable[str]) -> list[Kernel]:
+    """Our kernels in these modules. A fork asks for those of the modules that it imported alone: whoever goes
+    through a module's names copies its pages."""
+    return [
+        (module, name, kernel)
+        for module in modules
         if module.startswith(OURS)
-        for name, kernel in vars(content).items()
+        for name, kernel in vars(sys.modules[module]).items()
         if isinstance(kernel, Dispatcher)
-        for signature in kernel.signatures
-    }
+    ]
+
+
+def signatures(kernels: Iterable[Kernel]) -> set[tuple[str, str, Any]]:
+    """Module, name and types of the arguments of all that is compiled of these kernels."""
+    return {(module, name, types) for module, name, kernel in kernels for types in kernel.signatures}
 
 
 def learn(lessons: socket.socket) -> None:

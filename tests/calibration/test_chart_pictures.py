@@ -43,6 +43,10 @@ def made(folder: Path, *arguments: str | Path) -> Record:
     return read_record(folder / "x.yaml")
 
 
+profile = coupole.calibrate_colour
+"""The same without files: half of the command's time goes into its report."""
+
+
 def refusal(*arguments: str | Path) -> str:
     with tempfile.TemporaryDirectory() as folder:
         result = calibrate(Path(folder), *arguments)
@@ -114,10 +118,10 @@ def test_the_matrix_is_that_of_the_spectra_and_as_good_as_colour_sciences(even: 
     assert colour_of_record(tmp_path / "x.yaml").xyz_from_balanced is not None
 
 
-def test_the_light_is_taken_off_by_a_white_card_and_found_without_it(uneven: Path, tmp_path: Path) -> None:
-    chart = ("--chart", uneven / "chart.yaml")
-    by_card = made(tmp_path / "card", uneven / "chart.tif", *chart, "--white", uneven / "white.tif")
-    by_patches = made(tmp_path / "patches", uneven / "chart.tif", *chart)
+def test_the_light_is_taken_off_by_a_white_card_and_found_without_it(uneven: Path) -> None:
+    chart, white = uneven / "chart.yaml", uneven / "white.tif"
+    by_card = profile(uneven / "chart.tif", chart=chart, white=white)
+    by_patches = profile(uneven / "chart.tif", chart=chart)
     truth = uneven_chart().true_matrix()
     (sure, u_sure), (matrix, u) = matrix_of(by_card), matrix_of(by_patches)
     assert np.abs((sure - truth) / u_sure).max() < 3.5
@@ -127,8 +131,7 @@ def test_the_light_is_taken_off_by_a_white_card_and_found_without_it(uneven: Pat
     widths = [float(remark_with(one, "differ").split("%")[0].split()[-1]) for one in (by_card, by_patches)]
     assert widths[0] > 25.0
     assert widths[1] == pytest.approx(widths[0], abs=12.0)
-    folder = made(tmp_path / "folder", uneven, *chart, "--white", uneven / "white.tif")
-    assert matrix_of(folder)[0] == pytest.approx(sure)
+    assert matrix_of(profile(uneven, chart=chart, white=white))[0] == pytest.approx(sure)
 
 
 @pytest.mark.parametrize("with_white", [True, False])
@@ -169,10 +172,9 @@ def test_a_turned_chart_is_found_by_its_colours_and_told(tmp_path: Path) -> None
     drawn = replace(EVEN, turn_deg=180.0)
     picture = write_picture(tmp_path / "p.tif", drawn.picture())
     chart = drawn.write_chart(tmp_path)
-    record = made(tmp_path / "a", picture, "--chart", chart)
+    record = profile(picture, chart=chart)
     assert "the chart is turned; its top left patch is at" in remark_with(record, "turned")
-    words = " ".join(f"{x:.0f},{y:.0f}" for x, y in np.roll(drawn.corners_px, 1, axis=0)[::-1])
-    given = made(tmp_path / "b", picture, "--chart", chart, "--corners", words)
+    given = profile(picture, chart=chart, corners_px=np.rint(np.roll(drawn.corners_px, 1, axis=0)[::-1]))
     assert matrix_of(given)[0] == pytest.approx(matrix_of(record)[0], abs=0.01)
     assert remark_with(given, "turned")
     mirrored = write_picture(tmp_path / "m.tif", drawn.picture()[:, ::-1])
@@ -189,7 +191,7 @@ def test_saturated_patches_are_left_out_and_told(tmp_path: Path) -> None:
     matrix, u = matrix_of(record)
     assert np.abs((matrix - EVEN.true_matrix()) / u).max() < 5.0  # of fewer patches
     cut = np.minimum(drawn.picture(), 0.9)  # as a converter does that keeps room above white
-    cut_record = made(tmp_path / "cut", write_picture(tmp_path / "c.tif", cut), "--chart", tmp_path / "chart.yaml")
+    cut_record = profile(write_picture(tmp_path / "c.tif", cut), chart=tmp_path / "chart.yaml")
     assert "D1" in remark_with(cut_record, "saturated, and left out")
     too_bright = write_picture(tmp_path / "b.tif", replace(EVEN, exposure=12.0).picture())
     assert "leave the picture or are saturated" in refusal(
@@ -205,7 +207,7 @@ def test_several_pictures_are_one_profile(even: Path, tmp_path: Path) -> None:
     for number, turn in enumerate((0.0, 180.0, 90.0)):
         write_picture(tmp_path / f"p{number}.tif", replace(EVEN, turn_deg=turn, exposure=0.5).picture())
     write_picture(tmp_path / "q.png", np.full((480, 640, 3), 0.2))
-    record = made(tmp_path / "made", tmp_path, "--chart", even / "chart.yaml")
+    record = profile(tmp_path, chart=even / "chart.yaml")
     matrix, u = matrix_of(record)
     assert np.abs((matrix - EVEN.true_matrix()) / u).max() < 3.5
     assert "left out: q.png: the chart was not found" in remark_with(record, "q.png")
@@ -216,7 +218,7 @@ def test_several_pictures_are_one_profile(even: Path, tmp_path: Path) -> None:
 
 def test_values_alone_are_a_chart_of_letters_for_rows(even: Path, tmp_path: Path) -> None:
     record = made(tmp_path, even / "chart.tif", "--chart", even / "values.csv")
-    by_description = made(tmp_path / "y", even / "chart.tif", "--chart", even / "chart.yaml")
+    by_description = profile(even / "chart.tif", chart=even / "chart.yaml")
     assert matrix_of(record)[0] == pytest.approx(matrix_of(by_description)[0], abs=0.02)
     odd = tmp_path / "odd.csv"
     odd.write_text((even / "values.csv").read_text().replace("B3,", "skin,"))
@@ -231,18 +233,18 @@ def test_openexr_and_floating_point_are_linear_and_may_say_what_is_saturated(eve
     full = (values > 0.5).any(axis=2).astype(np.float32)
     channels = {name: np.ascontiguousarray(values[..., n]) for n, name in enumerate("RGB")} | {"saturated": full}
     OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(tmp_path / "p.exr"))
-    record = made(tmp_path, tmp_path / "p.exr", "--chart", even / "chart.yaml")
+    record = profile(tmp_path / "p.exr", chart=even / "chart.yaml")
     assert "D1" in remark_with(record, "saturated, and left out")
     floating = write_picture(tmp_path / "f.tiff", EVEN.picture(), bits=32)
-    matrix, u = matrix_of(made(tmp_path / "f", floating, "--chart", even / "chart.yaml"))
+    matrix, u = matrix_of(profile(floating, chart=even / "chart.yaml"))
     assert np.abs((matrix - EVEN.true_matrix()) / u).max() < 3.5
 
 
 def test_an_offset_of_the_greys_is_told(even: Path, tmp_path: Path) -> None:
     veiled = write_picture(tmp_path / "p.tif", EVEN.picture() + np.array([0.003, 0.008, 0.004]))
-    record = made(tmp_path, veiled, "--chart", even / "chart.yaml")
+    record = profile(veiled, chart=even / "chart.yaml")
     assert "offset of +" in remark_with(record, "stray light")
-    clean = made(tmp_path / "clean", even / "chart.tif", "--chart", even / "chart.yaml")
+    clean = profile(even / "chart.tif", chart=even / "chart.yaml")
     assert not any("stray light" in remark for remark in clean.remarks)
 
 
@@ -250,10 +252,10 @@ def test_edges_of_the_chart_give_the_sharpness_or_say_why_not(even: Path, tmp_pa
     text = (even / "chart.yaml").read_text().replace("values.csv", str(even / "values.csv"))
     edges = "edges:\n  - {name: white, centre_mm: [-64.0, -33.0], size_mm: [4.0, 14.0]}\n"
     (tmp_path / "chart.yaml").write_text(text + edges)
-    record = made(tmp_path / "a", even / "chart.tif", "--chart", tmp_path / "chart.yaml")
+    record = profile(even / "chart.tif", chart=tmp_path / "chart.yaml")
     assert 0.2 < record.fixed["figure.mtf50"] < 1.0
     (tmp_path / "chart.yaml").write_text(text + edges.replace("-64.0, -33.0", "-55.0, -33.0"))
-    record = made(tmp_path / "b", even / "chart.tif", "--chart", tmp_path / "chart.yaml")
+    record = profile(even / "chart.tif", chart=tmp_path / "chart.yaml")
     assert "sharpness is not stated: " in remark_with(record, "sharpness")
     assert "figure.mtf50" not in record.fixed
 
@@ -269,7 +271,7 @@ def test_a_real_chart_in_a_raw_file_has_its_published_colours(
         name = f"{'ABCD'[number // 6]}{number % 6 + 1}"
         lines.append(f"{name}," + ",".join(f"{value:.5f}" for value in spectrum.values))
     (tmp_path / "values.csv").write_text("\n".join(lines) + "\n")
-    record = made(tmp_path, REAL_DNG, "--chart", tmp_path / "values.csv")
+    record = profile(REAL_DNG, chart=tmp_path / "values.csv")
     assert record.fixed["left_out.matrix.mean_de00"] < 4.0
     assert "black level" in remark_with(record, "offset of")
 
@@ -320,7 +322,7 @@ def test_pictures_for_displays_are_refused_unless_their_curve_is_stated(even: Pa
         "p.png: its values are not linear: on the greys they are proportional to light to the power of 0." in why
     )
     assert "--srgb" in why
-    matrix, u = matrix_of(made(tmp_path, encoded, *chart, "--srgb"))
+    matrix, u = matrix_of(profile(encoded, chart=even / "chart.yaml", srgb=True))
     assert np.abs((matrix - EVEN.true_matrix()) / u).max() < 3.5
     assert "to the power of 1.6" in refusal(even / "chart.tif", *chart, "--srgb")
     jpeg = tmp_path / "p.jpg"

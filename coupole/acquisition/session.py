@@ -1,4 +1,4 @@
-"""One `coupole acquire` from reading the plan to the last journal line, or one dry run."""
+"""One `coupole acquire` from reading the plan to the last journal line."""
 
 from __future__ import annotations
 
@@ -18,11 +18,9 @@ from rich.console import Console
 from coupole.acquisition.changed_inputs import tell_changes
 from coupole.acquisition.compiled_ahead import compile_ahead
 from coupole.acquisition.conclusion import close_complete, conclude, note_unread, open_for_session
-from coupole.acquisition.memory_recorder import DryRecorder
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell, open_cell
 from coupole.acquisition.operator import (
-    UNLIMITED_BYTES,
     ask_to_begin,
     identity_printer,
     refuse,
@@ -41,7 +39,6 @@ from coupole.acquisition.session_failure import (
 from coupole.acquisition.signals import obeyed_by
 from coupole.bounded import left_behind, on_disk, run_bounded
 from coupole.errors import (
-    DeviceError,
     Interrupted,
     PreflightRefused,
     StorageError,
@@ -49,10 +46,9 @@ from coupole.errors import (
 )
 from coupole.plan.rig_devices import trusted_by_name
 from coupole.plan.shot_id import ShotId
-from coupole.preflight.checking import calibration_refusals, check_job, preflight_of
+from coupole.preflight.checking import calibration_refusals, preflight_of
 from coupole.preflight.discard_room import discard_room
 from coupole.preflight.job import Job, with_choices, without_hidden
-from coupole.preflight.preflight import StorageFacts
 from coupole.storage.arm_faults import ArmFaults, faults_of
 from coupole.storage.discarding import finish as finish_discarding
 from coupole.storage.journal_events import (
@@ -68,7 +64,7 @@ from coupole.storage.view_reader import refuse_lost
 from coupole.viewing.keys import key_actions
 from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Outcome
-from coupole.viewing.terminal import RunObserver, alarm, show_dry_run
+from coupole.viewing.terminal import RunObserver, alarm
 
 if TYPE_CHECKING:
     from coupole.acquisition.processing_beside import ProcessingBeside
@@ -348,58 +344,3 @@ def _say_outcome(console: Console, run: Run, outcome: Outcome, ending: str) -> N
     console.print(f"  frames  {run.folder / 'views'}")
     if ending != "done":
         console.print(f"  go on   {run.go_on_command}")
-
-
-# -- the dry run ------------------------------------------------------------------------------------------
-
-
-def rehearse(job: Job, console: Console, *, speed: float, figures: dict[str, Any]) -> None:
-    """Run a whole plan on the rig's twin, faster than real time. Report the figures that preflight cannot
-    compute."""
-    job = without_hidden(job)
-    job, preflight = check_job(job, StorageFacts(UNLIMITED_BYTES))
-    show_preflight(console, preflight, name=job.plan.name, rig=f"the twin of {job.cell.rig.name}")
-    refuse(preflight)
-    recorder, control = DryRecorder(), Control()
-    with open_cell(job.cell, job=job, dry_run=True, speed=speed, on_opened=identity_printer(console)) as cell:
-        observer = RunObserver(console, cell.sensor.width_px * cell.sensor.height_px * 2, 0, speed=speed)
-        sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
-        outcome = sequencer.outcome
-        started_s = time.monotonic()
-        try:
-            with (
-                obeyed_by(control, cell.halt),
-                observer.showing(job.schedule.frames, job.schedule.view_count),
-                control.explains(DeviceError),
-            ):
-                run_bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
-        finally:
-            machine_s = time.monotonic() - started_s
-            figures.update(
-                {
-                    "dry_run": True,
-                    "shots": outcome.shots,
-                    "proven": outcome.proven,
-                    "missing": len(outcome.missing),
-                    "missing_darks": len(outcome.missing_darks),
-                    "reshot": outcome.reshot,
-                    "duration_s": round(outcome.duration_s, 3),
-                    "preflight_s": round(preflight.duration_s, 3),
-                    "ideal_s": round(outcome.ideal_s, 3),
-                    "machine_s": round(machine_s, 3),
-                    "speed": round(outcome.duration_s / machine_s, 2),
-                    "speed_asked": speed,
-                    "over_triggers": outcome.over_triggers,
-                    "exposure_scale": preflight.exposure_scale,
-                    "exposure": {
-                        view: {
-                            "pictures": exposure.pictures,
-                            "brightest": round(exposure.brightest, 4) if preflight.exposure_scale else None,
-                            "saturated": round(exposure.saturated_share, 6) if preflight.exposure_scale else None,
-                            "verdict": exposure.verdict() if preflight.exposure_scale else "not known",
-                        }
-                        for view, exposure in recorder.exposures.items()
-                    },
-                }
-            )
-            show_dry_run(console, recorder.exposures, outcome, figures)

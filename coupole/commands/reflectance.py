@@ -219,7 +219,7 @@ def extract(
         extract_runs(request, out, scheduler=scheduler, say=say)
         return {"views": RunResult(out).summaries}
 
-    _do(step, as_json=as_json, done=f"samples {out}\nnext: coupole reflectance fit {quote(str(out))}")
+    _do(step, as_json=as_json, closing_words=f"samples {out}\nnext: coupole reflectance fit {quote(str(out))}")
 
 
 @reflectance_app.command()
@@ -238,7 +238,11 @@ def fit(
         fit_result(result, workers.memory_bytes, scheduler=workers.scheduler, say=say)
         return {"fits": list(FITS)}
 
-    _do(step, as_json=as_json, done=f"all fits {result}\nnext: coupole reflectance check {quote(str(result))}")
+    _do(
+        step,
+        as_json=as_json,
+        closing_words=f"all fits {result}\nnext: coupole reflectance check {quote(str(result))}",
+    )
 
 
 @reflectance_app.command()
@@ -312,9 +316,9 @@ def cluster(
     _do(step, as_json=as_json)
 
 
-def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool, done: str = "") -> None:
+def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool, closing_words: str = "") -> None:
     """Run one step with progress bars. Print its result for `--json`, and otherwise its report or the words
-    `done`."""
+    `closing_words`."""
     from coupole.viewing.terminal import make_console, step_bars
 
     try:
@@ -326,7 +330,7 @@ def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool, done: str = ""
     if as_json:
         print(json.dumps(document))
     else:
-        print(f"report {document['report']}" if "report" in document else done)
+        print(f"report {document['report']}" if "report" in document else closing_words)
 
 
 reflectance_app.command()(choose)

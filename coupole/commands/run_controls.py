@@ -209,21 +209,21 @@ def _answer_to(run: Path | None, command: Command) -> State:
 
         terminal.alarm(message)
 
-    silent: dict[Path, State] = {}
+    silent_sessions: dict[Path, State] = {}
     for patience_s in _SESSION_PATIENCE_S:
         try:
             return ask(run or Path(running_run(run)["run"]), command, alarm)
         except NoRun as none:
-            nobody = none
+            no_run = none
         with contextlib.suppress(SessionEnded):  # its run may have begun
-            found = dict(sessions_without_run(patience_s))
-            silent = {path: state for path, state in found.items() if state["state"] == "silent"}
-            answering = {path: state for path, state in found.items() if path not in silent}
-            if session := _session_of(run, answering):
+            sessions = dict(sessions_without_run(patience_s))
+            silent_sessions = {path: state for path, state in sessions.items() if state["state"] == "silent"}
+            answering_sessions = {path: state for path, state in sessions.items() if path not in silent_sessions}
+            if session := _session_of(run, answering_sessions):
                 return ask_session(*session, command, alarm)
-    if session := _session_of(None, silent):
+    if session := _session_of(None, silent_sessions):
         return ask_session(*session, command, alarm)
-    raise nobody
+    raise no_run
 
 
 def _session_of(run: Path | None, sessions: Mapping[Path, State]) -> tuple[Path, State] | None:
@@ -231,12 +231,14 @@ def _session_of(run: Path | None, sessions: Mapping[Path, State]) -> tuple[Path,
     rig; None if there is none. Raises InputError if there are several."""
     from coupole.acquisition.sessions_without_run import name_of
 
-    named = run and str(run.resolve())
-    meant = [(path, state) for path, state in sessions.items() if named in (None, state["run"], state["plan"])]
-    if len(meant) > 1:
-        names = "\n".join(f"  {name_of(state)}" for _, state in meant)
+    path_text = run and str(run.resolve())
+    matches = [
+        (path, state) for path, state in sessions.items() if path_text in (None, state["run"], state["plan"])
+    ]
+    if len(matches) > 1:
+        names = "\n".join(f"  {name_of(state)}" for _, state in matches)
         raise InputError(f"several sessions have no run; name the run, plan or rig of one of\n{names}")
-    return meant[0] if meant else None
+    return matches[0] if matches else None
 
 
 def _say(state: State, *, as_json: bool) -> None:

@@ -73,7 +73,8 @@ def acquire(
     pause`, `go-on` and `stop`. If a console owns the cell (`coupole serve`), the command acquires in the console's
     name, if nothing runs or waits there.
     """
-    from coupole.acquisition.session import SessionRequest, rehearse
+    from coupole.acquisition.dry_run import rehearse
+    from coupole.acquisition.session import SessionRequest
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
 

@@ -85,7 +85,7 @@ def _moved_until_pressed(bench: Bench) -> _Press:
             robot.move_to(way.target_deg)
         except DeviceFault as error:  # pressed since the last look at the arm
             raise StepFailedError(_PRESSED_AT_REST.format(error.happened)) from error
-        if fault := _followed(bench, way, lambda way=way: way.speed_deg_s() >= fast_deg_s and ask()):
+        if fault := _follow(bench, way, lambda way=way: way.speed_deg_s() >= fast_deg_s and ask()):
             bench.findings.remarks.append(f"the arm's fault: {fault}")
             return way.press(fast_deg_s, robot.stopping_deg(), fault)
     robot.stop()
@@ -95,19 +95,19 @@ def _moved_until_pressed(bench: Bench) -> _Press:
     )
 
 
-def _followed(bench: Bench, way: _Way, meanwhile: Callable[[], object]) -> str:
+def _follow(bench: Bench, way: _Way, meanwhile: Callable[[], object]) -> str:
     """Follow a motion until the arm has arrived; return its fault if there is one. An arm that stopped on its way
     may tell the reason later."""
     robot, clock = bench.opened.robot, bench.opened.clock
-    told = Deadline(clock, _TOLD_WITHIN_S)
+    fault_deadline = Deadline(clock, _TOLD_WITHIN_S)
     while True:
         state = robot.measured()
         way.add(state)
         if state.fault:
             return state.fault
         if state.moving:
-            told = Deadline(clock, _TOLD_WITHIN_S)
-        elif way.has_arrived or told.has_expired:
+            fault_deadline = Deadline(clock, _TOLD_WITHIN_S)
+        elif way.has_arrived or fault_deadline.has_expired:
             return ""
         meanwhile()
         bench.pause(_POLL_S)
@@ -115,7 +115,7 @@ def _followed(bench: Bench, way: _Way, meanwhile: Callable[[], object]) -> str:
 
 @dataclass(frozen=True)
 class _Press:
-    """Where the arm was when the emergency stop began to brake it."""
+    """The place of the arm when the emergency stop began to brake it."""
 
     joints_deg: NDArray[np.float64]
     """[6] last reported axes before it slowed down."""
@@ -125,7 +125,7 @@ class _Press:
 
 @dataclass
 class _Way:
-    """One motion so far."""
+    """The reports of one motion so far."""
 
     target_deg: NDArray[np.float64]
     """[6]"""

@@ -1,5 +1,5 @@
-"""LEDs that are not steady Lambertian squares: a measured lobe, lobes that vary, tilted dies, a primary lens, lamps
-that warm."""
+"""LEDs that are not steady Lambertian squares: a measured lobe, lobes that vary, tilted dies, a primary lens, and
+lamps that warm."""
 
 from __future__ import annotations
 

@@ -80,6 +80,16 @@ PROOFS = (
         "tools/prove_led_positions.py",
     ),
     Proof(
+        "flat-field",
+        "intervals of the flat field hold with causes that a plain fit lacks",
+        "tools/prove_flat_field.py",
+    ),
+    Proof(
+        "led-power",
+        "intervals of LED power hold with causes that a plain calibration lacks",
+        "tools/prove_led_power.py",
+    ),
+    Proof(
         "artefacts",
         "E_n of independent boards and tiles holds as stated; wrong ones are found",
         "tools/prove_artefacts.py",

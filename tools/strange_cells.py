@@ -69,6 +69,8 @@ STRANGERS: dict[str, Draw] = {
     "sag": _sag,
     "ripple": _ripple,
     "tails": lambda random: {"sensor": {"tails_dn": 12.0, "seed": int(random.integers(1 << 30))}},
+    "exponents": lambda random: {"light": {"exponent_spread": 0.2, "seed": int(random.integers(1 << 30))}},
+    "warming": lambda random: {"light": {"warming": 0.01, "warming_frames": float(random.uniform(100.0, 1000.0))}},
     "gain": lambda random: {"sensor": {"gain_drift": 0.01, "seed": int(random.integers(1 << 30))}},
 }
 """The rig's `world.settings.strangers` by name."""

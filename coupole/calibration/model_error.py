@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
@@ -25,7 +26,10 @@ _NULL = 1e-7
 """Least share of the information in one direction of the space of the modes. With less, the direction belongs to
 the model itself."""
 _LEAST_LOG = -60.0
-_ROUNDS, _SETTLED = 4, 0.01
+_ROUNDS, _SETTLED = 8, 0.01
+_FARTHER = (0.0, 7.0, 13.0)
+"""Logarithms of the variances from which the search for the amplitudes begins, above those that noise alone gives.
+If priors share a pattern with a suspect, there are several minima."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,18 @@ class Suspect:
 
     name: str
     modes: Floats
+
+
+@dataclass(frozen=True)
+class Search:
+    """Rules by which suspects are judged."""
+
+    group: int = 0
+    """The group of residuals that they explain."""
+    priors: tuple[int, ...] = ()
+    """Groups that are priors of parameters: a suspect may explain why parameters are far from them."""
+    doubtful: float = 0.0
+    """A suspect with less evidence than this counts for nothing."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +81,10 @@ class ModelError:
     noise: float
     """Noise of the group without the patterns, divided by the stated noise."""
     suspects: tuple[Suspected, ...]
+    coefficients: Floats
+    """[modes] of all suspects together, in their order."""
+    joint_covariance: Floats
+    """[p + modes] squared, of the parameters and all coefficients."""
 
     def of(self, name: str) -> Suspected:
         return next(suspect for suspect in self.suspects if suspect.name == name)
@@ -77,29 +97,33 @@ def with_suspects(
     parameters: int,
     redundancy: float,
     suspects: Sequence[Suspect],
-    group: int = 0,
+    search: Search = Search(),
 ) -> ModelError:
-    """Judge the suspects by the residuals of `group`, at the solution of an adjustment.
+    """Judge the suspects by the residuals of the search's group, at the solution of an adjustment.
 
     `weights` are 1 for a residual that was kept, otherwise 0. `factors` [groups] are the estimated noises, divided
     by the stated ones. `redundancy` is that of the group.
     """
+    group = search.group
     noise = float(factors[group])
     for _ in range(_ROUNDS):
         scaled_factors = factors.copy()
         scaled_factors[group] = noise
-        fit = _Fit(blocks, weights, scaled_factors, parameters, suspects, group)
+        fit = _Fit(blocks, weights, scaled_factors, parameters, suspects, search)
         logs = fit.most_likely(redundancy, [True] * len(suspects))
         again = noise * float(np.exp(0.5 * logs[0]))
         is_settled = abs(again / noise - 1.0) < _SETTLED
         noise = again
         if is_settled:
             break
-    return fit.result(logs, redundancy, noise)
+    return fit.result(logs, redundancy, noise, search.doubtful)
 
 
 class _Fit:
-    """Normal equations with the modes, after elimination of the parameters. The group's noise is 1 here."""
+    """Normal equations with the modes, after elimination of the parameters. The group's noise is 1 here.
+
+    With another noise than that of the adjustment, priors have another weight: the parameters first take the step
+    to the solution with this noise."""
 
     def __init__(
         self,
@@ -108,31 +132,36 @@ class _Fit:
         factors: Floats,
         parameters: int,
         suspects: Sequence[Suspect],
-        group: int,
+        search: Search,
     ) -> None:
-        self.suspects = suspects
+        self.suspects, group = suspects, search.group
         modes = np.concatenate([suspect.modes for suspect in suspects], axis=1) / factors[group]
         self.of_mode = np.repeat(np.arange(len(suspects)), [suspect.modes.shape[1] for suspect in suspects])
-        normal = np.zeros((parameters, parameters))
+        normal, slope = np.zeros((parameters, parameters)), np.zeros(parameters)
+        for block, weight in zip(blocks, weights, strict=True):
+            jacobian = block.jacobian / factors[block.group]
+            normal[np.ix_(block.columns, block.columns)] += (jacobian * weight[:, None]).T @ jacobian
+            slope[block.columns] += jacobian.T @ (weight * block.residuals) / factors[block.group]
+        self.covariance = np.asarray(cho_solve(cho_factor(normal), np.eye(parameters)))
+        self.settled_step = self.covariance @ slope
         cross, gram, side = np.zeros((parameters, modes.shape[1])), 0.0, np.zeros(modes.shape[1])
         self.chi2, first = 0.0, 0
         self._own: list[tuple[Floats, Block, Floats, slice]] = []
         for block, weight in zip(blocks, weights, strict=True):
             jacobian = block.jacobian / factors[block.group]
-            normal[np.ix_(block.columns, block.columns)] += (jacobian * weight[:, None]).T @ jacobian
+            residuals = block.residuals / factors[block.group] - jacobian @ self.settled_step[block.columns]
+            if block.group in (group, *search.priors):
+                self.chi2 += float(weight @ residuals**2)
             if block.group != group:
                 continue
             rows = slice(first, first + len(weight))
             first += len(weight)
             weighted_modes = modes[rows] * weight[:, None]
-            residuals = block.residuals / factors[group]
             cross[block.columns] += jacobian.T @ weighted_modes
             gram = gram + modes[rows].T @ weighted_modes
             side += weighted_modes.T @ residuals
-            self.chi2 += float(weight @ residuals**2)
             self._own.append((jacobian, block, weight, rows))
         self.modes, self.cross = modes, cross
-        self.covariance = np.asarray(cho_solve(cho_factor(normal), np.eye(parameters)))
         remaining_gram = gram - cross.T @ self.covariance @ cross
         values, vectors = np.linalg.eigh(0.5 * (remaining_gram + remaining_gram.T))
         usable = values > _NULL * max(float(np.max(np.diag(gram))), 1e-300)
@@ -169,42 +198,80 @@ class _Fit:
             start[1 + number] = -np.log(max(float(information), 1e-12))
         bounds = [(-12.0, 3.0) if place == 0 else (start[place] - 14.0, start[place] + 14.0) for place in free]
 
-        def cost(values: Floats) -> float:
+        def cost(values: Floats) -> tuple[float, Floats]:
             logs = start.copy()
             logs[free] = values
-            return self.minus_twice_log_likelihood(logs, redundancy)
+            return self.minus_twice_log_likelihood(logs, redundancy), self._slopes(logs, redundancy)[free]
 
-        minimum = minimize(cost, start[free], method="L-BFGS-B", bounds=bounds)
+        farther = [np.where(free == 0, 0.0, more) for more in (_FARTHER if len(free) > 1 else _FARTHER[:1])]
+        minima = [
+            minimize(cost, start[free] + more, jac=True, method="L-BFGS-B", bounds=bounds) for more in farther
+        ]
         best = start.copy()
-        best[free] = minimum.x
+        best[free] = min(minima, key=lambda minimum: float(minimum.fun)).x
         return best
 
-    def result(self, logs: Floats, redundancy: float, noise: float) -> ModelError:
+    def _slopes(self, logs: Floats, redundancy: float) -> Floats:
+        """Return [1 + suspects] derivatives of `minus_twice_log_likelihood` by the logarithms."""
+        inverse = np.linalg.inv(self._variance(logs))
+        along = inverse @ self.seen
+        noise_variance = float(np.exp(logs[0]))
+        rest = max(redundancy - len(self.seen), 1.0)
+        unexplained_chi2 = max(self.chi2 - float(self.seen @ self.seen), 0.0)
+        by_noise = noise_variance * (np.trace(inverse) - along @ along) + rest - unexplained_chi2 / noise_variance
+        by_mode = np.einsum("im,ij,jm->m", self.root, inverse, self.root) - (self.root.T @ along) ** 2
+        by_suspect = np.bincount(self.of_mode, self._prior_variances(logs) * by_mode, len(self.suspects))
+        return np.concatenate([[by_noise], by_suspect])
+
+    def result(self, logs: Floats, redundancy: float, noise: float, doubtful: float) -> ModelError:
+        logs, evidence = self._without_doubtful(logs, redundancy, doubtful)
         variances = self._prior_variances(logs)
         factor = cho_factor(self._variance(logs))
         gain = variances[:, None] * self.root.T
         coefficients = gain @ cho_solve(factor, self.seen)
         covariance = np.diag(variances) - gain @ cho_solve(factor, gain.T)
         by = self.covariance @ self.cross
-        step = -by @ coefficients
-        at_best = self.minus_twice_log_likelihood(logs, redundancy)
+        step = self.settled_step - by @ coefficients
         suspects = []
         for number, suspect in enumerate(self.suspects):
             own_modes = self.of_mode == number
-            without = self.most_likely(redundancy, [n != number for n in range(len(self.suspects))])
-            evidence = self.minus_twice_log_likelihood(without, redundancy) - at_best
             pattern = self._pattern(np.where(own_modes, coefficients, 0.0), by)
             suspects.append(
                 Suspected(
                     suspect.name,
                     float(np.exp(0.5 * logs[1 + number])),
-                    max(float(evidence), 0.0),
+                    float(evidence[number]),
                     coefficients[own_modes],
                     covariance[np.ix_(own_modes, own_modes)],
                     pattern * noise,
                 )
             )
-        return ModelError(step, self.covariance + by @ covariance @ by.T, noise, tuple(suspects))
+        parameters = self.covariance + by @ covariance @ by.T
+        between = -by @ covariance
+        joint = np.block([[parameters, between], [between.T, covariance]])
+        return ModelError(step, parameters, noise, tuple(suspects), coefficients, joint)
+
+    def _without_doubtful(self, logs: Floats, redundancy: float, doubtful: float) -> tuple[Floats, Floats]:
+        """Return the logarithms, and the evidence [suspects] of each suspect with all others present. The weakest
+        suspect is left out as long as its evidence is below `doubtful`."""
+        present = np.ones(len(self.suspects), np.bool_)
+        while True:
+            evidence = self._evidence(logs, redundancy, present)
+            weakest = int(np.argmin(np.where(present, evidence, np.inf)))
+            if not present.any() or evidence[weakest] >= doubtful:
+                return logs, evidence
+            present[weakest] = False
+            logs = self.most_likely(redundancy, present.tolist())
+
+    def _evidence(self, logs: Floats, redundancy: float, present: NDArray[np.bool_]) -> Floats:
+        """Return [suspects] twice the log-likelihood that each brings with all others present."""
+        at_best = self.minus_twice_log_likelihood(logs, redundancy)
+        evidence = np.zeros(len(self.suspects))
+        for number in np.flatnonzero(present):
+            other_suspects = [bool(there) and suspect != number for suspect, there in enumerate(present)]
+            without = self.most_likely(redundancy, other_suspects)
+            evidence[number] = max(self.minus_twice_log_likelihood(without, redundancy) - at_best, 0.0)
+        return evidence
 
     def _pattern(self, coefficients: Floats, by: Floats) -> float:
         """Return the root mean square of the pattern that these coefficients leave in the residuals."""

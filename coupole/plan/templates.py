@@ -126,7 +126,7 @@ darks_per_view: 2
     "spectralon": """\
 # A white tile at the support's centre, for `coupole calibrate led-power`. Each LED is taken from two sides: where
 # the arm shades the tile in one, it does not in the other. Two elevations tell how the tile departs from Lambert's
-# law.
+# law. Their order, and the first view once more at the end, tell drifts of light and gain from this.
 schema_version: 1
 name: {name}
 rig: {rig}
@@ -136,10 +136,12 @@ views:
      lights: {{kind: every, every: 2}}}}
   - {{kind: look_at, name: even-high, target_mm: [0, 0, 10], distance_mm: 335, azimuth_deg: -45, elevation_deg: 60,
      lights: {{kind: every, every: 2}}}}
-  - {{kind: look_at, name: odd-low, target_mm: [0, 0, 10], distance_mm: 335, azimuth_deg: -45, elevation_deg: 45,
-     lights: {{kind: every, every: 2, offset: 1}}}}
   - {{kind: look_at, name: odd-high, target_mm: [0, 0, 10], distance_mm: 335, azimuth_deg: 45, elevation_deg: 60,
      lights: {{kind: every, every: 2, offset: 1}}}}
+  - {{kind: look_at, name: odd-low, target_mm: [0, 0, 10], distance_mm: 335, azimuth_deg: -45, elevation_deg: 45,
+     lights: {{kind: every, every: 2, offset: 1}}}}
+  - {{kind: look_at, name: again, target_mm: [0, 0, 10], distance_mm: 335, azimuth_deg: 45, elevation_deg: 45,
+     lights: {{kind: every, every: 10}}}}
 lights: {{kind: all}}
 hidden_lights: skip
 exposure: {{kind: bracket, exposures_us: [2000, 6000]}}

@@ -227,7 +227,8 @@ class Photographer:
 
     def _lit(self, look: Look, exposure: Exposed) -> tuple[Radiance, float]:
         """Radiance of the sites, and its duration in seconds."""
-        lights = [(self._led(look, led), lit_s) for led, lit_s in exposure.seconds_of_led.items()]
+        warmth = self._strangers.light.warmth(exposure.number)
+        lights = [(self._led(look, led), warmth * lit_s) for led, lit_s in exposure.seconds_of_led.items()]
         lights += [(self._panel(look, panel), exposure.exposure_s) for panel in exposure.panels]
         if lamp_lux := exposure.disturbance.lamp_lux:
             lights.append((panel_radiance(look.view, self._scene.materials, lamp_lux), exposure.exposure_s))
@@ -301,8 +302,9 @@ class Photographer:
             radiance = led_radiance(view, *matter, emitter, emission)
             self._obstacles.cast(radiance, view.points_mm, view.triangle, view.normals, emitter.centre_mm)
         arm_shadow.cast(radiance, view.points_mm, look.arm_mm, emitter.centre_mm)
-        if self._strangers.light.lobe and row < len(self._emitters):
-            radiance *= self._strangers.light.over_cosine(emitter, view.points_mm)[:, None]
+        if self._strangers.light.has_lobe and row < len(self._emitters):
+            led = int(self.leds.ids[row])
+            radiance *= self._strangers.light.over_cosine(emitter, view.points_mm, led)[:, None]
         return radiance
 
     def _add_indirect(self, radiance: Radiance, look: Look, emitter: Emitter, emission: str) -> None:

@@ -1,4 +1,5 @@
-"""LEDs that are not Lambertian squares: a measured lobe, tilted dies, a primary lens."""
+"""LEDs that are not steady Lambertian squares: a measured lobe, lobes that vary, tilted dies, a primary lens, and
+lamps that warm."""
 
 from __future__ import annotations
 
@@ -12,8 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from sim.render.emitter import Emitter
 
-_TILT = 11
-"""Number of the seed's random stream."""
+_TILT, _EXPONENT = 11, 12
+"""Numbers of the seed's random streams."""
 _LEAST_COSINE = 0.02
 Floats = NDArray[np.float64]
 
@@ -29,7 +30,13 @@ class LightStranger(BaseModel):
     cosine."""
     die_tilt_deg: Annotated[float, Field(ge=0, le=30)] = 0.0
     """Standard deviation of each die's turn about two axes of its board. The die's position stays."""
+    exponent_spread: Annotated[float, Field(ge=0, lt=0.3)] = 0.0
+    """Standard deviation over the dies of the exponent of the cosine, which is 1 on average. The flux stays."""
     seed: int = 1
+    warming: Annotated[float, Field(gt=-1, lt=1)] = 0.0
+    """Share of the light that the LEDs lose while they warm."""
+    warming_frames: Annotated[float, Field(gt=0)] = 500.0
+    """Number of frames after which 63 % of that share are lost."""
     primary_lens_mm: float = 0.0
     """Shift of the die's image by the lens on it, across the die's normal and towards the viewer, over the sine of
     the angle to the normal."""
@@ -54,11 +61,27 @@ class LightStranger(BaseModel):
             tilted_normals[row] += lean - (lean @ normals[row]) * normals[row]
         return np.asarray(tilted_normals / np.linalg.norm(tilted_normals, axis=1, keepdims=True))
 
-    def over_cosine(self, emitter: Emitter, points_mm: NDArray[np.float32]) -> NDArray[np.float32]:
-        """[n] factor of the light at points [n, 3] relative to the light of the same flux by the cosine law."""
+    @property
+    def has_lobe(self) -> bool:
+        """True if light does not leave every die by the cosine law."""
+        return bool(self.lobe or self.exponent_spread)
+
+    def exponent(self, led: int) -> float:
+        """Exponent by which an LED's lobe departs from that of all LEDs."""
+        return float(self.exponent_spread * np.random.default_rng((self.seed, _EXPONENT, led)).standard_normal())
+
+    def warmth(self, frame: int) -> float:
+        """Factor of the light at a frame."""
+        return 1.0 - self.warming * (1.0 - float(np.exp(-frame / self.warming_frames)))
+
+    def over_cosine(self, emitter: Emitter, points_mm: NDArray[np.float32], led: int) -> NDArray[np.float32]:
+        """[n] factor of the light of an LED at points [n, 3] relative to the light of the same flux by the cosine
+        law."""
         away = points_mm - emitter.centre_mm
         cosine = np.clip(away @ emitter.normal / np.linalg.norm(away, axis=1), _LEAST_COSINE, 1.0)
-        return np.asarray(self.intensity(np.degrees(np.arccos(cosine))) / cosine, np.float32)
+        own = self.exponent(led)
+        own_lobe = (1.0 + 0.5 * own) * cosine**own
+        return np.asarray(own_lobe * self.intensity(np.degrees(np.arccos(cosine))) / cosine, np.float32)
 
     def intensity(self, angle_deg: Floats) -> Floats:
         """Return the intensity relative to pi times the flux: the cosine without a lobe, otherwise the lobe with

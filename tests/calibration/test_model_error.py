@@ -15,7 +15,7 @@ from coupole.calibration.cross_validation import left_out
 from coupole.calibration.lens.board import Sighting
 from coupole.calibration.lens.camera import CameraCalibration, calibrate_camera
 from coupole.calibration.lens.suspects import BOARD, FOCUS, LENS, PRINT, PRINT_UNIT, Field
-from coupole.calibration.model_error import Suspect, with_suspects
+from coupole.calibration.model_error import Search, Suspect, with_suspects
 
 GROUPS, EACH = 30, 12
 
@@ -46,6 +46,26 @@ def test_amplitude_and_uncertainty_are_those_of_the_analysis_of_variance() -> No
     assert found.of("groups").amplitude ** 2 == pytest.approx((between - within) / EACH, rel=0.02)
     assert found.covariance[0, 0] == pytest.approx(between / len(values), rel=0.02)
     assert found.of("groups").evidence > 50
+
+
+def test_a_suspect_explains_why_a_parameter_is_far_from_its_prior() -> None:
+    """Two unknown levels of 0 within 0.1, both seen at 3: either both are 30 sigma off, or all values are."""
+    random = np.random.default_rng(2)
+    levels = np.repeat(np.eye(2), 40, axis=0)
+    values = 3.0 + random.normal(0, 1.0, 80)
+    blocks = [Block(values, levels, np.arange(2), 0), Block(np.zeros(2), np.eye(2) / 0.1, np.arange(2), 1)]
+    suspects = [Suspect("all", np.ones((80, 1))), Suspect("alternating", np.tile([1.0, -1.0], 40)[:, None])]
+    found = with_suspects(
+        blocks, [np.ones(80), np.ones(2)], np.ones(2), 2, 80.0, suspects, Search(priors=(1,), doubtful=1.64)
+    )
+    assert found.of("all").evidence > 50
+    assert found.of("all").coefficients[0] == pytest.approx(values.mean(), abs=0.3)
+    assert np.abs(found.step).max() < 0.3
+    assert found.of("alternating").amplitude < 1e-6
+    assert found.noise == pytest.approx(1.0, abs=0.15)
+    assert found.joint_covariance[:2, :2] == pytest.approx(found.covariance)
+    both = found.joint_covariance[0, 0] + found.joint_covariance[2, 2] + 2 * found.joint_covariance[0, 2]
+    assert both == pytest.approx(1.0 / 80, rel=0.7)
 
 
 def test_noise_without_structure_gives_a_suspect_neither_evidence_nor_weight() -> None:

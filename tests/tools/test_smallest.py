@@ -91,6 +91,8 @@ RUNS = (
     Run("prove_watching.py --smallest", r"\d of 8 faults found and named; \d false alarms in 2", full=True),
     Run(f"prove_identification.py {PIGMENTS} --smallest", r"\(its class|its class left out: \d", True, PIGMENTS),
     Run("prove_layers.py --smallest", r"photons, another ground: 95 % intervals hold \d", full=True),
+    Run("prove_led_power.py --smallest", r"\| warming 0\.003 \| \d+\.\d%, \d\.\d\d, ", full=True),
+    Run("prove_flat_field.py --smallest", r"\| slant 0\.01 \| \d+\.\d%, \d\.\d\d, "),
     Run("prove_led_positions.py --smallest", r"\| oval 0\.4 \| \d+\.\d%, \d\.\d\d, ", full=True),
     Run("prove_materials.py --smallest", r"diffuse, white \| (0\.99|1\.00)\d\d \|", full=True),
     Run("prove_paper_table.py --smallest", r"hold the truth: 68 %: \d", full=True),

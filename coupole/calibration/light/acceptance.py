@@ -12,6 +12,12 @@ RESPONSE = (
 LED_POWER = (
     Allowed("power", "median uncertainty against the mean", 0.02),
     Allowed("unusable", "share of LEDs without a usable picture", 0.02),
+    Allowed("left_out", "moves of the powers by views left out, over their uncertainty", 3.0),
+    Allowed("scatter", "scatter of an LED between its views", 0.003),
+    Allowed("lobe", "share of light that a lobe of the tile reflects", 0.03),
+    Allowed("stain", "change of the tile's mean reflectance by a stain, with its uncertainty", 0.01),
+    Allowed("drift", "slow change of gain or light within the session", 0.02),
+    Allowed("unsteady", "unsteady change of gain or light within the session", 0.002),
 )
 DRIFT = (
     Allowed("factor", "uncertainty of the factor, worst frame", 0.01),

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.calibration.light.flat_suspects import FlatCauses, flat_causes, form_modes
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
@@ -72,11 +73,19 @@ class FlatField:
     """Share of the blocks with weight 0."""
     views: tuple[str, ...]
     degrees_of_freedom: float
+    form: Floats
+    """[modes] coefficients of a fall-off that is not round (`form_modes`); none without a search."""
+    field_covariance: Floats
+    """[5 + modes] squared, of the parameters and these coefficients."""
+    causes: FlatCauses
 
     def at(self, pixels: Floats) -> Floats:
         """Return g [...] at pixels [..., 2]. It is 1 at its centre."""
         radial, _ = _radial(pixels, self.parameters[:2], self.focal_px, self.size_px)
-        value: Floats = np.exp(radial[0] + np.tensordot(self.parameters[2:], radial[1:], 1))
+        log = radial[0] + np.tensordot(self.parameters[2:], radial[1:], 1)
+        if self.form.any():
+            log = log + form_modes(pixels, self.size_px) @ self.form
+        value: Floats = np.exp(log)
         return value
 
     def u_at(self, pixels: Floats) -> Floats:
@@ -85,8 +94,9 @@ class FlatField:
         A common factor of g is also in the LEDs' power and cancels in every reflectance.
         """
         grid = _grid(self.size_px)
-        by = self._slopes(pixels) - self._slopes(grid).mean(axis=1).reshape(5, *[1] * (pixels.ndim - 1))
-        return np.asarray(np.sqrt(np.einsum("i...,ij,j...->...", by, self.covariance, by)))
+        mean = self._slopes(grid).mean(axis=1).reshape(-1, *[1] * (pixels.ndim - 1))
+        by = self._slopes(pixels) - mean
+        return np.asarray(np.sqrt(np.einsum("i...,ij,j...->...", by, self.field_covariance, by)))
 
     def map(self) -> NDArray[np.float32]:
         """Return [H, W], g of every pixel."""
@@ -96,10 +106,13 @@ class FlatField:
         return np.stack([self.at(row).astype(np.float32) for row in rows])
 
     def _slopes(self, pixels: Floats) -> Floats:
-        """Return [5, ...], derivatives of ln g."""
+        """Return [5 + modes, ...], derivatives of ln g."""
         radial, by_centre = _radial(pixels, self.parameters[:2], self.focal_px, self.size_px)
         centre_slopes = by_centre[:, 0] + np.einsum("k,ck...->c...", self.parameters[2:], by_centre[:, 1:])
-        return np.concatenate([centre_slopes, radial[1:]])
+        own = np.concatenate([centre_slopes, radial[1:]])
+        if not len(self.form):
+            return own
+        return np.concatenate([own, np.moveaxis(form_modes(pixels, self.size_px), -1, 0)])
 
 
 def fit_flat_field(
@@ -109,8 +122,10 @@ def fit_flat_field(
     focal_px: float,
     size_px: tuple[int, int],
     panel_scale_mm: float = 100.0,
+    search: bool = True,
 ) -> FlatField:
-    """Fit one channel. Raises InputError if the views do not separate panel and lens, or have too few blocks."""
+    """Fit one channel. Without `search`, causes that the model lacks are left out. Raises InputError if the views
+    do not separate panel and lens, or have too few blocks."""
     usable = [np.isfinite(view.signal) & (view.signal > 0) for view in views]
     if len(views) < 3 or min(int(u.sum()) for u in usable) < _LEAST_BLOCKS:
         least = min((int(u.sum()) for u in usable), default=0)
@@ -121,28 +136,41 @@ def fit_flat_field(
         )
     blocks = _gathered_blocks(views, usable, panel_scale_mm)
     fit = _fit(blocks, len(views), focal_px, size_px)
-    covariance = _clustered_covariance(fit.design, fit.weight, fit.residuals, blocks.pixels)
+    causes = _no_causes(blocks, fit)
+    if search:
+        places = blocks.panel_terms[:, :2]
+        causes = flat_causes(blocks.pixels, places, fit.residuals, fit.design, fit.weight > 0.0, size_px)
     parts = np.split(fit.residuals, np.cumsum([int(u.sum()) for u in usable])[:-1])
     residuals = []
     for use, part in zip(usable, parts, strict=True):
         whole = np.full(len(use), np.nan)
         whole[use] = part
         residuals.append(whole)
-    clusters = len(np.unique(blocks.pixels, axis=0))
+    clusters, count = len(np.unique(blocks.pixels, axis=0)), fit.design.shape[1]
     return FlatField(
         channel,
-        fit.parameters,
-        covariance[:5, :5],
+        fit.parameters + causes.step[:5],
+        causes.joint_covariance[:5, :5],
         focal_px,
         size_px,
-        fit.panel,
-        covariance[-5:, -5:],
+        fit.panel + causes.step[-5:],
+        causes.joint_covariance[np.ix_(*[np.arange(count - 5, count)] * 2)],
         fit.sigma,
         tuple(residuals),
         float(np.mean(fit.weight == 0.0)),
         tuple(view.name for view in views),
-        float(max(1, clusters - fit.design.shape[1])),
+        float(max(1, clusters - count)),
+        causes.form,
+        causes.joint_covariance[
+            np.ix_(*[np.append(np.arange(5), np.arange(count, len(causes.joint_covariance)))] * 2)
+        ],
+        causes,
     )
+
+
+def _no_causes(blocks: _Blocks, fit: _Fit) -> FlatCauses:
+    covariance = _clustered_covariance(fit.design, fit.weight, fit.residuals, blocks.pixels)
+    return FlatCauses(np.zeros(len(covariance)), np.zeros(0), covariance, (), 0.0, 0.0)
 
 
 @dataclass(frozen=True)

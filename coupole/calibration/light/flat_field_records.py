@@ -47,6 +47,7 @@ _ROWS = 64
 _MOST_SATURATED = 1e-3
 _MOST_FLAT_U = 0.005
 _MOST_DUST_DEPTH = 0.05
+_MOST_PANEL, _MOST_OFF_ROUND = 0.003, 0.03
 
 
 def flat_field_outcome(
@@ -87,6 +88,7 @@ def flat_field_outcome(
     inputs = (*record_input(dark_record), *record_input(response_record), *record_input(hand_eye))
     dust = [f"({s.column_px:.0f}, {s.row_px:.0f}) by {s.depth:.1%}" for s in spots[:5]]
     remarks = [f"{len(spots)} dust spots on the sensor, the deepest at {', '.join(dust)}"] if spots else []
+    remarks += dict.fromkeys(sentence for fit in fits.values() for sentence in fit.causes.sentences())
     table = np.array([(s.column_px, s.row_px, s.pixels, s.depth) for s in spots]).reshape(-1, 4)
     return sealed_outcome(
         "flat-field",
@@ -96,7 +98,7 @@ def flat_field_outcome(
         Findings(
             parameters,
             covariance,
-            limits=_limits(fits, spots, size_px),
+            limits=limits_of(fits, spots, size_px),
             files={f"{request.name}.h5": h5_of({"g": g, "pixel_response": ratio, "dust_x_y_pixels_depth": table})},
             fixed_figures={"focal_px": frames.focal_px, "u_pixel_response": u_ratio},
             remarks=remarks,
@@ -106,7 +108,8 @@ def flat_field_outcome(
     )
 
 
-def _limits(fits: Mapping[str, FlatField], spots: Sequence[Spot], size_px: tuple[int, int]) -> tuple[Limit, ...]:
+def limits_of(fits: Mapping[str, FlatField], spots: Sequence[Spot], size_px: tuple[int, int]) -> tuple[Limit, ...]:
+    """Compare the fall-offs of all channels with their limits."""
     width, height = size_px
     corners = np.array([(0.0, 0.0), (width - 1.0, 0.0), (0.0, height - 1.0), (width - 1.0, height - 1.0)])
     worst = max(float(fit.u_at(corners).max()) for fit in fits.values())
@@ -116,6 +119,10 @@ def _limits(fits: Mapping[str, FlatField], spots: Sequence[Spot], size_px: tuple
         limit_of("uncertainty in the field's corners", worst, _MOST_FLAT_U),
         limit_of("share of blocks left out", rejected_share, 0.05),
         limit_of("deepest dust", deepest, _MOST_DUST_DEPTH),
+        limit_of("pattern of the panel", max(fit.causes.panel for fit in fits.values()), _MOST_PANEL),
+        limit_of(
+            "fall-off that is not round", max(fit.causes.off_round for fit in fits.values()), _MOST_OFF_ROUND
+        ),
     )
 
 

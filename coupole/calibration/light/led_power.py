@@ -23,7 +23,18 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from coupole.calibration.light.irradiance import LED_SIDE_MM, Emission
+from coupole.calibration.light.power_between import between_views
+from coupole.calibration.light.power_figures import common_figures
+from coupole.calibration.light.power_left_out import ViewsLeftOut, views_left_out
+from coupole.calibration.light.power_suspects import (
+    REACH_MM,
+    CausesFound,
+    causes_of,
+    sentences,
+    without_causes,
+)
 from coupole.calibration.light.spectralon import Tile
+from coupole.calibration.light.tile_parts import NO_PARTS, PartsFound, parts_of
 from coupole.calibration.light.tile_views import (
     OF_PLACE,
     Emitter,
@@ -66,12 +77,20 @@ class LedPower:
     remarks: tuple[str, ...]
     """Named faults: dead LEDs, shadows, saturation."""
     degrees_of_freedom: float
+    causes: CausesFound
+    parts: PartsFound
+    left_out: ViewsLeftOut
 
     def u(self) -> Floats:
         """Relative standard uncertainty [n], from all errors together."""
         together = np.einsum("ni,ij,nj->n", self.common, self.common_covariance, self.common)
         total: Floats = np.sqrt(self.u_own**2 + together)
         return total
+
+    def u_scale(self) -> float:
+        """Relative standard uncertainty of all powers together."""
+        mean = np.nanmean(self.common[self.power > 0], axis=0)
+        return float(np.sqrt(mean @ self.common_covariance @ mean))
 
     def u_against_mean(self) -> Floats:
         """Relative standard uncertainty [n] of an LED's power relative to the mean of all LEDs. The common scale
@@ -102,56 +121,85 @@ def calibrate_led_power(
     emission: Emission = "lambertian",
     side_mm: float = LED_SIDE_MM,
     flash_noise: float = 5e-4,
+    search: bool = True,
 ) -> LedPower:
     """Find the powers of one channel from the tile's views.
 
-    `flash_noise` is the stated relative scatter of an LED's flashes. Raises InputError if no view shows the tile
+    `flash_noise` is the stated relative scatter of an LED's flashes. Without `search`, causes that the model lacks
+    are left out. Raises InputError if no view shows the tile
     lit, if all views are saturated, or if the tile was moved between views of one place.
     """
-    if not views:
-        raise InputError("LED power: expected views of the tile, found none")
+    _refuse_none(views)
     ids = np.unique(np.concatenate([view.leds for view in views]))
     places = sorted({view.place for view in views})
     names = _common_names(places)
     remarks: list[str] = []
+    rows, dead = _rows(views, ids, positions, tile, Emitter(emission, side_mm), remarks)
+    y, w, led, view_of, design = arrays_of(rows, ids, flash_noise)
+    prior = np.maximum(prior_of(tile, len(places)), LEAST_PRIOR)
+    between, mean_y = between_views(y, w, led, design, len(ids), prior)
+    causes = causes_of(rows, between, tile) if search else without_causes(between)
+    parts = parts_of(rows, [_on_tile_mm(view) for view in views], tile, prior) if search else NO_PARTS
+    residuals = between.residuals - between.design @ causes.figures - causes.pattern
+    factor = max(1.0, float(np.sum(w * residuals**2)) / between.redundancy)
+    _refuse_moved(views, view_of, residuals, w, design, between.redundancy)
+    is_used = between.weight > 0.0
+    mean_design = between.means(design)
+    log_power = mean_y - mean_design @ causes.figures - causes.mean_modes @ causes.error.coefficients - parts.loss
+    power = np.where(dead, 0.0, np.exp(np.where(is_used, log_power, np.nan)))
+    variance = factor / np.maximum(between.weight, 1e-300) + (REACH_MM * parts.fall_off_per_mm) ** 2
+    own_u = np.where(is_used, np.sqrt(variance), np.nan)
+    common = common_figures(mean_design, causes, parts, own_u, is_used)
+    figures = np.pad(causes.figures, (0, len(common.names)))
+    figures[names.index("ln_reflectance")] += parts.loss
+    if (missing := ids[~is_used & ~dead]).size:
+        remarks.append(f"{len(missing)} LEDs have no usable picture: {list_of(missing)}")
+    return LedPower(
+        ids,
+        power,
+        common.u_own,
+        np.where(is_used[:, None], common.slopes, np.nan),
+        (*names, *common.names),
+        common.covariance,
+        figures,
+        float(np.sqrt(factor / np.median(w))),
+        _by_view(views, view_of, ids[led], residuals),
+        (*remarks, *sentences(causes, parts)),
+        between.redundancy,
+        causes,
+        parts,
+        views_left_out(y, causes.with_modes(between, design, factor), [views[v].name for v in view_of]),
+    )
+
+
+def _refuse_none(views: Sequence[TileView]) -> None:
+    if not views:
+        raise InputError("LED power: expected views of the tile, found none")
+
+
+def _rows(
+    views: Sequence[TileView],
+    ids: NDArray[np.int64],
+    positions: Positions,
+    tile: Tile,
+    emitter: Emitter,
+    remarks: list[str],
+) -> tuple[list[Row], NDArray[np.bool_]]:
+    """Return the observations of lit LEDs, and a mask [n] of dead ones. Sentences on frames that cannot be used
+    are added to the remarks. Raises InputError if no LED can be used."""
+    places = sorted({view.place for view in views})
+    figures = len(_common_names(places))
     rows: list[Row] = []
     lit_elsewhere: set[int] = set()
     for v, view in enumerate(views):
         place = places.index(view.place)
-        view_rows = rows_of(v, view, positions, tile, Emitter(emission, side_mm), place=place, figures=len(names))
+        view_rows = rows_of(v, view, positions, tile, emitter, place=place, figures=figures)
         rows += view_rows.rows
         remarks += view_rows.remarks
         lit_elsewhere |= view_rows.unused_leds
     if not rows:
         raise InputError("LED power: no LED could be used: " + ("; ".join(remarks[:5]) or "all are too low"))
-    rows, dead = without_dark(rows, views, ids, lit_elsewhere, remarks)
-    y, w, led, view_of, design = arrays_of(rows, ids, flash_noise)
-    solution = _solve(y, w, led, design, len(ids), prior_of(tile, len(places)))
-    redundancy = max(1.0, float(len(y) - len(np.unique(led))))
-    chi2 = float(np.sum(w * solution.residuals**2))
-    factor = max(1.0, chi2 / redundancy) if len(y) > len(np.unique(led)) else 1.0
-    _refuse_moved(views, view_of, solution.residuals, w, design, redundancy)
-    is_used = np.zeros(len(ids), bool)
-    is_used[np.unique(led)] = True
-    power = np.where(is_used, np.exp(np.where(is_used, solution.log_power, 0.0)), np.nan)
-    power[dead] = 0.0
-    own_u = np.where(is_used, np.sqrt(factor / np.maximum(solution.weight, 1e-300)), np.nan)
-    missing = ids[~is_used & ~dead]
-    if len(missing):
-        remarks.append(f"{len(missing)} LEDs have no usable picture: {list_of(missing)}")
-    return LedPower(
-        ids,
-        power,
-        own_u,
-        np.where(is_used[:, None], -solution.mean_design, np.nan),
-        names,
-        solution.covariance,
-        solution.theta,
-        float(np.sqrt(factor / np.median(w))),
-        _by_view(views, view_of, ids[led], solution.residuals),
-        tuple(remarks),
-        redundancy,
-    )
+    return without_dark(rows, views, ids, lit_elsewhere, remarks)
 
 
 def _by_view(
@@ -168,30 +216,10 @@ def _by_view(
     return tuple(residuals)
 
 
-@dataclass(frozen=True)
-class _Solved:
-    log_power: Floats
-    weight: Floats
-    """[leds] sum of weights."""
-    mean_design: Floats
-    """[leds, c] weighted mean of the design."""
-    theta: Floats
-    covariance: Floats
-    residuals: Floats
-
-
-def _solve(y: Floats, w: Floats, led: NDArray[np.intp], design: Floats, leds: int, prior: Floats) -> _Solved:
-    """Solve by least squares. The LEDs' own unknowns are eliminated first."""
-    weight: Floats = np.bincount(led, w, leds).astype(np.float64)
-    safe = np.maximum(weight, 1e-300)
-    mean_y = np.bincount(led, w * y, leds) / safe
-    mean_design: Floats = np.column_stack([np.bincount(led, w * column, leds) / safe for column in design.T])
-    off_y, off = y - mean_y[led], design - mean_design[led]
-    prior_sigmas = np.maximum(prior, LEAST_PRIOR)
-    normal = np.diag(prior_sigmas**-2.0) + off.T @ (off * w[:, None])
-    covariance: Floats = np.asarray(np.linalg.inv(normal), np.float64)
-    theta: Floats = covariance @ (off.T @ (w * off_y))
-    return _Solved(mean_y - mean_design @ theta, weight, mean_design, theta, covariance, off_y - off @ theta)
+def _on_tile_mm(view: TileView) -> Floats:
+    """Return [m, 2] places of the parts on the tile."""
+    turn, middle_mm = view.base_from_tile[:3, :3], view.base_from_tile[:3, 3]
+    return np.asarray(((view.points_mm - middle_mm) @ turn)[:, :2])
 
 
 def _refuse_moved(

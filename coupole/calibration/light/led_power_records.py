@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from coupole.calibration.acceptance import against_limits
 from coupole.calibration.earlier import GLARE, READ_WITH
@@ -18,7 +20,7 @@ from coupole.calibration.light.led_power_tile import Setting, TileReader
 from coupole.calibration.light.radiometric_record import Findings, sealed_outcome
 from coupole.calibration.light.records import Progress, counter
 from coupole.calibration.light.tile_views import TileView, list_of
-from coupole.calibration.record import Parameter
+from coupole.calibration.record import Limit, Parameter
 from coupole.calibration.report import Outcome
 from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
@@ -47,17 +49,16 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
         )
         for channel in channels
     }
+    powers = with_equal_figures(powers)
     warm = board_temperatures(lit)
     covariance = covariance_of(powers, {channel: prior_of(setting.tile_of(channel)) for channel in channels})
     parameters = _parameters(powers, covariance)
     height, width = reader.shape
-    green = powers["G"]
-    good = np.isfinite(green.power) & (green.power > 0)
-    typical = float(np.median(green.u_against_mean()[good]))
-    unusable = float(np.mean(~np.isfinite(green.power)))
-    other_ids = np.setdiff1d(setting.positions.ids, green.ids)
+    other_ids = np.setdiff1d(setting.positions.ids, powers["G"].ids)
     remarks = [f"{len(other_ids)} LEDs of the dome have no frame: {list_of(other_ids)}"] if len(other_ids) else []
     remarks += list(dict.fromkeys(remark for power in powers.values() for remark in power.remarks))
+    limits = power_limits(powers, request.limits)
+    remarks += _of_views(powers["G"], limits)
     return sealed_outcome(
         "led-power",
         request,
@@ -66,7 +67,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
         Findings(
             parameters,
             covariance,
-            limits=against_limits(LED_POWER, request.limits, {"power": typical, "unusable": unusable}),
+            limits=limits,
             files={f"{request.name}.csv": power_table(powers, warm).encode()},
             fixed_figures={
                 "tile.reflectance": setting.tile_of("G").reflectance,
@@ -82,6 +83,57 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
         ),
         partial(pictures.draw_led_power, powers, setting.positions),
     )
+
+
+def power_limits(powers: Mapping[str, LedPower], operator_limits: Mapping[str, float]) -> tuple[Limit, ...]:
+    """Compare the powers with their limits: those of green, and the worst channel's causes."""
+    green = powers["G"]
+    good = np.isfinite(green.power) & (green.power > 0)
+    u = green.u_against_mean()
+    figures = {
+        "power": float(np.median(u[good])),
+        "unusable": float(np.mean(~np.isfinite(green.power))),
+        "left_out": green.left_out.ratio(np.where(good, u, np.nan)),
+        "scatter": green.noise,
+        "lobe": max(abs(power.causes.gloss) for power in powers.values()),
+        "stain": max(abs(power.parts.loss) + power.parts.u_loss for power in powers.values()),
+        "drift": max(power.causes.drift for power in powers.values()),
+        "unsteady": max(power.causes.unsteady for power in powers.values()),
+    }
+    return against_limits(LED_POWER, operator_limits, figures)
+
+
+def _of_views(power: LedPower, limits: Sequence[Limit]) -> list[str]:
+    """Return what views left out in turn say, and what to do if they contradict each other."""
+    figures = {limit.name: limit for limit in limits}
+    if not power.left_out.worst:
+        return ["each LED is in one view only: nothing tells a drift, or a lobe of the tile"]
+    line = (
+        f"views left out in turn move the powers by {figures['left_out'].found:.2f} of the stated uncertainty; "
+        f"{power.left_out.worst} moves them most"
+    )
+    if figures["left_out"].is_met and figures["scatter"].is_met:
+        return [line]
+    return [
+        f"{line}. Views contradict each other by more than noise, and what is named does not explain it. Look for "
+        "a tile, camera or lamp that moved between the views; then take the views anew"
+    ]
+
+
+def with_equal_figures(powers: Mapping[str, LedPower]) -> dict[str, LedPower]:
+    """Return the powers with as many figures of causes in each channel; those that are added change nothing."""
+    most = max(powers.values(), key=lambda power: len(power.common_names)).common_names
+    equal = {}
+    for channel, power in powers.items():
+        more = len(most) - len(power.common_names)
+        equal[channel] = replace(
+            power,
+            common=np.pad(power.common, ((0, 0), (0, more))),
+            common_names=most,
+            common_covariance=np.asarray(block_diag(power.common_covariance, np.eye(more))),
+            departures=np.pad(power.departures, (0, more)),
+        )
+    return equal
 
 
 def board_temperatures(lit: Sequence[LightFrame]) -> dict[int, float]:
@@ -152,7 +204,9 @@ def covariance_of(powers: Mapping[str, LedPower], priors: Mapping[str, Floats]) 
     posteriors C_a, C_b. Then the errors of channels a and b have the covariance C_a diag(1 / (s_a s_b)) C_b, which
     is the remaining part of the priors' error. Their noise is independent.
     """
-    size = 1 + len(next(iter(priors.values())))
+    powers = with_equal_figures(powers)
+    of_tile = len(next(iter(priors.values())))
+    size = 1 + len(next(iter(powers.values())).common_names)
     whole = np.zeros((size * len(powers), size * len(powers)))
     sigmas = [np.maximum(priors[channel], LEAST_PRIOR) for channel in powers]
     by_common = [np.vstack([_mean_and_slopes(power)[1], np.eye(size - 1)]) for power in powers.values()]
@@ -160,7 +214,8 @@ def covariance_of(powers: Mapping[str, LedPower], priors: Mapping[str, Floats]) 
         for j, second in enumerate(powers.values()):
             between = first.common_covariance
             if i != j:
-                between = between @ np.diag(1.0 / (sigmas[i] * sigmas[j])) @ second.common_covariance
+                inverse_priors = np.diag(1.0 / (sigmas[i] * sigmas[j]))
+                between = between[:, :of_tile] @ inverse_priors @ second.common_covariance[:of_tile]
             block = by_common[i] @ between @ by_common[j].T
             if i == j:
                 good = np.isfinite(first.power) & (first.power > 0)

@@ -125,6 +125,7 @@ class TileReader:
                 signal,
                 u_signal,
                 is_saturated,
+                np.array([frame.t_s for frame in view_frames]),
             )
             for channel, (signal, u_signal) in signals.items()
         }

@@ -18,6 +18,8 @@ _DEAD_SHARE = 0.01
 _SHADED = 0.03
 """Relative departure of a part of the tile, beyond noise. A larger one counts as shadow."""
 _SHADED_SIGMA = 6.0
+_FEW_LEDS = 8
+"""Least number of LEDs of a view by which a pattern of the tile is told from shadows."""
 _LOWEST_COSINE = 0.05
 """Least cosine of incidence on the tile. For LEDs within 3 degrees of its horizon, the signal depends mostly on
 the tile's tilt."""
@@ -47,6 +49,8 @@ class TileView:
     """[n, m] uncertainty of each signal from noise."""
     saturation_mask: NDArray[np.bool_]
     """[n] True where pixels of the tile were saturated."""
+    times_s: Floats | None = None
+    """[n] times of the frames, on the box's clock."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,22 @@ class Positions:
 
 
 @dataclass(frozen=True)
+class Angles:
+    """Cosines [..., m] at the parts of the tile."""
+
+    incidence: Floats
+    observation: Floats
+    half: Floats
+    """Cosine between the normal and the half vector of light and view."""
+    difference: Floats
+    """Cosine between the light and the half vector."""
+
+    def at(self, row: int) -> Angles:
+        """Return those of one LED."""
+        return Angles(self.incidence[row], self.observation[row], self.half[row], self.difference[row])
+
+
+@dataclass(frozen=True)
 class Row:
     """One LED in one view."""
 
@@ -93,6 +113,16 @@ class Row:
     design: Floats
     """Relative change of h by the figures that LEDs share: two tilts and the height of all places, then ln
     reflectance and Minnaert's k."""
+    parts: Floats
+    """[m] value of each part of the tile, relative to the row's value."""
+    u_parts: Floats
+    """[m] relative standard uncertainty of each part from noise."""
+    part_slopes: Floats
+    """[m, figures] relative change of h of each part by the shared figures."""
+    angles: Angles
+    """Directions at each part."""
+    time_s: float
+    """Time of the frame; NaN if it is not known."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +164,19 @@ def transfer(
     return h, cos_in
 
 
+def angles_of(view: TileView, leds: Positions) -> Angles:
+    """Return the cosines [n, m] at the tile's parts, for the tile as described."""
+    normal = view.base_from_tile[:3, 2]
+    to_led = leds.centres_mm[:, None] - view.points_mm
+    to_led /= np.linalg.norm(to_led, axis=-1)[..., None]
+    to_eye = view.camera_mm - view.points_mm
+    to_eye /= np.linalg.norm(to_eye, axis=-1)[..., None]
+    half = to_led + to_eye
+    half /= np.linalg.norm(half, axis=-1)[..., None]
+    observation = np.broadcast_to(to_eye @ normal, half.shape[:-1])
+    return Angles(to_led @ normal, observation, half @ normal, np.sum(half * to_led, axis=-1))
+
+
 def rows_of(
     number: int,
     view: TileView,
@@ -151,25 +194,26 @@ def rows_of(
     """
     leds = positions.only(view.leds)
     h, cos_in = transfer(view, leds, tile, emitter)
-    slopes = np.zeros((len(view.leds), figures))
+    slopes = np.zeros((*h.shape, figures))
     of_place = slice(OF_PLACE * place, OF_PLACE * (place + 1))
-    slopes[:, of_place], slopes[:, -2:] = _slopes(view, leds, tile, emitter)
+    slopes[..., of_place], slopes[..., -2:] = _slopes(view, leds, tile, emitter)
+    angles = angles_of(view, leds)
+    times_s = np.full(len(view.leds), np.nan) if view.times_s is None else view.times_s
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio, u_ratio = view.signal / h, view.u_signal / h
     usable = (cos_in.min(axis=1) > _LOWEST_COSINE) & (h > 0).all(axis=1) & np.isfinite(view.signal).all(axis=1)
     rows: list[Row] = []
     remarks: list[str] = []
-    shaded_leds: list[int] = []
-    for n in np.flatnonzero(usable & ~view.saturation_mask):
-        middle = float(np.median(ratio[n]))
-        # A shadow's edge across a part raises that part's noise, so the median noise of all parts is used.
-        limit = _SHADED * abs(middle) + _SHADED_SIGMA * float(np.median(u_ratio[n]))
-        if (np.abs(ratio[n] - middle) > limit).any():
-            shaded_leds.append(int(view.leds[n]))
-            continue
+    candidates = np.flatnonzero(usable & ~view.saturation_mask)
+    shaded_mask = _shaded_mask(ratio[candidates], u_ratio[candidates])
+    shaded_leds = [int(led) for led in view.leds[candidates[shaded_mask]]]
+    for n in candidates[~shaded_mask]:
         total = float(h[n].sum())
         u = float(np.sqrt(np.sum(view.u_signal[n] ** 2)) / total)
-        rows.append(Row(number, int(view.leds[n]), float(view.signal[n].sum() / total), u, slopes[n]))
+        value, design = float(view.signal[n].sum() / total), slopes[n].mean(axis=0)
+        parts, u_parts, time_s = ratio[n] / value, u_ratio[n] / value, float(times_s[n])
+        led = int(view.leds[n])
+        rows.append(Row(number, led, value, u, design, parts, u_parts, slopes[n], angles.at(n), time_s))
     if shaded_leds:
         remarks.append(f"view {view.name}: the tile is partly in shadow under {list_of(shaded_leds)}; not used")
     if (full := view.leds[view.saturation_mask & usable]).size:
@@ -177,20 +221,37 @@ def rows_of(
     return ViewRows(rows, {*shaded_leds, *map(int, full)}, remarks)
 
 
+def _shaded_mask(ratio: Floats, u_ratio: Floats) -> NDArray[np.bool_]:
+    """Return a mask [n] of LEDs under which a part of the tile is in shadow, by the values [n, m] of its parts."""
+    clean = ratio / _own_pattern(ratio)
+    middle = np.median(clean, axis=1)
+    # A shadow's edge across a part raises that part's noise, so the median noise of all parts is used.
+    limit = _SHADED * np.abs(middle) + _SHADED_SIGMA * np.median(u_ratio, axis=1)
+    return np.asarray((np.abs(clean - middle[:, None]) > limit[:, None]).any(axis=1))
+
+
+def _own_pattern(ratio: Floats) -> Floats:
+    """Return [m] the pattern of the tile's parts that most LEDs [n, m] show: a stain, and no shadow. With few
+    LEDs, none is known."""
+    if len(ratio) < _FEW_LEDS:
+        return np.ones(ratio.shape[1])
+    pattern: Floats = np.median(ratio / np.median(ratio, axis=1, keepdims=True), axis=0)
+    return pattern
+
+
 def _slopes(view: TileView, leds: Positions, tile: Tile, emitter: Emitter) -> tuple[Floats, Floats]:
-    """Return derivatives of ln h by the tile's two tilts and its height [n, 3], and by ln reflectance and
-    Minnaert's k [n, 2], as central differences."""
+    """Return derivatives of ln h of each part by the tile's two tilts and its height [n, m, 3], and by ln
+    reflectance and Minnaert's k [n, m, 2], as central differences."""
 
     def log_h(tilt_deg: Floats | None = None, height_mm: float = 0.0, minnaert: float | None = None) -> Floats:
         h, _ = transfer(view, leds, tile, emitter, tilt_deg=tilt_deg, height_mm=height_mm, minnaert=minnaert)
-        mean: Floats = np.log(np.maximum(h.mean(axis=1), 1e-300))
-        return mean
+        return np.asarray(np.log(np.maximum(h, 1e-300)))
 
     tilts = [(log_h(tilt) - log_h(-tilt)) / (2 * _STEP) for tilt in _STEP * np.eye(2)]
     height = (log_h(height_mm=_STEP_MM) - log_h(height_mm=-_STEP_MM)) / (2 * _STEP_MM)
     more, less = (log_h(minnaert=tile.minnaert + step) for step in (_STEP, -_STEP))
     by_minnaert = (more - less) / (2 * _STEP)
-    return np.column_stack([*tilts, height]), np.column_stack([np.ones(len(leds.ids)), by_minnaert])
+    return np.stack([*tilts, height], axis=-1), np.stack([np.ones_like(height), by_minnaert], axis=-1)
 
 
 def arrays_of(

@@ -122,7 +122,7 @@ def test_an_led_with_a_lobe_gives_its_flux_by_its_lobe() -> None:
     led = square((0, 0, 0), (0, 0, 1.0), side_mm=7.0, flux_lm=10.0)
     angle = np.radians(np.linspace(0.05, 89.95, 900))
     ways = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
-    lux = irradiance(led, 1000.0 * ways, -ways) * light.over_cosine(led, (1000.0 * ways).astype(np.float32))
+    lux = irradiance(led, 1000.0 * ways, -ways) * light.over_cosine(led, (1000.0 * ways).astype(np.float32), 1)
     assert 2 * np.pi * np.trapezoid(lux * np.sin(angle), angle) == pytest.approx(10.0, rel=2e-3)
     assert np.interp(np.radians(40), angle, lux) / lux[0] == pytest.approx(0.8, rel=2e-3)
     assert lux[angle > np.radians(81)].max() == 0.0
@@ -138,6 +138,26 @@ def test_dies_are_tilted_by_as_much_as_said_and_stay_where_they_are() -> None:
     tilted = LightStranger(die_tilt_deg=2.0).tilted_normals(normals, np.arange(2000))
     off_deg = np.degrees(np.arccos(np.sum(tilted * normals, axis=1)))
     assert np.sqrt(np.mean(off_deg**2)) == pytest.approx(2.0 * np.sqrt(2.0), rel=0.05)
+
+
+def test_dies_of_unequal_lobes_give_their_flux_by_powers_of_the_cosine() -> None:
+    light = LightStranger(exponent_spread=0.2)
+    exponents = np.array([light.exponent(led) for led in range(2000)])
+    assert np.std(exponents) == pytest.approx(0.2, rel=0.05)
+    led = square((0, 0, 0), (0, 0, 1.0), side_mm=7.0, flux_lm=10.0)
+    angle = np.radians(np.linspace(0.05, 89.0, 900))
+    ways = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
+    lux = irradiance(led, 1000.0 * ways, -ways) * light.over_cosine(led, (1000.0 * ways).astype(np.float32), 7)
+    assert 2 * np.pi * np.trapezoid(lux * np.sin(angle), angle) == pytest.approx(10.0, rel=3e-3)
+    at_60 = float(np.interp(np.radians(60), angle, lux)) / lux[0]
+    assert at_60 == pytest.approx(0.5 ** (1.0 + light.exponent(7)), rel=2e-3)
+
+
+def test_lamps_that_warm_lose_their_share() -> None:
+    lamps = LightStranger(warming=0.02, warming_frames=100.0)
+    assert lamps.warmth(0) == 1.0
+    assert 1.0 - lamps.warmth(100) == pytest.approx(0.02 * 0.632, rel=1e-3)
+    assert 1.0 - lamps.warmth(5000) == pytest.approx(0.02)
 
 
 def test_a_primary_lens_shows_the_die_nearer_to_whoever_looks() -> None:

@@ -151,7 +151,7 @@ class ObjectLight:
     points_support_mm: NDArray[np.float64]
     """[n, 3] points at which the dose is computed, support frame. The highest dose counts."""
     dose_before_lux_h: float = 0.0
-    """Light that it has received before, by its ledger."""
+    """Light that the object has received before, by its ledger."""
     dose_budget_lux_h: float | None = None
     """Budget of the object, as its ledger has it; a plan's budget can be stricter."""
 

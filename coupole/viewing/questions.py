@@ -32,8 +32,9 @@ def ask(question: str, is_over: Callable[[], bool] = lambda: False, *, default: 
 
 
 def ask_number(question: str, is_over: Callable[[], bool] = lambda: False) -> float | None:
-    """Ask for a number on standard error, again if the answer is not a number; None for an empty answer, and for a
-    question that is given up because `is_over()`."""
+    """Ask for a number on standard error, and ask again if the answer is not a number. Return None for an empty
+    answer, or if the question is given up because `is_over()` is true.
+    """
     while True:
         _forget_typing()
         print(f"{question} ", end="", file=sys.stderr, flush=True)

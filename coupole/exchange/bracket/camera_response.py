@@ -237,9 +237,10 @@ def _normal_equations(predicted_values: Array, weights: Array, target: Array) ->
 
 
 def _average_curve(matrix: Array, right: Array, squares: float, wanders: Array) -> tuple[Array, Array]:
-    """g [NODES] and its covariance without the middle node: the mean over all amounts of variation, weighted by
-    the likelihood of the samples. All amounts have the same prior (Hoeting et al., "Bayesian model averaging",
-    Stat. Sci. 14, 382, 1999)."""
+    """Return g [NODES], and its covariance without the middle node. Both are means over all amounts of variation,
+    weighted by the likelihood of the samples. All amounts have the same prior (Hoeting et al., "Bayesian model
+    averaging", Stat. Sci. 14, 382, 1999).
+    """
     matrix, right, roughness = matrix[np.ix_(_OTHERS, _OTHERS)], right[_OTHERS], _roughness()
     log_likelihoods, curves = np.zeros(len(wanders)), np.zeros((len(wanders), NODES - 1))
     inverses = np.zeros((len(wanders), NODES - 1, NODES - 1))

@@ -3,10 +3,10 @@
 Two fluxes are valid for light that is diffuse inside the layer: under diffuse illumination, or where the layer
 scatters so much that nothing reaches its ground unscattered. A thin or clear layer under directional light (a
 dome's LEDs, 45:0) needs four fluxes. A layer that hides its ground needs K/S only, from R_inf. If spectra under
-directional light were measured, they decide. Otherwise the film is computed with four fluxes for grains that
-scatter equally to all sides, for which K = 2 k and S = 3 s/4 (Mudgett and Richards, Appl. Opt. 10, 1485, 1971).
-Two fluxes are enough if the light that reaches the ground unscattered changes the reflectance by at most twice the
-noise.
+directional light were measured, they decide which model is needed. Otherwise the film is computed with four
+fluxes for grains that scatter equally to all sides, for which K = 2 k and S = 3 s/4 (Mudgett and Richards, Appl.
+Opt. 10, 1485, 1971). Two fluxes are enough if the light that reaches the ground unscattered changes the
+reflectance by at most twice the noise.
 """
 
 from __future__ import annotations

@@ -4,10 +4,10 @@ From one answer to the next, the target of the corrections moves by at most the 
 the commanded axes advance, this step differs from the previous one by at most the highest acceleration times the
 cycle squared. The only other allowed change is to no step at all.
 
-A place is the axes, or the flange's pose. The trajectory obeys this by construction. Here it is checked again on
-the answer that is about to be sent, from the sent numbers alone. So no earlier mistake can reach the arm. Limits
-of the pose follow from those of the axes: no point of the arm moves faster than its reach times the sum of all
-axis speeds.
+A place is the axes, or the flange's pose. The trajectory obeys this invariant by construction. This module checks
+the invariant again on the answer that is about to be sent, from the sent numbers alone. So no earlier mistake can
+reach the arm. Limits of the pose follow from those of the axes: no point of the arm moves faster than its reach
+times the sum of all axis speeds.
 """
 
 from __future__ import annotations

@@ -268,7 +268,7 @@ def test_an_adaptive_bsdf_misses_what_it_says_and_is_small(tmp_path: Path) -> No
     assert (of_lobe < [7e-4, 3.2e-3]).all()
     assert spread_of_drawn_light(path) < 0.1
     told = re.search(
-        rb"by (\S+) in the median and (\S+) at 95 % of all directions, by (\S+) and (\S+)", path.read_bytes()
+        rb"by (\S+) in the median and (\S+) at 95 % of all directions, and by (\S+) and (\S+)", path.read_bytes()
     )
     assert told is not None
     np.testing.assert_allclose([float(one) for one in told.groups()], [*of_all, *of_lobe], rtol=0.2)
@@ -330,7 +330,7 @@ def test_a_merl_table_is_read_as_its_reader_does() -> None:
         (("--to", "gltf", "--refined", "there"), "--refined: is for --to colmap"),
         (("--to", "ply", "--adaptive", "0.01"), "--adaptive: is for --to bsdf; found --to ply"),
         (("--to", "exr", "--licence", "CC BY 4.0"), "--licence: is for --to rocrate"),
-        (("--to", "rocrate", "--author", "A. Person"), "--licence: RO-Crate demands one"),
+        (("--to", "rocrate", "--author", "A. Person"), "--licence: RO-Crate requires a licence"),
         (("--to", "rocrate", "--licence", "CC0"), "--author: expected at least one"),
         (("--to", "rocrate", "--licence", "CC0", "--author", "A <x>"), "expected 'NAME'"),
         (

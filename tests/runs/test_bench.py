@@ -178,7 +178,7 @@ def test_an_arm_whose_console_is_killed_stops_at_once(asked: Bench, world: World
     work = asked.ended_work()
     assert (work["state"], work["why"]) == ("stopped", f"process {console.pid}, which asked for it, has ended")
     again = {"axis": "A1", "direction": 1, "from": HERE, "hold": work["hold"]}
-    assert "is of another process" in asked.ask("jog", **again)["error"]
+    assert "is held by another process" in asked.ask("jog", **again)["error"]
     time.sleep(0.3)
     assert np.allclose(joints_deg(world), rested["joints_deg"], atol=0.01)
 

@@ -141,7 +141,7 @@ def test_a_button_is_held_only_by_the_process_that_pressed_it(
                 console.wait()
             refused = asked.ask("jog", axis="A1", direction=1, hold=hold, **{"from": HERE})
             console.kill()
-        assert f"hold: {hold} is of another process" in refused["error"]
+        assert f"hold: {hold} is held by another process" in refused["error"]
         assert refused["exit_code"] == 2
         work = asked.ended_work()
         for _ in range(10):

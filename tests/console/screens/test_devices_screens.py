@@ -65,7 +65,7 @@ def test_open_devices_are_told_and_test_themselves(room: Room) -> None:
         ada.clicks(f"[data-name=test-{kind}]")
         ada.sees(f"[data-name=report-{kind}]", "Test passed")
     assert room.bench()["state"]["devices"]["ledbox"]["self_test"]["passed"]
-    assert "not told by this controller" in ada.sees("[data-name=arm]"), "RSI does not tell"
+    assert "not reported by this controller" in ada.sees("[data-name=arm]"), "RSI does not tell"
     assert_usable(ada)
 
 

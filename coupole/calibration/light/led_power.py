@@ -126,8 +126,8 @@ def calibrate_led_power(
     """Find the powers of one channel from the tile's views.
 
     `flash_noise` is the stated relative scatter of an LED's flashes. Without `search`, causes that the model lacks
-    are left out. Raises InputError if no view shows the tile
-    lit, if all views are saturated, or if the tile was moved between views of one place.
+    are left out. Raises InputError if no view shows the tile lit, if all views are saturated, or if the tile was
+    moved between views of one place.
     """
     _refuse_none(views)
     ids = np.unique(np.concatenate([view.leds for view in views]))

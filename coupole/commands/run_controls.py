@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -201,7 +201,6 @@ def _answer_to(run: Path | None, command: Command) -> State:
     """Send a command to the given run, or to the only one that is being acquired; without a run, to the session
     that has none (`_session_of`). Return the state after it. Raises InputError."""
     from coupole.acquisition.run_control import NoRun, ask
-    from coupole.acquisition.sessions_without_run import SessionEnded, ask_session, sessions_without_run
 
     def alarm(message: str) -> None:
         """Print a warning: a run does not answer."""
@@ -215,15 +214,37 @@ def _answer_to(run: Path | None, command: Command) -> State:
             return ask(run or Path(running_run(run)["run"]), command, alarm)
         except NoRun as none:
             no_run = none
-        with contextlib.suppress(SessionEnded):  # its run may have begun
-            sessions = dict(sessions_without_run(patience_s))
-            silent_sessions = {path: state for path, state in sessions.items() if state["state"] == "silent"}
-            answering_sessions = {path: state for path, state in sessions.items() if path not in silent_sessions}
-            if session := _session_of(run, answering_sessions):
-                return ask_session(*session, command, alarm)
-    if session := _session_of(None, silent_sessions):
-        return ask_session(*session, command, alarm)
+        sessions, silent_sessions = _sessions(patience_s)
+        if (answer := _answer_of_session(run, sessions, command, alarm)) is not None:
+            return answer
+    if (answer := _answer_of_session(None, silent_sessions, command, alarm)) is not None:
+        return answer
     raise no_run
+
+
+def _sessions(patience_s: float) -> tuple[dict[Path, State], dict[Path, State]]:
+    """Return sockets and states of the sessions without a run: those that answer, and those that do not."""
+    from coupole.acquisition.sessions_without_run import sessions_without_run
+
+    answering_sessions: dict[Path, State] = {}
+    silent_sessions: dict[Path, State] = {}
+    for path, state in sessions_without_run(patience_s):
+        (silent_sessions if state["state"] == "silent" else answering_sessions)[path] = state
+    return answering_sessions, silent_sessions
+
+
+def _answer_of_session(
+    run: Path | None, sessions: Mapping[Path, State], command: Command, alarm: Callable[[str], None]
+) -> State | None:
+    """Send a command to the session of these that is meant; return its state afterwards. None if there is no such
+    session, or if it has just ended: its run may have begun. Raises InputError."""
+    from coupole.acquisition.sessions_without_run import SessionEnded, ask_session
+
+    session = _session_of(run, sessions)
+    try:
+        return None if session is None else ask_session(*session, command, alarm)
+    except SessionEnded:
+        return None
 
 
 def _session_of(run: Path | None, sessions: Mapping[Path, State]) -> tuple[Path, State] | None:

@@ -73,7 +73,6 @@ def acquire(
     pause`, `go-on` and `stop`. If a console owns the cell (`coupole serve`), the command acquires in the console's
     name, if nothing runs or waits there.
     """
-    from coupole.acquisition.dry_run import rehearse
     from coupole.acquisition.session import SessionRequest
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
@@ -92,6 +91,8 @@ def acquire(
             flags = {"with_mesh": with_mesh, "reflectance": reflectance or result is not None}
             acquire_by_console(console_cell, console, {**request, **flags}, confirm=not yes, summary=summary)
         elif dry_run:
+            from coupole.acquisition.dry_run import rehearse
+
             rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, figures=summary)
         else:
             wanted_session = SessionRequest(output, resume, confirm=not yes, with_mesh=with_mesh)

@@ -7,7 +7,9 @@ The world stands by itself, so that it can be asked for its state when the contr
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -340,9 +342,10 @@ def test_a_disk_with_too_little_room_for_a_views_file_ends_the_run_with_six_befo
     cell.rig_data["storage"]["folder"] = str(small_disk / "storage")
     cell.join()
     with cell.world() as world:
-        with (small_disk / "ballast").open("wb") as ballast:
-            ballast.write(bytes(12 * 2**20 - FRAMES * 24576 - 200_000))  # enough by preflight's count of frames
+        taker = threading.Thread(target=_take_room_from, args=(small_disk,))
+        taker.start()
         ended = cell.acquire()
+        taker.join()
         assert cells.safe(world)
         assert ended.code == 6, ended
         (small_disk / "ballast").unlink()
@@ -350,6 +353,15 @@ def test_a_disk_with_too_little_room_for_a_views_file_ends_the_run_with_six_befo
         assert cells.events(run, "burst") == []
         assert cell.acquire("--resume", run).code == 0
     cells.assert_each_shot_proven_once(run)
+
+
+def _take_room_from(disk: Path) -> None:
+    """Take free space as soon as a run is there: preflight has passed, and the arm is on its way. There is room for
+    the frames of a view, but not for its spare slots."""
+    cells.wait_until(lambda: [*disk.glob("storage/2*/run.json")], "a run")
+    facts = os.statvfs(disk)
+    with (disk / "ballast").open("wb") as ballast:
+        os.posix_fallocate(ballast.fileno(), 0, facts.f_bavail * facts.f_frsize - FRAMES * 24576 - 200_000)
 
 
 def test_a_plan_that_does_not_fit_on_the_disk_is_refused_with_three(tmp_path: Path, small_disk: Path) -> None:

@@ -79,7 +79,7 @@ def test_the_operator_chooses_light_and_exposure(browser: Browser, shown_cell: C
         exposure.clear()
         exposure.send_keys("4000", Keys.ENTER)
         cells.wait_until(lambda: "4000 us" in browser.text("#table"), "the shorter exposure")
-        assert browser.text("#error") == ""
+        cells.wait_until(lambda: browser.text("#error") == "", "no reason of a refusal")
         refused = [line for line in browser.troubles() if "choose" not in line]
         assert refused == []
 

@@ -356,8 +356,8 @@ def test_a_disk_with_too_little_room_for_a_views_file_ends_the_run_with_six_befo
 
 
 def _take_room_from(disk: Path) -> None:
-    """Take free space as soon as a run is there: preflight has passed, and the arm is on its way. There is room for
-    the frames of a view, but not for its spare slots."""
+    """Take free space as soon as a run is there: preflight has passed, and the arm is on its way. There is room
+    for the frames of a view, but not for its spare slots."""
     cells.wait_until(lambda: [*disk.glob("storage/2*/run.json")], "a run")
     facts = os.statvfs(disk)
     with (disk / "ballast").open("wb") as ballast:

@@ -38,6 +38,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from coupole.calibration.light.flat_field import FlatField, fit_flat_field
 from coupole.calibration.light.flat_field_records import limits_of
 from drawn_panels import FOCAL_PX, SIZE_PX, DrawnField, draw_field
+from kept_cells import keep_cell, read_cells
 from smallest import add_smallest
 
 SWEEP = {
@@ -93,7 +94,7 @@ def main() -> None:
                 key = (cause, strength, seed)
                 if key not in kept_cells:
                     kept_cells[key] = judge_cell(seed, cause, strength)
-                    keep(arguments.keep, key, kept_cells[key])
+                    keep_cell(arguments.keep, key, kept_cells[key])
                 cells.append(kept_cells[key])
             tell(cause, strength, cells, as_json=arguments.json)
 
@@ -103,11 +104,8 @@ Key = tuple[str, float, int]
 
 def read_kept(path: Path | None) -> dict[Key, Judged]:
     """Cells of an earlier call, by cause, strength and seed."""
-    if path is None or not path.exists():
-        return {}
     kept_cells = {}
-    for line in path.read_text(encoding="utf-8").splitlines():
-        cell = json.loads(line)
+    for cell in read_cells(path):
         cause, strength, seed = cell["key"]
         kept_cells[cause, strength, seed] = Judged(
             Held(**cell["plain"]),
@@ -116,12 +114,6 @@ def read_kept(path: Path | None) -> dict[Key, Judged]:
             tuple(cell["missed_limits"]),
         )
     return kept_cells
-
-
-def keep(path: Path | None, key: Key, judgement: Judged) -> None:
-    if path is not None:
-        with path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"key": key, **asdict(judgement)}) + "\n")
 
 
 def tell(cause: str, strength: float, cells: Sequence[Judged], *, as_json: bool) -> None:

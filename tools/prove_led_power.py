@@ -51,6 +51,7 @@ from coupole.calibration.light.led_power_records import power_limits
 from coupole.calibration.light.power_suspects import names_of
 from coupole.errors import InputError
 from drawn_lights import PLACES_MM, TILE, DrawnPowers, draw_powers
+from kept_cells import keep_cell, read_cells
 from smallest import add_smallest
 
 SWEEP = {
@@ -92,7 +93,7 @@ class Judged:
     ours: Held | None
     named_suspects: tuple[str, ...]
     refusals: tuple[str, ...]
-    """Limits that are missed_limits, or an error."""
+    """Limits that are missed, or an error."""
 
 
 def main() -> None:
@@ -117,7 +118,7 @@ def main() -> None:
                 work = partial(judge_cell, leds=arguments.leds, cause=cause, strength=strength)
                 for seed, judgement in zip(missing, pool.map(work, missing), strict=True):
                     kept_cells[cause, strength, arguments.leds, seed] = judgement
-                    keep(arguments.keep, (cause, strength, arguments.leds, seed), judgement)
+                    keep_cell(arguments.keep, (cause, strength, arguments.leds, seed), judgement)
                 cells = [kept_cells[cause, strength, arguments.leds, seed] for seed in seeds]
                 tell(cause, strength, cells, as_json=arguments.json)
 
@@ -127,23 +128,14 @@ Key = tuple[str, float, int, int]
 
 def read_kept(path: Path | None) -> dict[Key, Judged]:
     """Cells of an earlier call, by cause, strength, LEDs and seed."""
-    if path is None or not path.exists():
-        return {}
     kept_cells = {}
-    for line in path.read_text(encoding="utf-8").splitlines():
-        cell = json.loads(line)
+    for cell in read_cells(path):
         plain, ours = (None if cell[name] is None else Held(**cell[name]) for name in ("plain", "ours"))
         cause, strength, leds, seed = cell["key"]
         kept_cells[cause, strength, leds, seed] = Judged(
             plain, ours, tuple(cell["named_suspects"]), tuple(cell["refusals"])
         )
     return kept_cells
-
-
-def keep(path: Path | None, key: Key, judgement: Judged) -> None:
-    if path is not None:
-        with path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"key": key, **asdict(judgement)}) + "\n")
 
 
 def tell(cause: str, strength: float, cells: Sequence[Judged], *, as_json: bool) -> None:

@@ -85,7 +85,7 @@ def _moved_until_pressed(bench: Bench) -> _Press:
             robot.move_to(way.target_deg)
         except DeviceFault as error:  # pressed since the last look at the arm
             raise StepFailedError(_PRESSED_AT_REST.format(error.happened)) from error
-        if fault := _follow(bench, way, lambda way=way: way.speed_deg_s() >= fast_deg_s and ask()):
+        if fault := _follow(bench, way, fast_deg_s, ask):
             bench.findings.remarks.append(f"the arm's fault: {fault}")
             return way.press(fast_deg_s, robot.stopping_deg(), fault)
     robot.stop()
@@ -95,9 +95,9 @@ def _moved_until_pressed(bench: Bench) -> _Press:
     )
 
 
-def _follow(bench: Bench, way: _Way, meanwhile: Callable[[], object]) -> str:
-    """Follow a motion until the arm has arrived; return its fault if there is one. An arm that stopped on its way
-    may tell the reason later."""
+def _follow(bench: Bench, way: _Way, fast_deg_s: float, ask: Callable[[], None]) -> str:
+    """Follow a motion until the arm has arrived; return its fault if there is one. `ask` is called while an axis is
+    as fast as this. An arm that stopped on its way may tell the reason later."""
     robot, clock = bench.opened.robot, bench.opened.clock
     fault_deadline = Deadline(clock, _TOLD_WITHIN_S)
     while True:
@@ -109,7 +109,8 @@ def _follow(bench: Bench, way: _Way, meanwhile: Callable[[], object]) -> str:
             fault_deadline = Deadline(clock, _TOLD_WITHIN_S)
         elif way.has_arrived or fault_deadline.has_expired:
             return ""
-        meanwhile()
+        if way.speed_deg_s() >= fast_deg_s:
+            ask()
         bench.pause(_POLL_S)
 
 

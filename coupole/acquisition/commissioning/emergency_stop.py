@@ -96,8 +96,8 @@ def _moved_until_pressed(bench: Bench) -> _Press:
 
 
 def _follow(bench: Bench, way: _Way, fast_deg_s: float, ask: Callable[[], None]) -> str:
-    """Follow a motion until the arm has arrived; return its fault if there is one. `ask` is called while an axis is
-    as fast as this. An arm that stopped on its way may tell the reason later."""
+    """Follow a motion until the arm has arrived; return its fault if there is one. `ask` is called while an axis
+    is as fast as this. An arm that stopped on its way may tell the reason later."""
     robot, clock = bench.opened.robot, bench.opened.clock
     fault_deadline = Deadline(clock, _TOLD_WITHIN_S)
     while True:

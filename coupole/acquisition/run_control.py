@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 VERSION = 1
 Command = Literal["pause", "go-on", "stop", "state"]
 State = dict[str, Any]
-"""`run`, `rig`, `pid`, `light_after_lux_h`, `state` (running, pausing, paused, stopping). From the first burst on
-it also has the fields of `Progress`."""
+"""`run`, `plan`, `rig`, `pid`, `light_after_lux_h`, `state` (running, pausing, paused, stopping). From the first
+burst on it also has the fields of `Progress`."""
 _SAFE_WITHIN_S = 4.0
 _UNHEARD = "the process did not run for a while, and is making the cell safe; when the cell is safe, ask again"
 _LOOK_PATIENCE_S = 0.5
@@ -50,6 +50,7 @@ class RunControl:
     def __init__(
         self,
         run: Path,
+        plan: Path,
         rig: Path,
         control: Control,
         halt: Callable[[], Sequence[Safeguard]],
@@ -61,7 +62,8 @@ class RunControl:
         progress. `light_after_lux_h` is the total light of each object (by its id) when the run is complete, as
         preflight expects it. `when_served` is called when the socket is there, or cannot be."""
         self._when_served = when_served
-        self._about: State = {"version": VERSION, "run": str(run), "rig": str(rig.resolve()), "pid": os.getpid()}
+        files = {"plan": str(plan.resolve()), "rig": str(rig.resolve())}
+        self._about: State = {"version": VERSION, "run": str(run), **files, "pid": os.getpid()}
         self._about["light_after_lux_h"] = dict(light_after_lux_h)
         self._run, self._control, self._halt, self._progress = run, control, halt, progress
         self.trouble = ""
@@ -173,7 +175,7 @@ def _running() -> Iterator[State]:
         except (ConnectionRefusedError, FileNotFoundError):  # of a process that was killed, or has just ended
             continue
         except (OSError, ValueError) as error:
-            about = {"version": VERSION, "run": "", "rig": "", "pid": 0, "socket": path.name}
+            about = {"version": VERSION, "run": "", "plan": "", "rig": "", "pid": 0, "socket": path.name}
             yield {**about, "state": "silent", "trouble": [str(error)]}
 
 

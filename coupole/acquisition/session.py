@@ -243,9 +243,8 @@ def _acquire(
     sequencer = run_bounded(partial(Sequencer, job, cell, recorder, observer=observer, control=control))
     outcome: Literal["done", "interrupted", "failed"] = "failed"
     failure: BaseException | None = None
-    remote = RunControl(
-        run.folder, job.cell.document.path, control, cell.halt, lambda: observer.newest, light, session.when_served
-    )
+    paths = run.folder, job.document.path, job.cell.document.path
+    remote = RunControl(*paths, control, cell.halt, lambda: observer.newest, light, session.when_served)
 
     def stop() -> None:
         control.stop_by(signal.SIGINT, "the key q")

@@ -6,10 +6,12 @@ controller must be started first. In this time a session serves a socket of its 
 acquisition does so until the socket of its run is there (`coupole.acquisition.run_control`)::
 
     {"version": 1, "command": "stop"}       stop | state
-    {"version": 1, "run": "", "plan": "/plans/bust.yaml", "doing": "acquire", "pid": 4711, "state": "starting"}
+    {"version": 1, "run": "", "plan": "/plans/bust.yaml", "rig": "", "doing": "acquire", "pid": 4711,
+     "state": "starting"}
 
-`run` is the run that is resumed; empty for others. `plan` is the file of the plan or rig. `doing` is the command,
-and `state` is `starting`, `working` (all commands but `acquire`) or `stopping`.
+`run` is the run that is resumed; empty for others. `plan` and `rig` are files; empty if there is none, or if it is
+not known yet. `doing` is the command, and `state` is `starting`, `working` (all commands but `acquire`) or
+`stopping`.
 """
 
 from __future__ import annotations
@@ -37,12 +39,13 @@ class SessionWithoutRun:
     """Serves the socket of a session that has no run, while a context lasts. If this is not possible on a machine,
     nothing is served; a run's own socket then has the same trouble, and says so."""
 
-    def __init__(self, doing: str, file: Path, resumed_run: Path | None = None) -> None:
-        """`doing` is the command, and `file` its plan or rig."""
+    def __init__(self, doing: str, plan: Path | None, rig: Path | None, resumed_run: Path | None = None) -> None:
+        """`doing` is the command; it has a plan or a rig, or both."""
         self._about: State = {
             "version": VERSION,
             "run": str(resumed_run.resolve()) if resumed_run else "",
-            "plan": str(file.resolve()),
+            "plan": str(plan.resolve()) if plan else "",
+            "rig": str(rig.resolve()) if rig else "",
             "doing": doing,
             "pid": os.getpid(),
         }
@@ -85,13 +88,13 @@ def sessions_without_run(patience_s: float) -> Iterator[tuple[Path, State]]:
         except (ConnectionRefusedError, FileNotFoundError):  # of a process that was killed, or has just ended
             continue
         except (OSError, ValueError):
-            unknown = {"run": "", "plan": "", "doing": "", "state": "silent"}
+            unknown = {"run": "", "plan": "", "rig": "", "doing": "", "state": "silent"}
             yield path, {"version": VERSION, **unknown, "pid": int(path.stem)}
 
 
 def name_of(state: State) -> str:
     """Return the command of a session and its run, plan or rig, or its process if these are not known."""
-    file = state["run"] or state["plan"]
+    file = state["run"] or state["plan"] or state.get("rig")
     return f"{state['doing']} {file}" if file else f"process {state['pid']}, which does not answer"
 
 

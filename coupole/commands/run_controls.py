@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 RunningRun = Annotated[
     Path | None,
     typer.Argument(
-        help="The run's folder; not needed while only one run is being acquired.",
+        help="The run's folder, or its plan or rig; not needed while only one run is being acquired.",
         show_default=False,
         autocompletion=runs,
     ),
@@ -33,6 +33,8 @@ _LOOK_EVERY_S = 0.2
 _ENDS_WITHIN_S = 600.0
 """Longest wait for the end of a process, s: longer than a session in which every call hangs (`coupole.bounded`),
 and than a slow report."""
+_LEAVES_WITHIN_S = 2.0
+"""Longest wait for the end of the process of a run that has ended, s. A Python program may go on after its run."""
 _PLAIN_LINE_EVERY_S = 5.0
 _SESSION_PATIENCE_S = (0.5, 5.0, 0.5)
 """Longest waits for the answer of a session without a run. A frozen one must not delay the stop of another one; a
@@ -65,7 +67,7 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     emergency stop: that is the button at the cell.
     """
     reply = _state_after(run, "stop")  # sent before the imports, which only the outcome needs
-    if "plan" in reply:
+    if "doing" in reply:
         _await_end_without_run(reply, as_json=as_json)
         return
 
@@ -86,6 +88,7 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
                 remedy="Look at the cell, then end the process (`kill -9`); the run can be resumed.",
             )
         time.sleep(_LOOK_EVERY_S)
+    _has_ended(reply["pid"], _LEAVES_WITHIN_S)
     progress = status(folder)
     if as_json:
         print(json.dumps(progress.figures()))
@@ -97,29 +100,36 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
 
 def _await_end_without_run(reply: State, *, as_json: bool) -> None:
     """Wait until a session without a run has ended, which was stopped. Raises DeviceError."""
-    import os
-    import select
-
     from coupole.acquisition.sessions_without_run import ACQUIRE
     from coupole.viewing.terminal import make_console
 
-    with contextlib.suppress(ProcessLookupError):
-        process = os.pidfd_open(reply["pid"])
-        try:
-            if not select.select([process], [], [], _ENDS_WITHIN_S)[0]:
-                raise DeviceError(
-                    "cell",
-                    expected=f"the process {reply['pid']} to end within {_ENDS_WITHIN_S:g} s of its stop",
-                    happened="it is still there",
-                    remedy="Look at the cell, then end the process (`kill -9`).",
-                )
-        finally:
-            os.close(process)
+    if not _has_ended(reply["pid"], _ENDS_WITHIN_S):
+        raise DeviceError(
+            "cell",
+            expected=f"the process {reply['pid']} to end within {_ENDS_WITHIN_S:g} s of its stop",
+            happened="it is still there",
+            remedy="Look at the cell, then end the process (`kill -9`).",
+        )
     if as_json:
         print(json.dumps(reply))
     when = "stopped while it was starting: " if reply["doing"] == ACQUIRE else f"stopped: {reply['doing']} "
-    words = f"{when}{reply['plan']}; its process {reply['pid']} has ended"
+    words = f"{when}{reply['plan'] or reply.get('rig')}; its process {reply['pid']} has ended"
     make_console(quiet=as_json).print(words, markup=False)
+
+
+def _has_ended(pid: int, within_s: float) -> bool:
+    """Wait until a process has ended; return whether it has."""
+    import os
+    import select
+
+    try:
+        process = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return True
+    try:
+        return bool(select.select([process], [], [], within_s)[0])
+    finally:
+        os.close(process)
 
 
 def _unsafe(run: Run) -> list[str]:
@@ -211,7 +221,7 @@ def _answer_to(run: Path | None, command: Command) -> State:
     silent_sessions: dict[Path, State] = {}
     for patience_s in _SESSION_PATIENCE_S:
         try:
-            return ask(run or Path(running_run(run)["run"]), command, alarm)
+            return ask(_run_of(run), command, alarm)
         except NoRun as none:
             no_run = none
         sessions, silent_sessions = _sessions(patience_s)
@@ -220,6 +230,24 @@ def _answer_to(run: Path | None, command: Command) -> State:
     if (answer := _answer_of_session(None, silent_sessions, command, alarm)) is not None:
         return answer
     raise no_run
+
+
+def _run_of(named: Path | None) -> Path:
+    """Return the folder of the given run, of the run with this plan or rig, or of the only run that is being
+    acquired. Raises InputError."""
+    if named is None:
+        return Path(running_run(None)["run"])
+    if named.is_dir():
+        return named
+    from coupole.acquisition.run_control import running
+
+    file = str(named.resolve())
+    keys = ("plan", "rig")  # a run of an earlier version tells no plan
+    folders = [state["run"] for state in running() if file in [state.get(key) for key in keys] and state["run"]]
+    if len(folders) > 1:
+        names = "\n".join(f"  {folder}" for folder in folders)
+        raise InputError(f"several runs with {named} are being acquired; name one of\n{names}")
+    return Path(folders[0]) if folders else named
 
 
 def _sessions(patience_s: float) -> tuple[dict[Path, State], dict[Path, State]]:
@@ -254,7 +282,9 @@ def _session_of(run: Path | None, sessions: Mapping[Path, State]) -> tuple[Path,
 
     path_text = run and str(run.resolve())
     matches = [
-        (path, state) for path, state in sessions.items() if path_text in (None, state["run"], state["plan"])
+        (path, state)
+        for path, state in sessions.items()
+        if path_text in (None, state["run"], state["plan"], state.get("rig"))
     ]
     if len(matches) > 1:
         names = "\n".join(f"  {name_of(state)}" for _, state in matches)

@@ -128,7 +128,7 @@ def _acquire_here(
     from coupole.preflight.job import read_job
 
     resume, (result, is_asked) = wanted_session.resume, asked_result
-    with SessionWithoutRun(ACQUIRE, plan, resume) as starting:
+    with SessionWithoutRun(ACQUIRE, plan, rig, resume) as starting:
         job = read_job(plan, rig)
         with _beside(job, console, resume, result, summary, is_asked=is_asked) as beside:
             acquire_plan(job, console, replace(wanted_session, beside=beside, when_served=starting.end), summary)
@@ -233,7 +233,7 @@ def meter(
     console = make_console(quiet=as_json)
     try:
         job = read_job(plan, rig)
-        with borrowed_cell(job.cell, f"meter {plan.name}"):
+        with borrowed_cell(job.cell, f"meter {plan.name}", plan):
             advice = meter_plan(job, console, Request(max_saturated_share, snr, share), confirm=not yes)
         if write is not None:
             write_plan(job.document, write, advice.exposure)
@@ -279,7 +279,8 @@ def live(
         return
     source = cell_or_job(what)
     choice = Choice(led, exposure_us)
-    with borrowed_cell(source if isinstance(source, Cell) else source.cell, "live"):
+    plan = None if isinstance(source, Cell) else source.document.path
+    with borrowed_cell(source if isinstance(source, Cell) else source.cell, "live", plan):
         watch_cell(source, console, choice, frames_per_s=frames_per_s, port=port, confirm=not yes)
 
 

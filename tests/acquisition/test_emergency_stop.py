@@ -48,6 +48,8 @@ class ScriptedArm:
     """Time from the press until its fault is told."""
     coasts_deg: float = 0.5
     coasts_deg_s: float = SPEED_DEG_S
+    stale_s: float = 0.0
+    """Age of the axes in one report, half a second after a motion has begun."""
     a1_deg: float = 0.0
     target_deg: float = 0.0
     since_s: float = 0.0
@@ -75,7 +77,9 @@ class ScriptedArm:
             moving = self.clock.now_s - self.since_s < self.coasts_deg / self.coasts_deg_s
         is_told = self.tells and self.clock.now_s >= self.since_s + self.tells_after_s
         fault = "emergency stop" if self.pressed_at is not None and is_told else ""
-        return ArmState((angle_deg, 0, 0, 0, 0, 0), np.eye(4), self.clock.now_ns(), moving, fault)
+        is_stale = 0.5 <= self.clock.now_s - self.since_s < 0.51
+        reported_deg = angle_deg - SPEED_DEG_S * self.stale_s * is_stale
+        return ArmState((reported_deg, 0, 0, 0, 0, 0), np.eye(4), self.clock.now_ns(), moving, fault)
 
     def move_to(self, joints_deg: Any, speed: float = 1.0) -> None:
         if self.pressed_at is not None:
@@ -138,6 +142,23 @@ def test_the_turn_is_measured_from_the_braking_also_if_the_fault_is_told_late() 
         bench = bench_of(ScriptedArm(Clock(), coasts_deg=coasts_deg, coasts_deg_s=2.0, tells_after_s=2.0))
         emergency_stop(bench)
         assert missed(bench) == failures
+
+
+def test_reports_that_come_unevenly_are_no_turn() -> None:
+    """One speed over 0.05 s is wrong by two fifths, as seen with a UR; the person presses much later."""
+    arm = ScriptedArm(Clock(), coasts_deg=0.1, stale_s=0.03)
+    bench = bench_of(arm)
+    sleep = arm.clock.sleep
+
+    def press_later(seconds: float, at_most_s: float = math.inf) -> None:
+        sleep(seconds, at_most_s)
+        if arm.pressed_at is None and arm.target_deg and arm.clock.now_s - arm.since_s >= 2.0:
+            arm.press()
+
+    bench.person.press = lambda: None  # type: ignore[attr-defined]
+    arm.clock.sleep = press_later  # type: ignore[method-assign]
+    emergency_stop(bench)
+    assert missed(bench) == []
 
 
 def test_an_arm_that_stands_when_the_stop_is_pressed_does_not_pass() -> None:

@@ -52,7 +52,13 @@ def base(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def served(tmp_path: Path) -> Iterator[Served]:
     found = Served(tmp_path / "run")
     with RunControl(
-        found.run, tmp_path / "rig.yaml", found.control, found.halt, lambda: PROGRESS, {"relief": 4.5}
+        found.run,
+        tmp_path / "plan.yaml",
+        tmp_path / "rig.yaml",
+        found.control,
+        found.halt,
+        lambda: PROGRESS,
+        {"relief": 4.5},
     ) as control:
         assert control.trouble == ""
         yield found
@@ -68,7 +74,8 @@ def say(line: bytes) -> dict[str, object]:
 
 def test_it_pauses_goes_on_and_stops_and_tells_its_state_each_time(served: Served) -> None:
     assert say(b'{"version": 1, "command": "state"}\n') == {
-        "version": 1, "run": str(served.run), "rig": str(served.run.parent / "rig.yaml"), "pid": os.getpid(),
+        "version": 1, "run": str(served.run), "plan": str(served.run.parent / "plan.yaml"),
+        "rig": str(served.run.parent / "rig.yaml"), "pid": os.getpid(),
         "state": "running", "view": "top",
         "view_number": 0, "views": 2, "proven": 52, "frames": 132, "light": "led0417", "dose_lux_h": 0.125,
         "left_s": 33.5, "light_after_lux_h": {"relief": 4.5},
@@ -218,7 +225,9 @@ def test_without_a_folder_for_its_socket_a_run_is_acquired_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(runtime_folder, "_BASE", tmp_path / ("long" * 30))
-    with RunControl(tmp_path, tmp_path / "rig.yaml", Control(), list, lambda: None) as control:
+    with RunControl(
+        tmp_path, tmp_path / "plan.yaml", tmp_path / "rig.yaml", Control(), list, lambda: None
+    ) as control:
         assert "will not reach this run" in control.trouble
 
 
@@ -232,7 +241,7 @@ from coupole.acquisition.run_control import RunControl
 runtime_folder._BASE = Path({str(runtime_folder._BASE)!r})
 control = Control()
 control.pause.set()
-with RunControl(Path({str(tmp_path)!r}), Path("rig.yaml"), control, list, lambda: None):
+with RunControl(Path({str(tmp_path)!r}), Path("plan.yaml"), Path("rig.yaml"), control, list, lambda: None):
     print("serves", flush=True)
     time.sleep(60)
 """

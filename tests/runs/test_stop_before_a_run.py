@@ -73,6 +73,27 @@ def test_a_run_that_is_being_resumed_is_stopped_by_its_folder(tmp_path: Path) ->
     assert cell.acquire("--resume", run).document["missing"] == 0
 
 
+@pytest.mark.parametrize("file", ["plan", "rig"])
+def test_a_run_that_has_begun_is_stopped_by_its_plan_or_rig_too(tmp_path: Path, file: str) -> None:
+    cell = CellFolder(tmp_path)
+    cell.write(lights={"kind": "every", "every": 2})
+    process = cell.start_acquire()
+    cells.wait_until(lambda: cells.frame_lines(cell.run_folder) > 3, "proven frames")
+    stopped = cells.here("stop", getattr(cell, file))
+    assert stopped.code == 0, stopped.err
+    assert cells.finish(process).code == 130
+
+
+def test_a_metering_is_stopped_by_its_plan(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path)
+    cell.write(lights={"kind": "all"})
+    process = cells.start("meter", cell.plan, "--yes")
+    _until(process, "simulated")
+    stopped = cells.here("stop", cell.plan)
+    assert stopped.code == 0, stopped.err
+    assert cells.finish(process).code == 130
+
+
 # -- in a runtime folder of their own, without the sessions of other tests ---------------------------------------
 
 _STARTING = """
@@ -81,7 +102,7 @@ from pathlib import Path
 from coupole.acquisition import runtime_folder
 from coupole.acquisition.sessions_without_run import SessionWithoutRun
 runtime_folder._BASE = Path(sys.argv[1])
-with SessionWithoutRun("acquire", Path(sys.argv[2])):
+with SessionWithoutRun("acquire", Path(sys.argv[2]), None):
     print("serves", flush=True)
     time.sleep(60)
 """
@@ -151,13 +172,13 @@ def test_a_session_that_ends_before_its_answer_was_sent_is_stopped(apart: Path) 
 
         closing = threading.Thread(target=closes)
         closing.start()
-        state = {"run": "", "plan": "plan.yaml", "doing": "acquire", "pid": 1}
+        state = {"run": "", "plan": "plan.yaml", "rig": "", "doing": "acquire", "pid": 1}
         assert ask_session(path, state, "stop", print)["state"] == "stopping"
         closing.join()
 
 
 def test_a_session_whose_socket_has_gone_is_not_said_to_give_no_answer(apart: Path) -> None:
-    state = {"run": "", "plan": "rig.yaml", "doing": "meter bust", "pid": 1}
+    state = {"run": "", "plan": "", "rig": "rig.yaml", "doing": "meter bust", "pid": 1}
     with pytest.raises(SessionEnded, match=r"meter bust rig\.yaml: it has just ended"):
         ask_session(runtime_folder.runtime_folder() / "1.start", state, "stop", print)
 

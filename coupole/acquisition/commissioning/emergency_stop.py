@@ -25,11 +25,13 @@ _STILL_DEG = 0.02
 _ARRIVED_DEG = 0.1
 _TOLD_WITHIN_S = 3.0
 """Time within which an arm that stopped on its way tells its fault."""
-_SPEED_OVER_S = 0.05
+_SPEED_OVER_S, _MOMENT_S = 0.3, 0.08
+"""Times over which speeds are measured: that of the motion, and one in which the arm has begun to brake. Reports
+come unevenly, so speeds over shorter times are noise."""
 _FAST_SHARE = 0.5
 """Share of the axis's greatest speed in this session that it must have had."""
-_STEADY_SHARE = 0.95
-"""Share of the greatest speed in the motion; the arm brakes when it is slower."""
+_STEADY_SHARE = 0.8
+"""Share of the speed of the motion; the arm brakes when it is slower."""
 _PRESSED_AT_REST = (
     "the arm's fault ({}) came while the arm was not at speed, so nothing was measured: release the emergency "
     "stop, acknowledge it, start the robot program again, and repeat the step; press while the arm turns"
@@ -143,11 +145,10 @@ class _Way:
         """True if the arm is at the target."""
         return bool(np.abs(self.reports[-1][1] - self.target_deg).max() <= _ARRIVED_DEG)
 
-    def speed_deg_s(self, index: int = -1) -> float:
-        """Return the speed of the fastest axis over the `_SPEED_OVER_S` before a report; 0 if there is no earlier
-        one."""
-        now_ns, now_deg = self.reports[index]
-        before = [report for report in self.reports if now_ns - report[0] >= _SPEED_OVER_S * 1e9]
+    def speed_deg_s(self, number: int = -1, over_s: float = _SPEED_OVER_S) -> float:
+        """Return the speed of the fastest axis over the time before a report; 0 if there is no earlier one."""
+        now_ns, now_deg = self.reports[number]
+        before = [report for report in self.reports if now_ns - report[0] >= over_s * 1e9]
         if not before:
             return 0.0
         then_ns, then_deg = before[-1]
@@ -156,13 +157,12 @@ class _Way:
     def press(self, fast_deg_s: float, stopping_deg: NDArray[np.float64], fault: str) -> _Press:
         """Return where the arm began to brake before this fault was seen. Raises StepFailedError if it was not as
         fast as this, or so near its target that it would have braked anyway."""
-        speeds_deg_s = [self.speed_deg_s(index) for index in range(len(self.reports))]
-        if max(speeds_deg_s) < fast_deg_s:
+        numbers = range(len(self.reports))
+        steady_deg_s = max(self.speed_deg_s(number) for number in numbers)
+        if steady_deg_s < fast_deg_s:
             raise StepFailedError(_PRESSED_AT_REST.format(fault))
-        at_speed = [
-            index for index, speed in enumerate(speeds_deg_s) if speed >= _STEADY_SHARE * max(speeds_deg_s)
-        ]
-        last = at_speed[-1]
+        least_deg_s = _STEADY_SHARE * steady_deg_s
+        last = max(number for number in numbers if self.speed_deg_s(number, _MOMENT_S) >= least_deg_s)
         joints_deg = self.reports[last][1]
         if np.all(np.abs(self.target_deg - joints_deg) <= stopping_deg):
             raise StepFailedError(_PRESSED_AT_REST.format(fault))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from coupole.acquisition.commissioning.bench import Bench, StepFailedError
 from coupole.clock import Deadline
 from coupole.devices import NO_LED, STEP_DTYPE, Exposure, Frame, Step, StepRecord, table_box
-from coupole.errors import DeviceTimeout
+from coupole.errors import DeviceError, DeviceTimeout
 from coupole.plan.bursts import LED_GAP_US, BurstTiming, burst_timing
 from coupole.plan.rig_devices import device_times
 
@@ -60,8 +60,16 @@ def triggered_by_box(bench: Bench, step: Step) -> tuple[NDArray[np.float64], Ste
     box.start(table)
     pixels = pixels_of(next_frame(bench, step.period_us * 1e-6))
     wait_for_end(bench, step.period_us * 1e-6)
-    (record,) = box.poll_log()
-    return pixels, StepRecord(*record.tolist())
+    records = box.poll_log()
+    if len(records) != 1:
+        bench.control.go_on()
+        raise DeviceError(
+            "led box",
+            expected="a record of the step that has ended",
+            happened=f"{len(records)} came",
+            remedy="Find out what else commands the box, then repeat the step.",
+        )
+    return pixels, StepRecord(*records[0].tolist())
 
 
 def next_frame(bench: Bench, within_s: float) -> Frame:

@@ -217,11 +217,11 @@ def ask_permission(cell: Cell, action: str) -> None:
 
 
 @contextlib.contextmanager
-def borrowed_cell(cell: Cell, purpose: str) -> Iterator[None]:
+def borrowed_cell(cell: Cell, purpose: str, plan: Path | None = None) -> Iterator[None]:
     """Borrow the cell from its console for the `purpose` of this process; without a console, the cell needs no
-    loan. Meanwhile `coupole stop` ends this process as Ctrl-C does. Raises InputError if a run is being acquired,
-    or if another person is in control or has the cell."""
-    with SessionWithoutRun(purpose, cell.document.path), _loan(cell, purpose):
+    loan. Meanwhile `coupole stop`, perhaps with the `plan` or the rig, ends this process as Ctrl-C does. Raises
+    InputError if a run is being acquired, or if another person is in control or has the cell."""
+    with SessionWithoutRun(purpose, plan, cell.document.path), _loan(cell, purpose):
         yield
 
 

@@ -18,7 +18,7 @@ import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from coupole.acquisition.observer import Control
 from coupole.acquisition.runtime_folder import named_after, runtime_folder
@@ -43,15 +43,22 @@ _LOOK_PATIENCE_S = 0.5
 # -- the side of the acquisition ------------------------------------------------------------------------------
 
 
+class RunPaths(NamedTuple):
+    """Paths by which a run is named."""
+
+    run: Path
+    """Its folder."""
+    plan: Path
+    rig: Path
+
+
 class RunControl:
     """Serves the socket of a run while a context lasts. If this is not possible on a machine, the run goes on
     without a socket, and `trouble` says why."""
 
     def __init__(
         self,
-        run: Path,
-        plan: Path,
-        rig: Path,
+        paths: RunPaths,
         control: Control,
         halt: Callable[[], Sequence[Safeguard]],
         progress: Callable[[], Progress | None],
@@ -62,10 +69,10 @@ class RunControl:
         progress. `light_after_lux_h` is the total light of each object (by its id) when the run is complete, as
         preflight expects it. `when_served` is called when the socket is there, or cannot be."""
         self._when_served = when_served
-        files = {"plan": str(plan.resolve()), "rig": str(rig.resolve())}
-        self._about: State = {"version": VERSION, "run": str(run), **files, "pid": os.getpid()}
+        files = {"plan": str(paths.plan.resolve()), "rig": str(paths.rig.resolve())}
+        self._about: State = {"version": VERSION, "run": str(paths.run), **files, "pid": os.getpid()}
         self._about["light_after_lux_h"] = dict(light_after_lux_h)
-        self._run, self._control, self._halt, self._progress = run, control, halt, progress
+        self._run, self._control, self._halt, self._progress = paths.run, control, halt, progress
         self.trouble = ""
 
     def __enter__(self) -> RunControl:

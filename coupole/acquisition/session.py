@@ -27,7 +27,7 @@ from coupole.acquisition.operator import (
     refuse_uncommissioned,
 )
 from coupole.acquisition.recorder import RunRecorder
-from coupole.acquisition.run_control import RunControl
+from coupole.acquisition.run_control import RunControl, RunPaths
 from coupole.acquisition.run_description import about_run, camera_name, described_cell, metadata_of_views
 from coupole.acquisition.sequencer import Sequencer
 from coupole.acquisition.session_failure import (
@@ -243,8 +243,8 @@ def _acquire(
     sequencer = run_bounded(partial(Sequencer, job, cell, recorder, observer=observer, control=control))
     outcome: Literal["done", "interrupted", "failed"] = "failed"
     failure: BaseException | None = None
-    paths = run.folder, job.document.path, job.cell.document.path
-    remote = RunControl(*paths, control, cell.halt, lambda: observer.newest, light, session.when_served)
+    paths = RunPaths(run.folder, job.document.path, job.cell.document.path)
+    remote = RunControl(paths, control, cell.halt, lambda: observer.newest, light, session.when_served)
 
     def stop() -> None:
         control.stop_by(signal.SIGINT, "the key q")

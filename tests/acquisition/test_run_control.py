@@ -19,7 +19,7 @@ import pytest
 
 from coupole.acquisition import run_control, runtime_folder, user_socket
 from coupole.acquisition.observer import Control
-from coupole.acquisition.run_control import RunControl, ask, running
+from coupole.acquisition.run_control import RunControl, RunPaths, ask, running
 from coupole.acquisition.safeguard import Safeguard
 from coupole.errors import InputError
 from coupole.viewing.progress import Progress
@@ -51,15 +51,8 @@ def base(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Served]:
     found = Served(tmp_path / "run")
-    with RunControl(
-        found.run,
-        tmp_path / "plan.yaml",
-        tmp_path / "rig.yaml",
-        found.control,
-        found.halt,
-        lambda: PROGRESS,
-        {"relief": 4.5},
-    ) as control:
+    paths = RunPaths(found.run, tmp_path / "plan.yaml", tmp_path / "rig.yaml")
+    with RunControl(paths, found.control, found.halt, lambda: PROGRESS, {"relief": 4.5}) as control:
         assert control.trouble == ""
         yield found
 
@@ -225,9 +218,8 @@ def test_without_a_folder_for_its_socket_a_run_is_acquired_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(runtime_folder, "_BASE", tmp_path / ("long" * 30))
-    with RunControl(
-        tmp_path, tmp_path / "plan.yaml", tmp_path / "rig.yaml", Control(), list, lambda: None
-    ) as control:
+    paths = RunPaths(tmp_path, tmp_path / "plan.yaml", tmp_path / "rig.yaml")
+    with RunControl(paths, Control(), list, lambda: None) as control:
         assert "will not reach this run" in control.trouble
 
 
@@ -237,11 +229,12 @@ import time
 from pathlib import Path
 from coupole.acquisition import runtime_folder
 from coupole.acquisition.observer import Control
-from coupole.acquisition.run_control import RunControl
+from coupole.acquisition.run_control import RunControl, RunPaths
 runtime_folder._BASE = Path({str(runtime_folder._BASE)!r})
 control = Control()
 control.pause.set()
-with RunControl(Path({str(tmp_path)!r}), Path("plan.yaml"), Path("rig.yaml"), control, list, lambda: None):
+paths = RunPaths(Path({str(tmp_path)!r}), Path("plan.yaml"), Path("rig.yaml"))
+with RunControl(paths, control, list, lambda: None):
     print("serves", flush=True)
     time.sleep(60)
 """

@@ -63,8 +63,8 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     """Stop a running acquisition now: lights off, arm still, camera disarmed. It can be resumed.
 
     While nothing is acquired, it stops a commissioning, metering, live view, bench or drive of the arm. Ends when
-    the process has ended; exit code 4 if the journal says that the cell may not be safe. This is no
-    emergency stop: that is the button at the cell.
+    the process has ended; exit code 4 if the journal says that the cell may not be safe. This is no emergency
+    stop: that is the button at the cell.
     """
     reply = _state_after(run, "stop")  # sent before the imports, which only the outcome needs
     if "doing" in reply:
@@ -201,7 +201,7 @@ def _state_after(run: Path | None, command: Command, *, until: str = "") -> Stat
     state = _answer_to(run, command)
     while until and state["state"] != until:
         time.sleep(_LOOK_EVERY_S)
-        state = ask(run or Path(state["run"]), "state")
+        state = ask(Path(state["run"]), "state")
         if state["state"] in ("running", "stopping"):
             break
     return state

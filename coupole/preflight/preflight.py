@@ -39,7 +39,6 @@ SETTLE_CHECK_S = 0.1
 DISK_SHARE = 0.9
 """Share of the disk's measured speed that the frame rate may use."""
 PAGE_BYTES = 4096
-_LEAST_GB = 100_000_000
 _NOTE_BYTES, _SMALL_BYTES = 1000, 4_000_000
 """Bytes of a frame's records and lines of the journal (measured: 920), and of a run's report and inputs
 without large meshes (measured: 2.8 million in the demonstration)."""
@@ -366,10 +365,6 @@ def room_bytes(frames: int, views: int, frame_bytes: int) -> int:
     return (frames + SPARE_SLOTS * views) * frame_bytes + frames * _NOTE_BYTES + _SMALL_BYTES
 
 
-def _room_text(count: int) -> str:
-    return f"{count / 1e9:.2f} GB" if count >= _LEAST_GB else f"{count / 1e6:.1f} MB"
-
-
 def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts, *, keeps_all: bool) -> None:
     frame_bytes = rig.frame_bytes
     folder = storage.folder or rig.storage.folder
@@ -384,8 +379,8 @@ def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts
         report.refusals.append(f"storage {folder}: expected a folder that can be written; {storage.trouble}")
     if keeps_all and needed_bytes + rig.storage.reserve_bytes > storage.free_bytes:
         report.refusals.append(
-            f"storage {folder}: the run needs {_room_text(needed_bytes)} and "
-            f"{_room_text(rig.storage.reserve_bytes)} must stay free; {_room_text(storage.free_bytes)} are free"
+            f"storage {folder}: the run needs {needed_bytes / 1e9:.3f} GB and "
+            f"{rig.storage.reserve_bytes / 1e9:.3f} GB must stay free; {storage.free_bytes / 1e9:.3f} GB are free"
         )
     if frame_bytes % PAGE_BYTES:
         report.warnings.append(

@@ -22,7 +22,7 @@ from coupole.acquisition.commissioning.bench import Bench, Findings, StepFailedE
 from coupole.acquisition.commissioning.light_directions import deviations_deg
 from coupole.acquisition.commissioning.reduced_speed import REDUCED_MM_S, at_reduced_speed, greatest_speeds_deg_s
 from coupole.acquisition.observer import Control
-from coupole.errors import DeviceTimeout, Interrupted
+from coupole.errors import DeviceError, DeviceTimeout, Interrupted
 from coupole.kinematics import link_frames
 from coupole.motion.itinerary import bodies_of
 from coupole.plan.cell import read_cell
@@ -323,6 +323,24 @@ def test_a_step_that_the_person_stops_has_no_result(
     with pytest.raises(Interrupted) as interruption:
         session._run_step("lamps", bench, bench.cell, "A. Person")
     assert interruption.value.exit_code == 128 + signal.SIGTERM
+
+
+@pytest.mark.parametrize(("is_stopped", "error"), [(True, Interrupted), (False, DeviceError)])
+def test_a_flash_whose_record_does_not_come_is_the_boxs_failure_unless_it_was_stopped(
+    wrong: Bench, *, is_stopped: bool, error: type[Exception]
+) -> None:
+    """A stop switches the box off, which forgets the step's record."""
+    box: Any = wrong.opened.ledbox
+    control = Control()
+
+    def forgets() -> Any:
+        if is_stopped:
+            control.stop_by(signal.SIGINT)
+        return box.poll_log()[:0]
+
+    bench = replace(with_devices(wrong, ledbox=Wrapped(box, poll_log=forgets)), control=control)
+    with pytest.raises(error):
+        lamp_step.lamps(bench)
 
 
 def test_a_stop_in_a_motion_keeps_the_earlier_result_and_notes_no_fault_of_the_arm(

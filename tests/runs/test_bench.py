@@ -183,23 +183,6 @@ def test_an_arm_whose_console_is_killed_stops_at_once(asked: Bench, world: World
     assert np.allclose(joints_deg(world), rested["joints_deg"], atol=0.01)
 
 
-def test_while_a_button_is_held_no_drive_is_shown_or_begun_or_kept_for_later(asked: Bench, world: World) -> None:
-    asked.drive("home")
-    to_park = asked.done("plan_path", to="park")
-    with holding(asked, "A1", 1) as console:
-        cells.wait_until(lambda: joints_deg(world)[0] > 1.0, "the arm under way")
-        assert "error" in asked.ask("drive", path=to_park["path"])
-        cells.wait_until(
-            lambda: asked.ask("plan_path", to="park").get("error", "").startswith("jog is under way"),
-            "a refusal, also while the arm rests between steps",
-        )
-        console.kill()
-    assert asked.ended_work()["kind"] == "jog"
-    time.sleep(0.5)
-    assert not world.ask("state")["arm_moving"]
-    asked.drive("home")
-
-
 def test_a_renewal_that_comes_late_revives_no_hold() -> None:
     """As after a freeze of the bench, when the renewal is read before the watch looks at the time."""
     asked = JogAsked.model_validate({"version": 1, "command": "jog", "axis": "A1", "direction": 1, "from": HERE})

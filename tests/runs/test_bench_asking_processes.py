@@ -155,6 +155,25 @@ def test_a_button_is_held_only_by_the_process_that_pressed_it(
         assert np.allclose(at_rest(world)["joints_deg"], at_rest_deg, atol=0.01)
 
 
+def test_while_a_button_is_held_no_drive_is_shown_or_begun_or_kept_for_later(
+    cell: CellFolder, world: World
+) -> None:
+    with bench(cell.rig, "--object", cell.plan) as asked:
+        asked.drive("home")
+        to_park = asked.done("plan_path", to="park")
+        with holding(asked, "A1", 1) as console:
+            cells.wait_until(lambda: turned_deg(world) > 1.0, "the arm under way")
+            assert "error" in asked.ask("drive", path=to_park["path"])
+            cells.wait_until(
+                lambda: asked.ask("plan_path", to="park").get("error", "").startswith("jog is under way"),
+                "a refusal, also while the arm rests between steps",
+            )
+            console.kill()
+        assert asked.ended_work()["kind"] == "jog"
+        time.sleep(0.5)
+        assert not world.ask("state")["arm_moving"]
+
+
 @pytest.mark.parametrize("plan", ["/tmp/a\0b", "/tmp/" + 5000 * "a", "relative.yaml", "/proc/self/mem"])
 def test_a_plan_whose_name_is_none_is_bad_input(cell: CellFolder, world: World, plan: str) -> None:
     with bench(cell.rig) as asked:

@@ -76,9 +76,12 @@ def test_a_run_that_is_being_resumed_is_stopped_by_its_folder(tmp_path: Path) ->
 @pytest.mark.parametrize("file", ["plan", "rig"])
 def test_a_run_that_has_begun_is_stopped_by_its_plan_or_rig_too(tmp_path: Path, file: str) -> None:
     cell = CellFolder(tmp_path)
-    cell.write(lights={"kind": "every", "every": 2})
+    cell.write(views=[cells.TOP, cells.SIDE], lights={"kind": "every", "every": 5})
     process = cell.start_acquire()
     cells.wait_until(lambda: cells.frame_lines(cell.run_folder) > 3, "proven frames")
+    paused = cells.here("pause", getattr(cell, file), "--json")
+    assert paused.code == 0, paused.err
+    assert paused.document["state"] == "paused"
     stopped = cells.here("stop", getattr(cell, file))
     assert stopped.code == 0, stopped.err
     assert cells.finish(process).code == 130

@@ -141,7 +141,7 @@ class BenchArm:
             hold.let_go("another process renewed it")
             raise InputError(
                 f"hold: {request.hold} is held by another process, and only this process may renew it; the hold "
-                f"was ended"
+                "was ended"
             )
         if (request.axis, request.direction) == (hold.asked.axis, hold.asked.direction):
             hold.renew()

@@ -159,10 +159,11 @@ class _Way:
         fast as this, or so near its target that it would have braked anyway."""
         numbers = range(len(self.reports))
         steady_deg_s = max(self.speed_deg_s(number) for number in numbers)
-        if steady_deg_s < fast_deg_s:
-            raise StepFailedError(_PRESSED_AT_REST.format(fault))
         least_deg_s = _STEADY_SHARE * steady_deg_s
-        last = max(number for number in numbers if self.speed_deg_s(number, _MOMENT_S) >= least_deg_s)
+        at_speed = [number for number in numbers if self.speed_deg_s(number, _MOMENT_S) >= least_deg_s]
+        if steady_deg_s < fast_deg_s or not at_speed:
+            raise StepFailedError(_PRESSED_AT_REST.format(fault))
+        last = at_speed[-1]
         joints_deg = self.reports[last][1]
         if np.all(np.abs(self.target_deg - joints_deg) <= stopping_deg):
             raise StepFailedError(_PRESSED_AT_REST.format(fault))

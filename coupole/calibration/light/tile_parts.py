@@ -1,4 +1,4 @@
-"""A stain of a white tile, and LEDs whose dies or lobes differ, by the differences between the tile\'s parts.
+"""A stain of a white tile, and LEDs whose dies or lobes differ, by the differences between the tile's parts.
 
 A stain is a pattern over the parts of the tile that all LEDs and views share. Its mean is not seen, but scales all
 powers. So its modes are those of a random field over the tile (covariance exp(-d / `_STAIN_MM`)), whose mean is

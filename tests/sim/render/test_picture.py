@@ -12,6 +12,7 @@ from scenes import camera_above, quad
 from coupole.geometry import Transform
 from sim.devices.camera_body import Exposed
 from sim.optics.photographer import Photographer
+from sim.strangers.light_stranger import LightStranger
 from sim.world.config import CameraConfig, SceneConfig, Settings
 
 ABOVE = camera_above(335.0)
@@ -85,6 +86,26 @@ def test_lights_add_up(shading: str, tmp_path: Path) -> None:
         alone[0] + signal(frame(by, {}, panels=1)), rel=0.02
     )
     assert abs(signal(frame(by, {}))) < 1.0
+
+
+def test_lamps_that_warm_give_less_light_frame_by_frame(tmp_path: Path) -> None:
+    warming = {"light": {"warming": 0.2, "warming_frames": 10.0}}
+    by = photographer(tmp_path, {"strangers": warming})
+    first, late = (signal(frame(by, {0: 0.003}, number=number)) for number in (0, 1000))
+    assert late / first == pytest.approx(0.8, rel=0.01)
+
+
+def test_dies_of_unequal_lobes_light_a_place_beside_their_axis_unequally(tmp_path: Path) -> None:
+    """LED 9 points beside the tile; LED 0 has the tile on its axis, where a lobe changes the light by its flux."""
+    plain, strange = (
+        photographer(tmp_path, {"strangers": {"light": light}}) for light in ({}, {"exponent_spread": 0.2})
+    )
+    lobe = LightStranger(exponent_spread=0.2)
+    for led, away_mm, axis in ((0, (0, 0, -1460), (0, 0, -1)), (9, (0, 900, -860), (0, 0.70711, -0.70711))):
+        cosine = float(np.dot(away_mm, axis) / np.linalg.norm(away_mm))
+        own = lobe.exponent(led)
+        ratio = signal(frame(strange, {led: 0.003})) / signal(frame(plain, {led: 0.003}))
+        assert ratio == pytest.approx((1.0 + 0.5 * own) * cosine**own, rel=0.02)
 
 
 @pytest.mark.parametrize("shading", ["flat", "pixel"])

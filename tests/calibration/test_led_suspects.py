@@ -18,7 +18,7 @@ from coupole.calibration.adjustment import coverage_factor
 from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
 from coupole.calibration.leds.boards import board_poses, boards_of
 from coupole.calibration.leds.drawing import draw_leds
-from coupole.calibration.leds.equations import LedState, Problem, Stated, at_centres, problem_of
+from coupole.calibration.leds.equations import SPOTS, LedState, Problem, Stated, at_centres, problem_of
 from coupole.calibration.leds.left_out import views_left_out
 from coupole.calibration.leds.matching import Matching, match_leds
 from coupole.calibration.leds.normal_equations import centres_by_own, reduced_normal
@@ -141,19 +141,42 @@ def test_views_left_out_move_the_leds_as_an_adjustment_without_them_would() -> N
         for view in range(8)
     ]
     by_refits = sum(move[:, :, None] * move[:, None, :] for move in moves) * 7 / 8
-    closed = views_left_out(problem, state, geometry.noise, everything > 0).centre_covariance
+    reduced = reduced_normal(problem, state, geometry.noise, everything)
+    closed = views_left_out(problem, state, geometry.noise, everything > 0, reduced).centre_covariance
     is_seen = np.isin(np.arange(len(closed)), seen.led)
     assert np.allclose(closed[is_seen], by_refits[is_seen], rtol=0.02, atol=0.02 * np.abs(by_refits).max())
 
 
+def test_the_freedom_that_spots_use_is_the_trace_of_their_part_of_the_hat_matrix() -> None:
+    made = dome(1, views=8)
+    geometry = geometry_of(made, ())
+    boards, seen = boards_of(made.table), matched(made).sightings
+    problem = problem_of(seen, seen.led, boards, made.base_from_flange, made.prior, Stated(), ())
+    problem, keep = at_centres(problem, geometry.state), geometry.accepted_mask
+    reduced = reduced_normal(problem, geometry.state, geometry.noise, keep.astype(float))
+    own_at = np.cumsum([0, *(len(part.side) for part in reduced.parts)])
+    shared = own_at[-1] + np.arange(problem.shared_count)
+    whole = np.zeros((own_at[-1] + problem.shared_count,) * 2)
+    jacobians = []
+    whole[np.ix_(shared, shared)] = reduced.matrix  # to which what the elimination of the boards took off is added
+    for part, first, end in zip(reduced.parts, own_at, own_at[1:], strict=False):
+        own, columns = np.arange(first, end), shared[part.columns]
+        whole[np.ix_(own, own)] = part.own_normal
+        whole[np.ix_(own, columns)], whole[np.ix_(columns, own)] = part.cross, part.cross.T
+        whole[np.ix_(columns, columns)] += part.cross.T @ np.linalg.solve(part.own_normal, part.cross)
+        jacobians.append((part.jacobian, np.concatenate([own, columns])))
+    covariance = np.linalg.inv(whole)
+    used = sum(np.sum((j @ covariance[np.ix_(at, at)]) * j) for j, at in jacobians)
+    assert geometry.redundancy[SPOTS] == pytest.approx(2 * keep.sum() - used, rel=1e-3)
+
+
 def centres_step(problem: Problem, state: LedState, noise: Array, weights: Array) -> Array:
     """[n, 3] step of the centres by one more adjustment with these weights of the spots."""
-    parts, solutions, matrix, side = reduced_normal(problem, state, noise, weights)
-    shared = np.linalg.solve(matrix, side)
+    reduced = reduced_normal(problem, state, noise, weights)
+    shared = np.linalg.solve(reduced.matrix, reduced.side)
     steps = np.zeros((len(problem.boards.places_mm), 3))
-    for board, (part, solution) in enumerate(zip(parts, solutions, strict=True)):
-        own = solution[:, -1] - solution[:, :-1] @ shared[part.columns]
-        steps[problem.boards.rows_of(board)] = centres_by_own(problem, state, board) @ own
+    for board, part in enumerate(reduced.parts):
+        steps[problem.boards.rows_of(board)] = centres_by_own(problem, state, board) @ part.own_step(shared)
     return steps
 
 

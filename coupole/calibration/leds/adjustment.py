@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve
 
 from coupole.calibration.adjustment import HUBER, REJECT_SIGMA
 from coupole.calibration.leds.equations import (
@@ -35,11 +34,12 @@ from coupole.calibration.leds.equations import (
     cost_of,
     pose_errors,
     stepped_state,
+    table_sigmas,
     whitened_residuals,
     with_modes,
 )
 from coupole.calibration.leds.left_out import LeftOutViews, views_left_out
-from coupole.calibration.leds.normal_equations import centres_by_own, cholesky_factor, reduced_normal, solve
+from coupole.calibration.leds.normal_equations import Reduced, centres_by_own, reduced_normal, solve
 from coupole.calibration.leds.suspects import FIELD, SuspectedShift, as_found, judge, step_of_records
 from coupole.calibration.point_sets import Indices
 from coupole.calibration.rotations import Floats
@@ -111,13 +111,14 @@ def adjust_leds(problem: Problem, start: Floats) -> LedGeometry:
         np.zeros(len(modes)),
     )
     factors, keep = np.ones(len(GROUPS)), np.ones(len(problem.place), np.bool_)
-    state, _ = _descend(problem, state, factors, keep, 3.0 * HUBER)
+    state = _descend(problem, state, factors, keep, 3.0 * HUBER).state
     problem = at_centres(problem, state)
     fit = _settled_fit(problem, _Fit(state, factors, keep, 0), is_robust=True)
     fit = _settled_fit(problem, fit, is_robust=False)
     suspects: tuple[SuspectedShift, ...] = ()
     if modes:
-        solution = _solution(problem, fit.state, fit.factors, fit.accepted_mask)
+        reduced = _reduced_at(problem, fit)
+        solution = _solution(problem, fit.state, fit.factors, fit.accepted_mask, reduced)
         degrees = float(solution.redundancy[[POSITION, ORIENTATION]].sum())
         suspects = judge(modes, fit.state.coefficients, solution.coefficient_covariance, degrees)
         problem = with_modes(problem, as_found(modes, suspects))
@@ -139,15 +140,15 @@ def _settled_fit(problem: Problem, fit: _Fit, *, is_robust: bool) -> _Fit:
     """Adjust until noises and accepted spots no longer change."""
     state, factors, keep, step_count = fit.state, fit.factors, fit.accepted_mask, fit.steps
     for _ in range(_MOST_ROUNDS):
-        state, steps = _descend(problem, state, factors, keep, HUBER if is_robust else np.inf)
-        step_count += steps
+        descent = _descend(problem, state, factors, keep, HUBER if is_robust else np.inf)
+        state, step_count = descent.state, step_count + descent.steps
         residuals = whitened_residuals(problem, state)
         off = np.sqrt(np.mean(residuals**2, axis=1))
         before, seen_factors = keep, factors.copy()
         if is_robust:
             seen_factors[SPOTS] = max(1.4826 * float(np.median(np.abs(residuals))), _LEAST_FACTOR)
         else:
-            seen_factors = _solution(problem, state, factors, keep).noise_factors
+            seen_factors = _solution(problem, state, factors, keep, descent.last_equations).noise_factors
         is_settled = bool(np.all(np.abs(seen_factors / factors - 1) < _SETTLED))
         factors = seen_factors
         keep = off <= REJECT_SIGMA * factors[SPOTS] / np.sqrt(2)
@@ -156,17 +157,27 @@ def _settled_fit(problem: Problem, fit: _Fit, *, is_robust: bool) -> _Fit:
     return _Fit(state, factors, keep, step_count)
 
 
+@dataclass(frozen=True)
+class _Descent:
+    """Where a descent ended."""
+
+    state: LedState
+    steps: int
+    last_equations: Reduced
+    """Normal equations of the last step, which changed the cost by less than `_STILL` of it."""
+
+
 def _descend(
     problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], huber: float
-) -> tuple[LedState, int]:
+) -> _Descent:
     """Gauss-Newton with Huber's weights; a step that does not lower the cost is halved."""
     cost = cost_of(problem, state, factors, accepted_mask, huber)
     for step in range(1, _MOST_STEPS + 1):
         off = np.sqrt(np.sum(whitened_residuals(problem, state) ** 2, axis=1)) / factors[SPOTS]
         weights = np.where(accepted_mask, np.minimum(1.0, huber / np.maximum(off, 1e-12)), 0.0)
-        parts, solutions, matrix, side = reduced_normal(problem, state, factors, weights)
-        shared_step = cho_solve(cholesky_factor(matrix), side)
-        own_steps = [s[:, -1] - s[:, :-1] @ shared_step[p.columns] for p, s in zip(parts, solutions, strict=True)]
+        reduced = reduced_normal(problem, state, factors, weights)
+        shared_step = reduced.shared_step
+        own_steps = [part.own_step(shared_step) for part in reduced.parts]
         share, tried_state = 1.0, stepped_state(problem, state, shared_step, own_steps, 1.0)
         while (now := cost_of(problem, tried_state, factors, accepted_mask, huber)) > cost * (
             1 + 1e-12
@@ -174,10 +185,10 @@ def _descend(
             share /= 2
             tried_state = stepped_state(problem, state, shared_step, own_steps, share)
         if now > cost * (1 + 1e-12):
-            return state, step
+            return _Descent(state, step, reduced)
         state, gain, cost = tried_state, cost - now, now
         if gain < _STILL * max(cost, 1.0):
-            return state, step
+            return _Descent(state, step, reduced)
     raise InputError(
         f"LEDs: no convergence in {_MOST_STEPS} steps. Look for views of another camera or dome, and for "
         "records of another lens"
@@ -201,25 +212,41 @@ class _Solved:
     """[c, c] of the suspects' modes."""
 
 
-def _solution(problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_]) -> _Solved:
-    parts, solutions, matrix, _ = reduced_normal(problem, state, factors, accepted_mask.astype(np.float64))
-    shared_covariance = cho_solve(cholesky_factor(matrix), np.eye(len(matrix)))
+def _reduced_at(problem: Problem, fit: _Fit) -> Reduced:
+    """The normal equations at a fit, its spots with equal weights."""
+    return reduced_normal(problem, fit.state, fit.factors, fit.accepted_mask.astype(np.float64))
+
+
+def _solution(
+    problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], reduced: Reduced
+) -> _Solved:
+    """Covariances by `reduced`, noise by the residuals of the accepted spots [k] at `state`.
+
+    The freedom that the spots use is not summed over them: all parameters together are as many as the traces of
+    the spots' and the priors' parts, and those of the priors need the diagonal blocks alone.
+    """
+    shared_covariance = reduced.shared_covariance
     own_covariances: list[Floats] = []
     alone: list[Floats] = []
-    used_freedom = np.zeros(len(GROUPS))
-    for part, solution in zip(parts, solutions, strict=True):
-        count, gain = len(part.own_normal), solution[:, :-1]
+    of_table = table_sigmas(problem) ** -2
+    used_freedom, by_priors, parameters = np.zeros(len(GROUPS)), 0.0, len(shared_covariance)
+    for part in reduced.parts:
         block = shared_covariance[np.ix_(part.columns, part.columns)]
-        alone.append(solve(part.own_normal, np.eye(count)))
-        own_covariances.append(alone[-1] + gain @ block @ gain.T)
-        whole = np.block([[own_covariances[-1], -gain @ block], [-block @ gain.T, block]])
-        used_freedom[SPOTS] += float(np.sum((part.jacobian @ whole) * part.jacobian))
-        used_freedom[TOLERANCE] += float(np.trace(own_covariances[-1][6:, 6:]))
-        assert count == len(own_covariances[-1])
-    variance = _of_pose_errors(problem, shared_covariance)
+        alone.append(solve(part.own_normal, np.eye(len(part.own_normal))))
+        own_covariances.append(alone[-1] + part.gain @ block @ part.gain.T)
+        own_variance = np.diag(own_covariances[-1])
+        parameters += len(own_variance)
+        by_priors += float(of_table @ own_variance[:6])
+        used_freedom[TOLERANCE] += float(own_variance[6:].sum())
     used_freedom[TOLERANCE] /= (problem.stated_noise.tolerance_mm * factors[TOLERANCE]) ** 2
+    variance = _of_pose_errors(problem, shared_covariance)
     scaled_variance = variance / (problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)) ** 2
     used_freedom[POSITION], used_freedom[ORIENTATION] = scaled_variance[:, :3].sum(), scaled_variance[:, 3:].sum()
+    of_camera = (
+        problem.prior_whiten @ shared_covariance[-len(problem.prior_whiten) :, -len(problem.prior_whiten) :]
+    )
+    by_priors += float(np.sum(of_camera * problem.prior_whiten))
+    used_freedom[SPOTS] = parameters - by_priors - used_freedom[[TOLERANCE, POSITION, ORIENTATION]].sum()
     off = pose_errors(problem, state) / problem.sigmas
     groups = (
         whitened_residuals(problem, state)[accepted_mask],
@@ -254,7 +281,8 @@ def _of_pose_errors(problem: Problem, shared_covariance: Floats) -> Floats:
 
 def _summary(problem: Problem, fit: _Fit, suspects: tuple[SuspectedShift, ...]) -> LedGeometry:
     state, factors = fit.state, fit.factors
-    solution = _solution(problem, state, factors, fit.accepted_mask)
+    reduced = _reduced_at(problem, fit)
+    solution = _solution(problem, state, factors, fit.accepted_mask, reduced)
     boards = problem.boards
     centres = np.empty((len(boards.places_mm), 3, 3))
     shared_part = np.empty(len(centres))
@@ -286,7 +314,7 @@ def _summary(problem: Problem, fit: _Fit, suspects: tuple[SuspectedShift, ...]) 
         step / np.sqrt(np.diag(problem.prior.covariance)),
         fit.steps,
         suspects,
-        views_left_out(problem, state, factors, fit.accepted_mask),
+        views_left_out(problem, state, factors, fit.accepted_mask, reduced),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,11 @@ class Boards:
 
     def rows_of(self, board: int) -> Indices:
         """Places on a board (row of `numbers`)."""
-        return np.flatnonzero(self.board_of == board)
+        return self._rows_of[board]
+
+    @cached_property
+    def _rows_of(self) -> tuple[Indices, ...]:
+        return tuple(np.flatnonzero(self.board_of == board) for board in range(len(self.numbers)))
 
     def in_base(self, base_from_board: Floats, offsets_mm: Floats | float = 0.0) -> Floats:
         """Centres [n, 3] of LEDs for these poses of the boards and offsets of the LEDs on them."""

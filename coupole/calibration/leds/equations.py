@@ -55,6 +55,20 @@ class LedState:
 
 
 @dataclass(frozen=True)
+class BoardSpots:
+    """The spots [k] on one board, and what their equations depend on."""
+
+    rows: Indices
+    """[k] rows of all spots."""
+    leds: Indices
+    """[k] LED of each spot: its number on the board."""
+    views: Indices
+    """[k] view of each spot: its number among the views of the board, in ascending order."""
+    columns: Indices
+    """Columns of the shared parameters: six of each view of the board, then those of the camera."""
+
+
+@dataclass(frozen=True)
 class Problem:
     """Quantities that do not change between iterations."""
 
@@ -73,10 +87,8 @@ class Problem:
     stated_noise: Stated
     modes: tuple[Mode, ...]
     """[c] of suspects."""
-    sightings_of: tuple[Indices, ...]
-    """[b] spots on each board."""
-    columns_of: tuple[Indices, ...]
-    """[b] columns of the shared parameters that these depend on."""
+    spots_of: tuple[BoardSpots, ...]
+    """[b]."""
 
     @property
     def columns_of_modes(self) -> slice:
@@ -112,13 +124,7 @@ def problem_of(
     """Return the problem of adjusting LEDs from their spots. `place` [k] is that of each spot, `reported_poses`
     [v, 4, 4] are those of the flange, `modes` are those of the suspects."""
     whiten = np.linalg.inv(np.linalg.cholesky(sightings.covariance))
-    board = boards.board_of[place]
-    sightings_of = tuple(np.flatnonzero(board == b) for b in range(len(boards.numbers)))
-    tail = 6 * len(reported_poses) + np.arange(6 + len(prior.free) + len(modes))
-    columns_of = tuple(
-        np.concatenate([(6 * np.unique(sightings.view[rows])[:, None] + np.arange(6)).ravel(), tail])
-        for rows in sightings_of
-    )
+    of_camera = 6 * len(reported_poses) + np.arange(6 + len(prior.free) + len(modes))
     return Problem(
         boards,
         place,
@@ -131,9 +137,16 @@ def problem_of(
         prior.by_axes(reported_poses),
         stated_noise,
         tuple(modes),
-        sightings_of,
-        columns_of,
+        tuple(_spots_of(board, sightings.view, place, boards, of_camera) for board in range(len(boards.numbers))),
     )
+
+
+def _spots_of(board: int, view: Indices, place: Indices, boards: Boards, of_camera: Indices) -> BoardSpots:
+    """The spots on a board; `view` and `place` [k] are those of all spots."""
+    rows = np.flatnonzero(boards.board_of[place] == board)
+    views, number = np.unique(view[rows], return_inverse=True)
+    columns = np.concatenate([(6 * views[:, None] + np.arange(6)).ravel(), of_camera])
+    return BoardSpots(rows, np.searchsorted(boards.rows_of(board), place[rows]), number, columns)
 
 
 def _prior_whiten(prior: CameraPrior, modes: Sequence[Mode]) -> Floats:

@@ -10,12 +10,10 @@ pose parameters are determined by the view alone; their directions do not count.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve
 
 from coupole.calibration.leds.equations import (
     ORIENTATION,
@@ -26,13 +24,7 @@ from coupole.calibration.leds.equations import (
     pose_errors,
     whitened_residuals,
 )
-from coupole.calibration.leds.normal_equations import (
-    BoardPart,
-    centres_by_own,
-    cholesky_factor,
-    reduced_normal,
-    solve,
-)
+from coupole.calibration.leds.normal_equations import Reduced, centres_by_own, solve
 from coupole.calibration.rotations import Floats
 
 _OWN = 1e-6
@@ -65,58 +57,63 @@ class _InView:
 
 
 def views_left_out(
-    problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_]
+    problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], reduced: Reduced
 ) -> LeftOutViews:
-    """Leave out each view at the solution with these noises [groups]; `accepted_mask` [k] are the spots used."""
-    parts, solutions, matrix, _ = reduced_normal(problem, state, factors, accepted_mask.astype(np.float64))
-    shared_covariance = np.asarray(cho_solve(cholesky_factor(matrix), np.eye(len(matrix))))
-    residuals = whitened_residuals(problem, state) / factors[SPOTS]
-    gains = [solution[:, :-1] for solution in solutions]
-    by_own = [centres_by_own(problem, state, board).reshape(-1, len(gain)) for board, gain in enumerate(gains)]
-    by_shared = [by @ gain for by, gain in zip(by_own, gains, strict=True)]
+    """Leave out each view at the solution with these noises [groups] and normal equations; `accepted_mask` [k]
+    are the spots used."""
     count = len(problem.reported_poses)
-    ratios, squares = np.zeros(count), np.zeros((len(problem.boards.places_mm), 3, 3))
-    for view in range(count):
-        in_view = list(_in_view(problem, parts, gains, residuals, accepted_mask, view))
+    by_own = [
+        centres_by_own(problem, state, board).reshape(-1, len(part.gain))
+        for board, part in enumerate(reduced.parts)
+    ]
+    ratios, shared_moves = np.zeros(count), np.zeros((problem.shared_count, count))
+    moves_mm = np.zeros((count, len(problem.boards.places_mm), 3))
+    for view, boards_in_view in enumerate(_boards_in_views(problem, state, factors, accepted_mask, reduced)):
         derivatives, values = _pose_rows(problem, state, factors, view)
-        whole = np.concatenate([derivatives, *(board_view.by_shared for board_view in in_view)])
-        gain = shared_covariance @ whole.T
-        hat, at = whole @ gain, len(values)
-        for board_view in in_view:
-            rows = slice(at, at + len(board_view.residuals))
-            hat[rows, rows] += board_view.own_hat
-            at = rows.stop
+        half = reduced.half_solve(np.concatenate([derivatives, *(of.by_shared for of in boards_in_view)]).T)
+        hat, at = half.T @ half, len(values)
+        rows_of = []
+        for of_board in boards_in_view:
+            rows_of.append(slice(at, at + len(of_board.residuals)))
+            hat[rows_of[-1], rows_of[-1]] += of_board.own_hat
+            at = rows_of[-1].stop
         ratios[view], left_residuals = _left_residuals(
-            hat, np.concatenate([values, *(board_view.residuals for board_view in in_view)])
+            hat, np.concatenate([values, *(of_board.residuals for of_board in boards_in_view)])
         )
-        shared_move = gain @ left_residuals
-        moves_mm = _moves(problem, parts, by_shared, by_own, in_view, shared_move, left_residuals[len(values) :])
-        squares += moves_mm[:, :, None] * moves_mm[:, None, :]
+        shared_moves[:, view] = reduced.other_half_solve(half @ left_residuals)
+        for of_board, rows in zip(boards_in_view, rows_of, strict=True):
+            own_move_mm = by_own[of_board.board] @ (of_board.own_gain @ left_residuals[rows])
+            moves_mm[view, problem.boards.rows_of(of_board.board)] = own_move_mm.reshape(-1, 3)
+    for board, part in enumerate(reduced.parts):
+        by_shared_mm = by_own[board] @ part.gain @ shared_moves[part.columns]
+        moves_mm[:, problem.boards.rows_of(board)] -= by_shared_mm.T.reshape(count, -1, 3)
+    squares = np.einsum("vni,vnj->nij", moves_mm, moves_mm)
     return LeftOutViews(ratios, squares * (count - 1) / count)
 
 
-def _in_view(
-    problem: Problem,
-    parts: Sequence[BoardPart],
-    gains: Sequence[Floats],
-    residuals: Floats,
-    accepted_mask: NDArray[np.bool_],
-    view: int,
-) -> list[_InView]:
-    boards_in_view = []
-    for board, (part, gain, spots) in enumerate(zip(parts, gains, problem.sightings_of, strict=True)):
-        rows_in_view = np.flatnonzero((problem.view[spots] == view) & accepted_mask[spots])
-        if not len(rows_in_view):
-            continue
-        jacobian = part.jacobian[(2 * rows_in_view[:, None] + np.arange(2)).ravel()]
-        of_own = jacobian[:, : len(gain)]
-        by_shared = np.zeros((len(jacobian), problem.shared_count))
-        by_shared[:, part.columns] = jacobian[:, len(gain) :] - of_own @ gain
+def _boards_in_views(
+    problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], reduced: Reduced
+) -> list[list[_InView]]:
+    """[v] the boards with spots in each view."""
+    residuals = whitened_residuals(problem, state) / factors[SPOTS]
+    boards_in_views: list[list[_InView]] = [[] for _ in problem.reported_poses]
+    for board, (part, spots) in enumerate(zip(reduced.parts, problem.spots_of, strict=True)):
+        count = len(part.own_normal)
+        of_own = part.jacobian[:, :count]
         own_gain = solve(part.own_normal, of_own.T)
-        boards_in_view.append(
-            _InView(board, own_gain, of_own @ own_gain, by_shared, residuals[spots[rows_in_view]].ravel())
-        )
-    return boards_in_view
+        by_shared = part.jacobian[:, count:] - of_own @ part.gain
+        accepted_rows = np.flatnonzero(accepted_mask[spots.rows])
+        views = problem.view[spots.rows[accepted_rows]]
+        for view in np.unique(views):
+            in_view = accepted_rows[views == view]
+            rows = (2 * in_view[:, None] + np.arange(2)).ravel()
+            of_shared = np.zeros((len(rows), problem.shared_count))
+            of_shared[:, part.columns] = by_shared[rows]
+            gain = own_gain[:, rows]
+            boards_in_views[view].append(
+                _InView(board, gain, of_own[rows] @ gain, of_shared, residuals[spots.rows[in_view]].ravel())
+            )
+    return boards_in_views
 
 
 def _pose_rows(problem: Problem, state: LedState, factors: Floats, view: int) -> tuple[Floats, Floats]:
@@ -137,24 +134,3 @@ def _left_residuals(hat: Floats, residuals: Floats) -> tuple[float, Floats]:
     along = vectors[:, usable].T @ residuals
     ratio = float(np.sqrt(np.sum(along**2 / values[usable]) / max(int(usable.sum()), 1)))
     return ratio, np.asarray(vectors[:, usable] @ (along / values[usable]))
-
-
-def _moves(
-    problem: Problem,
-    parts: Sequence[BoardPart],
-    by_shared: Sequence[Floats],
-    by_own: Sequence[Floats],
-    in_view: Sequence[_InView],
-    shared_move: Floats,
-    left_residuals: Floats,
-) -> Floats:
-    """[n, 3] mm by which a view moves the centres, against a fit without it."""
-    moves_mm = np.zeros((len(problem.boards.places_mm), 3))
-    for board, part in enumerate(parts):
-        moves_mm[problem.boards.rows_of(board)] = -(by_shared[board] @ shared_move[part.columns]).reshape(-1, 3)
-    at = 0
-    for board_view in in_view:
-        own_step = board_view.own_gain @ left_residuals[at : at + len(board_view.residuals)]
-        moves_mm[problem.boards.rows_of(board_view.board)] += (by_own[board_view.board] @ own_step).reshape(-1, 3)
-        at += len(board_view.residuals)
-    return moves_mm

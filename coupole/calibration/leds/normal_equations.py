@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
+from scipy.linalg.lapack import dpotri
 
 from coupole.calibration.leds.equations import (
     ORIENTATION,
@@ -40,55 +43,99 @@ class BoardPart:
     jacobian: Floats
     """[2 k, m + columns] of its spots, weighted."""
     columns: Indices
+    solution: Floats
+    """[m, columns + 1] own_normal^-1 [cross, side]."""
+
+    @property
+    def gain(self) -> Floats:
+        """[m, columns] step of the own parameters for a step of the shared ones, with the sign changed."""
+        return self.solution[:, :-1]
+
+    def own_step(self, shared_step: Floats) -> Floats:
+        """Step [m] of the own parameters that belongs to a step of all shared ones."""
+        return np.asarray(self.solution[:, -1] - self.gain @ shared_step[self.columns])
 
 
-def board_parts(
+@dataclass(frozen=True)
+class Reduced:
+    """Normal equations whose boards are eliminated."""
+
+    parts: list[BoardPart]
+    """[b]."""
+    matrix: Floats
+    """[s, s] of the shared parameters."""
+    side: Floats
+    """[s]."""
+
+    @cached_property
+    def _factor(self) -> tuple[Floats, bool]:
+        return cholesky_factor(self.matrix)
+
+    @cached_property
+    def shared_step(self) -> Floats:
+        """[s]."""
+        return np.asarray(cho_solve(self._factor, self.side))
+
+    @cached_property
+    def shared_covariance(self) -> Floats:
+        """[s, s]."""
+        inverse, _ = dpotri(self._factor[0], lower=True)  # its lower triangle
+        return np.asarray(np.tril(inverse) + np.tril(inverse, -1).T)
+
+    def half_solve(self, side: Floats) -> Floats:
+        """L^-1 side, with L the lower triangle for which matrix = L L^T; `side` is [s, m]."""
+        return np.asarray(solve_triangular(self._factor[0], side, lower=True))
+
+    def other_half_solve(self, side: Floats) -> Floats:
+        """L^-T side [s]; of the result of `half_solve` this gives matrix^-1 side."""
+        return np.asarray(solve_triangular(self._factor[0], side, lower=True, trans=1))
+
+
+def _board_parts(
     problem: Problem, state: LedState, linear: Linear, factors: Floats, weights: Floats
 ) -> Iterator[tuple[BoardPart, Floats]]:
     """The part of each board, and the residuals [2 k] of its spots."""
     off_table = between(state.base_from_board, problem.boards.base_from_board)
     tolerance = problem.stated_noise.tolerance_mm * factors[TOLERANCE]
-    root = np.sqrt(weights)[:, None] / factors[SPOTS]
-    for board, (rows, columns) in enumerate(zip(problem.sightings_of, problem.columns_of, strict=True)):
-        places = problem.boards.rows_of(board)
-        count, own_count = len(rows), 6 + 3 * len(places)
-        jacobian = np.zeros((count, 2, own_count + len(columns)))
-        jacobian[:, :, :6] = linear.by_board[rows]
-        at = np.arange(count)[:, None]
-        led = np.searchsorted(places, problem.place[rows])
-        view = np.searchsorted(columns[: -problem.of_camera : 6], 6 * problem.view[rows])
-        for axis in range(2):
-            jacobian[at, axis, 6 + 3 * led[:, None] + np.arange(3)] = linear.by_offset[rows, axis]
-            jacobian[at, axis, own_count + 6 * view[:, None] + np.arange(6)] = linear.by_view[rows, axis]
-        jacobian[:, :, -problem.of_camera :] = linear.by_camera[rows]
-        jacobian *= root[rows][:, :, None]
-        flat = jacobian.reshape(2 * count, jacobian.shape[2])
-        residuals = (linear.residuals[rows] * root[rows]).ravel()
-        normal, side = flat[:, :own_count].T @ flat, flat[:, :own_count].T @ residuals
-        prior_weights = np.concatenate([table_sigmas(problem), np.full(own_count - 6, tolerance)]) ** -2
+    of_table = table_sigmas(problem)
+    root = np.sqrt(weights)[:, None, None] / factors[SPOTS]
+    by_board, by_offset = linear.by_board * root, linear.by_offset * root
+    by_view, by_camera = linear.by_view * root, linear.by_camera * root
+    weighted_residuals = linear.residuals * root[:, :, 0]
+    for board, spots in enumerate(problem.spots_of):
+        rows, places = spots.rows, problem.boards.rows_of(board)
+        count, at = len(rows), np.arange(len(rows))
+        leds = np.zeros((count, 2, len(places), 3))
+        leds[at, :, spots.leds] = by_offset[rows]
+        views = np.zeros((count, 2, (len(spots.columns) - problem.of_camera) // 6, 6))
+        views[at, :, spots.views] = by_view[rows]
+        blocks = (by_board[rows], leds, views, by_camera[rows])
+        jacobian = np.concatenate(
+            [block.reshape(2 * count, math.prod(block.shape[2:])) for block in blocks], axis=1
+        )
+        own_count = 6 + 3 * len(places)
+        residuals = weighted_residuals[rows].ravel()
+        normal, side = jacobian[:, :own_count].T @ jacobian, jacobian[:, :own_count].T @ residuals
+        prior_weights = np.concatenate([of_table, np.full(own_count - 6, tolerance)]) ** -2
         normal[np.arange(own_count), np.arange(own_count)] += prior_weights
         side += prior_weights * np.concatenate([off_table[board], -state.offsets_mm[places].ravel()])
-        yield BoardPart(normal[:, :own_count], normal[:, own_count:], side, flat, columns), residuals
+        own_normal, cross = normal[:, :own_count], normal[:, own_count:]
+        solution = solve(own_normal, np.column_stack([cross, side]))
+        yield BoardPart(own_normal, cross, side, jacobian, spots.columns, solution), residuals
 
 
-def reduced_normal(
-    problem: Problem, state: LedState, factors: Floats, weights: Floats
-) -> tuple[list[BoardPart], list[Floats], Floats, Floats]:
-    """The boards' parts with G = own^-1 [cross, side] of each; the reduced normal matrix and right-hand side of
-    the shared parameters."""
+def reduced_normal(problem: Problem, state: LedState, factors: Floats, weights: Floats) -> Reduced:
+    """The normal equations at `state`, with the noise of each group [groups] and the weights of the spots [k]."""
     parts: list[BoardPart] = []
-    solutions: list[Floats] = []
     views, axes = 6 * len(problem.reported_poses), slice(6 * len(problem.reported_poses) + problem.of_camera, None)
     matrix, side = np.zeros((problem.shared_count, problem.shared_count)), np.zeros(problem.shared_count)
-    for part, residuals in board_parts(problem, state, linearisation(problem, state), factors, weights):
+    for part, residuals in _board_parts(problem, state, linearisation(problem, state), factors, weights):
         shared_jacobian = part.jacobian[:, len(part.own_normal) :]
-        solution = solve(part.own_normal, np.column_stack([part.cross, part.side]))
         matrix[np.ix_(part.columns, part.columns)] += (
-            shared_jacobian.T @ shared_jacobian - part.cross.T @ solution[:, :-1]
+            shared_jacobian.T @ shared_jacobian - part.cross.T @ part.gain
         )
-        side[part.columns] += shared_jacobian.T @ residuals - part.cross.T @ solution[:, -1]
+        side[part.columns] += shared_jacobian.T @ residuals - part.cross.T @ part.solution[:, -1]
         parts.append(part)
-        solutions.append(solution)
     pose_weights = (problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)) ** -2
     off = pose_weights * pose_errors(problem, state)
     by_axes = pose_weights[:, None] * problem.by_axes
@@ -101,7 +148,7 @@ def reduced_normal(
     camera = problem.prior_whiten.T @ problem.prior_whiten
     matrix[views:, views:] += camera
     side[views:] -= camera @ camera_step(problem, state)
-    return parts, solutions, matrix, side
+    return Reduced(parts, matrix, side)
 
 
 def centres_by_own(problem: Problem, state: LedState, board: int) -> Floats:

@@ -223,9 +223,11 @@ class BurstRunner:
                 edges = box.edges()
             complete = last_frames is not None and (taken_frames >= edges or last_frames.has_expired)
             if complete:
-                clock.sleep(readout_s)  # a surplus frame may still be in transfer
-                taken_frames = confirmed_frames = len(grabber)
+                in_transfer = Deadline(clock, readout_s)  # a surplus frame, exposed before now like all others
                 running.arm_after = self._arm.await_news()
+                clock.sleep(in_transfer.remaining_s)
+                taken_frames = confirmed_frames = len(grabber)
+                grabber.end_soon()
             if complete or (confirmed_frames, len(running.log)) != judged_at:
                 judged_at = (confirmed_frames, len(running.log))
                 running.match = self._match(running, taken_frames, complete=complete)

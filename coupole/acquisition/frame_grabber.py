@@ -102,6 +102,10 @@ class FrameGrabber:
         """Return the frame's slot; waits for its bytes to be written. Raises the error of writing."""
         return self._slots[frame].result()
 
+    def end_soon(self) -> None:
+        """Ask for no frame after the one that is being waited for. Does not wait; `stop` does."""
+        self._stopping.set()
+
     def stop(self) -> None:
         """Take no more frames; frames that were taken are still written. Never raises. Call it where a hang of
         camera or disk is noticed (`coupole.bounded`)."""

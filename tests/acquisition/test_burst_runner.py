@@ -15,7 +15,7 @@ from scripted_cell import Cell
 from coupole.acquisition import burst_runner
 from coupole.acquisition.arm_supervisor import ArmMovedError
 from coupole.acquisition.frame_matching import Match, match
-from coupole.devices import CameraStatistics, Frame
+from coupole.devices import Frame
 from coupole.errors import DeviceError, DeviceTimeout, StorageError
 
 BURST = whole_burst(40)
@@ -41,7 +41,7 @@ def test_a_camera_that_fails_after_its_last_frame_is_told_and_no_frame_is_lost(
     """The burst's loop has counted its frames by then, and asks no more."""
     cell = Cell(BURST, take(BURST))
     over, failed = threading.Event(), threading.Event()
-    take_one, statistics = cell.camera.next_frame, cell.camera.statistics
+    take_one, end_soon = cell.camera.next_frame, burst_runner.FrameGrabber.end_soon
 
     def next_frame(timeout_s: float) -> Frame | None:
         if over.is_set():
@@ -49,13 +49,13 @@ def test_a_camera_that_fails_after_its_last_frame_is_told_and_no_frame_is_lost(
             raise RuntimeError("a defect of the driver")
         return take_one(timeout_s)
 
-    def after_the_loop() -> CameraStatistics:
+    def after_the_loop(grabber: burst_runner.FrameGrabber) -> None:
         over.set()
         assert failed.wait(10.0)
-        return statistics()
+        end_soon(grabber)
 
     monkeypatch.setattr(cell.camera, "next_frame", next_frame)
-    monkeypatch.setattr(cell.camera, "statistics", after_the_loop)
+    monkeypatch.setattr(burst_runner.FrameGrabber, "end_soon", after_the_loop)
     with pytest.raises(RuntimeError, match="a defect of the driver"):
         cell.fire()
     assert {str(shot) for shot in cell.proven} == shots_of(cell)

@@ -171,10 +171,13 @@ def state_in_words(run: Path, processing: Processing, *, is_acquired: bool) -> t
 
 def basis_in_words(view_pictures: ViewPictures, *, is_simulated: bool) -> str:
     """Say on which data pictures rest, and when they were drawn."""
-    frames = f"{count(view_pictures.frames, 'frame')}; {count(view_pictures.triangles, 'triangle')} in this view"
-    when = f", while its frames arrive ({view_pictures.arrived} so far)" if view_pictures.arrived else ""
+    arrived = f" of the {view_pictures.arrived} that have arrived" if view_pictures.arrived else ""
+    frames = (
+        f"{count(view_pictures.frames, 'frame')}{arrived}; "
+        f"{count(view_pictures.triangles, 'triangle')} in this view"
+    )
     how = (
-        f"first look by a quick fit to this view alone{when} ({frames}); light from other surfaces is still in it"
+        f"first look by a quick fit to this view alone ({frames}); light from other surfaces is still in it"
         if view_pictures.kind == "first-look"
         else f"result of {view_pictures.fitted_views} of {count(view_pictures.views, 'view')} so far ({frames})"
     )

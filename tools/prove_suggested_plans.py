@@ -4,9 +4,9 @@
 
 There are three meshes, each with one of the assumed materials. For each, a plan is suggested and acquired, and its
 reflectance is fitted, by the user's commands. The medians of the stated uncertainties of the result are compared
-with the promised ones, and the share of the mesh's triangles that got a material. The rendered highlights have Fresnel's term. LEDs and arm are at their true positions,
-which differ from those in the records. Exits with 1 unless each ratio is within a fifth of 1; not with
-`--smallest`.
+with the promised ones. The share of the mesh's triangles that got a material is shown beside the promised share.
+The rendered highlights have Fresnel's term. LEDs and arm are at their true positions, which differ from those in
+the records. Exits with 1 unless each ratio is within a fifth of 1; not with `--smallest`.
 """
 
 from __future__ import annotations
@@ -102,8 +102,8 @@ def main() -> int:
                 for (promise, result), ratio in zip(pairs, ratios, strict=True)
             ]
             size = f"{len(promised_figures['views'])}, {promised_figures['leds']}"
-            known = f"{promised_figures['known_share']:.1%} / {known_share:.1%}"
-            table.add_row(name, material, size, known, *cells)
+            known_words = f"{promised_figures['known_share']:.1%} / {known_share:.1%}"
+            table.add_row(name, material, size, known_words, *cells)
     Console(soft_wrap=True, width=200).print(table, "promised / stated by the result", sep="\n")
     return int(is_off and not options.smallest)
 

@@ -147,8 +147,8 @@ def _fit_part(  # type: ignore[no-untyped-def]
     memory, indices = np.empty(COUNT * len(used_samples)), np.empty(len(used_samples), np.int64)
     xyz, product, frame = np.empty((3, len(used_samples))), np.zeros((COUNT, COUNT)), np.empty((3, 3))
     room, shape = np.empty(2 * COUNT * COUNT), (channels, len(used_samples))
-    own = (np.empty(COUNT), np.empty((COUNT, COUNT)), np.empty(shape), np.empty((channels, COUNT)))
-    plain = (np.empty(COUNT), np.empty((COUNT, COUNT)), np.empty(shape), np.empty((channels, COUNT)))
+    own_memory = (np.empty(COUNT), np.empty((COUNT, COUNT)), np.empty(shape), np.empty((channels, COUNT)))
+    plain_memory = (np.empty(COUNT), np.empty((COUNT, COUNT)), np.empty(shape), np.empty((channels, COUNT)))
     for triangle in range(count):
         _frame(normals[triangle], centres_mm[triangle], camera_mm, frame)
         end = np.int64(0)  # no literal, for which functions would be compiled once more
@@ -167,42 +167,53 @@ def _fit_part(  # type: ignore[no-untyped-def]
                     rows[k, number] *= z[number]
             if n >= COUNT:
                 gram(rows, product)
-            plain[0][:] = np.nan
+            plain_memory[0][:] = np.nan
             for fit in range(len(residuals)):
                 _fit_one(
                     rows, product, values[triangle], residuals[fit, triangle], indices[:n], first, penalties[fit],
-                    over[fit], room, own, plain, coefficients[fit, triangle, first:end],
+                    over[fit], room, own_memory, plain_memory, coefficients[fit, triangle, first:end],
                 )  # fmt: skip
 
 
 @kernel
 def _fit_one(  # type: ignore[no-untyped-def]
-    rows, product, values, residuals, sample_numbers, first, penalty, over, room, own, plain, coefficients
+    rows,
+    product,
+    values,
+    residuals,
+    sample_numbers,
+    first,
+    penalty,
+    over,
+    room,
+    own_memory,
+    plain_memory,
+    coefficients,
 ):
     """Fill `coefficients` [channels, COUNT + 1] with a fit to `residuals` of the samples `sample_numbers` [n], in
-    the channels from `first` on. `own` and `plain` are working memory. `plain` keeps the fit to the samples
-    themselves with its ridge, because another fit of the same channels may need it too."""
+    the channels from `first` on. `own_memory` and `plain_memory` are working memory. The latter keeps the fit to
+    the samples themselves with its ridge, because another fit of the same channels may need it too."""
     channels, n = len(coefficients), len(sample_numbers)
-    own, plain = _memory_of(own, channels, n), _memory_of(plain, channels, n)
+    own_fit, plain_fit = _memory_of(own_memory, channels, n), _memory_of(plain_memory, channels, n)
     if not over:
-        if _fit_targets(rows, product, values, sample_numbers, first, penalty, 1.0, room, plain):
-            assign_rows(coefficients[:, :COUNT], plain[3])
+        if _fit_targets(rows, product, values, sample_numbers, first, penalty, 1.0, room, plain_fit):
+            assign_rows(coefficients[:, :COUNT], plain_fit[3])
             coefficients[:, COUNT] = 1.0
         return
-    ridge, factor, targets, right = own
+    ridge, factor, targets, right = own_fit
     _take_samples(residuals, sample_numbers, first, targets)
     share = _held_by(targets, values, sample_numbers, first)
     ridge[:] = np.nan
-    if not _fit_targets(rows, product, residuals, sample_numbers, first, penalty, share, room, own):
+    if not _fit_targets(rows, product, residuals, sample_numbers, first, penalty, share, room, own_fit):
         return
     assign_rows(coefficients[:, :COUNT], right)
     coefficients[:, COUNT] = 1.0
     step = max(1, n // _LEFT_OUT)
     off = np.empty((2, channels, (n + step - 1) // step))
     left_out(rows, targets, right, factor, step, off[0])
-    if _fit_targets(rows, product, values, sample_numbers, first, penalty, LEAST_RESIDUAL, room, plain):
-        left_out(rows, plain[2], plain[3], plain[1], step, off[1])
-        _stack(off, plain[3], coefficients)
+    if _fit_targets(rows, product, values, sample_numbers, first, penalty, LEAST_RESIDUAL, room, plain_fit):
+        left_out(rows, plain_fit[2], plain_fit[3], plain_fit[1], step, off[1])
+        _stack(off, plain_fit[3], coefficients)
 
 
 @kernel

@@ -287,9 +287,7 @@ def test_a_view_is_drawn_while_its_frames_arrive_and_the_result_is_the_same(
     shutil.copytree(acquired.run_folder, run)
     journal = run / "journal.jsonl"
     lines = journal.read_text().splitlines(keepends=True)
-    lit = [
-        number for number, line in enumerate(lines) if json.loads(line).get("shot", "").startswith("side/led")
-    ]
+    lit = [number for number, line in enumerate(lines) if json.loads(line).get("shot", "").startswith("side/led")]
     end = lit[39] + 1
     journal.write_text("".join(lines[:end]))
     told: list[dict[str, Any]] = []
@@ -299,7 +297,7 @@ def test_a_view_is_drawn_while_its_frames_arrive_and_the_result_is_the_same(
         with journal.open("a") as file:
             file.write("".join(lines[end:]))
         assert ended.result(), told
-    assert (early.kind, early.arrived, early.frames) == ("first-look", 40, 40)
+    assert (early.kind, early.arrived_frames, early.frames) == ("first-look", 40, 40)
     assert [picture.title for picture in early.pictures][:2] == ["Normals", "Uncertainty of normals"]
     assert not [document for document in told if document.get("progress", {}).get("undrawn")]
     said_by("reflectance", run, "--out", tmp_path / "afterwards")

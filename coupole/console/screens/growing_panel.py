@@ -171,9 +171,11 @@ def state_in_words(run: Path, processing: Processing, *, is_acquired: bool) -> t
 
 def basis_in_words(view_pictures: ViewPictures, *, is_simulated: bool) -> str:
     """Say on which data pictures rest, and when they were drawn."""
-    arrived = f" of the {view_pictures.arrived} that have arrived" if view_pictures.arrived else ""
+    of_arrived = (
+        f" of the {view_pictures.arrived_frames} that have arrived" if view_pictures.arrived_frames else ""
+    )
     frames = (
-        f"{count(view_pictures.frames, 'frame')}{arrived}; "
+        f"{count(view_pictures.frames, 'frame')}{of_arrived}; "
         f"{count(view_pictures.triangles, 'triangle')} in this view"
     )
     how = (

@@ -17,9 +17,9 @@ from coupole.storage.durable import make_folder
 
 
 def extract_early(run: Path, view_name: str, folder: Path, most_leds: int, say: Said) -> int:
-    """Write the samples of a view to a folder of their own, in the form of a result, from at most `most_leds` of the
-    LEDs whose frames have arrived. Return the number of the view's frames under LEDs that have arrived; 0 if there is
-    none, and nothing is written. An error that `say` raises ends it. Raises as `reflectance_of`."""
+    """Write the samples of a view to a folder of their own, in the form of a result, from at most `most_leds` of
+    the LEDs whose frames have arrived. Return the number of the view's frames under LEDs that have arrived; 0 if
+    there is none, and nothing is written. An error that `say` raises ends it. Raises as `reflectance_of`."""
     request = RunRequest((run,))
     try:
         measured_run, geometry, radiometry = prepare_run(uuid4().hex, run.resolve(), request.sources)

@@ -218,9 +218,9 @@ class _Follower:
         return not self._looks or not (self._is_done or self._remaining_views())
 
     def _look_early(self) -> bool:
-        """Draw the newest view from some of its frames while the others arrive, each time that it has twice as many;
-        False if there is nothing to do. It is abandoned when a view is complete. A run that discards frames has no
-        such look, because preflight has not counted the disk space of its samples."""
+        """Draw the newest view from some of its frames while the others arrive, each time that it has twice as
+        many; False if there is nothing to do. It is abandoned when a view is complete. A run that discards frames
+        has no such look, because preflight has not counted the disk space of its samples."""
         view = self._newest_view
         if view in self._taken or self._arrived < self._next_early_look or self._run.discards:
             return False

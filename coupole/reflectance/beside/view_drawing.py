@@ -1,8 +1,9 @@
 """Draws normals and materials, with their uncertainty, while a run goes on.
 
 A view whose samples have just been taken gets a first look: a quick fit to some of its triangles and LEDs. While
-its frames arrive, it gets earlier ones, from some of the frames that are there. First looks are not part of the result. It uses one view alone, and its samples still contain light that was reflected by
-other surfaces. When the result of the views so far is complete, its maps replace the first looks.
+its frames arrive, it gets earlier ones, from some of the frames that are there. First looks are not part of the
+result. They use one view alone, and its samples still contain light that was reflected by other surfaces. When the
+result of the views so far is complete, its maps replace the first looks.
 """
 
 from __future__ import annotations
@@ -45,17 +46,17 @@ class Drawing:
     """Views of the plan."""
 
     def early_look(self, run: Path, view: str, say: Said) -> None:
-        """Draw a view while its frames arrive, from samples that are taken for this and then removed. An error that
-        `say` raises ends it. Raises as `reflectance_of`."""
+        """Draw a view while its frames arrive, from samples that are taken for this and then removed. An error
+        that `say` raises ends it. Raises as `reflectance_of`."""
         folder = self.result / FOLDER / "early"
         try:
-            arrived = extract_early(run, view, folder, _MOST_LEDS, say)
-            if arrived:
-                self.first_look(view, folder, arrived)
+            arrived_frames = extract_early(run, view, folder, _MOST_LEDS, say)
+            if arrived_frames:
+                self.first_look(view, folder, arrived_frames)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
-    def first_look(self, view: str, folder: Path | None = None, arrived: int = 0) -> None:
+    def first_look(self, view: str, folder: Path | None = None, arrived_frames: int = 0) -> None:
         """Draw a view by a quick fit to some of its samples, which are in the result's folder or in another one.
         Raises OSError."""
         folder = folder or self.result
@@ -82,7 +83,7 @@ class Drawing:
             fitted_views=1,
             views=self.views,
             frames=len(all_of_them),
-            arrived=arrived,
+            arrived_frames=arrived_frames,
             triangles=int(np.count_nonzero(np.isfinite(materials.alpha))),
             t=utc_now(),
             pictures=(),

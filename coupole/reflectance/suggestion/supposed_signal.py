@@ -75,11 +75,11 @@ class CameraNoise:
         triangle of one pixel has one channel. They are drawn from a tile without replacement."""
         tile = np.rint(self.channel_share / self.channel_share.min()).astype(np.int64)
         tiles, rest = np.divmod(np.floor(pixels + random.random(len(pixels))).astype(np.int64), tile.sum())
-        drawn = tiles[:, None] * tile
+        channel_counts = tiles[:, None] * tile
         for count in range(1, int(tile.sum())):
             rows = np.flatnonzero(rest == count)
-            drawn[rows] += random.multivariate_hypergeometric(tile, count, len(rows))
-        return drawn
+            channel_counts[rows] += random.multivariate_hypergeometric(tile, count, len(rows))
+        return channel_counts
 
 
 @dataclass(frozen=True)

@@ -136,9 +136,9 @@ def test_each_state_has_words(state: str, is_acquired: bool, remedy: str, words:
 
 def test_a_look_at_a_view_whose_frames_arrive_says_how_many_it_has() -> None:
     shown = ViewPictures(
-        view="top", kind="first-look", fitted_views=1, views=3, frames=43, arrived=128, triangles=5, pictures=(),
-        t="2026-01-01T10:20:30.000Z",
+        view="top", kind="first-look", fitted_views=1, views=3, frames=43, arrived_frames=128, triangles=5,
+        pictures=(), t="2026-01-01T10:20:30.000Z",
     )  # fmt: skip
     words = basis_in_words(shown, is_simulated=False)
     assert "this view alone (43 frames of the 128 that have arrived; 5 triangles in this view)" in words
-    assert "arrive" not in basis_in_words(shown.model_copy(update={"arrived": 0}), is_simulated=False)
+    assert "arrive" not in basis_in_words(shown.model_copy(update={"arrived_frames": 0}), is_simulated=False)

@@ -75,7 +75,7 @@ class CameraNoise:
         triangle of one pixel has one channel. They are drawn from a tile without replacement."""
         tile = np.rint(self.channel_share / self.channel_share.min()).astype(np.int64)
         tiles, rest = np.divmod(np.floor(pixels + random.random(len(pixels))).astype(np.int64), tile.sum())
-        channel_counts = tiles[:, None] * tile
+        channel_counts: NDArray[np.int64] = tiles[:, None] * tile
         for count in range(1, int(tile.sum())):
             rows = np.flatnonzero(rest == count)
             channel_counts[rows] += random.multivariate_hypergeometric(tile, count, len(rows))

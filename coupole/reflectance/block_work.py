@@ -6,6 +6,7 @@ result with the process that asks them. If a worker dies, another one repeats it
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -17,7 +18,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from coupole.errors import InputError
-from coupole.reflectance.run_result import MOST_ROWS
 
 Block = TypeVar("Block")
 Done = TypeVar("Done")
@@ -27,6 +27,9 @@ _AHEAD = 3
 """Blocks for each thread of the workers that are requested before their results are taken."""
 _BLOCKS_EACH, _FEWEST_ROWS, _MOST_ROWS = 8, 256, 1 << 12
 """Least number of blocks for each thread; least and largest number of triangles in a block."""
+_ROWS_OF_A_CORE = 1024
+"""Number of triangles of a block in this process, for each core: four parts for each thread, and arrays so small
+that the C library uses their memory again. For larger arrays the kernel clears new pages each time."""
 _MISSING = "--scheduler: dask.distributed is not installed here; `pip install 'coupole[cluster]'` adds it"
 
 
@@ -69,7 +72,7 @@ class Here:
     threads: int | None = None
 
     def most_rows(self, count: int) -> int:
-        return MOST_ROWS
+        return _ROWS_OF_A_CORE * len(os.sched_getaffinity(0))
 
     def map(self, function: Callable[[Block], Done], blocks: Iterable[Block]) -> Iterator[Done]:
         return map(function, blocks)

@@ -94,8 +94,9 @@ def subtract(
     say("inter-reflection", 1, 2 + len(missing))
     form_factors = paths.form_factors()
     say("inter-reflection", 2, 2 + len(missing))
+    of_leds = _ExitanceOfLeds(paths, form_factors, patch_reflectance)
     for number, view in enumerate(missing):
-        _subtract_view(view, paths, form_factors, patch_reflectance, diffuse[view.path.stem], say)
+        _subtract_view(view, paths, of_leds.exitance(view), patch_reflectance, diffuse[view.path.stem], say)
         say("inter-reflection", 3 + number, 2 + len(missing))
 
 
@@ -180,15 +181,34 @@ def _fill_medians(reflectances: Floats, samples: TriangleSamples) -> None:
     in_threads(fill, len(reflectances), part=_PART)
 
 
+class _ExitanceOfLeds:
+    """Exitance of patches under the LEDs of a view. Views under the same LEDs, one after the other, share it,
+    because it does not depend on the camera."""
+
+    def __init__(self, paths: PathsOfLight, form_factors: csr_array, apparent_reflectance: Floats) -> None:
+        self._paths, self._form_factors = paths, form_factors
+        self._apparent_reflectance = apparent_reflectance
+        self._leds: tuple[bytes, bytes] | None = None
+        self._exitance = np.empty((0, 0, 0), np.float32)
+
+    def exitance(self, view: ViewSamples) -> NDArray[np.float32]:
+        """[channels, patches, leds] of a view, by `radiosity`."""
+        leds = (view.led_mm.tobytes(), view.led_normals.tobytes())
+        if leds != self._leds:
+            direct = self._paths.direct(view.led_mm, view.led_normals)
+            self._exitance = radiosity(self._form_factors, direct, self._apparent_reflectance)
+            self._leds = leds
+        return self._exitance
+
+
 def _subtract_view(
     view: ViewSamples,
     paths: PathsOfLight,
-    form_factors: csr_array,
+    exitance: NDArray[np.float32],
     apparent_reflectance: Floats,
     diffuse: Floats,
     say: Said,
 ) -> None:
-    exitance = radiosity(form_factors, paths.direct(view.led_mm, view.led_normals), apparent_reflectance)
     gathers = paths.gathers(view.triangles)
     of_patches = apparent_reflectance[paths.scene.patch[view.triangles]] / np.pi
     diffuse = np.where(np.isfinite(diffuse), diffuse, of_patches)

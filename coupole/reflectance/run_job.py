@@ -31,7 +31,7 @@ from coupole.reflectance.discarded_frames import (
     read_back_or_drop,
     refuse_without_frames,
 )
-from coupole.reflectance.extraction.extraction import Geometry, extract_view, geometry_of
+from coupole.reflectance.extraction.extraction import Geometry, extract_view, forget_codes, geometry_of
 from coupole.reflectance.extraction.frames_for_check import write_frames
 from coupole.reflectance.extraction.measured_run import (
     MeasuredRun,
@@ -348,6 +348,7 @@ def _extract_one(
         if summary_path.exists()  # of samples whose pictures for the check alone are missing
         else extract_view(measured_run, geometry, radiometry, view, task.path, say, threads=threads)
     )
+    forget_codes()
     complete(task.frames_path, partial(write_frames, radiometry, view, task.path, task.left_out, threads))
     return summary, digest
 

@@ -146,11 +146,9 @@ def _fit_part(  # type: ignore[no-untyped-def]
     count, _, channels = values.shape
     memory, indices = np.empty(COUNT * len(used_samples)), np.empty(len(used_samples), np.int64)
     xyz, product, frame = np.empty((3, len(used_samples))), np.zeros((COUNT, COUNT)), np.empty((3, 3))
-    memories = (
-        np.empty(COUNT), np.empty(COUNT * COUNT), np.empty(2 * COUNT * COUNT),
-        np.empty(channels * len(used_samples)),
-        np.empty((channels, COUNT)),
-    )  # fmt: skip
+    room, shape = np.empty(2 * COUNT * COUNT), (channels, len(used_samples))
+    own_memory = (np.empty(COUNT), np.empty((COUNT, COUNT)), np.empty(shape), np.empty((channels, COUNT)))
+    plain_memory = (np.empty(COUNT), np.empty((COUNT, COUNT)), np.empty(shape), np.empty((channels, COUNT)))
     for triangle in range(count):
         _frame(normals[triangle], centres_mm[triangle], camera_mm, frame)
         end = np.int64(0)  # no literal, for which functions would be compiled once more
@@ -169,41 +167,86 @@ def _fit_part(  # type: ignore[no-untyped-def]
                     rows[k, number] *= z[number]
             if n >= COUNT:
                 gram(rows, product)
+            plain_memory[0][:] = np.nan
             for fit in range(len(residuals)):
                 _fit_one(
                     rows, product, values[triangle], residuals[fit, triangle], indices[:n], first, penalties[fit],
-                    over[fit], memories, coefficients[fit, triangle, first:end],
+                    over[fit], room, own_memory, plain_memory, coefficients[fit, triangle, first:end],
                 )  # fmt: skip
 
 
 @kernel
 def _fit_one(  # type: ignore[no-untyped-def]
-    rows, product, values, residuals, sample_numbers, first, penalty, over, memories, coefficients
+    rows,
+    product,
+    values,
+    residuals,
+    sample_numbers,
+    first,
+    penalty,
+    over,
+    room,
+    own_memory,
+    plain_memory,
+    coefficients,
 ):
     """Fill `coefficients` [channels, COUNT + 1] with a fit to `residuals` of the samples `sample_numbers` [n], in
-    the channels from `first` on."""
-    channels, n, size = len(coefficients), len(sample_numbers), min(len(sample_numbers), COUNT)
-    ridge, matrix, room, target_memory, solution = memories
-    targets, right = target_memory[: channels * n].reshape(channels, n), solution[:channels]
-    factor = matrix[: size * size].reshape(size, size)
+    the channels from `first` on. `own_memory` and `plain_memory` are working memory. The latter keeps the fit to
+    the samples themselves with its ridge, because another fit of the same channels may need it too."""
+    channels, n = len(coefficients), len(sample_numbers)
+    own_fit, plain_fit = _memory_of(own_memory, channels, n), _memory_of(plain_memory, channels, n)
+    if not over:
+        if _fit_targets(rows, product, values, sample_numbers, first, penalty, 1.0, room, plain_fit):
+            assign_rows(coefficients[:, :COUNT], plain_fit[3])
+            coefficients[:, COUNT] = 1.0
+        return
+    ridge, factor, targets, right = own_fit
     _take_samples(residuals, sample_numbers, first, targets)
-    share = _held_by(targets, values, sample_numbers, first) if over else 1.0
-    for k in range(COUNT):
-        ridge[k] = share * penalty[k]
-    if not _solve(rows, product, ridge, targets, room, factor, right):
+    share = _held_by(targets, values, sample_numbers, first)
+    ridge[:] = np.nan
+    if not _fit_targets(rows, product, residuals, sample_numbers, first, penalty, share, room, own_fit):
         return
     assign_rows(coefficients[:, :COUNT], right)
     coefficients[:, COUNT] = 1.0
-    if over:
-        step = max(1, n // _LEFT_OUT)
-        off = np.empty((2, channels, (n + step - 1) // step))
-        left_out(rows, targets, right, factor, step, off[0])
-        _take_samples(values, sample_numbers, first, targets)
-        for k in range(COUNT):
-            ridge[k] = LEAST_RESIDUAL * penalty[k]
-        if _solve(rows, product, ridge, targets, room, factor, right):
-            left_out(rows, targets, right, factor, step, off[1])
-            _stack(off, right, coefficients)
+    step = max(1, n // _LEFT_OUT)
+    off = np.empty((2, channels, (n + step - 1) // step))
+    left_out(rows, targets, right, factor, step, off[0])
+    if _fit_targets(rows, product, values, sample_numbers, first, penalty, LEAST_RESIDUAL, room, plain_fit):
+        left_out(rows, plain_fit[2], plain_fit[3], plain_fit[1], step, off[1])
+        _stack(off, plain_fit[3], coefficients)
+
+
+@kernel
+def _memory_of(memory, channels, samples):  # type: ignore[no-untyped-def]
+    """Return the working memory of a fit: its ridge [COUNT]; its factor; targets [channels, samples]; and
+    coefficients [channels, COUNT]."""
+    ridge, factor, targets, right = memory
+    size = min(samples, COUNT)
+    return (
+        ridge,
+        factor.reshape(-1)[: size * size].reshape(size, size),
+        targets.reshape(-1)[: channels * samples].reshape(channels, samples),
+        right[:channels],
+    )
+
+
+@kernel
+def _fit_targets(rows, product, values, sample_numbers, first, penalty, share, room, memory):  # type: ignore[no-untyped-def]
+    """Fit the functions to the samples `sample_numbers` [n] of `values`, in the channels from `first` on, with a
+    ridge that is `share` of the penalty. Return whether there is a solution. A `memory` with this ridge has the
+    solution already."""
+    ridge, factor, targets, right = memory
+    is_there = True
+    for k in range(COUNT):
+        is_there &= ridge[k] == share * penalty[k]
+        ridge[k] = share * penalty[k]
+    if is_there:
+        return True
+    _take_samples(values, sample_numbers, first, targets)
+    is_solved = _solve(rows, product, ridge, targets, room, factor, right)
+    if not is_solved:
+        ridge[:] = np.nan
+    return is_solved
 
 
 @kernel

@@ -71,6 +71,8 @@ class ViewPictures(_Plain):
     """Views of the plan."""
     frames: Annotated[int, Field(ge=0)]
     """Frames under one LED to which the materials were fitted."""
+    arrived_frames: Annotated[int, Field(ge=0)] = 0
+    """Frames under one LED that the view had then, while others still arrived; 0 if the view was complete."""
     triangles: Annotated[int, Field(ge=0)]
     """Triangles that were fitted."""
     t: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Iterator
 from functools import partial
@@ -86,3 +87,11 @@ def test_blocks_are_alike_and_enough_for_every_worker(triangles: int, most: int)
     sizes = [block.stop - block.start for block in blocks]
     assert max(sizes) <= most
     assert sizes[0] - sizes[-1] < len(sizes)
+
+
+def test_blocks_in_this_process_are_small_and_enough_for_every_core(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part of a thread has 256 triangles (`triangle_fit`). Arrays of a block are made anew for each block."""
+    for cores in (1, 8):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _, cores=cores: set(range(cores)))
+        most = Here().most_rows(1_000_000)
+        assert 2 * 256 * cores <= most <= 2048 * cores

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 import trimesh
 
+from coupole.reflectance import inter_reflection
 from coupole.reflectance.inter_reflection import radiosity, subtract
 from coupole.reflectance.light_paths import Ahead, direct_irradiance, points_of, scene_of, seen_from
 from coupole.reflectance.run_result import OBJECT, RunResult
@@ -139,3 +141,26 @@ def test_what_is_left_out_has_no_share_and_noise_grows_with_what_was_taken_off(t
         assert share[known].max() < 0.5
         np.testing.assert_allclose(u_own[known] * (1 - share[known]), 0.01, rtol=2e-3)
         assert int(file.attrs["samples"]) == known.sum()
+
+
+def test_views_under_the_same_leds_share_the_exitance_and_others_do_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    computed = []
+
+    def counted(*arguments: Any, **more: Any) -> np.ndarray:
+        computed.append(exitance := radiosity(*arguments, **more))
+        return exitance
+
+    monkeypatch.setattr(inter_reflection, "radiosity", counted)
+    subtract(folded(tmp_path / "same"), paper=False)
+    assert len(computed) == 1
+    moved = folded(tmp_path / "moved")
+    with h5py.File(moved.folder / "samples/second.h5", "r+") as file:
+        file["led_positions_mm"][0] += 50.0
+    subtract(moved, paper=False)
+    assert len(computed) == 3
+    first, second = (
+        h5py.File(tmp_path / name / "samples/second.h5")["inter_reflection"][()] for name in ("same", "moved")
+    )
+    assert not np.array_equal(first[:, 0], second[:, 0], equal_nan=True)

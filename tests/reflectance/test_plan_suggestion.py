@@ -132,12 +132,25 @@ def test_noise_of_a_mean_is_that_of_counted_electrons() -> None:
     noise = CameraNoise(np.zeros(1), np.array([gain_dn]), 10.0, 4000.0, np.array([0.5]))
 
     def variance(signal_dn: float, *exposures_us: int) -> float:
-        return float(noise.relative_variances(np.array([signal_dn / 0.01]), np.float64(8.0), exposures_us)[0])
+        return float(noise.relative_variances(np.array([signal_dn / 0.01]), np.array([4.0]), exposures_us)[0])
 
     assert variance(gain_dn * electrons, 10_000) == pytest.approx(1.0 / (4 * electrons))
     assert variance(gain_dn * electrons, 10_000, 20_000) == pytest.approx(1.0 / (4 * electrons * 3.0))
     assert math.isinf(variance(5.0, 10_000))
     assert math.isinf(variance(5000.0, 10_000))
+
+
+def test_triangles_of_less_than_a_tile_lack_channels() -> None:
+    """As a lattice of Bayer tiles under squares of one, four and six pixels has it; a camera of one channel lacks
+    none."""
+    random, zeros = np.random.default_rng(1), np.zeros(3)
+    noise = CameraNoise(zeros, zeros, 0.0, 1.0, np.array([0.25, 0.5, 0.25]))
+    for pixels, share in ((1.0, 0.0), (2.5, 0.25), (3.0, 0.5), (4.0, 1.0), (6.3, 1.0)):
+        drawn = noise.drawn_pixels(np.full(20_000, pixels), random)
+        assert (drawn > 0).all(axis=1).mean() == pytest.approx(share, abs=0.02)
+        np.testing.assert_allclose(drawn.mean(axis=0), pixels * noise.channel_share, rtol=0.03)
+    mono = CameraNoise(zeros, zeros, 0.0, 1.0, np.array([1.0]))
+    assert mono.drawn_pixels(np.full(20_000, 0.3), random).mean() == pytest.approx(0.3, abs=0.02)
 
 
 def told(known: list[float]) -> ViewInformation:

@@ -153,3 +153,15 @@ def test_a_model_that_leaves_everything_holds_coefficients_no_more_than_none() -
     used = np.ones(len(samples.led_mm), bool)
     alone, of_the_rest = fit_slices(samples, used, (RADIAL, None), (RESIDUAL, np.zeros_like(samples.values)))
     np.testing.assert_allclose(of_the_rest[..., :COUNT], alone, rtol=1e-5, atol=1e-5)
+
+
+def test_a_fit_that_another_needs_too_changes_no_bit(shiny: TriangleSamples) -> None:
+    """The fit to the samples themselves is made once, for both, and made anew for other channels and ridges."""
+    values = shiny.values.copy()
+    values[::2, ::3, 1] = np.nan
+    some = replace(shiny, values=values)
+    model = model_values(some, fit_triangles(some, ~HELD_OUT, 30.0))
+    alone = fit_slices(some, ~HELD_OUT, (RESIDUAL, model), threads=1)[0]
+    for other in (RADIAL, fewer(RADIAL, 16)):
+        _, together = fit_slices(some, ~HELD_OUT, (other, None), (RESIDUAL, model), threads=1)
+        np.testing.assert_array_equal(together, alone)

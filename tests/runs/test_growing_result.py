@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from PIL import Image
 from coupole.errors import StorageError
 from coupole.pages import palettes
 from coupole.reflectance import light_paths
+from coupole.reflectance.beside.follower import process_run
 from coupole.reflectance.beside.growing import Growth, fit_so_far
 from coupole.reflectance.beside.looking_ahead import look_ahead
 from coupole.reflectance.beside.page_maker import PageMaker
@@ -28,7 +30,7 @@ from coupole.reflectance.extraction import extraction
 from coupole.reflectance.light_paths import Ahead
 from coupole.reflectance.run_job import RunRequest, extract_beside, reflectance_of
 from coupole.reflectance.run_result import RunResult, read_view_samples
-from coupole.storage.growing_pictures import PICTURES, GrowingPictures, PictureShown, read_growing
+from coupole.storage.growing_pictures import PICTURES, GrowingPictures, PictureShown, ViewPictures, read_growing
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("hurried")]
 MEMORY_BYTES = 2_000_000_000
@@ -275,3 +277,32 @@ def test_what_is_known_ahead_and_given_up_changes_no_bit_of_the_result(
     reflectance_of(RunRequest((run,)), result, ahead=ahead)
     reflectance_of(RunRequest((run,)), tmp_path / "afterwards")
     same_result(result, tmp_path / "afterwards")
+
+
+def test_a_view_is_drawn_while_its_frames_arrive_and_the_result_is_the_same(
+    acquired: CellFolder, tmp_path: Path
+) -> None:
+    """Of the second view, 40 of 45 frames under LEDs are there; then the run goes on."""
+    run, result = tmp_path / acquired.run_folder.name, tmp_path / "result"
+    shutil.copytree(acquired.run_folder, run)
+    journal = run / "journal.jsonl"
+    lines = journal.read_text().splitlines(keepends=True)
+    lit = [number for number, line in enumerate(lines) if json.loads(line).get("shot", "").startswith("side/led")]
+    end = lit[39] + 1
+    journal.write_text("".join(lines[:end]))
+    told: list[dict[str, Any]] = []
+    with ThreadPoolExecutor(1) as pool:
+        ended = pool.submit(process_run, run, result, told.append, lambda work: work())
+        early = cells.wait_until(lambda: drawn_early(result, "side"), "a look at the second view")
+        with journal.open("a") as file:
+            file.write("".join(lines[end:]))
+        assert ended.result(), told
+    assert (early.kind, early.arrived_frames, early.frames) == ("first-look", 40, 40)
+    assert [picture.title for picture in early.pictures][:2] == ["Normals", "Uncertainty of normals"]
+    assert not [document for document in told if document.get("progress", {}).get("undrawn")]
+    said_by("reflectance", run, "--out", tmp_path / "afterwards")
+    same_result(result, tmp_path / "afterwards")
+
+
+def drawn_early(result: Path, view: str) -> ViewPictures | None:
+    return next((shown for shown in read_growing(result).of_views if shown.view == view), None)

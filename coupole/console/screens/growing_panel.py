@@ -171,7 +171,13 @@ def state_in_words(run: Path, processing: Processing, *, is_acquired: bool) -> t
 
 def basis_in_words(view_pictures: ViewPictures, *, is_simulated: bool) -> str:
     """Say on which data pictures rest, and when they were drawn."""
-    frames = f"{count(view_pictures.frames, 'frame')}; {count(view_pictures.triangles, 'triangle')} in this view"
+    of_arrived = (
+        f" of the {view_pictures.arrived_frames} that have arrived" if view_pictures.arrived_frames else ""
+    )
+    frames = (
+        f"{count(view_pictures.frames, 'frame')}{of_arrived}; "
+        f"{count(view_pictures.triangles, 'triangle')} in this view"
+    )
     how = (
         f"first look by a quick fit to this view alone ({frames}); light from other surfaces is still in it"
         if view_pictures.kind == "first-look"

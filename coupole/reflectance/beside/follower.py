@@ -29,6 +29,8 @@ from coupole.storage.run import Run
 
 _LOOK_EVERY_S = 0.2
 _TELL_EVERY_S = 1.0
+_FIRST_EARLY_LOOK = 32
+"""Frames under LEDs that a view has when it is drawn first. It is drawn again when it has twice as many."""
 _NONE_SO_FAR = "result so far and page to relight"
 Say = Callable[[dict[str, Any]], object]
 AtTheEnd = Callable[[Callable[[], None]], None]
@@ -117,6 +119,8 @@ class _Follower:
         self._newest_view, self._begun_view = "", ""
         """View of the newest proven frame; and the view whose visible surface is to be computed next, or an empty
         text."""
+        self._arrived, self._next_early_look = 0, _FIRST_EARLY_LOOK
+        """Proven frames under LEDs of the newest view, and their number at which the view is drawn next."""
         self._tried_views: tuple[str, ...] = ()
         """Views of the newest partial result that was made or tried."""
         self._may_give_up = True
@@ -134,7 +138,7 @@ class _Follower:
                     self._offer_safe()
                     if not self._take_samples():
                         self._looks = False
-                elif not (self._look_ahead() or self._grow()):
+                elif not (self._look_ahead() or self._look_early() or self._grow()):
                     time.sleep(_LOOK_EVERY_S)
                 self._read_news()
         finally:
@@ -162,6 +166,8 @@ class _Follower:
                     self._last_frame = event.t
                     if event.shot.is_shot and event.shot.view != self._newest_view:
                         self._begun_view = self._newest_view = event.shot.view
+                        self._arrived, self._next_early_look = 0, _FIRST_EARLY_LOOK
+                    self._arrived += event.shot.is_shot
                 case SessionStopped():
                     self._is_done, self._looks = event.outcome == "done", True
                 case ViewBegun() | ViewSealed():
@@ -210,6 +216,26 @@ class _Follower:
     def _may_look_ahead(self) -> bool:
         self._read_news()
         return not self._looks or not (self._is_done or self._remaining_views())
+
+    def _look_early(self) -> bool:
+        """Draw the newest view from some of its frames while the others arrive, each time that it has twice as
+        many; False if there is nothing to do. It is abandoned when a view is complete. A run that discards frames
+        has no such look, because preflight has not counted the disk space of its samples."""
+        view = self._newest_view
+        if view in self._taken or self._arrived < self._next_early_look or self._run.discards:
+            return False
+        self._next_early_look = 2 * self._arrived
+
+        def go_on(_detail: str, _done_count: int, _of: int) -> None:
+            if not self._may_look_ahead():
+                raise _ViewsCameError
+
+        def draw() -> None:
+            with contextlib.suppress(_ViewsCameError):
+                self._drawing.early_look(self._run.folder, view, go_on)
+
+        self._draw(f"pictures of {view}", draw)
+        return True
 
     def _grow(self) -> bool:
         """Make a result of the views so far, if it has more views than the newest one; False if there is nothing

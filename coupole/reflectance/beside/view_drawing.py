@@ -1,12 +1,14 @@
 """Draws normals and materials, with their uncertainty, while a run goes on.
 
-A view whose samples have just been taken gets a first look: a quick fit to some of its triangles and LEDs.
-It is not part of the result. It uses one view alone, and its samples still contain light that was reflected by
-other surfaces. When the result of the views so far is complete, its maps replace the first looks.
+A view whose samples have just been taken gets a first look: a quick fit to some of its triangles and LEDs. While
+its frames arrive, it gets earlier ones, from some of the frames that are there. First looks are not part of the
+result. They use one view alone, and its samples still contain light that was reflected by other surfaces. When the
+result of the views so far is complete, its maps replace the first looks.
 """
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from io import BytesIO
@@ -19,6 +21,8 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from coupole.pages.page_parts import Map
+from coupole.reflectance.beside.early_samples import extract_early
+from coupole.reflectance.block_work import Said
 from coupole.reflectance.fits import GGX_NORMAL
 from coupole.reflectance.result_folder import read_settings
 from coupole.reflectance.result_pages.material_maps import MapValues, MaterialMaps, material_maps
@@ -26,6 +30,7 @@ from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples, re
 from coupole.reflectance.triangle_fit import TriangleMaterials
 from coupole.storage.growing_pictures import GrowingPictures, PictureShown, ViewPictures, new_picture_name
 from coupole.storage.line_file import utc_now
+from coupole.storage.processing import FOLDER
 
 _MOST_TRIANGLES, _MOST_LEDS, _MOST_WIDTH_PX = 5000, 64, 480
 _SCAN_NOISE_UM = 30.0
@@ -40,13 +45,26 @@ class Drawing:
     views: int
     """Views of the plan."""
 
-    def first_look(self, view: str) -> None:
-        """Draw a view by a quick fit to some of its samples. Raises OSError."""
-        samples_of_view = read_view_samples(self.result / "samples" / f"{view}.h5")
+    def early_look(self, run: Path, view: str, say: Said) -> None:
+        """Draw a view while its frames arrive, from samples that are taken for this and then removed. An error
+        that `say` raises ends it. Raises as `reflectance_of`."""
+        folder = self.result / FOLDER / "early"
+        try:
+            arrived_frames = extract_early(run, view, folder, _MOST_LEDS, say)
+            if arrived_frames:
+                self.first_look(view, folder, arrived_frames)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def first_look(self, view: str, folder: Path | None = None, arrived_frames: int = 0) -> None:
+        """Draw a view by a quick fit to some of its samples, which are in the result's folder or in another one.
+        Raises OSError."""
+        folder = folder or self.result
+        samples_of_view = read_view_samples(folder / "samples" / f"{view}.h5")
         rows = slice(0, None, -(-len(samples_of_view.triangles) // _MOST_TRIANGLES))
         led_mask = np.zeros(len(samples_of_view.leds), np.bool_)
         led_mask[:: -(-len(led_mask) // _MOST_LEDS)] = True
-        result = RunResult(self.result)
+        result = RunResult(folder)
         samples = result.view_samples(samples_of_view, rows, led_mask)
         all_of_them = np.ones(np.count_nonzero(led_mask), np.bool_)
         materials = GGX_NORMAL.fit(samples, all_of_them, _SCAN_NOISE_UM, None)
@@ -65,6 +83,7 @@ class Drawing:
             fitted_views=1,
             views=self.views,
             frames=len(all_of_them),
+            arrived_frames=arrived_frames,
             triangles=int(np.count_nonzero(np.isfinite(materials.alpha))),
             t=utc_now(),
             pictures=(),

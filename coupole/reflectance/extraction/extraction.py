@@ -115,7 +115,6 @@ def extract_view(
             digest.add_attributes(file)
 
     complete(path, write, unless=path.with_suffix(".json"))
-    _newest_codes.begin("")
     summary = {
         "view": path.stem,
         "pixels": surface.pixels,
@@ -190,6 +189,11 @@ def find_codes_ahead(
                 break
             if not _newest_codes.keep(positions, lamp_codes(geometry.mesh, facets, positions, pool)):
                 break
+
+
+def forget_codes() -> None:
+    """Free the memory of what `find_codes_ahead` has found, when the samples of its view are there."""
+    _newest_codes.begin("")
 
 
 def shadows_of(work: ViewPass, geometry: Geometry) -> Callable[[slice, Executor], NDArray[np.uint8]]:

@@ -70,7 +70,8 @@ def drawn_samples(
     random: np.random.Generator,
 ) -> TriangleSamples:
     """Return samples of some of the parts. The places and the power of the LEDs have errors against the
-    records."""
+    records. Each part has a triangle with whole pixels: where a view gives it no pixel of a channel, it has no
+    sample of this channel, and so no material from this view."""
     leds_mm, channels = surface.leds_mm[led_rows], surface.signal_per_f.shape[2]
     true_leds_mm = leds_mm + surface.u_led_mm * random.standard_normal(leds_mm.shape)
     own_power = 1.0 + surface.u_own[led_rows] * random.standard_normal(len(led_rows))
@@ -79,8 +80,9 @@ def drawn_samples(
     for number, view in enumerate(views):
         lit_by_these = replace(view, is_lit=view.is_lit[:, led_rows])
         f, cosines = reflectances(surface, lit_by_these, material, true_leds_mm, rows)
+        channel_pixels = surface.noise.drawn_pixels(view.pixels[rows], random)
         variances = surface.noise.relative_variances(
-            per_f * f[:, :, None], view.pixels[rows][:, None], exposures_us
+            per_f * f[:, :, None], channel_pixels[:, None].astype(np.float64), exposures_us
         )
         variances[~np.isfinite(variances)] = np.nan
         noisy = 1.0 + np.sqrt(variances) * random.standard_normal(variances.shape)

@@ -52,20 +52,34 @@ class CameraNoise:
     channel_share: Floats
     """[channels] share of the pixels that have this colour."""
 
-    def relative_variances(self, signal_dn_per_s: Floats, pixels: Floats, exposures_us: Sequence[int]) -> Floats:
+    def relative_variances(
+        self, signal_dn_per_s: Floats, channel_pixels: Floats, exposures_us: Sequence[int]
+    ) -> Floats:
         """[..., channels] relative variances, from noise, of triangles' mean signals. They use all exposures in
-        which a signal is neither too dark nor saturated, and are infinite without such an exposure. `pixels` [...]
-        is the number of all pixels of a triangle."""
+        which a signal is neither too dark nor saturated, and are infinite without such an exposure.
+        `channel_pixels` [..., channels] is the number of a triangle's pixels of each channel."""
         precision = np.zeros(signal_dn_per_s.shape)
         for exposure_us in exposures_us:
             signal_dn = signal_dn_per_s * exposure_us * 1e-6
             is_used = (signal_dn > self.least_dn) & (signal_dn < self.most_dn)
             electrons_weight = signal_dn**2 / (self.in_dark_dn2 + self.gain_dn * signal_dn)
             precision += np.where(is_used, electrons_weight, 0.0)
-        precision *= np.asarray(pixels)[..., None] * self.channel_share
+        precision *= channel_pixels
         with np.errstate(divide="ignore"):
             variances: Floats = 1.0 / precision
         return variances
+
+    def drawn_pixels(self, pixels: Floats, random: np.random.Generator) -> NDArray[np.int64]:
+        """[n, channels] pixels of each channel on triangles that cover `pixels` [n] on average. A triangle covers
+        whole pixels, and the pixels beside each other that complete no tile of the Bayer pattern lack channels: a
+        triangle of one pixel has one channel. They are drawn from a tile without replacement."""
+        tile = np.rint(self.channel_share / self.channel_share.min()).astype(np.int64)
+        tiles, rest = np.divmod(np.floor(pixels + random.random(len(pixels))).astype(np.int64), tile.sum())
+        channel_counts: NDArray[np.int64] = tiles[:, None] * tile
+        for count in range(1, int(tile.sum())):
+            rows = np.flatnonzero(rest == count)
+            channel_counts[rows] += random.multivariate_hypergeometric(tile, count, len(rows))
+        return channel_counts
 
 
 @dataclass(frozen=True)

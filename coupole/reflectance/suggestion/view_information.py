@@ -90,7 +90,8 @@ def information_of(
     bread, meat = np.zeros((2, len(numbers), len(parts), UNKNOWNS, UNKNOWNS))
     f = reflectances(surface, view, material, surface.leds_mm, parts)[0]
     signal_dn_per_s = surface.signal_per_f[parts] * f[:, :, None]
-    by_channel = surface.noise.relative_variances(signal_dn_per_s, view.pixels[parts][:, None], exposures_us)
+    channel_pixels = view.pixels[parts][:, None, None] * surface.noise.channel_share
+    by_channel = surface.noise.relative_variances(signal_dn_per_s, channel_pixels, exposures_us)
     channels = by_channel.shape[2]
     variances = by_channel.sum(axis=2) / channels**2 + surface.u_own**2
     variances[~np.isfinite(f)] = np.inf

@@ -17,8 +17,9 @@ from cells import CellFolder
 from coupole.console.runs import run_watch
 from coupole.console.runs.run_files import RunFiles
 from coupole.console.runs.run_watch import RunWatch
-from coupole.console.screens.growing_panel import state_in_words
+from coupole.console.screens.growing_panel import basis_in_words, state_in_words
 from coupole.errors import InputError
+from coupole.storage.growing_pictures import ViewPictures
 from coupole.storage.line_file import utc_now
 from coupole.storage.processing import Processing, Progress, tell
 
@@ -131,3 +132,13 @@ def test_each_state_has_words(state: str, is_acquired: bool, remedy: str, words:
     told, kind = state_in_words(Path("/runs/a"), processing, is_acquired=is_acquired)
     assert words in told
     assert kind == sign
+
+
+def test_a_look_at_a_view_whose_frames_arrive_says_how_many_it_has() -> None:
+    shown = ViewPictures(
+        view="top", kind="first-look", fitted_views=1, views=3, frames=43, arrived_frames=128, triangles=5,
+        pictures=(), t="2026-01-01T10:20:30.000Z",
+    )  # fmt: skip
+    words = basis_in_words(shown, is_simulated=False)
+    assert "this view alone (43 frames of the 128 that have arrived; 5 triangles in this view)" in words
+    assert "arrive" not in basis_in_words(shown.model_copy(update={"arrived_frames": 0}), is_simulated=False)

@@ -104,8 +104,8 @@ def strata_of(result: RunResult, view: ViewSamples, texels: ViewTexels) -> NDArr
     with h5py.File(view.path, "r") as file:
         codes = file["codes"][()]
         shares = file[INTER_REFLECTION][()].astype(float).mean(axis=2) if INTER_REFLECTION in file else 0.0 * codes
-    is_reached = codes == REACHED
-    mean_share = np.where(is_reached, shares, 0.0).sum(axis=1) / np.maximum(is_reached.sum(axis=1), 1)
+    is_known = (codes == REACHED) & np.isfinite(shares)
+    mean_share = np.where(is_known, shares, 0.0).sum(axis=1) / np.maximum(is_known.sum(axis=1), 1)
     ways = view.camera_mm - surface.places_mm.reshape(-1, 3)[texels.pixels]
     cosines = np.sum(ways * surface.normals[triangle], axis=1) / np.linalg.norm(ways, axis=1)
     stratum = np.where((codes == PENUMBRA).mean(axis=1)[triangle] > _EDGE_SHARE, 1, 0)

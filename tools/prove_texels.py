@@ -13,14 +13,14 @@ of their 95 % intervals that contain the truth; and seconds, memory and disk, wi
 Then five small objects are acquired (`painted_objects.py`: paint and bumps of 0.2 to 1 mm on triangles of 0.3 mm,
 pixels of 0.05 mm). For each object and size, the following is printed: the share of 95 % intervals of kd and of
 tilts that contain the truth, by strata; how many dB pictures of left-out LEDs are better than by the best fit of
-triangles, and which fit `relight` takes; and the contrast of a pattern of 5 lines per mm in these pictures, relative
-to that in the frames, for texels and for triangles.
+triangles, and which fit `relight` takes; and the contrast of a pattern of 5 lines per mm in these pictures,
+relative to that in the frames, for texels and for triangles.
 
-The exit code is 1 if less than 80 % of the intervals of kd of the relief contain the truth, if the forecast of memory
-was too small by more than half, or if an object has less than it must: 90 % of the intervals in a stratum of at least
-500 texels and, with single pixels and paint, 3 dB and four fifths of the contrast. `relight` must take what is
-better. More than 99 % of the intervals are told, as these are too wide. With `--smallest` the figures are not
-meaningful, and the exit code is 0.
+The exit code is 1 if less than 80 % of the intervals of kd of the relief contain the truth, if the forecast of
+memory was too small by more than half, or if an object has less than it must: 90 % of the intervals in a stratum of
+at least 500 texels and, with single pixels and paint, 3 dB and four fifths of the contrast. `relight` must take
+what is better. More than 99 % of the intervals are told, as these are too wide. With `--smallest` the figures are
+not meaningful, and the exit code is 0.
 """
 
 from __future__ import annotations

@@ -79,8 +79,8 @@ class TexelReader:
         return int(np.count_nonzero(self.grid.triangle >= 0))
 
     def bend(self) -> NDArray[np.float32]:
-        """[rows, columns] variance, rad^2, of each tilt of a texel, because its pixels see triangles that are turned
-        to each other, and under some LEDs not all of the pixels are lit: half of the variance of their mean."""
+        """[rows, columns] variance, rad^2, of each tilt of a texel whose pixels see triangles that are turned to
+        each other: half of the variance of their mean, because under some LEDs not all of the pixels are lit."""
         texel = self.grid.texel_of_pixel.reshape(-1)
         pixels = np.flatnonzero(texel >= 0)
         seen_normals = self.mesh_normals[self._triangle_of_pixel.reshape(-1)[pixels]]
@@ -92,8 +92,8 @@ class TexelReader:
         return np.where(self.grid.triangle >= 0, bend, np.float32(0.0))
 
     def channel_offsets(self) -> NDArray[np.float32]:
-        """[rows, columns, channels, 2] middle of each channel's pixels from the middle of all pixels of a texel, to
-        the right and down, in widths of a texel."""
+        """[rows, columns, channels, 2] middle of each channel's pixels from the middle of all pixels of a texel,
+        to the right and down, in widths of a texel."""
         texel, width = self.grid.texel_of_pixel, self.grid.triangle.size
         row, column = np.nonzero(texel >= 0)
         number, channel = texel[row, column], self._radiometry.channel[row, column]

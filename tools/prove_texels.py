@@ -17,8 +17,8 @@ triangles, and which fit `relight` takes; and the contrast of a pattern of 5 lin
 relative to that in the frames, for texels and for triangles.
 
 The exit code is 1 if less than 80 % of the intervals of kd of the relief contain the truth, if the forecast of
-memory was too small by more than half, or if an object has less than it must: 90 % of the intervals in a stratum of
-at least 500 texels and, with single pixels and paint, 3 dB and four fifths of the contrast. `relight` must take
+memory was too small by more than half, or if an object has less than it must: 90 % of the intervals in a stratum
+of at least 500 texels and, with single pixels and paint, 3 dB and four fifths of the contrast. `relight` must take
 what is better. More than 99 % of the intervals are told, as these are too wide. With `--smallest` the figures are
 not meaningful, and the exit code is 0.
 """
@@ -67,7 +67,9 @@ _QUANTILE = 1.96
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", nargs="+", default=["auto", "0.8", "1.6"], help="as --texels takes them")
+    parser.add_argument(
+        "--sizes", nargs="*", default=["auto", "0.8", "1.6"], help="as --texels takes them; of the relief"
+    )
     parser.add_argument("--every", type=int, default=24, help="LEDs are lit, of the dome's 1080")
     parser.add_argument("--objects", nargs="*", choices=list(OBJECTS), default=list(OBJECTS))
     parser.add_argument("--object-sizes", nargs="+", default=["auto", "0.1"], help="as --texels takes them")
@@ -76,8 +78,8 @@ def main() -> int:
     add_smallest(parser, sizes=["1.6"], every=48, objects=["ridge"], object_sizes=["0.2"])
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="coupole-texels-") as folder:
-        relief_run = acquire(Path(folder), arguments.every)
-        rows = [judge(relief_run, size) for size in arguments.sizes]
+        relief_run = acquire(Path(folder) / "relief", arguments.every) if arguments.sizes else None
+        rows = [judge(relief_run, size) for size in arguments.sizes if relief_run is not None]
         painted_rows = []
         for name in arguments.objects:
             acquired = acquire_painted(Path(folder) / name, name, every=arguments.every, seed=arguments.seed)
@@ -99,6 +101,7 @@ def main() -> int:
 
 
 def acquire(folder: Path, every: int) -> Acquired:
+    folder.mkdir()
     material = {"diffuse": DIFFUSE, "f0": F0, "roughness": ROUGHNESS}
     cell = shipped_cell(folder, material=material, shading="pixel", detail=list(DETAIL))
     cell.write(lights={"kind": "every", "every": every})

@@ -1,4 +1,4 @@
-"""Uncertainty of texels: errors that LEDs share, light from other surfaces, meshes that turn, and colours of squares."""
+"""Uncertainty of texels: errors that LEDs share, light from other surfaces, bent meshes, colours of squares."""
 
 from __future__ import annotations
 
@@ -57,16 +57,16 @@ def tilts_off(fit: PixelMaterials) -> np.ndarray:
     return np.asarray(np.einsum("nki,ni->nk", steps, NORMAL - fit.normals))
 
 
-@pytest.mark.parametrize(("count", "u_group", "u_own"), [(30, 0.04, 0.02), (45, 0.05, 0.03)])
-def test_intervals_hold_errors_that_neighbouring_leds_share(count: int, u_group: float, u_own: float) -> None:
-    """Eight groups and five unknowns: residuals alone are too small, because the fit follows each group."""
+@pytest.mark.parametrize(("count", "u_group"), [(60, 0.08), (82, 0.15)])
+def test_intervals_hold_errors_that_neighbouring_leds_share(count: int, u_group: float) -> None:
+    """Eight groups and five unknowns: the fit follows each group, so residuals alone hold 91 to 93 % of tilts."""
     lights, random, pixels = dome(count), np.random.default_rng(1), 1500
     of_groups = random.standard_normal((pixels, lights.group.max() + 1))[:, lights.group]
-    errors = u_group * of_groups + u_own * random.standard_normal((pixels, count))
+    errors = u_group * of_groups + 0.02 * random.standard_normal((pixels, count))
     fit = fitted(values_of(lights) * (1 + errors), lights)
     u = np.sqrt(np.einsum("nii->ni", fit.covariance))
-    assert 0.90 < np.mean(np.abs(tilts_off(fit)) < 1.96 * u[:, :2]) < 0.99
-    assert 0.90 < np.mean(np.abs(fit.logs[:, 0] - math.log(KD)) < 1.96 * u[:, 2]) < 0.99
+    assert 0.95 < np.mean(np.abs(tilts_off(fit)) < 1.96 * u[:, :2]) < 0.99
+    assert 0.95 < np.mean(np.abs(fit.logs[:, 0] - math.log(KD)) < 1.96 * u[:, 2]) < 0.99
 
 
 def view_with_shares(path: Path, lights: Lights, shares: np.ndarray) -> Any:
@@ -89,7 +89,7 @@ def test_a_normal_in_a_fold_is_as_uncertain_as_light_from_the_other_wall_turns_i
     fit = fitted(wrong[None], lights)
     turned = np.linalg.norm(tilts_off(fit)[0])
     assert np.degrees(turned) > 0.3
-    assert math.sqrt(np.trace(covariance[0, :2, :2])) == pytest.approx(turned, rel=0.15)
+    assert math.sqrt(np.trace(covariance[0, :2, :2])) == pytest.approx(turned, rel=0.3)
     assert math.sqrt(np.trace(covariance[1, :2, :2])) < 0.1 * turned
 
 

@@ -42,7 +42,7 @@ class Acquired:
     """A run of an object, its records, and its result without texels."""
 
     name: str
-    """One of `OBJECTS`, or another object."""
+    """Its name in `OBJECTS`, or that of another object."""
     run: Path
     records: Path
     result: Path
@@ -52,7 +52,7 @@ class Acquired:
         return RunRequest((self.run,), None, records_named([self.records]))
 
     @property
-    def painted(self) -> Painted:
+    def painted_object(self) -> Painted:
         return OBJECTS[self.name]
 
 
@@ -63,35 +63,35 @@ def acquire_painted(folder: Path, name: str, *, every: int, seed: int) -> Acquir
     outcome = cell.acquire()
     if outcome.code:
         raise RuntimeError(outcome.err)
-    acquired = Acquired(name, cell.run_folder, folder / "records", folder / "result")
-    reflectance_of(acquired.request, acquired.result)
-    return acquired
+    object_run = Acquired(name, cell.run_folder, folder / "records", folder / "result")
+    reflectance_of(object_run.request, object_run.result)
+    return object_run
 
 
-def judge_painted(acquired: Acquired, out: Path, size: TexelSize) -> dict[str, Any]:
+def judge_painted(object_run: Acquired, out: Path, size: TexelSize) -> dict[str, Any]:
     """Add texels to the result in `out`, a copy of the object's, and compare them with the truth."""
-    about = add_texels(acquired.request, out, size)
+    about = add_texels(object_run.request, out, size)
     result = RunResult(out)
-    poses = {view.name: view.base_from_camera for view in read_runs(acquired.request, "truth")[0].views}
+    poses = {view.name: view.base_from_camera for view in read_runs(object_run.request, "truth")[0].views}
     forget()
-    (other,) = set(about["mae"]) - {TEXELS}
+    (triangle_fit,) = set(about["mae"]) - {TEXELS}
     psnr_db = about["held_out_psnr_db"]
     parts: dict[str, list[tuple[Floats, ...]]] = {stratum: [] for stratum in STRATA}
     seen_lines: dict[str, Floats] = {name: np.zeros(2) for name in (TEXELS, "ggx_normal")}
     for view in result.views:
-        truth = truth_of(result, view, poses[view.view], acquired.painted.detail)
-        _add_errors(parts, result, view, truth, np.array(acquired.painted.material["diffuse"]))
-        if acquired.painted.detail:
+        truth = truth_of(result, view, poses[view.view], object_run.painted_object.detail)
+        _add_errors(parts, result, view, truth, np.array(object_run.painted_object.material["diffuse"]))
+        if object_run.painted_object.detail:
             _add_lines(seen_lines, result, view, truth)
     return {
-        "object": acquired.name,
+        "object": object_run.name,
         "size": size.text,
         "texels": sum(about["pixels"].values()),
-        "strata": {stratum: _held(part) for stratum, part in parts.items() if part},
+        "strata": {stratum: _shares_held(part) for stratum, part in parts.items() if part},
         "psnr_db": psnr_db[TEXELS],
-        "over_triangles_db": psnr_db[TEXELS] - psnr_db[other],
-        "triangles": other,
-        "is_better": about["mae"][TEXELS] < about["mae"][other],
+        "over_triangles_db": psnr_db[TEXELS] - psnr_db[triangle_fit],
+        "triangles": triangle_fit,
+        "is_better": about["mae"][TEXELS] < about["mae"][triangle_fit],
         "chosen": best_with_texels(result),
         "lines": {name: float(sums[0] / sums[1]) if sums[1] else None for name, sums in seen_lines.items()},
     }
@@ -121,8 +121,8 @@ def _add_errors(
     texels = read_view_texels(result, view)
     paint, true_normals = means_of(texels, truth)
     row, column = np.divmod(texels.pixels, SIZE_PX[0])
-    own = BAYER[row % 2, column % 2][:, None]
-    channel = own if texels.side_px == 1 else np.broadcast_to(np.arange(3), (len(own), 3))
+    own_channel = BAYER[row % 2, column % 2][:, None]
+    channel = own_channel if texels.side_px == 1 else np.broadcast_to(np.arange(3), (len(own_channel), 3))
     off = np.log(np.take_along_axis(texels.kd, channel, 1) * np.pi / diffuse[channel]) - np.log(paint)[:, None]
     variances = texels.covariance[:, VARIANCES]
     u_kd = np.sqrt(variances[:, 2] + np.sum(np.square(texel_uncertainty(result, view))))
@@ -137,7 +137,7 @@ def _add_errors(
             )
 
 
-def _held(part: list[tuple[Floats, ...]]) -> dict[str, float]:
+def _shares_held(part: list[tuple[Floats, ...]]) -> dict[str, float]:
     off, off_of_u, tilts, tilts_of_u = (np.concatenate([view[k] for view in part]) for k in range(4))
     return {
         "texels": len(off),
@@ -201,10 +201,13 @@ def print_painted(rows: list[dict[str, Any]]) -> None:
         lines = " and ".join("-" if value is None else f"{value:.2f}" for value in row["lines"].values())
         over = f"{row['over_triangles_db']:.1f} ({row['triangles']})"
         for stratum, part in row["strata"].items():
-            held = [f"{part[name]:.1%}" + " wide" * (part[name] > MOST_HELD) for name in ("kd_held", "tilts_held")]
+            shares = [
+                f"{part[name]:.1%}" + " wide" * (part[name] > MOST_HELD) for name in ("kd_held", "tilts_held")
+            ]
             cells = (
                 f"{row['object']}, {row['size']}", stratum, str(part["texels"]),
-                f"{part['kd_off_percent']:.1f} %, {held[0]}", f"{part['normals_off_deg']:.2f} degrees, {held[1]}",
+                f"{part['kd_off_percent']:.1f} %, {shares[0]}",
+                f"{part['normals_off_deg']:.2f} degrees, {shares[1]}",
                 over, row["chosen"], lines,
             )  # fmt: skip
             print(f"| {' | '.join(cells)} |")

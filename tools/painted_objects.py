@@ -92,11 +92,11 @@ OBJECTS = {
 }
 
 
-def painted_cell(folder: Path, painted: Painted, *, every: int, seed: int) -> CellFolder:
+def painted_cell(folder: Path, painted_object: Painted, *, every: int, seed: int) -> CellFolder:
     """Write a cell with an object, and its records, which have no errors, to a folder. The arm repeats its places
     exactly: 10 um are a fifth of a pixel, and the truth would be that of other places than the pixels see."""
     cell = CellFolder(folder, speed=10.0)
-    mesh_of(painted.height_mm).export(folder / "object.ply")
+    mesh_of(painted_object.height_mm).export(folder / "object.ply")
     cell.plan_data["object"]["mesh"] = str(folder / "object.ply")
     cell.rig_data["sensor"] |= {"width_px": SIZE_PX[0], "height_px": SIZE_PX[1], "pixel_pitch_um": PITCH_UM}
     cell.world_settings["robot"] = {
@@ -105,7 +105,11 @@ def painted_cell(folder: Path, painted: Painted, *, every: int, seed: int) -> Ce
         "repeatability_deg": 0,
     }
     cell.world_settings.update(
-        white_at_us=8000, material=painted.material, shading="pixel", detail=list(painted.detail), seed=seed
+        white_at_us=8000,
+        material=painted_object.material,
+        shading="pixel",
+        detail=list(painted_object.detail),
+        seed=seed,
     )
     cell.write(views=[cells.TOP, SIDE], lights={"kind": "every", "every": every}, darks_per_view=2)
     draw_records(folder / "records", None, Scale(pitch_um=PITCH_UM, size_px=SIZE_PX))
@@ -126,7 +130,7 @@ def mesh_of(height_mm: Callable[[Floats, Floats], Floats]) -> trimesh.Trimesh:
 
 @dataclass(frozen=True)
 class Truth:
-    """What the pixels of a view see, through its lens."""
+    """Paint and normals that the pixels of a view see, through its lens."""
 
     paint: Floats
     """[h, w] factor of the diffuse reflectance."""
@@ -166,18 +170,18 @@ def truth_of(
     depth_mm[is_seen] = depths_mm
     spread_px = defocus_blur_px(LENS, depth_mm, PITCH_UM)
 
-    def blurred(values: Floats) -> Floats:
+    def blur(values: Floats) -> Floats:
         """The blur is of light, which is not below 0: so 4 is added before it."""
         picture = np.zeros((*is_seen.shape, 3), np.float32)
         picture[is_seen] = (values + 4.0)[:, None]
         sums = through(LENS, picture, spread_px, BAYER, pixel_pitch_um=PITCH_UM).astype(float)
         return np.where(is_seen, sums / np.maximum(weight, 1e-6) - 4.0, 0.0)
 
-    seen = np.repeat(is_seen[..., None], 3, axis=2).astype(np.float32)
-    weight = through(LENS, seen, spread_px, BAYER, pixel_pitch_um=PITCH_UM).astype(float)
-    seen_normals = np.stack([blurred(column) for column in normals.T], axis=-1)
+    seen_mask = np.repeat(is_seen[..., None], 3, axis=2).astype(np.float32)
+    weight = through(LENS, seen_mask, spread_px, BAYER, pixel_pitch_um=PITCH_UM).astype(float)
+    seen_normals = np.stack([blur(column) for column in normals.T], axis=-1)
     seen_normals /= np.maximum(np.linalg.norm(seen_normals, axis=-1, keepdims=True), 1e-9)
-    return Truth(blurred(paint), seen_normals, blurred(lines))
+    return Truth(blur(paint), seen_normals, blur(lines))
 
 
 def means_of(texels: ViewTexels, truth: Truth) -> tuple[Floats, Floats]:

@@ -82,10 +82,10 @@ def main() -> int:
         rows = [judge(relief_run, size) for size in arguments.sizes if relief_run is not None]
         painted_rows = []
         for name in arguments.objects:
-            acquired = acquire_painted(Path(folder) / name, name, every=arguments.every, seed=arguments.seed)
+            object_run = acquire_painted(Path(folder) / name, name, every=arguments.every, seed=arguments.seed)
             for size in arguments.object_sizes:
-                out = shutil.copytree(acquired.result, Path(folder) / f"{name}-{size}")
-                painted_rows.append(judge_painted(acquired, out, read_size(size)))
+                out = shutil.copytree(object_run.result, Path(folder) / f"{name}-{size}")
+                painted_rows.append(judge_painted(object_run, out, read_size(size)))
                 shutil.rmtree(out)
     faults = [fault for row in rows for fault in _faults(row)]
     faults += [fault for row in painted_rows for fault in faults_of_painted(row)]

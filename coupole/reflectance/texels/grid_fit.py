@@ -112,9 +112,15 @@ def without_slopes(
     """Return colours of texels [h, w, channels] without what only looks like a colour: paint gets lighter across a
     texel, and the channels' pixels are at different places (`TexelReader.channel_offsets`). `lightness` [h, w] is
     the logarithm of kd; its slope is that between the texels on both sides."""
-    known = np.where(is_fitted, lightness, np.float32(np.nan))
-    padded = np.pad(known, 1, constant_values=np.nan)
-    slopes = np.stack([padded[1:-1, 2:] - padded[1:-1, :-2], padded[2:, 1:-1] - padded[:-2, 1:-1]], axis=-1)
+    known_lightness = np.where(is_fitted, lightness, np.float32(np.nan))
+    framed_lightness = np.pad(known_lightness, 1, constant_values=np.nan)
+    slopes = np.stack(
+        [
+            framed_lightness[1:-1, 2:] - framed_lightness[1:-1, :-2],
+            framed_lightness[2:, 1:-1] - framed_lightness[:-2, 1:-1],
+        ],
+        axis=-1,
+    )
     slopes = np.clip(np.nan_to_num(0.5 * slopes), -_MOST_MORE, _MOST_MORE)
     level = colours - np.einsum("hwck,hwk->hwc", channel_offsets, slopes)
     level -= np.log(np.exp(level).mean(axis=-1, keepdims=True))

@@ -77,13 +77,13 @@ def _propagate(  # type: ignore[no-untyped-def]
         information, scores = prior.copy(), np.zeros((groups + 2, UNKNOWNS))
         per_variance = 1.0 / (CAUCHY * CAUCHY * kd[n])
         for led in np.flatnonzero(roots > 0.0):
-            own = per_variance * 0.5 * roots[led] * u_samples[n, led]
-            around = per_variance * 0.5 * kd[n] * u_around[led] / roots[led]
+            own_factor = per_variance * 0.5 * roots[led] * u_samples[n, led]
+            around_factor = per_variance * 0.5 * kd[n] * u_around[led] / roots[led]
             add_product(per_variance, rows[led], rows[led], information)
             for i in range(UNKNOWNS):
-                scores[groups, i] += own * rows[led, i]
-                scores[groups + 1, i] += around * rows[led, i]
-                scores[group[led], i] += around * rows[led, i]
+                scores[groups, i] += own_factor * rows[led, i]
+                scores[groups + 1, i] += around_factor * rows[led, i]
+                scores[group[led], i] += around_factor * rows[led, i]
         if np.isfinite(information).all() and np.isfinite(scores).all():
             for number in range(groups + 2):
                 step = np.linalg.solve(information, scores[number])

@@ -210,15 +210,15 @@ def _add_step(rows, bends, scores, information, whole):  # type: ignore[no-untyp
 
 
 @kernel
-def _dot(left, right):  # type: ignore[no-untyped-def]
-    return left[0] * right[0] + left[1] * right[1] + left[2] * right[2]
+def _dot(first, second):  # type: ignore[no-untyped-def]
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 @kernel
-def add_product(factor, left, right, matrix):  # type: ignore[no-untyped-def]
+def add_product(factor, first, second, matrix):  # type: ignore[no-untyped-def]
     for i in range(UNKNOWNS):
         for j in range(UNKNOWNS):
-            matrix[i, j] += factor * left[i] * right[j]
+            matrix[i, j] += factor * first[i] * second[j]
 
 
 @kernel(error_model="numpy")

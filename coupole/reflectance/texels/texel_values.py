@@ -87,8 +87,8 @@ class TexelReader:
         shape = self.grid.triangle.shape
         counts = np.maximum(np.bincount(texel[pixels], minlength=self.grid.triangle.size), 1)
         sums = [np.bincount(texel[pixels], column, len(counts)) / counts for column in seen_normals.T]
-        spread = 0.5 * np.maximum(1.0 - np.sum(np.square(sums), axis=0), 0.0)
-        bend: NDArray[np.float32] = (0.5 * spread / counts).astype(np.float32).reshape(shape)
+        tilt_variance = 0.5 * np.maximum(1.0 - np.sum(np.square(sums), axis=0), 0.0)
+        bend: NDArray[np.float32] = (0.5 * tilt_variance / counts).astype(np.float32).reshape(shape)
         return np.where(self.grid.triangle >= 0, bend, np.float32(0.0))
 
     def channel_offsets(self) -> NDArray[np.float32]:
@@ -98,8 +98,8 @@ class TexelReader:
         row, column = np.nonzero(texel >= 0)
         number, channel = texel[row, column], self._radiometry.channel[row, column]
         middles = [_middles(number, row, column, width)]
-        for one in range(self._radiometry.channels):
-            is_here = channel == one
+        for number_of_channel in range(self._radiometry.channels):
+            is_here = channel == number_of_channel
             middles.append(_middles(number[is_here], row[is_here], column[is_here], width))
         offsets = (np.stack(middles[1:], axis=1) - middles[0][:, None]) / self.grid.side_px
         return np.nan_to_num(offsets).astype(np.float32).reshape(*self.grid.triangle.shape, -1, 2)

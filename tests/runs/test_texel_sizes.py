@@ -84,7 +84,7 @@ def test_paint_is_the_mean_of_what_their_pixels_see_in_all_channels(coarse: Made
         u_kd = np.sqrt(texels.covariance[:, 5] + np.sum(np.square(texel_uncertainty(result, view))))
         assert (np.median(np.abs(error), axis=0) < 0.05).all()
         held = (np.abs(error) < 1.96 * u_kd[:, None]).mean(axis=0)
-        assert (held > 0.7).all()
+        assert (held > 0.85).all()
         assert (held < 0.995).all()
 
 

@@ -39,7 +39,7 @@ Floats = NDArray[np.float64]
 
 GROUPS = 8
 """Number of groups of LEDs in each view."""
-_FEWEST_GROUPS = 6
+FEWEST_GROUPS = 6
 """Least number of groups. Fewer groups say too little about errors that their samples share; then single samples
 are used too."""
 _LEAST_KS = 1e-3
@@ -210,7 +210,7 @@ def add_scores(roots, good, lights, half, views, view_of, group, normal, grey, b
                 bread[i, j] += bend * row[i] * row[j]
                 single[i, j] += (weight * off / scale) ** 2 * row[i] * row[j]
     _add_square(score, meat)
-    if groups < _FEWEST_GROUPS:
+    if groups < FEWEST_GROUPS:
         _add(single.reshape(-1), meat.reshape(-1))
     few = groups / max(groups - 1.0, 1.0) * (len(good) - 1.0) / max(len(good) - UNKNOWNS, 1.0)
     for i in range(UNKNOWNS):
@@ -260,7 +260,7 @@ def _colours(  # type: ignore[no-untyped-def]
             _add_square(part, single[channel])
     for channel in range(channels + 1):
         _add_square(score[channel], meat[channel])
-    if groups < _FEWEST_GROUPS:
+    if groups < FEWEST_GROUPS:
         _add(single.reshape(-1), meat.reshape(-1))
     bread[0, 0] += 1e-12
     bread[1, 1] += 1e-9 * bread[0, 0]

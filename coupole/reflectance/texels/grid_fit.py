@@ -34,6 +34,10 @@ _TOGETHER = 1 << 16
 _PART = 1 << 12
 _MOST_WIDER = 4.0
 """Largest factor by which kd's variance is enlarged."""
+_ALIKE = 2.0
+"""Number of neighbouring texels whose false colours are alike, because paint changes little between them."""
+_MOST_MORE = 1.0
+"""Largest logarithm by which the paint of a channel's pixels may differ from the texel's."""
 _SPREAD_PX, _LEAST_SPREAD = 2.5, 1.0
 """Standard deviation of the weights of surrounding texels in a colour, px, and its least value, in texels."""
 
@@ -71,13 +75,18 @@ def texels_of_grid(
     of_grid = colours.reshape(*grid.triangle.shape, channels), u_colours.reshape(grid.triangle.shape)
     fits.is_fitted[...] &= np.isfinite(of_grid[0]).all(axis=-1)
     is_fitted = fits.is_fitted
-    whole_colours, u_whole = colours_around(*of_grid, centres.colours, is_fitted, grid.side_px)
-    normals = fits.settle(view, centres, grid.triangle)
+    lightness = np.log(np.exp(centres.logs[..., :channels]).mean(axis=-1)) + fits.deviation[..., KD]
+    level_colours = without_slopes(of_grid[0], lightness, is_fitted, reader.channel_offsets())
+    whole_colours, u_whole = colours_around(level_colours, of_grid[1], centres.colours, is_fitted, grid.side_px)
+    normals = fits.settle(view, centres, lights, grid.triangle)
     fits.covariance[is_fitted, VARIANCES[KD]] *= _wider(whole_colours[is_fitted])
     fits.covariance[is_fitted, VARIANCES[KD]] += u_whole[is_fitted] ** 2
+    fits.covariance[is_fitted, :3:2] += reader.bend()[is_fitted, None]
     logs = centres.logs[is_fitted].astype(np.float64)
     deviation = fits.deviation[is_fitted]
     grey = np.log(np.exp(logs[:, :channels]).mean(axis=1)) + deviation[:, KD]
+    shares = reader.pixels_of_channels / reader.pixels_of_channels.sum()
+    grey += of_all_pixels(of_grid[0][is_fitted], whole_colours[is_fitted], shares)
     logs[:, :channels] = grey[:, None] + whole_colours[is_fitted]
     logs[:, channels:-1] += deviation[:, KS, None]
     logs[:, -1] += deviation[:, ALPHA]
@@ -90,10 +99,42 @@ def texels_of_grid(
 
 
 def _wider(colours: Singles) -> Singles:
-    """[n] factors of kd's variance for colours [n, channels], as means over the channels. If the lobe has another
-    form, the error of kd is as large in a dark channel as in a light one."""
-    factors: Singles = np.clip(np.exp(-2.0 * colours).mean(axis=1), 1.0, _MOST_WIDER)
+    """[n] factors of kd's variance for colours [n, channels]: those of the darkest channel, because all channels
+    have one uncertainty. If the lobe has another form, the error of kd is as large in a dark channel as in a light
+    one."""
+    factors: Singles = np.clip(np.exp(-2.0 * colours).max(axis=1), 1.0, _MOST_WIDER)
     return factors
+
+
+def without_slopes(
+    colours: Singles, lightness: Singles, is_fitted: NDArray[np.bool_], channel_offsets: Singles
+) -> Singles:
+    """Return colours of texels [h, w, channels] without what only looks like a colour: paint gets lighter across a
+    texel, and the channels' pixels are at different places (`TexelReader.channel_offsets`). `lightness` [h, w] is
+    the logarithm of kd; its slope is that between the texels on both sides."""
+    known_lightness = np.where(is_fitted, lightness, np.float32(np.nan))
+    framed_lightness = np.pad(known_lightness, 1, constant_values=np.nan)
+    slopes = np.stack(
+        [
+            framed_lightness[1:-1, 2:] - framed_lightness[1:-1, :-2],
+            framed_lightness[2:, 1:-1] - framed_lightness[:-2, 1:-1],
+        ],
+        axis=-1,
+    )
+    slopes = np.clip(np.nan_to_num(0.5 * slopes), -_MOST_MORE, _MOST_MORE)
+    level = colours - np.einsum("hwck,hwk->hwc", channel_offsets, slopes)
+    level -= np.log(np.exp(level).mean(axis=-1, keepdims=True))
+    return np.asarray(level, np.float32)
+
+
+def of_all_pixels(colours: Singles, whole_colours: Singles, shares: Floats) -> Floats:
+    """[n] logarithms of the mean paint of texels over that which the mean of their channels shows.
+
+    A channel shows the paint at its own pixels: its colour without the colour around. The mean of the channels
+    gives each channel the same weight, but channels have different shares [channels] of the pixels: in a Bayer
+    pattern green has half."""
+    more = np.clip(colours.astype(np.float64) - whole_colours, -_MOST_MORE, _MOST_MORE)
+    return np.asarray(np.log(np.exp(more) @ shares))
 
 
 def colours_around(
@@ -123,7 +164,7 @@ def colours_around(
     whole = triangle_colours + smooth
     whole -= np.log(np.exp(whole).mean(axis=-1, keepdims=True))
     own_variance = np.square(np.where(is_fitted, u_colours, np.float32(0.0)))
-    u_whole = np.sqrt(kept_share * (own_variance + lost_variance / (1.0 - kept_share)))
+    u_whole = np.sqrt(kept_share * (own_variance + _ALIKE * lost_variance / (1.0 - kept_share)))
     return whole.astype(np.float32), u_whole.astype(np.float32)
 
 

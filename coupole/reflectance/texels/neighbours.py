@@ -28,6 +28,8 @@ found."""
 _ALIKE_PX = 5
 """Side of the window in which covariances are averaged, because eight groups of LEDs determine a single covariance
 poorly."""
+_BESIDE_PX = 3
+"""Side of the window in which the mesh may turn."""
 _LEAST = 1e-6
 """Least variance of the surface, so that no triangle is treated as exact."""
 _FREE = 100.0
@@ -47,18 +49,32 @@ def lower_half(covariance: NDArray[np.float64]) -> Singles:
 
 
 def settle(
-    deviation: Singles, covariance: Singles, is_fitted: NDArray[np.bool_], centre_covariance: Singles
+    deviation: Singles,
+    covariance: Singles,
+    is_fitted: NDArray[np.bool_],
+    centre_covariance: Singles,
+    bend: Singles | None = None,
 ) -> None:
     """Shrink, in place, the deviations [h, w, 5] of a view's pixels from their triangles (tilts, logarithms)
     towards 0, as far as their neighbours agree. Replace their covariances [h, w, 15, lower half row by row] by
     those after the shrinkage. Only pixels with `is_fitted` [h, w] are used and changed. `centre_covariance` [h, w,
-    15] is the covariance of the triangles' materials.
+    15] is the covariance of the triangles' materials. `bend` [h, w] is the variance of the triangles' tilts
+    around a pixel (`bend_around`): where the mesh turns, a pixel sees more than its own triangle.
     """
     covariance[...] = mean_around(covariance, is_fitted, _ALIKE_PX)
     square = deviation**2
     np.minimum(square, np.float32(_OUTLIER) * mean_around(square, is_fitted, WINDOW_PX), out=square)
     surface = _surface(square, covariance[..., VARIANCES], is_fitted, WINDOW_PX)
+    if bend is not None:
+        surface[..., :2] += bend[..., None]
     _draw_rows(deviation, covariance, surface, is_fitted, centre_covariance)
+
+
+def bend_around(normals: Singles, is_used: NDArray[np.bool_]) -> Singles:
+    """[h, w] variance, rad^2, of each of two tilts among the unit normals [h, w, 3] next to a pixel."""
+    mean = mean_around(normals, is_used, _BESIDE_PX)
+    variance: Singles = 0.5 * np.maximum(1.0 - np.sum(mean**2, axis=-1), 0.0)
+    return np.where(is_used, variance, np.float32(0.0))
 
 
 def settle_triangles(logs: Singles, covariance: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:

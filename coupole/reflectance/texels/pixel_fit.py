@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.kernels import kernel
-from coupole.reflectance.ggx import UNKNOWNS, lobe
+from coupole.reflectance.ggx import UNKNOWNS, lobe, root_by_unknowns, tangents
 from coupole.reflectance.ggx_fit import ROWS, fit_packs, pack
-from coupole.reflectance.kernel_arrays import assign, assign_rows
+from coupole.reflectance.kernel_arrays import assign
 from coupole.reflectance.lanes import LANES
-from coupole.reflectance.material_uncertainty import add_scores
+from coupole.reflectance.material_uncertainty import FEWEST_GROUPS
+from coupole.reflectance.normal_fit import CAUCHY
 from coupole.reflectance.parts_in_threads import in_threads
 from coupole.reflectance.triangle_fit import between, towards
 
@@ -106,7 +107,7 @@ def _fit_part(  # type: ignore[no-untyped-def]
     only_view = np.zeros(leds, np.int64)
     good, roots = np.empty(leds, np.int64), np.empty(leds)
     packs, place = np.empty((leds // LANES + 1, ROWS, LANES)), np.empty(3)
-    unknowns, grey = np.empty(6), np.empty(3)
+    unknowns, grey, prior_weights = np.empty(6), np.empty(3), np.empty(UNKNOWNS)
     stiffness = 1.0 / TILT**2
     for pixel in range(count):
         normal = prior_normals[pixel]
@@ -139,14 +140,85 @@ def _fit_part(  # type: ignore[no-untyped-def]
         for k in range(3):
             grey[k] = math.exp(unknowns[3 + k])
         grey[1] = max(grey[1], LEAST_KS * grey[0])
-        bread, meat = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros((UNKNOWNS, UNKNOWNS))
-        add_scores(pixel_roots, pixel_leds, lights, half, views, only_view, group, unknowns[:3], grey, bread, meat)
         for k, weight in enumerate((stiffness, stiffness, 1e-2, usual[2], usual[3])):
-            bread[k, k] += weight
-            meat[k, k] += weight
-        if np.isfinite(bread).all() and np.isfinite(meat).all():
-            inverse = np.linalg.inv(bread)
-            assign_rows(covariance[pixel], inverse @ meat @ inverse.T)
+            prior_weights[k] = weight
+        _leave_out_groups(
+            pixel_roots, pixel_leds, lights, half, views[0], group, unknowns[:3], grey, prior_weights,
+            covariance[pixel],
+        )  # fmt: skip
+
+
+@kernel(error_model="numpy")
+def _leave_out_groups(  # type: ignore[no-untyped-def]
+    roots, good, lights, half, view, group, normal, grey, prior_weights, covariance
+):
+    """Fill `covariance` from the steps that the fit would take without each group of LEDs in turn (Quenouille's
+    jackknife, with Newton's step). Samples are in the order of their groups. Fewer than `FEWEST_GROUPS` groups say
+    too little; then single samples are left out as well. Left NaN where the fit has run off."""
+    scale = CAUCHY * math.sqrt(grey[0])
+    t1, t2 = tangents(normal[0], normal[1], normal[2])
+    nv, v1, v2 = _dot(normal, view), _dot(t1, view), _dot(t2, view)
+    count = len(good)
+    rows, bends, scores = np.zeros((count, UNKNOWNS)), np.zeros(count), np.zeros(count)
+    information, squares = np.diag(prior_weights), np.diag(prior_weights)
+    for number in range(count):
+        light = lights[good[number]]
+        if _dot(normal, light) <= 0.0:
+            continue
+        root = root_by_unknowns(
+            normal, t1, t2, light, half[good[number]], nv, v1, v2, grey[0], grey[1], grey[2], rows[number]
+        )
+        off = (root - roots[number]) / scale
+        weight = 1.0 / (1.0 + off * off)
+        bends[number] = max(1.0 - off * off, 0.0) * weight * weight / (scale * scale)
+        scores[number] = weight * off / scale
+        add_product(bends[number], rows[number], rows[number], information)
+    if not np.isfinite(information).all() or not np.isfinite(scores).all():
+        return
+    first, groups = 0, 0
+    for number in range(1, count + 1):
+        if number == count or group[good[number]] != group[good[first]]:
+            groups += 1
+            first = number
+    whole = np.zeros((UNKNOWNS, UNKNOWNS))
+    first = 0
+    for number in range(1, count + 1):
+        if number == count or group[good[number]] != group[good[first]]:
+            _add_step(rows[first:number], bends[first:number], scores[first:number], information, whole)
+            first = number
+    if groups < FEWEST_GROUPS:
+        for number in range(count):
+            some = slice(number, number + 1)
+            _add_step(rows[some], bends[some], scores[some], information, whole)
+    inverse = np.linalg.inv(information)
+    squares = inverse @ squares @ inverse
+    for i in range(UNKNOWNS):
+        for j in range(UNKNOWNS):
+            covariance[i, j] = squares[i, j] + whole[i, j]
+
+
+@kernel(error_model="numpy")
+def _add_step(rows, bends, scores, information, whole):  # type: ignore[no-untyped-def]
+    """Add the square of the step that the fit takes if some samples are left out."""
+    rest, score = information.copy(), np.zeros(UNKNOWNS)
+    for number in range(len(rows)):
+        add_product(-bends[number], rows[number], rows[number], rest)
+        for i in range(UNKNOWNS):
+            score[i] += scores[number] * rows[number, i]
+    step = np.linalg.solve(rest, score)
+    add_product(1.0, step, step, whole)
+
+
+@kernel
+def _dot(first, second):  # type: ignore[no-untyped-def]
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
+
+
+@kernel
+def add_product(factor, first, second, matrix):  # type: ignore[no-untyped-def]
+    for i in range(UNKNOWNS):
+        for j in range(UNKNOWNS):
+            matrix[i, j] += factor * first[i] * second[j]
 
 
 @kernel(error_model="numpy")

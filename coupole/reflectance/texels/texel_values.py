@@ -78,6 +78,32 @@ class TexelReader:
         """Number of the texels."""
         return int(np.count_nonzero(self.grid.triangle >= 0))
 
+    def bend(self) -> NDArray[np.float32]:
+        """[rows, columns] variance, rad^2, of each tilt of a texel whose pixels see triangles that are turned to
+        each other: half of the variance of their mean, because under some LEDs not all of the pixels are lit."""
+        texel = self.grid.texel_of_pixel.reshape(-1)
+        pixels = np.flatnonzero(texel >= 0)
+        seen_normals = self.mesh_normals[self._triangle_of_pixel.reshape(-1)[pixels]]
+        shape = self.grid.triangle.shape
+        counts = np.maximum(np.bincount(texel[pixels], minlength=self.grid.triangle.size), 1)
+        sums = [np.bincount(texel[pixels], column, len(counts)) / counts for column in seen_normals.T]
+        tilt_variance = 0.5 * np.maximum(1.0 - np.sum(np.square(sums), axis=0), 0.0)
+        bend: NDArray[np.float32] = (0.5 * tilt_variance / counts).astype(np.float32).reshape(shape)
+        return np.where(self.grid.triangle >= 0, bend, np.float32(0.0))
+
+    def channel_offsets(self) -> NDArray[np.float32]:
+        """[rows, columns, channels, 2] middle of each channel's pixels from the middle of all pixels of a texel,
+        to the right and down, in widths of a texel."""
+        texel, width = self.grid.texel_of_pixel, self.grid.triangle.size
+        row, column = np.nonzero(texel >= 0)
+        number, channel = texel[row, column], self._radiometry.channel[row, column]
+        middles = [_middles(number, row, column, width)]
+        for number_of_channel in range(self._radiometry.channels):
+            is_here = channel == number_of_channel
+            middles.append(_middles(number[is_here], row[is_here], column[is_here], width))
+        offsets = (np.stack(middles[1:], axis=1) - middles[0][:, None]) / self.grid.side_px
+        return np.nan_to_num(offsets).astype(np.float32).reshape(*self.grid.triangle.shape, -1, 2)
+
     def bands(self, memory_bytes: int) -> list[slice]:
         """Return slices of rows of the grid, with texels' values that fit into a memory."""
         counts = np.count_nonzero(self.grid.triangle >= 0, axis=1)
@@ -119,6 +145,15 @@ class TexelReader:
 
                 list(pool.map(first_alone(mean), range(0, len(values), _TEXELS)))
         return TexelBlock(band.texels, self.grid.places_mm.reshape(-1, 3)[band.texels], values)
+
+
+def _middles(
+    number: NDArray[np.integer], row: NDArray[np.int64], column: NDArray[np.int64], count: int
+) -> NDArray[np.float64]:
+    """[count, 2] mean column and row of the pixels with each number; NaN for none."""
+    counts = np.bincount(number, minlength=count)
+    with np.errstate(invalid="ignore"):
+        return np.stack([np.bincount(number, place, count) / counts for place in (column, row)], axis=1)
 
 
 def channel_shares(radiometry: Radiometry) -> NDArray[np.float64]:

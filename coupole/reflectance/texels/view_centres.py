@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,11 +15,9 @@ from coupole.reflectance.ggx import UNKNOWNS
 from coupole.reflectance.material_uncertainty import groups_of_leds
 from coupole.reflectance.normal_fit import LEAST_ALPHA
 from coupole.reflectance.run_result import (
-    INTER_REFLECTION,
     VARIANCES,
     RunResult,
     ViewSamples,
-    u_inter_reflection,
 )
 from coupole.reflectance.texels.neighbours import (
     TRIANGLES_AROUND,
@@ -43,8 +40,6 @@ MOST_KD = 1.0
 failed."""
 MOST_VARIANCE = np.square([TILT, TILT, 1.0, LOG_KS, LOG_ALPHA]) * 4.0
 """Largest variances of a useful fit; they are larger than those of the prior."""
-_ROWS = 1 << 12
-"""Number of triangles whose inter-reflection is read together."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +76,17 @@ class Centres:
         ks = values[:, channels:-1].mean(axis=1)
         prior = Prior(self.normals[at].astype(np.float64), values[:, :channels].mean(axis=1), ks, values[:, -1])
         return prior, values[:, channels:-1] / ks[:, None]
+
+    def of_triangles(self, triangle: NDArray[np.int32], count: int) -> Prior:
+        """Return the materials of the `count` triangles of a view, as means of the channels, each where the first
+        texel sees it; `triangle` [h, w] is what each texel sees. NaN without texel or material."""
+        numbers, first = np.unique(triangle, return_index=True)
+        at = np.full(count, -1)
+        at[numbers[numbers >= 0]] = first[numbers >= 0]
+        prior, _ = self.grey_prior(np.maximum(at, 0))
+        for values in (prior.normals, prior.kd, prior.ks, prior.alpha):
+            values[at < 0] = np.nan
+        return prior
 
 
 def centres_of(
@@ -123,20 +129,6 @@ def _window_px(triangle_of_pixel: NDArray[np.int32]) -> int:
     counts = np.bincount(triangle_of_pixel)
     side_px = math.sqrt(TRIANGLES_AROUND * float(np.median(counts[counts > 0]))) if len(counts) else 0.0
     return max(WINDOW_PX, 2 * round(side_px / 2) + 1)
-
-
-def u_of_inter_reflection(view: ViewSamples) -> Floats:
-    """[triangles] relative standard uncertainty of kd from the inter-reflection that was subtracted from its
-    samples. The error is taken as equal under all LEDs."""
-    with h5py.File(view.path, "r") as file:
-        if INTER_REFLECTION not in file:
-            return np.zeros(len(view.triangles))
-        data = file[INTER_REFLECTION]
-        parts = [u_inter_reflection(data[first : first + _ROWS]) for first in range(0, len(data), _ROWS)]
-    sums = [np.where(np.isfinite(part), part, 0.0).sum(axis=(1, 2)) for part in parts]
-    count = [np.isfinite(part).sum(axis=(1, 2)) for part in parts]
-    mean: Floats = np.concatenate(sums) / np.maximum(np.concatenate(count), 1)
-    return mean
 
 
 def lights_of(result: RunResult, view: ViewSamples, left_out: Sequence[int]) -> Lights:

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from coupole.reflectance.ggx import UNKNOWNS
 from coupole.reflectance.normal_fit import LEAST_ALPHA
 from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples
+from coupole.reflectance.texels.inter_reflection_error import covariance_of_inter_reflection
 from coupole.reflectance.texels.mosaic import all_channels
-from coupole.reflectance.texels.neighbours import lower_half, settle, tilts_from
+from coupole.reflectance.texels.neighbours import bend_around, lower_half, settle, tilts_from
 from coupole.reflectance.texels.pixel_file import ViewTexels
-from coupole.reflectance.texels.pixel_fit import PixelMaterials, Prior, fit_pixels
+from coupole.reflectance.texels.pixel_fit import Lights, PixelMaterials, Prior, fit_pixels
 from coupole.reflectance.texels.pixel_values import PixelReader
 from coupole.reflectance.texels.view_centres import (
     ALPHA,
@@ -27,7 +28,6 @@ from coupole.reflectance.texels.view_centres import (
     Centres,
     centres_of,
     lights_of,
-    u_of_inter_reflection,
 )
 from coupole.reflectance.triangle_fit import MOST_KS, turned_normals
 
@@ -72,14 +72,17 @@ class Fitted:
             & (self.covariance[at][:, VARIANCES] < MOST_VARIANCE).all(axis=1)
         )
 
-    def settle(self, view: ViewSamples, centres: Centres, triangle: NDArray[np.int32]) -> Singles:
+    def settle(self, view: ViewSamples, centres: Centres, lights: Lights, triangle: NDArray[np.int32]) -> Singles:
         """Take the neighbours into account, and add the uncertainty from inter-reflection. It is taken from the
         `triangle` [h, w] of each texel. Return the normals [fitted, 3] of the fitted texels.
         """
         is_fitted = self.is_fitted
         before = self.deviation[is_fitted][:, :2]
-        settle(self.deviation, self.covariance, is_fitted, centres.covariance)
-        self.covariance[is_fitted, VARIANCES[KD]] += u_of_inter_reflection(view)[triangle[is_fitted]] ** 2
+        bend = bend_around(centres.normals, is_fitted)
+        settle(self.deviation, self.covariance, is_fitted, centres.covariance, bend)
+        materials = centres.of_triangles(triangle, len(view.triangles))
+        of_triangles = lower_half(covariance_of_inter_reflection(view, materials, lights))
+        self.covariance[is_fitted] += of_triangles[triangle[is_fitted]]
         normals = turned_normals(
             self.normals[is_fitted].astype(np.float64), self.deviation[is_fitted][:, :2] - before
         )
@@ -110,7 +113,7 @@ def texels_of_view(
         count += len(block.pixels)
         say(count, reader.count)
     is_fitted, channels = fits.is_fitted, result.channels
-    texel_normals = fits.settle(view, centres, reader.triangle_of_pixel)
+    texel_normals = fits.settle(view, centres, lights, reader.triangle_of_pixel)
     logs = centres.logs[is_fitted].astype(np.float64)
     logs[:, :channels] = _with_colours(logs[:, :channels], centres.colours[is_fitted], channel[is_fitted])
     for first, unknown in ((0, KD), (channels, KS)):

@@ -253,3 +253,9 @@ def test_a_texture_that_would_reflect_more_than_all_light_is_refused(tmp_path: P
     with pytest.raises(InputError, match=r"white\.ply: expected textures .* 0\.90 .* found changes of 0\.2 "):
         load_surface(path, "mm", white, (Layer(period_mm=1.0, texture=0.2),))
     assert load_surface(path, "mm", white, (Layer(period_mm=1.0, texture=0.1),)).materials[0].detail
+
+
+def test_lines_have_one_direction_and_their_period() -> None:
+    ((*way, _, texture, height_mm),) = Layer(period_mm=0.2, texture=0.3, along=(2.0, 0.0, 0.0)).waves()
+    np.testing.assert_allclose(way, [2 * np.pi / 0.2, 0.0, 0.0])
+    assert (texture, height_mm) == (0.3, 0.0)

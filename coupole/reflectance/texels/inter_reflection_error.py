@@ -12,6 +12,9 @@ Three parts are propagated through the normal equations of the fit, triangle by 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import h5py
 import numpy as np
 from numpy.typing import NDArray
@@ -33,36 +36,60 @@ _ROWS = 1 << 12
 def covariance_of_inter_reflection(view: ViewSamples, materials: Prior, lights: Lights) -> Floats:
     """[triangles, 5, 5] covariance of tilts and logarithms of kd, ks and alpha, for the triangles of a view with
     `materials` (NaN: none), fitted to some `lights`. 0 if nothing was subtracted."""
-    count, leds = len(view.triangles), len(lights.columns)
-    covariance = np.zeros((count, UNKNOWNS, UNKNOWNS))
+    covariance = np.zeros((len(view.triangles), UNKNOWNS, UNKNOWNS))
     with h5py.File(view.path, "r") as file:
         if INTER_REFLECTION not in file:
             return covariance
-        centres_mm = file["centres_mm"][()]
-        u_samples = np.empty((count, leds), np.float32)
-        for first in range(0, count, _ROWS):
-            rows = slice(first, min(first + _ROWS, count))
-            share = file[INTER_REFLECTION][rows][:, lights.columns]
-            share[file["codes"][rows][:, lights.columns] != REACHED] = np.nan
-            u_samples[rows] = u_inter_reflection(share).mean(axis=2)
-    places = centres_mm, lights.places_mm, lights.camera_mm
-    of_triangles = materials.normals, materials.kd, materials.ks, materials.alpha
-    u_around = _mean_around(u_samples, *places, *of_triangles)
-    _propagate(u_samples, u_around, lights.group, *places, *of_triangles, covariance)
+        parts = list(_parts(file, view, materials, lights))
+        sums, counts = np.zeros(len(lights.columns)), np.zeros(len(lights.columns))
+        for part in parts:
+            _add_parts_of_kd(part.u_samples(), *part.places, *part.of_triangles, sums, counts)
+        u_around = sums / np.maximum(counts, 1.0)
+        for part in parts:
+            _propagate(
+                part.u_samples(), u_around, lights.group, *part.places, *part.of_triangles, covariance[part.rows]
+            )
     return covariance
 
 
+@dataclass(frozen=True)
+class _Part:
+    """Triangles whose inter-reflection is read together."""
+
+    rows: slice
+    places: tuple[Floats, Floats, Floats]
+    """Centres of the triangles [n, 3], LEDs [leds, 3] and camera [3], mm."""
+    of_triangles: tuple[Floats, ...]
+    """Normals [n, 3], kd, ks and alpha [n]."""
+    _file: h5py.File
+    _columns: NDArray[np.integer]
+
+    def u_samples(self) -> NDArray[np.float32]:
+        """[n, leds] standard uncertainty of the samples, as a part of them; NaN without a sample."""
+        u = u_inter_reflection(self._file[INTER_REFLECTION][self.rows][:, self._columns]).mean(axis=2)
+        u[self._file["codes"][self.rows][:, self._columns] != REACHED] = np.nan
+        return np.asarray(u, np.float32)
+
+
+def _parts(file: h5py.File, view: ViewSamples, materials: Prior, lights: Lights) -> Iterator[_Part]:
+    for first in range(0, len(view.triangles), _ROWS):
+        rows = slice(first, first + _ROWS)
+        places = file["centres_mm"][rows], lights.places_mm, lights.camera_mm
+        of_triangles = materials.normals[rows], materials.kd[rows], materials.ks[rows], materials.alpha[rows]
+        yield _Part(rows, places, of_triangles, file, lights.columns)
+
+
 @kernel(error_model="numpy")
-def _mean_around(u_samples, centres_mm, led_mm, camera_mm, normals, kd, ks, alpha):  # type: ignore[no-untyped-def]
-    """[leds] mean over the triangles of the uncertainty of their values, as a part of kd."""
+def _add_parts_of_kd(  # type: ignore[no-untyped-def]
+    u_samples, centres_mm, led_mm, camera_mm, normals, kd, ks, alpha, sums, counts
+):
+    """Add the uncertainties of the triangles' values under each LED, as parts of kd, to `sums` [leds]."""
     rows, roots = np.empty((len(led_mm), UNKNOWNS)), np.empty(len(led_mm))
-    sums, counts = np.zeros(len(led_mm)), np.zeros(len(led_mm))
     for n in range(len(u_samples)):
         _look(u_samples[n], centres_mm[n], led_mm, camera_mm, normals[n], kd[n], ks[n], alpha[n], roots, rows)
         for led in np.flatnonzero(roots > 0.0):
             sums[led] += u_samples[n, led] * roots[led] * roots[led] / kd[n]
             counts[led] += 1.0
-    return sums / np.maximum(counts, 1.0)
 
 
 @kernel(error_model="numpy")

@@ -8,7 +8,6 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import cells
 import numpy as np
@@ -23,6 +22,7 @@ from coupole.console.plans.plan_files import PlanFiles
 from coupole.console.plans.plan_queue import PlanQueue
 from coupole.plan.cell import read_cell
 from sim.world.client import World
+
 NOT_THERE_DEG = 3.0
 """Farther from its goal than this, an arm has not arrived."""
 
@@ -77,12 +77,11 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Driven]:
 
 
 @pytest.fixture(autouse=True)
-def nobody_in_control(driven: Driven) -> Iterator[None]:
+def nobody_in_control(driven: Driven) -> None:
     """The arm is at home, and nobody in control, before each test."""
     driven.engineer.post("/api/v1/control/take")
     assert driven.engineer.post("/api/v1/control/give", {}).status == 200
     assert cells.here("arm", driven.cell.rig, "home", "--yes").code == 0
-    yield
 
 
 @pytest.fixture
@@ -129,6 +128,8 @@ def test_a_drive_that_a_person_began_at_the_page_ends_when_another_one_takes_con
         bench.drive(bench.ask("plan_path", to="park")["path"], "Ada")
         cells.wait_until(driven.is_moving, "the arm under way")
         controls.append(in_control)
-        work = cells.wait_until(lambda: (now := bench.ask("state")["work"])["state"] != "running" and now, "its end")
+        work = cells.wait_until(
+            lambda: (now := bench.ask("state")["work"])["state"] != "running" and now, "its end"
+        )
     assert (work["state"], "Max is in control" in work["why"]) == (state, in_control == "Max"), work
     assert (driven.off_deg("park") > NOT_THERE_DEG) is (in_control == "Max")

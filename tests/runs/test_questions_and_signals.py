@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import pty
 import signal
 import subprocess
 import time
@@ -60,6 +62,47 @@ def test_a_signal_ends_the_first_question_of_a_commissioning(
     with at_a_terminal("commission", cell.rig, "--name", "A", "--only", "axes") as typist:
         typist.waits_for("Go on? [y/N]")
         end_by(typist, number, cell.rig)
+    assert cells.safe(world)
+
+
+@pytest.mark.parametrize("answers", [0, 3], ids=["first question", "what was seen"])
+def test_a_terminal_that_is_gone_answers_nothing_even_before_its_signal_comes(
+    cell: CellFolder, world: World, answers: int
+) -> None:
+    """Here no signal comes at all: the terminal is not that of the command's session."""
+    keyboard_fd, terminal_fd = pty.openpty()
+    words = ("commission", cell.rig, "--name", "A", "--only", "axes")
+    process = cells.start(*words, stdin=terminal_fd, stderr=subprocess.PIPE)
+    os.close(terminal_fd)
+    shown = ""
+    for number in range(answers + 1):
+        shown = _read_until("[y/N]", process)
+        if number < answers:
+            os.write(keyboard_fd, b"y\n")
+    assert ("Did you see exactly this?" in shown) is (answers == 3)
+    os.close(keyboard_fd)
+    ended = cells.finish(process)
+    assert ended.code == 129, ended
+    assert read_commissioning(read_cell(cell.rig)) is None, "nothing was answered"
+    assert cells.safe(world)
+
+
+def _read_until(words: str, process: subprocess.Popen[str]) -> str:
+    """Read from a command's messages up to these words; return what was read."""
+    assert process.stderr is not None
+    shown = ""
+    while not shown.endswith(words):
+        letter = process.stderr.read(1)
+        assert letter, shown
+        shown += letter
+    return shown
+
+
+def test_the_end_of_the_input_of_a_terminal_that_is_there_is_a_no(cell: CellFolder, world: World) -> None:
+    with at_a_terminal("commission", cell.rig, "--name", "A", "--only", "axes") as typist:
+        typist.waits_for("Go on? [y/N]")
+        typist.types("\x04")  # Ctrl-D
+        assert typist.process.wait(cells.PATIENCE_S) == 130
     assert cells.safe(world)
 
 

@@ -59,8 +59,8 @@ def _line_typed(is_over: Callable[[], bool]) -> str:
     """Return the next line of standard input with its end; empty if there is none, or as soon as `is_over()`.
 
     Raises Interrupted (exit code 129) if the terminal is gone: that is no answer, and a read may tell it before
-    SIGHUP comes. A signal does not end a read in Python, so this waits in short steps. It takes byte after byte, so
-    that the lines that follow are left to whoever asks next.
+    SIGHUP comes. A signal does not end a read in Python, so this waits in short steps. It takes byte after byte,
+    so that the lines that follow are left to whoever asks next.
     """
     try:
         input_fd = sys.stdin.fileno()

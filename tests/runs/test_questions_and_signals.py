@@ -6,6 +6,7 @@ import os
 import pty
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -136,6 +137,42 @@ def test_a_real_cell_is_commissioned_by_a_person_at_a_terminal(tmp_path: Path) -
             typist.waits_for("Go on? [y/N]")
             typist.types("n\n")
             assert typist.process.wait(cells.PATIENCE_S) == 130, typist.shown.decode()
+
+
+_READS_THE_RECORD = """
+import os, sys
+from pathlib import Path
+from coupole.errors import StorageError
+from coupole.plan.cell import read_cell
+from coupole.preflight.commissioned import read_commissioning
+cell = read_cell(Path(sys.argv[1]))
+if os.geteuid() == 0:
+    os.seteuid(65534)
+try:
+    read_commissioning(cell)
+except StorageError as error:
+    print(error.exit_code, error)
+"""
+
+
+def test_a_record_in_a_folder_that_another_user_has_is_no_defect(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path)
+    state = tmp_path / "storage/state"
+    state.mkdir(parents=True)
+    state.chmod(0)
+    command = [sys.executable, "-c", _READS_THE_RECORD, str(cell.rig)]
+    ended = subprocess.run(command, cwd=cells.REPO, capture_output=True, text=True, check=True)
+    assert ended.stdout.startswith("6 ")
+    assert "cannot read the record of the commissioning: Permission denied" in ended.stdout
+
+
+def test_a_console_whose_folder_cannot_be_made_is_no_defect(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path)
+    (tmp_path / "file").write_text("")
+    cell.rig_data["storage"]["state"] = str(tmp_path / "file" / "state")
+    cell.write()
+    ended = cells.here("serve", cell.rig)
+    assert (ended.code, "the console's folder cannot be used: Not a directory" in ended.err) == (6, True), ended
 
 
 def test_a_simulated_cell_may_be_answered_from_a_pipe(cell: CellFolder, world: World) -> None:

@@ -40,7 +40,7 @@ _WHY_NOTHING_ELSE = {
     "stopping": "it is being stopped",
     "done": "the run has ended",
 }
-"""Why a session can only be stopped, by its state."""
+"""Reasons why a session can only be stopped, by its state."""
 
 
 class SessionEnded(InputError):
@@ -52,7 +52,7 @@ class SessionWithoutRun:
     ended, so that a second stop finds it too. If this is not possible on a machine, nothing is served; a run's own
     socket then has the same trouble, and says so."""
 
-    _stopped: ClassVar[SessionWithoutRun | None] = None
+    _stopped_session: ClassVar[SessionWithoutRun | None] = None
     """The session of this process that was stopped, and is still served."""
 
     def __init__(
@@ -73,16 +73,16 @@ class SessionWithoutRun:
 
     def __enter__(self) -> SessionWithoutRun:
         with contextlib.suppress(OSError, InputError):
-            if SessionWithoutRun._stopped is not None:
-                SessionWithoutRun._stopped._served.close()
-                SessionWithoutRun._stopped = None
+            if SessionWithoutRun._stopped_session is not None:
+                SessionWithoutRun._stopped_session._served.close()
+                SessionWithoutRun._stopped_session = None
             self._served.enter_context(UserSocket(socket_of(os.getpid()), self._answer))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         is_stopped = kind is not None and issubclass(kind, Interrupted) and self._state != "done"
         if self._state == "stopping" or is_stopped:
-            self._state, SessionWithoutRun._stopped = "stopping", self
+            self._state, SessionWithoutRun._stopped_session = "stopping", self
         else:
             self._served.close()
 

@@ -146,7 +146,7 @@ def _drive(cell: Cell, action: str, ask_bench: Asked, goal: Any, control: Contro
     control.go_on()
     if not agrees:
         raise Interrupted("the arm was not driven: answer the question, or give `--yes`")
-    with kept_control(cell, action) as kept:
+    with kept_control(cell, action) as kept_permission:
         is_refused = False
         try:
             answer = send_request("drive", path=path["path"])
@@ -154,11 +154,11 @@ def _drive(cell: Cell, action: str, ask_bench: Asked, goal: Any, control: Contro
             work = checked_answer(answer)
             while work["state"] == "running":
                 control.go_on()
-                kept.await_loss(_LOOK_EVERY_S)
+                kept_permission.await_loss(_LOOK_EVERY_S)
                 work = checked_answer(send_request("state"))["work"]
         except BaseException:
             if not is_refused:
-                _stop(send_request, kept.lost_because)
+                _stop(send_request, kept_permission.lost_because)
             raise
     if work["state"] != "done":
         control.go_on()  # this raises if the session was asked to stop, which also ends the motion

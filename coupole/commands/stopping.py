@@ -51,10 +51,10 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
             errors.append(error)
     if as_json and documents:
         print(json.dumps(documents if len(documents) > 1 else documents[0]))
-    for name in stopping.others:
+    for name in stopping.other_names:
         _alarm(f"not stopped: {name}; `coupole stop` with its plan or rig stops it")
-    for other in errors[1:]:
-        _alarm(str(other))
+    for further_error in errors[1:]:
+        _alarm(str(further_error))
     if errors:
         raise errors[0]
 
@@ -73,17 +73,17 @@ def _alarm(message: str) -> None:
 class _Stopping:
     """Stops the given run, or all that use the given plan or rig; without a name the only one that there is."""
 
-    named: Path | None
+    file: Path | None
     replies: dict[int, State] = field(default_factory=dict)
     """Answers of what was stopped, by process."""
-    others: list[str] = field(default_factory=list)
+    other_names: list[str] = field(default_factory=list)
     """Names of what was found and not stopped, because only one can be meant without a name."""
     _unclear: dict[int, str] = field(default_factory=dict)
     """Names of sessions whose rig is not known yet, by process."""
-    _told: set[int] = field(default_factory=set)
+    _told_pids: set[int] = field(default_factory=set)
     """Processes of which it was said that they are waited for."""
     _no_run: InputError | None = None
-    """Why no run was stopped."""
+    """Reason why no run was stopped."""
 
     def send(self) -> None:
         """Send the stop, also to what is just starting. Raises InputError if there is nothing to stop, or if it is
@@ -95,8 +95,8 @@ class _Stopping:
             silent_sessions = self._stop_those_that_listen(_SESSION_PATIENCE_S[min(look, _LOOKS) - 1])
             waited_s = time.monotonic() - begun_s
             starting = self._starting() if waited_s < YOUNG_S else {}
-            if self.named is None and self.replies:
-                self.others += starting.values()
+            if self.file is None and self.replies:
+                self.other_names += starting.values()
                 return
             if not starting and (self.replies or look >= _LOOKS):
                 break
@@ -119,11 +119,13 @@ class _Stopping:
         except NoRun as none:
             self._no_run = none
         answering_sessions, silent_sessions = sessions(patience_s)
-        meant = {path: state for path, state in answering_sessions.items() if self._means(state)}
-        if self.named is None and self.replies:
-            self.others = [name_of(state) for state in meant.values() if state["state"] in ("starting", "working")]
+        meant_sessions = {path: state for path, state in answering_sessions.items() if self._means(state)}
+        if self.file is None and self.replies:
+            self.other_names = [
+                name_of(state) for state in meant_sessions.values() if state["state"] in ("starting", "working")
+            ]
             return {}
-        for path, state in (self._only(meant) if self.named is None else meant).items():
+        for path, state in (self._only(meant_sessions) if self.file is None else meant_sessions).items():
             self._ask_session(path, state)
         self._unclear = {
             state["pid"]: name_of(state)
@@ -137,18 +139,18 @@ class _Stopping:
         there are several and none is named."""
         from coupole.acquisition.run_control import NoRun, running
 
-        if self.named is None:
+        if self.file is None:
             return [Path(running_run(None)["run"])]
-        if self.named.is_dir():
-            return [] if self.replies else [self.named]
+        if self.file.is_dir():
+            return [] if self.replies else [self.file]
         states = [state for state in running() if state["run"] and self._means(state)]
         if not states:
-            raise NoRun(f"{self.named}: no process of this user acquires into this run on this machine")
+            raise NoRun(f"{self.file}: no process of this user acquires into this run on this machine")
         return [Path(state["run"]) for state in states]
 
     def _means(self, state: State) -> bool:
         """Tell whether a run or session is meant and was not stopped yet."""
-        files = None if self.named is None else str(self.named.resolve())
+        files = None if self.file is None else str(self.file.resolve())
         return state["pid"] not in self.replies and (
             files is None or files in (state["run"], state["plan"], state.get("rig"))
         )
@@ -158,11 +160,11 @@ class _Stopping:
         there are several."""
         from coupole.acquisition.sessions_without_run import name_of
 
-        working = {path: state for path, state in meant.items() if state["state"] != "stopping"}
-        if len(working) > 1:
-            names = "\n".join(f"  {name_of(state)}" for state in working.values())
+        working_sessions = {path: state for path, state in meant.items() if state["state"] != "stopping"}
+        if len(working_sessions) > 1:
+            names = "\n".join(f"  {name_of(state)}" for state in working_sessions.values())
             raise InputError(f"several sessions have no run; name the run, plan or rig of one of\n{names}")
-        return working or meant
+        return working_sessions or meant
 
     def _ask_session(self, path: Path, state: State) -> None:
         """Stop a session, or its run if that has begun meanwhile. One that is ending already is only noted. Raises
@@ -188,21 +190,21 @@ class _Stopping:
         """Return names of the processes that are starting and that may be meant, by process."""
         from coupole.acquisition.starting_processes import starting_processes
 
-        named = self.named
+        file = self.file
         plans_stopped = [state["plan"] for state in self.replies.values()]
-        may_be_rig = named is None or str(named.resolve()) not in plans_stopped
+        may_be_rig = file is None or str(file.resolve()) not in plans_stopped
         processes = {
             process.pid: process.name
             for process in starting_processes()
-            if process.pid not in self.replies and (named is None or may_be_rig or process.names(named))
+            if process.pid not in self.replies and (file is None or may_be_rig or process.names(file))
         }
         return processes | (self._unclear if may_be_rig else {})
 
     def _tell(self, starting: Mapping[int, str], waited_s: float) -> None:
         """Say for what this waits, if it takes a while; wait a moment."""
         for pid, name in starting.items():
-            if waited_s > _SAID_AFTER_S and pid not in self._told:
-                self._told.add(pid)
+            if waited_s > _SAID_AFTER_S and pid not in self._told_pids:
+                self._told_pids.add(pid)
                 _alarm(f"{name} is just starting: waiting until it can be stopped, or is known not to be meant")
         if starting:
             time.sleep(_STARTING_EVERY_S)

@@ -46,7 +46,7 @@ class _Least:
     """Unit of the file's value, if it is not `unit`."""
     may_be_zero: bool = False
     of: str = ""
-    """What is judged, if the key has more than one value."""
+    """Quantity that is judged, in words, if the key has more than one value."""
 
     def doubts(self) -> Iterator[Doubt]:
         asks = f"is it in {self.hint or self.unit}?"

@@ -20,7 +20,7 @@ class KeptControl:
     def __init__(self) -> None:
         self._is_lost = threading.Event()
         self.lost_because = ""
-        """Who is in control; empty as long as this process may act."""
+        """Name of the person in control, in words; empty as long as this process may act."""
 
     def await_loss(self, seconds: float) -> None:
         """Wait for this time. Raises Interrupted as soon as another person is in control."""

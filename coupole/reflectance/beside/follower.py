@@ -56,12 +56,12 @@ def _words_on(error: Exception) -> str:
     """Return why there is no result. An error is told in any case, but it is no defect if memory ran short."""
     is_expected = isinstance(error, CoupoleError | OSError)
     words = reason(error) if is_expected else f"{type(error).__name__}: {error}"
-    if short := memory_behind(error):
-        return f"memory did not suffice: {short} ({words})"
+    if shortage := memory_behind(error):
+        return f"memory did not suffice: {shortage} ({words})"
     if is_expected:
         return words
-    if limited := little_address_space(os.getpid()):
-        return f"{words}. Unless the limit of memory is the cause, {_DEFECT} ({limited})"
+    if limit_words := little_address_space(os.getpid()):
+        return f"{words}. Unless the limit of memory is the cause, {_DEFECT} ({limit_words})"
     return f"{words}. T{_DEFECT[1:]}"
 
 

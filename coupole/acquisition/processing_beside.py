@@ -239,7 +239,7 @@ class ProcessingBeside:
 
     @property
     def _reason(self) -> str:
-        """Why the process has ended. Its own word counts; a limit of memory is named as the cause only if it could
+        """Return why the process has ended. Its own word counts; a limit of memory is named as the cause only if it could
         say nothing."""
         if why := self._why or self._progress.why:
             return why

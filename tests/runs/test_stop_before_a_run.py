@@ -18,7 +18,7 @@ import cells
 import pytest
 from cells import CellFolder
 
-from coupole.acquisition import runtime_folder
+from coupole.acquisition import runtime_folder, starting_processes
 from coupole.acquisition.sessions_without_run import SessionEnded, ask_session, sessions_without_run
 
 PATIENT_S = 5.0
@@ -193,7 +193,8 @@ def test_a_session_that_is_starting_has_nothing_to_pause(apart: Path) -> None:
         assert process.poll() is None
 
 
-def test_a_session_that_is_slow_to_answer_is_not_overlooked(apart: Path) -> None:
+def test_a_session_that_is_slow_to_answer_is_not_overlooked(apart: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(starting_processes, "YOUNG_S", 0.0)  # those of other tests are not waited for
     plan = apart / "plan.yaml"
     with _starts(plan) as process:
         process.send_signal(signal.SIGSTOP)

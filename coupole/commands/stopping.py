@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +16,7 @@ from coupole.errors import CoupoleError, DeviceError, InputError, unsafe_end
 
 if TYPE_CHECKING:
     from coupole.acquisition.run_control import State
+    from coupole.acquisition.starting_processes import StartingProcess
     from coupole.storage.run import Run
 
 _LOOK_EVERY_S, _STARTING_EVERY_S = 0.2, 0.05
@@ -88,13 +89,14 @@ class _Stopping:
     def send(self) -> None:
         """Send the stop, also to what is just starting. Raises InputError if there is nothing to stop, or if it is
         not clear what is meant."""
-        from coupole.acquisition.starting_processes import YOUNG_S
+        from coupole.acquisition.starting_processes import YOUNG_S, starting_processes
 
         begun_s = time.monotonic()
         for look in itertools.count(1):
+            processes = list(starting_processes())  # before the sockets, which one of them may have a moment later
             silent_sessions = self._stop_those_that_listen(_SESSION_PATIENCE_S[min(look, _LOOKS) - 1])
             waited_s = time.monotonic() - begun_s
-            starting = self._starting() if waited_s < YOUNG_S else {}
+            starting = self._starting(processes) if waited_s < YOUNG_S else {}
             if self.file is None and self.replies:
                 self.other_names += starting.values()
                 return
@@ -186,16 +188,14 @@ class _Stopping:
             _alarm(f"{name_of(state)} is being stopped already, or is ending: waiting for its end")
         self.replies[reply["pid"]] = reply
 
-    def _starting(self) -> dict[int, str]:
+    def _starting(self, starting_processes: Iterable[StartingProcess]) -> dict[int, str]:
         """Return names of the processes that are starting and that may be meant, by process."""
-        from coupole.acquisition.starting_processes import starting_processes
-
         file = self.file
         plans_stopped = [state["plan"] for state in self.replies.values()]
         may_be_rig = file is None or str(file.resolve()) not in plans_stopped
         processes = {
             process.pid: process.name
-            for process in starting_processes()
+            for process in starting_processes
             if process.pid not in self.replies and (file is None or may_be_rig or process.names(file))
         }
         return processes | (self._unclear if may_be_rig else {})

@@ -39,6 +39,7 @@ _PAGE_PROGRAM = "coupole.exchange.look.page_beside"
 _READY_WITHIN_S = 120.0
 """Longest wait for the first answer: the process needs less time for its imports, even on a busy machine."""
 _TOLD_AFTER_S = 1.0
+_NOTHING_SAID = "its process ended without a message"
 _SILENT_S, _LEAST_CPU_S = 120.0, 1.0
 """A process hangs if, with all frames there, it reports nothing and computes nothing for this time."""
 _IDLE_S = 20.0
@@ -238,9 +239,15 @@ class ProcessingBeside:
 
     @property
     def _reason(self) -> str:
-        if self._why or not self._shortage:
-            return self._why or self._progress.why or self._last_words
-        return f"{self._shortage} ({self._progress.why})" if self._progress.why else self._shortage
+        """Return why the process has ended. Its own word counts; a limit of memory is named as the cause only if
+        it could say nothing."""
+        if why := self._why or self._progress.why:
+            return why
+        words = self._last_words
+        if not self._shortage:
+            return words
+        said_nothing = (self._process.returncode or 0) < 0 or words == _NOTHING_SAID or "MemoryError" in words
+        return f"{self._shortage} ({words})" if said_nothing else f"{words} ({self._shortage.partition(': ')[2]})"
 
     def _say_unfinished(self) -> None:
         assert self._run is not None
@@ -324,7 +331,7 @@ class ProcessingBeside:
             return "its process ended"
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        return lines[-1] if lines else "its process ended without a message"
+        return lines[-1] if lines else _NOTHING_SAID
 
     def _end(self) -> bool:
         """End the process; False if it had ended."""

@@ -2,16 +2,17 @@
 
 A commissioning, a metering, a live view, a bench and a drive of the arm have none. An acquisition has none
 yet while it reads the plan, makes its preflight and opens devices, which takes seconds, or minutes if a
-controller must be started first. In this time a session serves a socket of its own, named after its process; an
-acquisition does so until the socket of its run is there (`coupole.acquisition.run_control`)::
+controller must be started first; and none any more while its process ends. In this time a session serves a socket
+of its own, named after its process; a run has another one (`coupole.acquisition.run_control`)::
 
     {"version": 1, "command": "stop"}       stop | state
     {"version": 1, "run": "", "plan": "/plans/bust.yaml", "rig": "", "doing": "acquire", "pid": 4711,
-     "state": "starting"}
+     "begun": false, "state": "starting"}
 
-`run` is the run that is resumed; empty for others. `plan` and `rig` are files; empty if there is none, or if it is
-not known yet. `doing` is the command, and `state` is `starting`, `working` (all commands but `acquire`) or
-`stopping`.
+`run` is the run that is acquired or resumed; empty for others. `plan` and `rig` are files; empty if there is none,
+or if it is not known yet. `doing` is the command. `begun` is true once the run has its own socket. `state` is
+`starting`, `running` (`begun`; only the run's socket stops it), `working` (all commands but `acquire`),
+`stopping`, or `done` (nothing here can be stopped).
 """
 
 from __future__ import annotations
@@ -21,14 +22,25 @@ import os
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import ClassVar
 
 from coupole.acquisition.run_control import VERSION, Command, NoAnswer, State, exchange_command, request_of
 from coupole.acquisition.runtime_folder import runtime_folder
 from coupole.acquisition.user_socket import Caller, UserSocket
-from coupole.errors import InputError, reason
+from coupole.errors import InputError, Interrupted, reason
 
 ACQUIRE = "acquire"
 _SUFFIX = ".start"
+
+
+_WHY_NOTHING_ELSE = {
+    "starting": "the run has not begun; `coupole stop` ends it",
+    "working": "this session has no run; `coupole stop` ends it",
+    "running": "the run has ended, or ends now",
+    "stopping": "it is being stopped",
+    "done": "the run has ended",
+}
+"""Reasons why a session can only be stopped, by its state."""
 
 
 class SessionEnded(InputError):
@@ -36,10 +48,16 @@ class SessionEnded(InputError):
 
 
 class SessionWithoutRun:
-    """Serves the socket of a session that has no run, while a context lasts. If this is not possible on a machine,
-    nothing is served; a run's own socket then has the same trouble, and says so."""
+    """Serves the socket of a session that has no run, while a context lasts; after a stop, until the process has
+    ended, so that a second stop finds it too. If this is not possible on a machine, nothing is served; a run's own
+    socket then has the same trouble, and says so."""
 
-    def __init__(self, doing: str, plan: Path | None, rig: Path | None, resumed_run: Path | None = None) -> None:
+    _stopped_session: ClassVar[SessionWithoutRun | None] = None
+    """The session of this process that was stopped, and is still served."""
+
+    def __init__(
+        self, doing: str, plan: Path | None, rig: Path | None = None, resumed_run: Path | None = None
+    ) -> None:
         """`doing` is the command; it has a plan or a rig, or both."""
         self._about: State = {
             "version": VERSION,
@@ -48,22 +66,42 @@ class SessionWithoutRun:
             "rig": str(rig.resolve()) if rig else "",
             "doing": doing,
             "pid": os.getpid(),
+            "begun": False,
         }
         self._state = "starting" if doing == ACQUIRE else "working"
         self._served = contextlib.ExitStack()
 
     def __enter__(self) -> SessionWithoutRun:
         with contextlib.suppress(OSError, InputError):
-            path = runtime_folder() / f"{os.getpid()}{_SUFFIX}"
-            self._served.enter_context(UserSocket(path, self._answer))
+            if SessionWithoutRun._stopped_session is not None:
+                SessionWithoutRun._stopped_session._served.close()
+                SessionWithoutRun._stopped_session = None
+            self._served.enter_context(UserSocket(socket_of(os.getpid()), self._answer))
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.end()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        is_stopped = kind is not None and issubclass(kind, Interrupted) and self._state != "done"
+        if self._state == "stopping" or is_stopped:
+            self._state, SessionWithoutRun._stopped_session = "stopping", self
+        else:
+            self._served.close()
+
+    def know(self, plan: Path, rig: Path) -> None:
+        """Tell the plan and its rig, now that they are known."""
+        self._about |= {"plan": str(plan.resolve()), "rig": str(rig.resolve())}
+
+    def begin_run(self, run: Path) -> None:
+        """Tell that the run has a socket now."""
+        self._about |= {"run": str(run.resolve()), "begun": True}
+        self._pass_on("running")
 
     def end(self) -> None:
-        """Serve no more: the run has a socket, or there is none."""
-        self._served.close()
+        """Tell that nothing can be stopped here from now on."""
+        self._pass_on("done")
+
+    def _pass_on(self, state: str) -> None:
+        if self._state != "stopping":
+            self._state = state
 
     def _answer(self, line: bytes, _: Caller) -> State:
         try:
@@ -71,25 +109,35 @@ class SessionWithoutRun:
         except InputError as error:
             return {"version": VERSION, "error": str(error)}
         if command == "stop":
-            self._state = "stopping"
-            os.kill(os.getpid(), signal.SIGINT)  # as Ctrl-C, at whatever it is
+            if self._state in ("starting", "working"):
+                self._state = "stopping"
+                os.kill(os.getpid(), signal.SIGINT)  # as Ctrl-C, at whatever it is
         elif command != "state":
-            has_no_run = "the run has not begun" if self._about["doing"] == ACQUIRE else "this session has no run"
-            return {**self._about, "error": f"{command}: {has_no_run}; `coupole stop` ends it"}
+            return {**self._about, "error": f"{command}: {_WHY_NOTHING_ELSE[self._state]}"}
         return {**self._about, "state": self._state, "trouble": []}
 
 
 def sessions_without_run(patience_s: float) -> Iterator[tuple[Path, State]]:
-    """Yield sockets and states of all sessions of this user on this machine that have no run. One that does not
-    answer within `patience_s` is `silent`: its run and plan are not known."""
+    """Yield sockets and states of all other sessions of this user on this machine that can be stopped, or that
+    are stopping. One that does not answer within `patience_s` is `silent`: its run and plan are not known."""
     for path in sorted(runtime_folder().glob(f"*{_SUFFIX}")):
-        try:
-            yield path, exchange_command(path, "state", patience_s)
-        except (ConnectionRefusedError, FileNotFoundError):  # of a process that was killed, or has just ended
+        if path == socket_of(os.getpid()):
             continue
+        try:
+            state = exchange_command(path, "state", patience_s)
+            if state["state"] != "done":
+                yield path, state
+        except (ConnectionRefusedError, FileNotFoundError):  # of a process that was killed, or has just ended
+            if not Path(f"/proc/{path.stem}").exists():
+                path.unlink(missing_ok=True)
         except (OSError, ValueError):
             unknown = {"run": "", "plan": "", "rig": "", "doing": "", "state": "silent"}
             yield path, {"version": VERSION, **unknown, "pid": int(path.stem)}
+
+
+def socket_of(pid: int) -> Path:
+    """Return the socket that the session of a process has. Raises InputError, OSError (`runtime_folder`)."""
+    return runtime_folder() / f"{pid}{_SUFFIX}"
 
 
 def name_of(state: State) -> str:

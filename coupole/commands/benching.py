@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -76,6 +76,7 @@ def arm(
     Without a plan the support is assumed to be empty. If a bench holds the cell, the command uses it; otherwise it
     opens and closes the devices. If a console is served, the command needs control of the cell either way.
     """
+    from coupole.acquisition.cell_bench.bench_client import ask_bench
     from coupole.acquisition.cell_bench.bench_service import bench_of
     from coupole.acquisition.cell_marks import is_in_use
     from coupole.acquisition.observer import Control
@@ -90,13 +91,15 @@ def arm(
     console, control = make_console(quiet=as_json), Control()
     try:
         cell = read_cell(rig)
+        action = f"arm to {view or to}"
         if is_in_use(cell):
-            answer = _drive(_asker(cell, f"arm to {view or to}"), goal, control, yes=yes)
+            ask_open_bench = functools.partial(ask_bench, cell, say=_say)
+            answer = _drive(cell, action, ask_open_bench, goal, control, yes=yes)
         else:
             lies = object_of or plan
             job_or_cell = read_job(lies, rig) if lies else cell
             with borrowed_cell(cell, "arm"), bench_of(job_or_cell, console, control, confirm=False) as service:
-                answer = _drive(service.ask, goal, control, yes=yes)
+                answer = _drive(cell, action, service.ask, goal, control, yes=yes)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -105,11 +108,10 @@ def arm(
         print(json.dumps(answer))
 
 
-def _asker(cell: Cell, action: str) -> Asked:
-    """Return a function that asks the open bench. Each request that shows or begins the motion first asks the
-    cell's console for permission, because control may change while a person answers a question. A refusal is an
+def _asker(cell: Cell, action: str, ask: Asked) -> Asked:
+    """Return a function that asks the bench. Each request that shows or begins the motion first asks the cell's
+    console for permission, because control may change while a person answers a question. A refusal is an
     answer."""
-    from coupole.acquisition.cell_bench.bench_client import ask_bench
     from coupole.console.command_line.client import ask_permission
 
     def send_request(command: str, **fields: Any) -> dict[str, Any]:
@@ -118,7 +120,7 @@ def _asker(cell: Cell, action: str) -> Asked:
                 ask_permission(cell, action)
             except InputError as refusal:
                 return {"error": str(refusal), "exit_code": refusal.exit_code}
-        return ask_bench(cell, command, say=_say, **fields)
+        return ask(command, **fields)
 
     return send_request
 
@@ -127,12 +129,15 @@ def _say(words: str) -> None:
     print(words, file=sys.stderr, flush=True)
 
 
-def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> dict[str, Any]:
+def _drive(cell: Cell, action: str, ask_bench: Asked, goal: Any, control: Control, *, yes: bool) -> dict[str, Any]:
     """Plan a path, show it, ask, and drive the arm. Return the figures of the motion when the arm has arrived. A
-    drive that is refused ends nothing: another motion may be under way."""
+    drive that is refused ends nothing: another motion may be under way. Raises Interrupted when another person
+    takes control at the console, which stops the arm."""
     from coupole.acquisition.cell_bench.bench_client import checked_answer
+    from coupole.console.command_line.keeping_control import kept_control
     from coupole.viewing.questions import ask
 
+    send_request = _asker(cell, action, ask_bench)
     path = checked_answer(send_request("plan_path", to=goal))
     steps = len(path["waypoints_deg"]) - 1
     print(f"{path['to']}: {path['duration_s']:.1f} s, {steps} straight motion(s)", file=sys.stderr)
@@ -141,19 +146,20 @@ def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> di
     control.go_on()
     if not agrees:
         raise Interrupted("the arm was not driven: answer the question, or give `--yes`")
-    is_refused = False
-    try:
-        answer = send_request("drive", path=path["path"])
-        is_refused = "error" in answer
-        work = checked_answer(answer)
-        while work["state"] == "running":
-            control.go_on()
-            time.sleep(_LOOK_EVERY_S)
-            work = checked_answer(send_request("state"))["work"]
-    except BaseException:
-        if not is_refused:
-            _stop(send_request)
-        raise
+    with kept_control(cell, action) as kept_permission:
+        is_refused = False
+        try:
+            answer = send_request("drive", path=path["path"])
+            is_refused = "error" in answer
+            work = checked_answer(answer)
+            while work["state"] == "running":
+                control.go_on()
+                kept_permission.await_loss(_LOOK_EVERY_S)
+                work = checked_answer(send_request("state"))["work"]
+        except BaseException:
+            if not is_refused:
+                _stop(send_request, kept_permission.lost_because)
+            raise
     if work["state"] != "done":
         control.go_on()  # this raises if the session was asked to stop, which also ends the motion
         raise DeviceError(
@@ -162,8 +168,8 @@ def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> di
     return {**work, "duration_s": path["duration_s"], "waypoints_deg": path["waypoints_deg"]}
 
 
-def _stop(send_request: Asked) -> None:
+def _stop(send_request: Asked, why: str) -> None:
     try:
-        send_request("stop")
+        send_request("stop", why=why)
     except InputError as silent:
         _say(str(silent))

@@ -11,6 +11,7 @@ from coupole.calibration.campaign_steps import OBJECT, STEPS, Step
 from coupole.commands import calibrate_geometry, calibrate_lens, calibrate_light
 from coupole.commands.simulated_support import BOARD, CERTIFICATE_OF_SIMULATED_TILE, TILE, with_things
 from coupole.errors import CalibrationRefused, Interrupted
+from coupole.storage.durable import write_synced
 from coupole.viewing.questions import ask
 
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ class Campaign:
                 text = led_plan(read_cell(rig), name=step.name, rig=str(rig), tell=status.update)
         else:
             text = TEMPLATES[step.name].format(name=step.name, rig=rig)
-        path.write_text(text, encoding="utf-8")
+        write_synced(path, text)
         return path
 
     def _rig_of(self, step: Step) -> Path:

@@ -97,7 +97,7 @@ GROUPS = {
         "status": "keeping.status",
         "pause": "run_controls.pause",
         "go-on": "run_controls.go_on",
-        "stop": "run_controls.stop",
+        "stop": "stopping.stop",
         "report": "keeping.report",
         "verify": "keeping.verify",
         "archive": "keeping.archive",

@@ -13,13 +13,12 @@ import typer
 
 from coupole.commands.common import JsonOption
 from coupole.commands.completion import runs
-from coupole.errors import DeviceError, InputError, unsafe_end
+from coupole.errors import DeviceError, InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from coupole.acquisition.run_control import Command, State
-    from coupole.storage.run import Run
 
 RunningRun = Annotated[
     Path | None,
@@ -57,96 +56,6 @@ def go_on(run: RunningRun = None, as_json: JsonOption = False) -> None:
             remedy="Give `coupole go-on` again when the run is paused.",
         )
     _say(state, as_json=as_json)
-
-
-def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
-    """Stop a running acquisition now: lights off, arm still, camera disarmed. It can be resumed.
-
-    While nothing is acquired, it stops a commissioning, metering, live view, bench or drive of the arm. Ends when
-    the process has ended; exit code 4 if the journal says that the cell may not be safe. This is no emergency
-    stop: that is the button at the cell.
-    """
-    reply = _state_after(run, "stop")  # sent before the imports, which only the outcome needs
-    if "doing" in reply:
-        _await_end_without_run(reply, as_json=as_json)
-        return
-
-    from coupole.storage.run import Run
-    from coupole.storage.run_status import status
-    from coupole.viewing.terminal import alarm, make_console, show_status
-
-    for trouble in reply["trouble"]:
-        alarm(trouble)
-    folder = Run(Path(reply["run"]))
-    end_s = time.monotonic() + _ENDS_WITHIN_S
-    while folder.in_use:
-        if time.monotonic() > end_s:
-            raise DeviceError(
-                "cell",
-                expected=f"the process {reply['pid']} to end within {_ENDS_WITHIN_S:g} s of its stop",
-                happened="the process still acquires frames into the run",
-                remedy="Look at the cell, then end the process (`kill -9`); the run can be resumed.",
-            )
-        time.sleep(_LOOK_EVERY_S)
-    _has_ended(reply["pid"], _LEAVES_WITHIN_S)
-    progress = status(folder)
-    if as_json:
-        print(json.dumps(progress.figures()))
-    show_status(make_console(quiet=as_json), progress)
-    if unsafe := _unsafe(folder):
-        raise unsafe_end("; ".join(unsafe))
-    make_console(quiet=as_json).print("lights are off, the arm is at rest, the camera is disarmed")
-
-
-def _await_end_without_run(reply: State, *, as_json: bool) -> None:
-    """Wait until a session without a run has ended, which was stopped. Raises DeviceError."""
-    from coupole.acquisition.sessions_without_run import ACQUIRE
-    from coupole.viewing.terminal import make_console
-
-    if not _has_ended(reply["pid"], _ENDS_WITHIN_S):
-        raise DeviceError(
-            "cell",
-            expected=f"the process {reply['pid']} to end within {_ENDS_WITHIN_S:g} s of its stop",
-            happened="it is still there",
-            remedy="Look at the cell, then end the process (`kill -9`).",
-        )
-    if as_json:
-        print(json.dumps(reply))
-    when = "stopped while it was starting: " if reply["doing"] == ACQUIRE else f"stopped: {reply['doing']} "
-    words = f"{when}{reply['plan'] or reply.get('rig')}; its process {reply['pid']} has ended"
-    make_console(quiet=as_json).print(words, markup=False)
-
-
-def _has_ended(pid: int, within_s: float) -> bool:
-    """Wait until a process has ended; return whether it has."""
-    import os
-    import select
-
-    try:
-        process = os.pidfd_open(pid)
-    except ProcessLookupError:
-        return True
-    try:
-        return bool(select.select([process], [], [], within_s)[0])
-    finally:
-        os.close(process)
-
-
-def _unsafe(run: Run) -> list[str]:
-    """Return reasons to doubt that the cell is safe after the last session, from the run's journal."""
-    from coupole.storage import journal
-    from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
-
-    reasons = ["the session has no end in its journal: its process was killed, or could not write it"]
-    has_end = False
-    for event in journal.read_events(run.journal_path):
-        if isinstance(event, SessionStarted | SessionResumed):
-            reasons, has_end = reasons[:1], False
-        elif isinstance(event, FaultNoted) and event.kind == "unsafe":
-            reasons.append(event.message)
-        elif isinstance(event, SessionStopped):
-            has_end = True
-    return reasons[1:] if has_end else reasons
 
 
 def follow(run: Path | None, console: Console) -> Path:
@@ -224,8 +133,8 @@ def _answer_to(run: Path | None, command: Command) -> State:
             return ask(_run_of(run), command, alarm)
         except NoRun as none:
             no_run = none
-        sessions, silent_sessions = _sessions(patience_s)
-        if (answer := _answer_of_session(run, sessions, command, alarm)) is not None:
+        answering_sessions, silent_sessions = sessions(patience_s)
+        if (answer := _answer_of_session(run, answering_sessions, command, alarm)) is not None:
             return answer
     if (answer := _answer_of_session(None, silent_sessions, command, alarm)) is not None:
         return answer
@@ -250,7 +159,7 @@ def _run_of(named: Path | None) -> Path:
     return Path(folders[0]) if folders else named
 
 
-def _sessions(patience_s: float) -> tuple[dict[Path, State], dict[Path, State]]:
+def sessions(patience_s: float) -> tuple[dict[Path, State], dict[Path, State]]:
     """Return sockets and states of the sessions without a run: those that answer, and those that do not."""
     from coupole.acquisition.sessions_without_run import sessions_without_run
 

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from coupole.acquisition.processing_beside import ProcessingBeside
     from coupole.acquisition.session import SessionRequest
+    from coupole.acquisition.sessions_without_run import SessionWithoutRun
     from coupole.plan.cell import Cell
     from coupole.preflight.job import Job
 
@@ -73,31 +74,36 @@ def acquire(
     pause`, `go-on` and `stop`. If a console owns the cell (`coupole serve`), the command acquires in the console's
     name, if nothing runs or waits there.
     """
-    from coupole.acquisition.session import SessionRequest
-    from coupole.preflight.job import read_job
-    from coupole.viewing.terminal import make_console
+    from coupole.acquisition.sessions_without_run import ACQUIRE, SessionWithoutRun
 
     _refuse_exclusive(resume, output, dry_run=dry_run, asks_result=reflectance or result is not None)
-    console = make_console(quiet=as_json and not begun_by_console)
     summary: dict[str, Any] = {}
     try:
-        console_cell = None if dry_run or begun_by_console else served_cell(plan, rig, resume)
-        if console_cell is not None:
-            from coupole.console.command_line.following import acquire_by_console
+        with SessionWithoutRun(ACQUIRE, plan, rig, resume) as starting:  # before the imports: they take seconds
+            from coupole.acquisition.session import SessionRequest
+            from coupole.preflight.job import read_job
+            from coupole.viewing.terminal import make_console
 
-            plan = plan or (plan_of(resume) if rig else None)
-            paths = {"plan": plan, "output": output, "resume": resume, "result": result}
-            request = {key: str(path.resolve()) for key, path in paths.items() if path is not None}
-            flags = {"with_mesh": with_mesh, "reflectance": reflectance or result is not None}
-            acquire_by_console(console_cell, console, {**request, **flags}, confirm=not yes, summary=summary)
-        elif dry_run:
-            from coupole.acquisition.dry_run import rehearse
+            console = make_console(quiet=as_json and not begun_by_console)
+            console_cell = None if dry_run or begun_by_console else served_cell(plan, rig, resume)
+            if console_cell is not None:
+                from coupole.console.command_line.following import acquire_by_console
 
-            rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, figures=summary)
-        else:
-            wanted_session = SessionRequest(output, resume, confirm=not yes, with_mesh=with_mesh)
-            asked_result = result, reflectance
-            _acquire_here(plan or plan_of(resume), rig, console, wanted_session, asked_result, summary)
+                starting.end()
+                plan = plan or (plan_of(resume) if rig else None)
+                paths = {"plan": plan, "output": output, "resume": resume, "result": result}
+                request = {key: str(path.resolve()) for key, path in paths.items() if path is not None}
+                flags = {"with_mesh": with_mesh, "reflectance": reflectance or result is not None}
+                acquire_by_console(console_cell, console, {**request, **flags}, confirm=not yes, summary=summary)
+            elif dry_run:
+                from coupole.acquisition.dry_run import rehearse
+
+                starting.end()
+                rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, figures=summary)
+            else:
+                job = read_job(plan or plan_of(resume), rig)
+                wanted_session = SessionRequest(output, resume, confirm=not yes, with_mesh=with_mesh)
+                _acquire_here(job, console, wanted_session, (result, reflectance), summary, starting)
     except CoupoleError as error:
         fail(error, as_json=as_json, figures=summary)
         raise
@@ -115,23 +121,22 @@ def _refuse_exclusive(resume: Path | None, output: Path | None, *, dry_run: bool
 
 
 def _acquire_here(
-    plan: Path,
-    rig: Path | None,
+    job: Job,
     console: Console,
     wanted_session: SessionRequest,
     asked_result: tuple[Path | None, bool],
     summary: dict[str, Any],
+    starting: SessionWithoutRun,
 ) -> None:
     """Acquire in this process. `asked_result` is the folder of the result, and whether one is asked for."""
     from coupole.acquisition.session import acquire_plan
-    from coupole.acquisition.sessions_without_run import ACQUIRE, SessionWithoutRun
-    from coupole.preflight.job import read_job
 
+    starting.know(job.document.path, job.cell.document.path)
     resume, (result, is_asked) = wanted_session.resume, asked_result
-    with SessionWithoutRun(ACQUIRE, plan, rig, resume) as starting:
-        job = read_job(plan, rig)
-        with _beside(job, console, resume, result, summary, is_asked=is_asked) as beside:
-            acquire_plan(job, console, replace(wanted_session, beside=beside, when_served=starting.end), summary)
+    with _beside(job, console, resume, result, summary, is_asked=is_asked) as beside:
+        wanted_session = replace(wanted_session, beside=beside, when_served=starting.begin_run)
+        acquire_plan(job, console, wanted_session, summary)
+        starting.end()  # what is processed beside the run goes on
 
 
 @contextmanager

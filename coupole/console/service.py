@@ -38,7 +38,7 @@ from coupole.console.service_parts import Service
 from coupole.console.upkeep.notifications import console_folder, read_settings
 from coupole.console.upkeep.notifier import Notifier, Occurrences
 from coupole.console.upkeep.support_bundle import SupportBundles
-from coupole.errors import InputError
+from coupole.errors import InputError, StorageError, reason
 from coupole.plan.cell import Cell
 from coupole.storage.durable import make_folder
 
@@ -66,8 +66,11 @@ def serve(
             f"--host {host}: other machines can reach this address: give --tls-certificate and --tls-key"
         )
     folder = console_folder(cell)
-    make_folder(folder)
-    folder.chmod(0o700)  # hashes of passwords, and the log of people's requests
+    try:
+        make_folder(folder)
+        folder.chmod(0o700)  # hashes of passwords, and the log of people's requests
+    except OSError as error:
+        raise StorageError(f"{folder}: the console's folder cannot be used: {reason(error)}") from error
     with _console_lock(folder):
         context, listening = tls_context(tls), listen(host, port)
         port = listening.getsockname()[1]
@@ -98,7 +101,9 @@ def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cooki
         runs = RunFiles(cell.storage_folder, folder / "verified")
         plan_files = PlanFiles(plans, cell.document.path, folder / "drawings")
 
-        bench = parts.enter_context(Bench(cell, acquisitions, plan_files, folder / "bench"))
+        bench = parts.enter_context(
+            Bench(cell, acquisitions, plan_files, folder / "bench", in_control=lambda: control.now.name)
+        )
         entering = parts.enter_context(contextlib.closing(Entering(cell, plans, queue, acquisitions)))
 
         def state() -> StateNow:

@@ -18,7 +18,7 @@ from pydantic import AwareDatetime, Field, JsonValue
 import coupole
 from coupole.calibration.record import Limit, Sha256, content_sha256, write_sealed
 from coupole.devices import Identity
-from coupole.errors import InputError
+from coupole.errors import InputError, StorageError, reason
 from coupole.plan import yamlfile
 from coupole.plan.base_model import Model, Name
 from coupole.plan.cell import Cell
@@ -119,10 +119,10 @@ def read_commissioning(cell: Cell) -> CommissioningRecord | None:
     there is none.
 
     For each step the newest result that fits the rig is taken. If none fits, it is the newest result. Raises
-    InputError for a record that was edited or cannot be read.
+    InputError for a record that was edited or cannot be read, StorageError if its folder cannot be entered.
     """
     paths = [place / _FILE for place in places_of_arm(cell)]
-    records = {path: _read_record(path) for path in paths if path.exists()}
+    records = {path: _read_record(path) for path in paths if _is_there(path)}
     is_simulated = in_world(cell.rig, dry_run=False)
     own_records = {path: record for path, record in records.items() if record.simulated == is_simulated}
     if not own_records:
@@ -137,6 +137,14 @@ def read_commissioning(cell: Cell) -> CommissioningRecord | None:
         fitting = [result for result in results if not why_outdated(cell, result)]
         steps += sorted(fitting or results, key=lambda result: result.ended)[-1:]
     return _sealed_record(cell.rig.name, tuple(steps), is_simulated=is_simulated)
+
+
+def _is_there(path: Path) -> bool:
+    """Tell whether a record exists. Raises StorageError if this cannot be seen."""
+    try:
+        return path.exists()
+    except OSError as error:
+        raise StorageError(f"{path}: cannot read the record of the commissioning: {reason(error)}") from error
 
 
 def _read_record(path: Path) -> CommissioningRecord:

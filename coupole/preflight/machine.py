@@ -4,6 +4,7 @@ doctor`).
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 import shutil
@@ -17,7 +18,8 @@ from coupole.plan.rig_devices import host_needs
 ROOM_BYTES = 20_400_000_000
 """Size of one view under 1080 LEDs: frames of 12 megapixels, 12 bits packed."""
 
-
+_USED_UP = 0.9
+"""A process that has more than this share of its limit may fail because of it."""
 LEAST_ADDRESS_SPACE_BYTES = 2_500_000_000
 """Least address space that a plan may be read with. The demo's run took 2.0 GB of it, most of it compiled code and
 libraries. Embree ends the process with a segmentation fault where it gets none."""
@@ -43,6 +45,25 @@ def little_address_space(pid: int = 0) -> str:
         f"{process} may have {limit_bytes / 1e9:.2f} GB of address space; a plan needs "
         f"{LEAST_ADDRESS_SPACE_BYTES / 1e9:.1f} GB, and large frames need more"
     )
+
+
+def memory_behind(error: BaseException) -> str:
+    """Return why this process had too little memory for what raised an error; empty if this is not known. A
+    library that gets no memory may raise any error; then the limit of memory is used up."""
+    link: BaseException | None = error
+    while link is not None:
+        if isinstance(link, MemoryError) or (isinstance(link, OSError) and link.errno == errno.ENOMEM):
+            return little_address_space(os.getpid()) or "this process got no more memory"
+        link = link.__cause__ or link.__context__
+    why = little_address_space(os.getpid())
+    limit_bytes, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return why if why and _address_space_bytes() > _USED_UP * limit_bytes else ""
+
+
+def _address_space_bytes() -> int:
+    """Return the address space that this process has."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def machine_needs(cell: Cell) -> list[tuple[str, HostNeed]]:

@@ -325,4 +325,4 @@ def newest_run(parent: Path, name: str, plan: Path, say: Callable[[str], object]
 def is_complete(folder: Path) -> bool:
     """Tell whether all frames of a run are proven, and no more are to be chosen."""
     found = status(Run(folder))
-    return not found.missing and not found.open_views and not found.wants_views
+    return not found.has_left

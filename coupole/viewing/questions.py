@@ -6,9 +6,13 @@ import contextlib
 import math
 import os
 import select
+import signal
+import stat
 import sys
 import termios
 from collections.abc import Callable
+
+from coupole.errors import Interrupted
 
 _LOOK_EVERY_MS = 50
 
@@ -24,7 +28,7 @@ def _forget_typing() -> None:
 def ask(question: str, is_over: Callable[[], bool] = lambda: False, *, default: bool = False) -> bool:
     """Ask a yes-or-no question on standard error, even with `--json`; any answer but yes counts as no, an empty
     one as `default`. What was typed before the question does not count. No answer is no: neither an input that has
-    ended, nor a question that is given up because `is_over()`."""
+    ended, nor a question that is given up because `is_over()`. Raises Interrupted if the terminal is gone."""
     _forget_typing()
     print(f"{question} {'[Y/n]' if default else '[y/N]'} ", end="", file=sys.stderr, flush=True)
     line = _line_typed(is_over)
@@ -33,7 +37,7 @@ def ask(question: str, is_over: Callable[[], bool] = lambda: False, *, default: 
 
 def ask_number(question: str, is_over: Callable[[], bool] = lambda: False) -> float | None:
     """Ask for a number on standard error, and ask again if the answer is not a number. Return None for an empty
-    answer, or if the question is given up because `is_over()` is true.
+    answer, or if the question is given up because `is_over()` is true. Raises Interrupted if the terminal is gone.
     """
     while True:
         _forget_typing()
@@ -54,8 +58,9 @@ def is_asked_at_a_terminal() -> bool:
 def _line_typed(is_over: Callable[[], bool]) -> str:
     """Return the next line of standard input with its end; empty if there is none, or as soon as `is_over()`.
 
-    A signal does not end a read in Python, so this waits in short steps. It takes byte after byte, so that the
-    lines that follow are left to whoever asks next.
+    Raises Interrupted (exit code 129) if the terminal is gone: that is no answer, and a read may tell it before
+    SIGHUP comes. A signal does not end a read in Python, so this waits in short steps. It takes byte after byte,
+    so that the lines that follow are left to whoever asks next.
     """
     try:
         input_fd = sys.stdin.fileno()
@@ -71,11 +76,27 @@ def _line_typed(is_over: Callable[[], bool]) -> str:
         except BlockingIOError:
             continue
         except OSError:  # no standard input
-            return ""
+            byte = b""
+        if not byte and _is_hung_up(input_fd):
+            raise Interrupted("the terminal is gone, so nobody can answer", signal.SIGHUP)
         line += byte
         if byte in (b"", b"\n"):
             return line.decode(errors="replace")
     return ""
+
+
+def _is_hung_up(input_fd: int) -> bool:
+    """Tell whether a file is a terminal that was closed at its other end. Nobody is told of this who ignores
+    SIGHUP (`nohup`)."""
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        return False
+    try:
+        is_terminal = stat.S_ISCHR(os.fstat(input_fd).st_mode)
+    except OSError:
+        return False
+    looking = select.poll()
+    looking.register(input_fd, 0)
+    return is_terminal and any(events & select.POLLHUP for _, events in looking.poll(0))
 
 
 def _line_in_memory() -> str:

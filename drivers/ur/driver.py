@@ -76,7 +76,7 @@ class Settings(BaseModel):
     """Deceleration of `stop`."""
     frequency_hz: float = Field(default=125.0, ge=10, le=500)
     """Rate of the controller's samples."""
-    watchdog_s: float = Field(default=0.1, ge=0.05)
+    watchdog_s: float = Field(default=0.1, ge=0.05, le=0.5)
     """The controller ends all motion after this time without a message from the host's process."""
     attention_s: float = Field(default=ATTENTION_S, gt=0, le=0.5)
     """A motion ends if nobody has looked at it for this time, machine time (`coupole.supervision`). Use a longer

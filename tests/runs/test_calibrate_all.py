@@ -12,8 +12,11 @@ from ruamel.yaml import YAML
 from coupole.calibration.record import read_record
 from coupole.commands.campaign import Campaign, Operator, Repeatability
 from coupole.plan.templates import TEMPLATES
+from coupole.storage.run_status import is_complete
 from coupole.viewing.terminal import make_console
 
+DARK_FRAMES = 120
+"""Of the plan `darks`, with its marks."""
 STEPS = ("--only", "darks", "--only", "response")
 
 
@@ -60,6 +63,26 @@ def test_records_are_made_from_nothing_and_not_made_twice(rig: Path, tmp_path: P
     anew = cells.here("calibrate", "all", "--rig", rig, "--out", out, *STEPS, "--json")
     assert anew.code == 0, anew.err
     assert len(list((out / "runs").glob("2*"))) == 3  # the plan was changed: its run is another one
+
+
+@pytest.mark.timeout(600)
+def test_a_run_of_dark_frames_that_was_stopped_is_resumed(rig: Path, tmp_path: Path) -> None:
+    """It has no shots, so none was missing: a record was then made of the dark frames that there were."""
+    out = tmp_path / "calibrations"
+    words = ("calibrate", "all", "--rig", rig, "--out", out, "--only", "darks", "--json")
+    process = cells.start(*words)
+
+    def moving_run() -> Path | None:
+        return next((run for run in (out / "runs").glob("2*") if cells.events(run, "move")), None)
+
+    run = cells.wait_until(moving_run, "a motion")
+    process.terminate()
+    assert cells.finish(process).code == 143
+    assert cells.frame_lines(run) < DARK_FRAMES
+    assert not is_complete(run)
+    again = cells.here(*words)
+    assert again.code == 0, again.err
+    assert cells.frame_lines(run) == DARK_FRAMES
 
 
 def take_away(folder: Path, record: str) -> None:

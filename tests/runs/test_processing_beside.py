@@ -30,12 +30,20 @@ from coupole.viewing.terminal import make_console
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("hurried")]
 NICE_OF_THE_END = 10
 LITTLE_BYTES = 300_000_000
+NOT_USED_UP_BYTES = 2_450_000_000
+"""Less than a plan needs, and more than the modules take."""
 WORDS_UNDER_A_LIMIT = f"""
 import resource
 from coupole.reflectance.beside.follower import _words_on
 print(_words_on(TypeError("int()")))
-resource.setrlimit(resource.RLIMIT_AS, ({LITTLE_BYTES}, {LITTLE_BYTES}))
-print(_words_on(TypeError("int()")))
+for limit_bytes in ({NOT_USED_UP_BYTES}, {LITTLE_BYTES}):
+    resource.setrlimit(resource.RLIMIT_AS, (limit_bytes, resource.RLIM_INFINITY))
+    print(_words_on(TypeError("int()")))
+resource.setrlimit(resource.RLIMIT_AS, ({NOT_USED_UP_BYTES}, resource.RLIM_INFINITY))
+try:
+    raise ValueError("x") from MemoryError("1 GiB")
+except ValueError as error:
+    print(_words_on(error))
 """
 
 
@@ -150,14 +158,19 @@ def test_a_processing_that_gets_no_more_memory_says_so_and_is_no_defect(tmp_path
     assert status(cell.run_folder)["why"] == said["why"]
 
 
-def test_an_error_of_a_library_that_gets_no_memory_is_not_called_a_defect() -> None:
+def test_only_a_shortage_of_memory_is_called_so_and_no_error_is_hidden_behind_it() -> None:
     ended = subprocess.run(
         [sys.executable, "-c", WORDS_UNDER_A_LIMIT], capture_output=True, text=True, check=True, cwd=cells.REPO
     )
-    assert ended.stdout.splitlines() == [
-        "TypeError: int(). This is a defect of Coupole: please report it",
-        "TypeError: int()",
-    ]
+    unlimited, limited, used_up, of_memory = ended.stdout.splitlines()
+    assert unlimited == "TypeError: int(). This is a defect of Coupole: please report it"
+    assert limited.startswith(
+        "TypeError: int(). Unless the limit of memory is the cause, this is a defect of Coupole"
+    )
+    assert "may have 2.45 GB of address space" in limited
+    for words, error in ((used_up, "TypeError: int()"), (of_memory, "ValueError: x")):
+        assert words.startswith("memory did not suffice: process ")
+        assert words.endswith(f"({error})")
 
 
 def test_a_processing_with_too_little_memory_is_refused_before_anything_moves(tmp_path: Path) -> None:

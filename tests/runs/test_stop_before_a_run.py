@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import socket
 import subprocess
@@ -17,7 +18,7 @@ import cells
 import pytest
 from cells import CellFolder
 
-from coupole.acquisition import runtime_folder
+from coupole.acquisition import runtime_folder, starting_processes
 from coupole.acquisition.sessions_without_run import SessionEnded, ask_session, sessions_without_run
 
 PATIENT_S = 5.0
@@ -97,6 +98,37 @@ def test_a_metering_is_stopped_by_its_plan(tmp_path: Path) -> None:
     assert cells.finish(process).code == 130
 
 
+def test_a_session_is_stopped_as_soon_as_its_process_was_started(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path)
+    process = cells.start("acquire", cell.plan, "--yes", anew=True)
+    stopped = cells.here("stop", cell.plan)
+    assert stopped.code == 0, stopped.err
+    assert cells.finish(process).code == 130
+    assert not list((tmp_path / "storage").glob("2*"))
+
+
+def test_a_session_that_is_starting_is_stopped_by_the_rig_that_its_plan_names(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path)
+    process = cells.start("acquire", cell.plan, "--yes", anew=True)
+    stopped = cells.here("stop", cell.rig)
+    assert stopped.code == 0, stopped.err
+    assert cells.finish(process).code == 130
+
+
+def test_a_second_stop_of_a_run_waits_for_the_same_end(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path)
+    cell.write(views=[cells.TOP, cells.SIDE], lights={"kind": "every", "every": 5})
+    process = cell.start_acquire()
+    cells.wait_until(lambda: cells.frame_lines(cell.run_folder) > 3, "proven frames")
+    first = cells.start("stop", cell.plan)
+    cells.wait_until(lambda: cells.events(cell.run_folder, "stop"), "the end of the session")
+    second = cells.start("stop", cell.plan)
+    for ended in map(cells.finish, (first, second)):
+        assert ended.code == 0, ended.err
+        assert "lights are off" in ended.err
+    assert cells.finish(process).code == 130
+
+
 # -- in a runtime folder of their own, without the sessions of other tests ---------------------------------------
 
 _STARTING = """
@@ -105,16 +137,28 @@ from pathlib import Path
 from coupole.acquisition import runtime_folder
 from coupole.acquisition.sessions_without_run import SessionWithoutRun
 runtime_folder._BASE = Path(sys.argv[1])
-with SessionWithoutRun("acquire", Path(sys.argv[2]), None):
-    print("serves", flush=True)
-    time.sleep(60)
+try:
+    with SessionWithoutRun("acquire", Path(sys.argv[2]), None):
+        print("serves", flush=True)
+        time.sleep(60)
+except KeyboardInterrupt:
+    print("ends", flush=True)
+    time.sleep(float(sys.argv[3]))
+"""
+_STOP = """
+import sys
+from pathlib import Path
+from coupole.acquisition import runtime_folder
+runtime_folder._BASE = Path(sys.argv.pop(1))
+from coupole.commands import cli
+cli.main()
 """
 
 
 @contextmanager
-def _starts(plan: Path) -> Iterator[subprocess.Popen[str]]:
-    """A process that is starting, for as long as nobody stops it."""
-    arguments = [sys.executable, "-c", _STARTING, str(runtime_folder._BASE), str(plan)]
+def _starts(plan: Path, *, ends_in_s: float = 0.0) -> Iterator[subprocess.Popen[str]]:
+    """A process that is starting, for as long as nobody stops it; it then takes some time to end."""
+    arguments = [sys.executable, "-c", _STARTING, str(runtime_folder._BASE), str(plan), str(ends_in_s)]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
@@ -149,7 +193,8 @@ def test_a_session_that_is_starting_has_nothing_to_pause(apart: Path) -> None:
         assert process.poll() is None
 
 
-def test_a_session_that_is_slow_to_answer_is_not_overlooked(apart: Path) -> None:
+def test_a_session_that_is_slow_to_answer_is_not_overlooked(apart: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(starting_processes, "YOUNG_S", 0.0)  # those of other tests are not waited for
     plan = apart / "plan.yaml"
     with _starts(plan) as process:
         process.send_signal(signal.SIGSTOP)
@@ -207,3 +252,53 @@ def test_of_several_sessions_that_are_starting_one_must_be_named(apart: Path) ->
             assert process.poll() is None
             assert cells.here("stop", plan).code == 0
             assert process.poll() is not None
+
+
+def test_all_sessions_with_the_named_plan_are_stopped(apart: Path) -> None:
+    plan = apart / "plan.yaml"
+    with _starts(plan) as one, _starts(plan) as other, _starts(apart / "another.yaml") as third:
+        stopped = cells.here("stop", plan, "--json")
+        assert stopped.code == 0, stopped.err
+        assert [process.poll() is None for process in (one, other, third)] == [False, False, True]
+        assert {state["pid"] for state in json.loads(stopped.out)} == {one.pid, other.pid}
+
+
+def test_a_second_stop_waits_for_the_end_that_the_first_one_has_begun(apart: Path) -> None:
+    plan = apart / "plan.yaml"
+    with _starts(plan, ends_in_s=2.0) as process:
+        command = [sys.executable, "-c", _STOP, str(apart), "stop", str(plan)]
+        with subprocess.Popen(command, cwd=cells.REPO, stderr=subprocess.PIPE) as first:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ends\n"
+            second = cells.here("stop")
+            assert second.code == 0, second.err
+            assert "is being stopped already" in " ".join(second.err.split())
+            assert process.poll() is not None
+            assert first.wait(cells.PATIENCE_S) == 0
+
+
+def test_what_is_just_starting_beside_the_only_session_is_named(apart: Path) -> None:
+    """A process that cannot be asked yet is not what a stop without a name waits for."""
+    with _starts(apart / "plan.yaml") as process:
+        young = cells.start("acquire", apart / "other.yaml", anew=True)
+        young.send_signal(signal.SIGSTOP)
+        try:
+            stopped = cells.here("stop")
+            assert stopped.code == 0, stopped.err
+            assert process.poll() is not None
+            assert f"not stopped: `coupole acquire {apart}/other.yaml`" in "".join(stopped.err.split("\n"))
+        finally:
+            young.kill()
+            cells.finish(young)
+
+
+def test_a_stop_says_for_what_it_waits_that_is_just_starting(apart: Path) -> None:
+    young = cells.start("meter", apart / "plan.yaml", anew=True)
+    young.send_signal(signal.SIGSTOP)
+    timer = threading.Timer(2.0, young.kill)
+    timer.start()
+    stopped = cells.here("stop", apart / "plan.yaml")
+    timer.join()
+    cells.finish(young)
+    assert stopped.code == 2
+    assert "is just starting: waiting" in " ".join(stopped.err.split())

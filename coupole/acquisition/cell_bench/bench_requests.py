@@ -71,6 +71,8 @@ class DriveAsked(_Request):
 
 class StopAsked(_Request):
     command: Literal["stop"]
+    why: Annotated[str, Field(max_length=400)] = ""
+    """The reason, in words, for whoever asked for the work that is stopped."""
 
 
 class JogAsked(_Request):

@@ -147,7 +147,7 @@ class BenchService:
             case MeterAsked():
                 return self._begin_metering(request, stops, asking_pid)
             case StopAsked():
-                return {"trouble": self._stop(), **self._state()}
+                return {"trouble": self._stop(request.why), **self._state()}
             case CloseAsked():
                 self._ending = True
                 self.trouble = self._stop()
@@ -176,11 +176,11 @@ class BenchService:
         self.works.begin(work, stops, asking_pid)
         return work.figures()
 
-    def _stop(self) -> list[str]:
-        """Stop everything; return sentences on devices that are not surely safe then. When this returns, the
-        picture under way and its light have ended.
+    def _stop(self, why: str = "") -> list[str]:
+        """Stop everything, for this reason; return sentences on devices that are not surely safe then. When this
+        returns, the picture under way and its light have ended.
         """
-        self.works.stop()
+        self.works.stop(why)
         trouble = unsure(self._opened.halt(), _STOPPED_WITHIN_S)
         if self.works.last is not None:
             self.works.last.join(_STOPPED_WITHIN_S)

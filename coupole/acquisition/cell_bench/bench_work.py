@@ -36,8 +36,10 @@ class Work:
         self._asking_pid = asking_pid
         self._thread.start()
 
-    def stop(self) -> None:
-        """Stop the work. Returns at once; nothing new is moved or lit after this."""
+    def stop(self, why: str = "") -> None:
+        """Stop the work. Returns at once; nothing new is moved or lit after this. The first `why` is told to
+        whoever asked for the work."""
+        self._lost = self._lost or why
         self.control.stop_by(signal.SIGINT)
 
     def join(self, seconds: float) -> None:
@@ -48,13 +50,9 @@ class Work:
         ended early."""
         return {"kind": self.kind, "state": self._state, **self._about, **self._found, "why": self._why}
 
-    def _lose(self, why: str) -> None:
-        self._lost = why
-        self.stop()
-
     def _run(self) -> None:
         try:
-            with watched_process(self._asking_pid, self._lose):
+            with watched_process(self._asking_pid, self.stop):
                 self._found = self._act(self.control)
         except Interrupted as error:
             self._why = self._lost or str(error)
@@ -94,12 +92,13 @@ class Works:
         if (work := self.running) is not None:
             raise InputError(f"{work.kind} is under way; stop it or let it end")
 
-    def stop(self) -> None:
-        """Stop the work. Returns at once. Work that was requested before and has not begun never begins."""
+    def stop(self, why: str = "") -> None:
+        """Stop the work, for this reason. Returns at once. Work that was requested before and has not begun never
+        begins."""
         with self._lock:
             self.stops += 1
             if self.last is not None:
-                self.last.stop()
+                self.last.stop(why)
 
     @property
     def running(self) -> Work | None:

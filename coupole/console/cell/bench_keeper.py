@@ -39,8 +39,11 @@ class Bench:
         plans: PlanFiles,
         folder: Path,
         now_s: Callable[[], float] = time.monotonic,
+        in_control: Callable[[], str] = lambda: "",
     ) -> None:
-        """`folder`: for the output of its process."""
+        """`folder`: for the output of its process. `in_control` returns the name of the person in control, empty
+        if nobody is."""
+        self._in_control, self._driver = in_control, ""
         self._cell, self._acquisitions, self._plans, self._now_s = cell, acquisitions, plans, now_s
         self._tasks = Tasks(folder)
         self._task: Task | None = None
@@ -152,6 +155,13 @@ class Bench:
         self._acted_s = self._now_s()
         return checked_answer(ask_bench(self._cell, command, **fields))
 
+    def drive(self, path: str, person: str) -> dict[str, Any]:
+        """Begin to drive the arm along a path for a person; return the work. It ends when another person is in
+        control. Raises InputError."""
+        work = self.ask("drive", path=path)
+        self._driver = person
+        return work
+
     def views(self) -> list[str]:
         """Return the names of the plan's views. Raises InputError."""
         if not self.plan:
@@ -187,6 +197,7 @@ class Bench:
 
     def _watch(self) -> None:
         while not self._ended.wait(_LOOK_EVERY_S):
+            self._end_drive_of_another()
             if self._closing:
                 continue
             if self._task is not None and not self._task.running:
@@ -194,6 +205,20 @@ class Bench:
                 self._task = self.state = None
             else:
                 self._look()
+
+    def _end_drive_of_another(self) -> None:
+        """Stop the arm if it is driven for a person, and another one is in control now."""
+        name = self._in_control()
+        if not self._driver or name in ("", self._driver):
+            return
+        try:
+            work = self.ask("state")["work"] or {}
+            if work.get("kind") == "drive" and work["state"] == "running":
+                self.ask("stop", why=f"{name} is in control")
+        except InputError:
+            if bench_socket(self._cell).exists():
+                return  # it does not answer: asked again in the next round
+        self._driver = ""
 
     def _look(self) -> None:
         now_s = self._now_s()

@@ -113,6 +113,10 @@ class Control:
     def now(self) -> InControl:
         return self._now
 
+    def may_act(self, account: Account) -> bool:
+        """Tell whether nobody else is in control. This changes nothing."""
+        return self._now.name in ("", account.name)
+
     def take(self, account: Account) -> InControl:
         """Take control if nobody has it, if its holder has done nothing for some time, or if this account is an
         engineer's; otherwise ask for it."""
@@ -139,7 +143,7 @@ class Control:
         """Tell whether a person may act now: the person in control, or any operator if nobody is in control. That
         operator then takes control, unless `keep` is false."""
         with self._lock:
-            if self._now.name not in ("", account.name):
+            if not self.may_act(account):
                 return False
             if not keep and not self._now.name:
                 return True

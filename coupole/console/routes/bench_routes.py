@@ -16,7 +16,7 @@ from coupole.console.people.asking import REFUSALS, Who
 from coupole.console.people.guard import account_here, address_of, is_of_this_machine, session_of
 from coupole.console.people.permission import NotAllowed, allow
 from coupole.console.people.still_wanted import HELD_STOOD_STILL_S
-from coupole.console.routes.messages import Permission, Text
+from coupole.console.routes.messages import Permission, Permitted, Text
 from coupole.console.service_parts import Service
 from coupole.errors import CoupoleError, InputError
 from coupole.intake.plain_data import json_of
@@ -57,6 +57,11 @@ def add_bench_routes(app: FastAPI, service: Service) -> None:
         request.state.about = question.action
         allow(service, person, Role.OPERATOR, question.action, acts=True)
         return {"in_control": service.control.now.name}
+
+    @app.get("/api/v1/bench/permission", responses=REFUSALS)
+    def still_permitted(person: Who) -> Permitted:
+        """Tell a command that drives the arm whether this person may still do so. It stops the arm if not."""
+        return Permitted(in_control=service.control.now.name, may_act=service.control.may_act(person))
 
     @app.websocket(HOLD)
     async def hold(socket: WebSocket) -> None:

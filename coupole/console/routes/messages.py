@@ -93,6 +93,15 @@ class Permission(Asked):
     """The action, in words."""
 
 
+class Permitted(BaseModel):
+    """Answer on who is in control, to a command that drives the arm."""
+
+    in_control: str
+    """The person in control; empty if nobody is."""
+    may_act: bool
+    """True unless another person is in control."""
+
+
 class Light(Asked):
     """Light that an object was given elsewhere."""
 

@@ -118,7 +118,9 @@ class ArmPanel:
         self._path, self._driven = None, path["path"]
         self._enable()
         self._words.text = f"The arm drives to {path['to']}."
-        work = await self._visit.act(f"drive to {path['to']}", lambda: self._bench.ask("drive", path=path["path"]))
+        account = self._visit.account
+        person = account.name if account else ""
+        work = await self._visit.act(f"drive to {path['to']}", lambda: self._bench.drive(path["path"], person))
         if work is None:
             self._words.text = "Not driven: show the path again."
 

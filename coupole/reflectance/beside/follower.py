@@ -4,6 +4,7 @@ for the next view, it makes a result of the views so far. After the last view it
 from __future__ import annotations
 
 import contextlib
+import os
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from coupole.errors import CoupoleError, reason
-from coupole.preflight.machine import little_address_space
+from coupole.preflight.machine import little_address_space, memory_behind
 from coupole.reflectance.beside.growing import Growth, fit_so_far
 from coupole.reflectance.beside.looking_ahead import look_ahead
 from coupole.reflectance.beside.page_maker import PageMaker
@@ -29,8 +30,12 @@ from coupole.storage.run import Run
 
 _LOOK_EVERY_S = 0.2
 _TELL_EVERY_S = 1.0
+<<<<<<< HEAD
 _FIRST_EARLY_LOOK = 32
 """Frames under LEDs that a view has when it is drawn first. It is drawn again when it has twice as many."""
+=======
+_DEFECT = "this is a defect of Coupole: please report it"
+>>>>>>> 7aea143d00941ef927d113955a02b1557bd1c120
 _NONE_SO_FAR = "result so far and page to relight"
 Say = Callable[[dict[str, Any]], object]
 AtTheEnd = Callable[[Callable[[], None]], None]
@@ -46,9 +51,6 @@ def process_run(folder: Path, result: Path, say: Say, at_the_end: AtTheEnd, page
             follower = _Follower(Run(folder), result, teller, page_program)
             follower.until_all_frames_are_there()
             at_the_end(follower.make_result)
-    except (CoupoleError, OSError, MemoryError) as error:
-        teller.fail(str(error) if isinstance(error, CoupoleError) else reason(error))
-        return False
     except Exception as error:  # noqa: BLE001  a defect must not end without a word
         teller.fail(_words_on(error))
         return False
@@ -56,10 +58,16 @@ def process_run(folder: Path, result: Path, say: Say, at_the_end: AtTheEnd, page
 
 
 def _words_on(error: Exception) -> str:
-    """Return a sentence on an error that nobody expected. A library that gets no memory may raise any error: that
-    is no defect."""
-    words = f"{type(error).__name__}: {error}"
-    return words if little_address_space() else f"{words}. This is a defect of Coupole: please report it"
+    """Return why there is no result. An error is told in any case, but it is no defect if memory ran short."""
+    is_expected = isinstance(error, CoupoleError | OSError)
+    words = reason(error) if is_expected else f"{type(error).__name__}: {error}"
+    if shortage := memory_behind(error):
+        return f"memory did not suffice: {shortage} ({words})"
+    if is_expected:
+        return words
+    if limit_words := little_address_space(os.getpid()):
+        return f"{words}. Unless the limit of memory is the cause, {_DEFECT} ({limit_words})"
+    return f"{words}. T{_DEFECT[1:]}"
 
 
 class _ViewsCameError(Exception):

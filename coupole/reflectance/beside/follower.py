@@ -30,12 +30,9 @@ from coupole.storage.run import Run
 
 _LOOK_EVERY_S = 0.2
 _TELL_EVERY_S = 1.0
-<<<<<<< HEAD
 _FIRST_EARLY_LOOK = 32
 """Frames under LEDs that a view has when it is drawn first. It is drawn again when it has twice as many."""
-=======
 _DEFECT = "this is a defect of Coupole: please report it"
->>>>>>> 7aea143d00941ef927d113955a02b1557bd1c120
 _NONE_SO_FAR = "result so far and page to relight"
 Say = Callable[[dict[str, Any]], object]
 AtTheEnd = Callable[[Callable[[], None]], None]

@@ -159,7 +159,7 @@ def _settled_fit(problem: Problem, fit: _Fit, *, is_robust: bool) -> _Fit:
 
 @dataclass(frozen=True)
 class _Descent:
-    """Where a descent ended."""
+    """State and equations at the end of a descent."""
 
     state: LedState
     steps: int

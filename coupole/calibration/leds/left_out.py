@@ -70,7 +70,9 @@ def views_left_out(
     moves_mm = np.zeros((count, len(problem.boards.places_mm), 3))
     for view, boards_in_view in enumerate(_boards_in_views(problem, state, factors, accepted_mask, reduced)):
         derivatives, values = _pose_rows(problem, state, factors, view)
-        half = reduced.half_solve(np.concatenate([derivatives, *(of.by_shared for of in boards_in_view)]).T)
+        half = reduced.half_solve(
+            np.concatenate([derivatives, *(of_board.by_shared for of_board in boards_in_view)]).T
+        )
         hat, at = half.T @ half, len(values)
         rows_of = []
         for of_board in boards_in_view:

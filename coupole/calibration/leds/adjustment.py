@@ -117,8 +117,8 @@ def adjust_leds(problem: Problem, start: Floats) -> LedGeometry:
     fit = _settled_fit(problem, fit, is_robust=False)
     suspects: tuple[SuspectedShift, ...] = ()
     if modes:
-        reduced = _reduced_at(problem, fit)
-        solution = _solution(problem, fit.state, fit.factors, fit.accepted_mask, reduced)
+        equations = _reduced_at(problem, fit)
+        solution = _solution(problem, fit.state, fit.factors, fit.accepted_mask, equations)
         degrees = float(solution.redundancy[[POSITION, ORIENTATION]].sum())
         suspects = judge(modes, fit.state.coefficients, solution.coefficient_covariance, degrees)
         problem = with_modes(problem, as_found(modes, suspects))
@@ -175,9 +175,9 @@ def _descend(
     for step in range(1, _MOST_STEPS + 1):
         off = np.sqrt(np.sum(whitened_residuals(problem, state) ** 2, axis=1)) / factors[SPOTS]
         weights = np.where(accepted_mask, np.minimum(1.0, huber / np.maximum(off, 1e-12)), 0.0)
-        reduced = reduced_normal(problem, state, factors, weights)
-        shared_step = reduced.shared_step
-        own_steps = [part.own_step(shared_step) for part in reduced.parts]
+        equations = reduced_normal(problem, state, factors, weights)
+        shared_step = equations.shared_step
+        own_steps = [part.own_step(shared_step) for part in equations.parts]
         share, tried_state = 1.0, stepped_state(problem, state, shared_step, own_steps, 1.0)
         while (now := cost_of(problem, tried_state, factors, accepted_mask, huber)) > cost * (
             1 + 1e-12
@@ -185,10 +185,10 @@ def _descend(
             share /= 2
             tried_state = stepped_state(problem, state, shared_step, own_steps, share)
         if now > cost * (1 + 1e-12):
-            return _Descent(state, step, reduced)
+            return _Descent(state, step, equations)
         state, gain, cost = tried_state, cost - now, now
         if gain < _STILL * max(cost, 1.0):
-            return _Descent(state, step, reduced)
+            return _Descent(state, step, equations)
     raise InputError(
         f"LEDs: no convergence in {_MOST_STEPS} steps. Look for views of another camera or dome, and for "
         "records of another lens"
@@ -218,19 +218,19 @@ def _reduced_at(problem: Problem, fit: _Fit) -> Reduced:
 
 
 def _solution(
-    problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], reduced: Reduced
+    problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], equations: Reduced
 ) -> _Solved:
-    """Covariances by `reduced`, noise by the residuals of the accepted spots [k] at `state`.
+    """Covariances by `equations`, noise by the residuals of the accepted spots [k] at `state`.
 
     The freedom that the spots use is not summed over them: all parameters together are as many as the traces of
     the spots' and the priors' parts, and those of the priors need the diagonal blocks alone.
     """
-    shared_covariance = reduced.shared_covariance
+    shared_covariance = equations.shared_covariance
     own_covariances: list[Floats] = []
     alone: list[Floats] = []
     of_table = table_sigmas(problem) ** -2
     used_freedom, by_priors, parameters = np.zeros(len(GROUPS)), 0.0, len(shared_covariance)
-    for part in reduced.parts:
+    for part in equations.parts:
         block = shared_covariance[np.ix_(part.columns, part.columns)]
         alone.append(solve(part.own_normal, np.eye(len(part.own_normal))))
         own_covariances.append(alone[-1] + part.gain @ block @ part.gain.T)
@@ -281,8 +281,8 @@ def _of_pose_errors(problem: Problem, shared_covariance: Floats) -> Floats:
 
 def _summary(problem: Problem, fit: _Fit, suspects: tuple[SuspectedShift, ...]) -> LedGeometry:
     state, factors = fit.state, fit.factors
-    reduced = _reduced_at(problem, fit)
-    solution = _solution(problem, state, factors, fit.accepted_mask, reduced)
+    equations = _reduced_at(problem, fit)
+    solution = _solution(problem, state, factors, fit.accepted_mask, equations)
     boards = problem.boards
     centres = np.empty((len(boards.places_mm), 3, 3))
     shared_part = np.empty(len(centres))
@@ -314,7 +314,7 @@ def _summary(problem: Problem, fit: _Fit, suspects: tuple[SuspectedShift, ...]) 
         step / np.sqrt(np.diag(problem.prior.covariance)),
         fit.steps,
         suspects,
-        views_left_out(problem, state, factors, fit.accepted_mask, reduced),
+        views_left_out(problem, state, factors, fit.accepted_mask, equations),
     )
 
 

@@ -57,20 +57,20 @@ class _InView:
 
 
 def views_left_out(
-    problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], reduced: Reduced
+    problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], equations: Reduced
 ) -> LeftOutViews:
     """Leave out each view at the solution with these noises [groups] and normal equations; `accepted_mask` [k]
     are the spots used."""
     count = len(problem.reported_poses)
     by_own = [
         centres_by_own(problem, state, board).reshape(-1, len(part.gain))
-        for board, part in enumerate(reduced.parts)
+        for board, part in enumerate(equations.parts)
     ]
     ratios, shared_moves = np.zeros(count), np.zeros((problem.shared_count, count))
     moves_mm = np.zeros((count, len(problem.boards.places_mm), 3))
-    for view, boards_in_view in enumerate(_boards_in_views(problem, state, factors, accepted_mask, reduced)):
+    for view, boards_in_view in enumerate(_boards_in_views(problem, state, factors, accepted_mask, equations)):
         derivatives, values = _pose_rows(problem, state, factors, view)
-        half = reduced.half_solve(
+        half = equations.half_solve(
             np.concatenate([derivatives, *(of_board.by_shared for of_board in boards_in_view)]).T
         )
         hat, at = half.T @ half, len(values)
@@ -82,11 +82,11 @@ def views_left_out(
         ratios[view], left_residuals = _left_residuals(
             hat, np.concatenate([values, *(of_board.residuals for of_board in boards_in_view)])
         )
-        shared_moves[:, view] = reduced.other_half_solve(half @ left_residuals)
+        shared_moves[:, view] = equations.other_half_solve(half @ left_residuals)
         for of_board, rows in zip(boards_in_view, rows_of, strict=True):
             own_move_mm = by_own[of_board.board] @ (of_board.own_gain @ left_residuals[rows])
             moves_mm[view, problem.boards.rows_of(of_board.board)] = own_move_mm.reshape(-1, 3)
-    for board, part in enumerate(reduced.parts):
+    for board, part in enumerate(equations.parts):
         by_shared_mm = by_own[board] @ part.gain @ shared_moves[part.columns]
         moves_mm[:, problem.boards.rows_of(board)] -= by_shared_mm.T.reshape(count, -1, 3)
     squares = np.einsum("vni,vnj->nij", moves_mm, moves_mm)
@@ -94,12 +94,12 @@ def views_left_out(
 
 
 def _boards_in_views(
-    problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], reduced: Reduced
+    problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], equations: Reduced
 ) -> list[list[_InView]]:
     """[v] the boards with spots in each view."""
     residuals = whitened_residuals(problem, state) / factors[SPOTS]
     boards_in_views: list[list[_InView]] = [[] for _ in problem.reported_poses]
-    for board, (part, spots) in enumerate(zip(reduced.parts, problem.spots_of, strict=True)):
+    for board, (part, spots) in enumerate(zip(equations.parts, problem.spots_of, strict=True)):
         count = len(part.own_normal)
         of_own = part.jacobian[:, :count]
         own_gain = solve(part.own_normal, of_own.T)

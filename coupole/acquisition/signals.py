@@ -1,7 +1,8 @@
 """Signals that end a session (Ctrl-C, SIGTERM, and SIGHUP when the terminal is gone), and signals that stop its
 process.
 
-Outside a session they raise `SignalReceived` in the main thread. In a session (`obeyed_by`) a thread of their own
+Outside a session they raise `SignalReceived` in the main thread; if Python drops that, the next session obeys. In
+a session (`obeyed_by`) a thread of their own
 obeys them at once, whatever the main thread waits for. The main thread learns of them from `Control`. While a cell
 is made safe (`drop_signals`) they do nothing, so that a second Ctrl-C does not cut it short.
 
@@ -34,6 +35,11 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _heard_s = deque([-math.inf], maxlen=1)
 """Time when the main thread last received a signal, outside sessions."""
 
+_raised: deque[int] = deque(maxlen=1)
+"""Newest signal that was raised outside sessions. Python drops an exception that is raised in a finalizer or in
+the callback of a weak reference (there are some while modules are imported). The session that then begins obeys
+it."""
+
 _PULSE_S, _TOLD_WITHIN_S = 0.25, 0.1
 _LEAVES_WITHIN_S = 300.0
 """The closing of hanging devices and the writing of a report take less time."""
@@ -56,6 +62,7 @@ class SignalReceived(BaseException):
 def raise_outside_sessions() -> None:
     """Have each signal raise SignalReceived from now on. A hang-up that is ignored (`nohup`) stays ignored. Ctrl-C
     and SIGTERM always count, even in the background of a script."""
+    _raised.clear()
     for number in ENDING:
         if not _stays_ignored(number):
             signal.signal(number, _raise)
@@ -67,6 +74,7 @@ def _stays_ignored(number: int) -> bool:
 
 def _raise(number: int, _: Any) -> None:
     _heard_s.append(time.monotonic())
+    _raised.append(number)
     raise SignalReceived(number)
 
 
@@ -145,6 +153,8 @@ def obeyed_by(control: Control, act: Act, *, is_watched: bool = True) -> Iterato
             | {signal.SIGUSR1: lambda *_: control.toggle_pause()}
             | {number: lambda *_: None for number in (signal.SIGTSTP, signal.SIGCONT)}
         ):
+            if _raised:
+                signal.raise_signal(_raised.pop())
             yield
     finally:
         signal.set_wakeup_fd(before)

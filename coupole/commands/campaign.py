@@ -11,7 +11,6 @@ from coupole.calibration.campaign_steps import OBJECT, STEPS, Step
 from coupole.commands import calibrate_geometry, calibrate_lens, calibrate_light
 from coupole.commands.simulated_support import BOARD, CERTIFICATE_OF_SIMULATED_TILE, TILE, with_things
 from coupole.errors import CalibrationRefused, Interrupted
-from coupole.storage.durable import write_synced
 from coupole.viewing.questions import ask
 
 if TYPE_CHECKING:
@@ -136,6 +135,8 @@ class Campaign:
         path, rig = self._out / "plans" / f"{step.name}.yaml", self._rig_of(step)
         if path.exists():
             return path
+        from coupole.storage.durable import write_synced
+
         if step.name == LEDS:
             with self._console.status("reading the rig") as status:
                 text = led_plan(read_cell(rig), name=step.name, rig=str(rig), tell=status.update)

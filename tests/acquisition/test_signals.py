@@ -5,8 +5,10 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import sys
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 
 import pytest
@@ -48,6 +50,30 @@ def test_a_session_obeys_while_the_main_thread_is_held_by_a_call(number: signal.
     with pytest.raises(Interrupted) as stopped:
         control.go_on()
     assert stopped.value.exit_code == 128 + number
+
+
+class _Collected:
+    """Something that is collected."""
+
+
+def test_a_signal_that_python_has_dropped_ends_the_session_that_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As while modules are imported: an exception in the callback of a weak reference is printed and forgotten."""
+    raise_outside_sessions()
+    something = _Collected()
+    watched = weakref.ref(something, lambda _: signal.raise_signal(signal.SIGTERM))
+    dropped: list[BaseException | None] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda told: dropped.append(told.exc_value))
+    del something
+    assert watched() is None
+    assert [type(error) for error in dropped] == [SignalReceived]
+    control, acted = Control(), threading.Event()
+    with obeyed_by(control, acted.set):
+        assert acted.wait(10.0)
+    with pytest.raises(Interrupted) as stopped:
+        control.go_on()
+    assert stopped.value.exit_code == 128 + signal.SIGTERM
+    with obeyed_by(control := Control(), lambda: ()):
+        control.go_on()  # it was obeyed once
 
 
 def test_a_session_obeys_though_the_main_threads_handler_was_first() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import pty
+import signal
 import sys
 import threading
 import time
@@ -15,6 +16,7 @@ from typing import IO
 
 import pytest
 
+from coupole.errors import Interrupted
 from coupole.viewing.questions import ask, ask_number, is_asked_at_a_terminal
 
 
@@ -125,10 +127,12 @@ def test_no_standard_input_is_no(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         assert (ask("Drive?"), ask("Drive?")) == (False, True)
 
 
-def test_a_terminal_that_is_gone_is_no(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_that_is_gone_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     keyboard_fd, terminal_fd = pty.openpty()
     with os.fdopen(terminal_fd, encoding="utf-8") as terminal:
         monkeypatch.setattr(sys, "stdin", terminal)
         assert is_asked_at_a_terminal()
         os.close(keyboard_fd)
-        assert not ask("Drive?")
+        with pytest.raises(Interrupted) as gone:
+            ask("Drive?")
+    assert gone.value.exit_code == 128 + signal.SIGHUP

@@ -81,6 +81,11 @@ def nobody_in_control(driven: Driven) -> None:
     """The arm is at home, and nobody in control, before each test."""
     driven.engineer.post("/api/v1/control/take")
     assert driven.engineer.post("/api/v1/control/give", {}).status == 200
+    queue = driven.cell.folder / "storage/state/console/queue.json"
+    cells.wait_until(
+        lambda: not queue.exists() or '"waiting"' not in queue.read_text(),
+        "a queue that has nothing left to begin",
+    )
     assert cells.here("arm", driven.cell.rig, "home", "--yes").code == 0
 
 

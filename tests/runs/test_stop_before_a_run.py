@@ -123,9 +123,12 @@ def test_a_second_stop_of_a_run_waits_for_the_same_end(tmp_path: Path) -> None:
     first = cells.start("stop", cell.plan)
     cells.wait_until(lambda: cells.events(cell.run_folder, "stop"), "the end of the session")
     second = cells.start("stop", cell.plan)
-    for ended in map(cells.finish, (first, second)):
-        assert ended.code == 0, ended.err
-        assert "lights are off" in ended.err
+    ended = cells.finish(second)
+    has_ended_before = ended.code == 2 and process.poll() is not None  # on a busy machine
+    assert has_ended_before or (ended.code == 0 and "lights are off" in ended.err), ended.err
+    ended = cells.finish(first)
+    assert ended.code == 0, ended.err
+    assert "lights are off" in ended.err
     assert cells.finish(process).code == 130
 
 

@@ -103,7 +103,9 @@ class Acquisitions:
         with self._beginning:
             if self.lending.has(pid):
                 return
-            if why := self._had_by() or ("the queue is about to begin a plan" if self._queue.following else ""):
+            following = self._queue.following
+            begins = following is not None and not following.hold
+            if why := self._had_by() or ("the queue is about to begin a plan" if begins else ""):
                 raise InputError(why)
             self.lending.lend(pid, borrower, purpose)
 
@@ -148,12 +150,11 @@ class Acquisitions:
             following = self._queue.following
             if following is None:
                 return
-            if self._had_by():
-                self.give_way(following.words)
-                return
-            if following.hold:
+            if following.hold:  # it needs no cell: a bench may stay open
                 now = utc_now()
                 self._queue.conclude(following.id, halt=following.words, state="done", begun=now, ended=now)
+            elif self._had_by():
+                self.give_way(following.words)
             else:
                 self._begin(following)
 

@@ -6,6 +6,7 @@ import os
 import pty
 import subprocess
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -31,7 +32,12 @@ class Typist:
 
     def waits_for(self, words: str, times: int = 1) -> None:
         def is_there() -> bool:
-            return self.shown.count(words.encode()) >= times or self.process.poll() is not None
+            if self.shown.count(words.encode()) >= times:
+                return True
+            if self.process.poll() is None:
+                return False
+            time.sleep(1.0)  # its last words may still be on their way
+            return True
 
         cells.wait_until(is_there, words)
         assert self.shown.count(words.encode()) >= times, self.shown.decode()

@@ -170,6 +170,8 @@ class _Followed:
                 self._say(output["said"])
                 self._show_progress()
                 figures = output["figures"]
+                if self._run is not None:
+                    summary["run"] = str(self._run)  # also if the console does not come to tell the end
         self._conclude(figures, summary)
 
     def _outputs(self) -> Iterator[dict[str, Any]]:

@@ -242,7 +242,7 @@ def test_the_arm_of_an_open_bench_is_not_driven_while_another_is_in_control(stan
         standing.engineer.post("/api/v1/control/take")
         typist.types("y\n")
         assert typist.process.wait(cells.PATIENCE_S) == 2, "control was taken while the question was open"
-        assert b"first engineer is in control" in typist.shown
+        typist.waits_for("first engineer is in control")
     assert stops() == 0, "what is refused does not stop the motion of the person in control"
     standing.engineer.post("/api/v1/control/give", {})
     assert cells.here("arm", rig, "home", "--yes").code == 0

@@ -103,9 +103,7 @@ class Acquisitions:
         with self._beginning:
             if self.lending.has(pid):
                 return
-            following = self._queue.following
-            begins = following is not None and not following.hold
-            if why := self._had_by() or ("the queue is about to begin a plan" if begins else ""):
+            if why := self._had_by() or ("the queue is about to begin a plan" if self._queue.following else ""):
                 raise InputError(why)
             self.lending.lend(pid, borrower, purpose)
 
@@ -150,11 +148,12 @@ class Acquisitions:
             following = self._queue.following
             if following is None:
                 return
-            if following.hold:  # it needs no cell: a bench may stay open
+            if self._had_by():
+                self.give_way(following.words)
+                return
+            if following.hold:
                 now = utc_now()
                 self._queue.conclude(following.id, halt=following.words, state="done", begun=now, ended=now)
-            elif self._had_by():
-                self.give_way(following.words)
             else:
                 self._begin(following)
 

@@ -220,6 +220,7 @@ def test_who_is_in_control_at_the_page_is_not_overruled_unasked(standing: Standi
     assert standing.state()["in_control"] == ""
     assert cells.here("queue", rig, "--go-on").code == 0
     assert standing.state()["in_control"] == "", "a command is over when it is answered"
+    cells.wait_until(lambda: standing.state()["queue"][-1]["state"] == "done", "the hold, which closes a bench")
 
 
 def test_the_arm_of_an_open_bench_is_not_driven_while_another_is_in_control(standing: Standing) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import time
@@ -72,18 +71,6 @@ def test_a_plan_is_begun_once_with_the_cells_rig(
         [name, "--rig", str(tmp_path / "rig.yaml")] for name in ("one.yaml", "two.yaml")
     ]
     assert [entry.state for entry in PlanQueue(tmp_path / "queue.json").entries] == ["done"] * 3
-
-
-def test_a_hold_leaves_the_cell_to_whoever_has_it(
-    queue: PlanQueue, running: Acquisitions, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[str] = []
-    monkeypatch.setattr(running, "give_way", asked.append)
-    running.lend(os.getpid(), "Ada", "bench")
-    queue.add("Ada", hold="change the object")
-    cells.wait_until(lambda: queue.halt_reason, "the hold")
-    assert not asked
-    running.lend(os.getpid(), "Ada", "bench")
 
 
 def test_a_queue_that_cannot_be_written_begins_nothing(

@@ -32,9 +32,9 @@ _EDGE_SHARE, _FOLD_SHARE, _GRAZING_COSINE = 0.05, 0.05, 0.5
 """Share of the LEDs in whose penumbra a triangle is; mean share of its light that comes from other surfaces; and
 cosine of the angle between view and mesh."""
 _QUANTILE, _AROUND_PX = 1.96, 3.0
-
-
 LEAST_HELD, MOST_HELD, FEWEST, LEAST_DB, LEAST_LINES = 0.90, 0.99, 500, 3.0, 0.8
+"""Bounds of the share of intervals that hold; least number of texels of a stratum that is judged; and what single
+pixels must gain: PSNR over triangles, and the share of the frames' contrast of lines."""
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ _PAGE_PROGRAM = "coupole.exchange.look.page_beside"
 _READY_WITHIN_S = 120.0
 """Longest wait for the first answer: the process needs less time for its imports, even on a busy machine."""
 _TOLD_AFTER_S = 1.0
-_NOTHING_SAID = "its process ended without a message"
+_NOTHING_SAID, _NO_MEMORY = "its process ended without a message", "memory did not suffice"
 _SILENT_S, _LEAST_CPU_S = 120.0, 1.0
 """A process hangs if, with all frames there, it reports nothing and computes nothing for this time."""
 _IDLE_S = 20.0
@@ -117,7 +117,7 @@ class ProcessingBeside:
         if not self._has_answered.wait(_READY_WITHIN_S):
             return [f"--reflectance: its process gave no answer within {_READY_WITHIN_S:g} s"]
         if why := self._shortage or self._shortage_now():
-            return [f"--reflectance: {why}"]
+            return [f"--reflectance: {_NO_MEMORY}: {why}"]
         if self._reasons is None:
             return [f"--reflectance: its process ended: {self._last_words}"]
         return self._reasons
@@ -247,7 +247,7 @@ class ProcessingBeside:
         if not self._shortage:
             return words
         said_nothing = (self._process.returncode or 0) < 0 or words == _NOTHING_SAID or "MemoryError" in words
-        return f"{self._shortage} ({words})" if said_nothing else f"{words} ({self._shortage.partition(': ')[2]})"
+        return f"{_NO_MEMORY}: {self._shortage} ({words})" if said_nothing else f"{words} ({self._shortage})"
 
     def _say_unfinished(self) -> None:
         assert self._run is not None
@@ -310,10 +310,9 @@ class ProcessingBeside:
         )
 
     def _shortage_now(self) -> str:
-        """Return that the process, which has not been waited for, may have too little memory; empty if it may have
+        """Return how little memory the process, which has not been waited for, may have; empty if it may have
         enough."""
-        why = little_address_space(self._process.pid)
-        return f"memory did not suffice: {why}" if why else ""
+        return little_address_space(self._process.pid)
 
     def _leave_word(self) -> None:
         """Write why the process has ended, for those who only see the folder of the result."""

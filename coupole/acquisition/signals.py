@@ -1,10 +1,10 @@
 """Signals that end a session (Ctrl-C, SIGTERM, and SIGHUP when the terminal is gone), and signals that stop its
 process.
 
-Outside a session they raise `SignalReceived` in the main thread; if Python drops that, the next session obeys. In
-a session (`obeyed_by`) a thread of their own
-obeys them at once, whatever the main thread waits for. The main thread learns of them from `Control`. While a cell
-is made safe (`drop_signals`) they do nothing, so that a second Ctrl-C does not cut it short.
+Outside a session they raise `SignalReceived` in the main thread, again if Python drops it (`unheard_end`). In a
+session (`obeyed_by`) a thread of their own obeys them at once, whatever the main thread waits for. The main thread
+learns of them from `Control`. While a cell is made safe (`drop_signals`) they do nothing, so that a second Ctrl-C
+does not cut it short.
 
 Ctrl-Z (SIGTSTP) makes the cell safe before the process stops. A process cannot notice SIGSTOP, or the machine's
 sleep, in advance. When it runs again, the session is held, and a person is asked (`Control.hold`).
@@ -16,6 +16,7 @@ import math
 import os
 import select
 import signal
+import sys
 import threading
 import time
 from collections import deque
@@ -35,12 +36,9 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _heard_s = deque([-math.inf], maxlen=1)
 """Time when the main thread last received a signal, outside sessions."""
 
-_raised: deque[int] = deque(maxlen=1)
-"""Newest signal that was raised outside sessions. Python drops an exception that is raised in a finalizer or in
-the callback of a weak reference (there are some while modules are imported). The session that then begins obeys
-it."""
-
 _PULSE_S, _TOLD_WITHIN_S = 0.25, 0.1
+_AGAIN_AFTER_S = 0.02
+"""Time after which a signal that Python has dropped is sent again."""
 _LEAVES_WITHIN_S = 300.0
 """The closing of hanging devices and the writing of a report take less time."""
 _STOPS_WITHIN_S = 0.1
@@ -62,7 +60,6 @@ class SignalReceived(BaseException):
 def raise_outside_sessions() -> None:
     """Have each signal raise SignalReceived from now on. A hang-up that is ignored (`nohup`) stays ignored. Ctrl-C
     and SIGTERM always count, even in the background of a script."""
-    _raised.clear()
     for number in ENDING:
         if not _stays_ignored(number):
             signal.signal(number, _raise)
@@ -74,7 +71,6 @@ def _stays_ignored(number: int) -> bool:
 
 def _raise(number: int, _: Any) -> None:
     _heard_s.append(time.monotonic())
-    _raised.append(number)
     raise SignalReceived(number)
 
 
@@ -87,19 +83,34 @@ def unheard_end() -> Iterator[None]:
     """End the process after a signal outside sessions even if the main thread hangs; nothing shines or moves then.
     The process ends if the main thread has not received the signal after `STOPPED_S`, because a call never returns
     (a dead network disk). It also ends if the main thread is still there `_LEAVES_WITHIN_S` after the signal,
-    because it waits for a thread that hangs."""
+    because it waits for a thread that hangs.
+
+    Python prints and drops an exception that is raised in a finalizer, or in the callback of a weak reference;
+    there are some while modules are imported. A `SignalReceived` that was dropped is sent again as its signal."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     read_fd, write_fd = os.pipe()
     os.set_blocking(write_fd, False)
     before = signal.set_wakeup_fd(write_fd, warn_on_full_buffer=False)
+    hook_before = sys.unraisablehook
+    sys.unraisablehook = partial(_send_again, hook_before)
     threading.Thread(target=_end_unheard, args=(read_fd,), name="unheard signals", daemon=True).start()
     try:
         yield
     finally:
+        sys.unraisablehook = hook_before
         signal.set_wakeup_fd(before)
         os.close(write_fd)
+
+
+def _send_again(otherwise: Callable[[Any], object], dropped: Any) -> None:
+    """Send the signal behind an exception that Python drops again, a moment later and thus elsewhere in the main
+    thread. `otherwise` gets all other exceptions."""
+    if isinstance(dropped.exc_value, SignalReceived):
+        threading.Timer(_AGAIN_AFTER_S, os.kill, (os.getpid(), dropped.exc_value.number)).start()
+    else:
+        otherwise(dropped)
 
 
 def _end_unheard(read_fd: int) -> None:
@@ -153,8 +164,6 @@ def obeyed_by(control: Control, act: Act, *, is_watched: bool = True) -> Iterato
             | {signal.SIGUSR1: lambda *_: control.toggle_pause()}
             | {number: lambda *_: None for number in (signal.SIGTSTP, signal.SIGCONT)}
         ):
-            if _raised:
-                signal.raise_signal(_raised.pop())
             yield
     finally:
         signal.set_wakeup_fd(before)

@@ -1,4 +1,4 @@
-"""Commands to a run that another process of this user acquires: pause, go-on, stop; and its progress."""
+"""Commands to a run that another process of this user acquires: pause and go-on; and its progress."""
 
 from __future__ import annotations
 
@@ -29,13 +29,8 @@ RunningRun = Annotated[
     ),
 ]
 _LOOK_EVERY_S = 0.2
-_ENDS_WITHIN_S = 600.0
-"""Longest wait for the end of a process, s: longer than a session in which every call hangs (`coupole.bounded`),
-and than a slow report."""
-_LEAVES_WITHIN_S = 2.0
-"""Longest wait for the end of the process of a run that has ended, s. A Python program may go on after its run."""
 _PLAIN_LINE_EVERY_S = 5.0
-_SESSION_PATIENCE_S = (0.5, 5.0, 0.5)
+SESSION_PATIENCE_S = (0.5, 5.0, 0.5)
 """Longest waits for the answer of a session without a run. A frozen one must not delay the stop of another one; a
 session that loads its modules on a busy machine answers late. After each wait the run may have begun."""
 
@@ -128,7 +123,7 @@ def _answer_to(run: Path | None, command: Command) -> State:
         terminal.alarm(message)
 
     silent_sessions: dict[Path, State] = {}
-    for patience_s in _SESSION_PATIENCE_S:
+    for patience_s in SESSION_PATIENCE_S:
         try:
             return ask(_run_of(run), command, alarm)
         except NoRun as none:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coupole.commands.common import JsonOption
-from coupole.commands.run_controls import RunningRun, running_run, sessions
+from coupole.commands.run_controls import SESSION_PATIENCE_S, RunningRun, running_run, sessions
 from coupole.errors import CoupoleError, DeviceError, InputError, unsafe_end
 
 if TYPE_CHECKING:
@@ -26,12 +26,8 @@ _ENDS_WITHIN_S = 600.0
 and than a slow report."""
 _LEAVES_WITHIN_S = 2.0
 """Longest wait for the end of the process of a run that has ended, s. A Python program may go on after its run."""
-_SESSION_PATIENCE_S = (0.5, 5.0, 0.5)
-"""Longest waits for the answer of a session without a run, and after these always the last one. A frozen one must
-not delay the stop of another one; a session that loads its modules on a busy machine answers late. After each wait
-the run may have begun."""
-_LOOKS = len(_SESSION_PATIENCE_S)
-"""Looks before it is said that there is nothing to stop."""
+_LOOKS = len(SESSION_PATIENCE_S)
+"""Looks before it is said that there is nothing to stop. Later ones have the patience of the last."""
 
 
 def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
@@ -94,7 +90,7 @@ class _Stopping:
         begun_s = time.monotonic()
         for look in itertools.count(1):
             processes = list(starting_processes())  # before the sockets, which one of them may have a moment later
-            silent_sessions = self._stop_those_that_listen(_SESSION_PATIENCE_S[min(look, _LOOKS) - 1])
+            silent_sessions = self._stop_those_that_listen(SESSION_PATIENCE_S[min(look, _LOOKS) - 1])
             waited_s = time.monotonic() - begun_s
             starting = self._starting(processes) if waited_s < YOUNG_S else {}
             if self.file is None and self.replies:

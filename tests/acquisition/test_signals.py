@@ -14,7 +14,14 @@ from collections.abc import Iterator
 import pytest
 
 from coupole.acquisition.observer import Control
-from coupole.acquisition.signals import ENDING, SignalReceived, drop_signals, obeyed_by, raise_outside_sessions
+from coupole.acquisition.signals import (
+    ENDING,
+    SignalReceived,
+    drop_signals,
+    obeyed_by,
+    raise_outside_sessions,
+    unheard_end,
+)
 from coupole.errors import Interrupted
 
 BLOCKED_S = 0.8
@@ -56,24 +63,40 @@ class _Collected:
     """Something that is collected."""
 
 
-def test_a_signal_that_python_has_dropped_ends_the_session_that_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_that_python_drops_is_raised_again() -> None:
     """As while modules are imported: an exception in the callback of a weak reference is printed and forgotten."""
-    raise_outside_sessions()
     something = _Collected()
     watched = weakref.ref(something, lambda _: signal.raise_signal(signal.SIGTERM))
-    dropped: list[BaseException | None] = []
-    monkeypatch.setattr(sys, "unraisablehook", lambda told: dropped.append(told.exc_value))
-    del something
-    assert watched() is None
-    assert [type(error) for error in dropped] == [SignalReceived]
-    control, acted = Control(), threading.Event()
-    with obeyed_by(control, acted.set):
-        assert acted.wait(10.0)
-    with pytest.raises(Interrupted) as stopped:
+    with unheard_end():
+        raise_outside_sessions()
+        del something
+        assert watched() is None
+        with pytest.raises(SignalReceived) as received:
+            time.sleep(10.0)
+    assert received.value.number == signal.SIGTERM
+
+
+def test_a_signal_that_python_drops_ends_the_session_that_has_begun_meanwhile() -> None:
+    something, control, acted = _Collected(), Control(), threading.Event()
+    watched = weakref.ref(something, lambda _: signal.raise_signal(signal.SIGTERM))
+    with unheard_end():
+        raise_outside_sessions()
+        del something
+        with obeyed_by(control, acted.set):
+            assert watched() is None
+            assert acted.wait(10.0)
+    with pytest.raises(Interrupted):
         control.go_on()
-    assert stopped.value.exit_code == 128 + signal.SIGTERM
-    with obeyed_by(control := Control(), lambda: ()):
-        control.go_on()  # it was obeyed once
+
+
+def test_other_exceptions_that_python_drops_are_told_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda dropped: told.append(str(dropped.exc_value)))
+    something = _Collected()
+    watched = weakref.ref(something, lambda _: {}["a defect"])
+    with unheard_end():
+        del something
+    assert (watched(), told) == (None, ["'a defect'"])
 
 
 def test_a_session_obeys_though_the_main_threads_handler_was_first() -> None:

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from our_robot_conformance import OurRobotConformance
+from pydantic import ValidationError
 from ur import needs_ur_rtde
 
 from coupole.devices import ArmCondition
@@ -382,3 +383,9 @@ def test_rotation_vectors_of_the_stand_in_are_those_of_scipy(turn_deg: float) ->
 def test_the_stand_in_stands_where_universal_robots_own_figures_say() -> None:
     # All joints at 0: the arm lies along -x. a2 + a3 = 1184.25 mm; d4 + d6 = 290.7 mm; d1 - d5 = 60.85 mm.
     assert np.allclose(flange_pose("ur10e", [0.0] * 6)[:3, 3], [-1184.25, -290.7, 60.85], atol=1e-9)
+
+
+@pytest.mark.parametrize("key", ["watchdog_s", "attention_s"])
+def test_no_setting_lets_the_arm_move_unwatched_for_more_than_half_a_second(key: str) -> None:
+    with pytest.raises(ValidationError, match=rf"{key}\n  Input should be less than or equal to 0\.5"):
+        Settings.model_validate({"host": "192.0.2.7", key: 0.51})

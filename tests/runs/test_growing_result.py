@@ -31,6 +31,7 @@ from coupole.reflectance.light_paths import Ahead
 from coupole.reflectance.run_job import RunRequest, extract_beside, reflectance_of
 from coupole.reflectance.run_result import RunResult, read_view_samples
 from coupole.storage.growing_pictures import PICTURES, GrowingPictures, PictureShown, ViewPictures, read_growing
+from coupole.storage.processing import FOLDER
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("hurried")]
 MEMORY_BYTES = 2_000_000_000
@@ -291,15 +292,22 @@ def test_a_view_is_drawn_while_its_frames_arrive_and_the_result_is_the_same(
     end = lit[39] + 1
     journal.write_text("".join(lines[:end]))
     told: list[dict[str, Any]] = []
+    of_killed_process = result / FOLDER / "early" / "samples"
+    of_killed_process.mkdir(parents=True)
+    for name in ("side.h5", "side.json", "top.h5"):
+        (of_killed_process / name).write_text("{}")
     with ThreadPoolExecutor(1) as pool:
         ended = pool.submit(process_run, run, result, told.append, lambda work: work())
-        early = cells.wait_until(lambda: drawn_early(result, "side"), "a look at the second view")
-        with journal.open("a") as file:
-            file.write("".join(lines[end:]))
+        try:
+            early = cells.wait_until(lambda: drawn_early(result, "side"), "a look at the second view")
+        finally:  # otherwise the process would wait for ever
+            with journal.open("a") as file:
+                file.write("".join(lines[end:]))
         assert ended.result(), told
     assert (early.kind, early.arrived_frames, early.frames) == ("first-look", 40, 40)
     assert [picture.title for picture in early.pictures][:2] == ["Normals", "Uncertainty of normals"]
     assert not [document for document in told if document.get("progress", {}).get("undrawn")]
+    assert not of_killed_process.parent.exists()
     said_by("reflectance", run, "--out", tmp_path / "afterwards")
     same_result(result, tmp_path / "afterwards")
 

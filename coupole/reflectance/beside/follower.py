@@ -107,6 +107,7 @@ class _Follower:
         self._run, self._result, self._teller = run, result, teller
         growing = GrowingPictures(result, is_simulated=run.is_simulated)
         self._drawing = Drawing(result, growing, run.expected_views)
+        self._drawing.forget_early_look()
         self._page = PageMaker(page_program, growing, run.expected_views)
         self._request, self._ahead = RunRequest((run.folder,)), Ahead()
         self._journal = Follower(run.journal_path)

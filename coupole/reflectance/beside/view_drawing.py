@@ -48,13 +48,20 @@ class Drawing:
     def early_look(self, run: Path, view: str, say: Said) -> None:
         """Draw a view while its frames arrive, from samples that are taken for this and then removed. An error
         that `say` raises ends it. Raises as `reflectance_of`."""
-        folder = self.result / FOLDER / "early"
         try:
-            arrived_frames = extract_early(run, view, folder, _MOST_LEDS, say)
+            arrived_frames = extract_early(run, view, self._early_samples, _MOST_LEDS, say)
             if arrived_frames:
-                self.first_look(view, folder, arrived_frames)
+                self.first_look(view, self._early_samples, arrived_frames)
         finally:
-            shutil.rmtree(folder, ignore_errors=True)
+            self.forget_early_look()
+
+    @property
+    def _early_samples(self) -> Path:
+        return self.result / FOLDER / "early"
+
+    def forget_early_look(self) -> None:
+        """Remove the samples of an early look, also those that a killed process has left."""
+        shutil.rmtree(self._early_samples, ignore_errors=True)
 
     def first_look(self, view: str, folder: Path | None = None, arrived_frames: int = 0) -> None:
         """Draw a view by a quick fit to some of its samples, which are in the result's folder or in another one.

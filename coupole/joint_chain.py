@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coupole.geometry import Transform, inverse
+from coupole.wrist_lengths import WristLengths
 
 Floats: TypeAlias = NDArray[np.float64]
 Vector: TypeAlias = tuple[float, float, float]
@@ -52,30 +53,18 @@ class JointChain:
 
 @dataclass(frozen=True)
 class SphericalWrist:
-    """Ortho-parallel basis and spherical wrist (OPW): axes 2 and 3 are parallel, axes 4, 5 and 6 meet in a point.
+    """Ortho-parallel basis and spherical wrist (OPW)."""
 
-    The lengths are those of Brandstoetter, Angerer, Hofbaur: "An Analytical Solution of the Inverse Kinematics
-    Problem of Industrial Serial Manipulators with an Ortho-parallel Basis and a Spherical Wrist" (2014), fig. 2.
-    The angles there are the joints' angles, negated where `flip_axes` is True, minus `offsets_deg`.
-    """
-
-    a1_mm: float
-    a2_mm: float
-    b_mm: float
-    c1_mm: float
-    c2_mm: float
-    c3_mm: float
-    c4_mm: float
-    offsets_deg: tuple[float, ...]
-    flip_axes: tuple[bool, ...]
-    """True for an axis that turns opposite to OPW's sense."""
+    lengths: WristLengths
     opw_from_flange: tuple[tuple[float, ...], ...]
     """4x4 transform from the paper's flange, whose z axis is along axis 6, to the chain's flange."""
 
     def theta(self, joints_deg: ArrayLike) -> Floats:
         """Return the paper's angles [..., 6] in radians."""
         joints = np.asarray(joints_deg, dtype=np.float64)
-        theta: Floats = np.radians(np.where(self.flip_axes, -joints, joints) - np.asarray(self.offsets_deg))
+        theta: Floats = np.radians(
+            np.where(self.lengths.flip_axes, -joints, joints) - np.asarray(self.lengths.offsets_deg)
+        )
         return theta
 
 
@@ -203,7 +192,7 @@ def _spherical_wrist(chain: JointChain) -> SphericalWrist | None:
     base_from_opw[:3, 3] = wrist + c4_mm * hand
     positive = (turns[0][2], turns[1][1], turns[2][1], turns[3] @ along, turns[4][1], turns[5] @ hand)
     offsets = (0.0, -upper_rad, upper_rad - fore_rad, 0.0, fore_rad - hand_rad, 0.0)
-    return SphericalWrist(
+    lengths = WristLengths(
         a1_mm=float(at[1, 0]),
         a2_mm=float(fore @ np.array((along[2], 0.0, -along[0]))),
         b_mm=float(wrist[1]),
@@ -213,8 +202,8 @@ def _spherical_wrist(chain: JointChain) -> SphericalWrist | None:
         c4_mm=c4_mm,
         offsets_deg=tuple(float(np.degrees(offset)) + 0.0 for offset in offsets),
         flip_axes=tuple(bool(sense < 0.0) for sense in positive),
-        opw_from_flange=_rows(inverse(base_from_opw) @ flange),
     )
+    return SphericalWrist(lengths, _rows(inverse(base_from_opw) @ flange))
 
 
 @lru_cache(maxsize=32)
@@ -223,15 +212,15 @@ def _solver(wrist: SphericalWrist) -> Any:
 
     new_model: Any = opw.KinematicModel  # its stub asks for tuples of six, which these fields are
     model = new_model(
-        a1=wrist.a1_mm,
-        a2=wrist.a2_mm,
-        b=wrist.b_mm,
-        c1=wrist.c1_mm,
-        c2=wrist.c2_mm,
-        c3=wrist.c3_mm,
-        c4=wrist.c4_mm,
-        offsets=wrist.offsets_deg,
-        flip_axes=wrist.flip_axes,
+        a1=wrist.lengths.a1_mm,
+        a2=wrist.lengths.a2_mm,
+        b=wrist.lengths.b_mm,
+        c1=wrist.lengths.c1_mm,
+        c2=wrist.lengths.c2_mm,
+        c3=wrist.lengths.c3_mm,
+        c4=wrist.lengths.c4_mm,
+        offsets=wrist.lengths.offsets_deg,
+        flip_axes=wrist.lengths.flip_axes,
     )
     return opw.Robot(model, degrees=True), inverse(np.array(wrist.opw_from_flange))
 
@@ -253,11 +242,11 @@ def _branches_of_spherical_wrist(wrist: SphericalWrist, base_from_flange: Transf
         return branches_deg
     # Turned a little about the wrist centre the same wrist position is reached by the same A1, A2, A3.
     nudged_pose = np.array(base_from_opw, dtype=np.float64)
-    wrist_mm = nudged_pose[:3, 3] - wrist.c4_mm * nudged_pose[:3, 2]
+    wrist_mm = nudged_pose[:3, 3] - wrist.lengths.c4_mm * nudged_pose[:3, 2]
     c, s = np.cos(_WRIST_NUDGE_RAD), np.sin(_WRIST_NUDGE_RAD)
     nudged_pose[:3, :3] = nudged_pose[:3, :3] @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-    nudged_pose[:3, 3] = wrist_mm + wrist.c4_mm * nudged_pose[:3, 2]
-    stretched_deg = wrist.offsets_deg[4] * (-1.0 if wrist.flip_axes[4] else 1.0)
+    nudged_pose[:3, 3] = wrist_mm + wrist.lengths.c4_mm * nudged_pose[:3, 2]
+    stretched_deg = wrist.lengths.offsets_deg[4] * (-1.0 if wrist.lengths.flip_axes[4] else 1.0)
     for branch in _raw_branches(wrist, nudged_pose):
         first, _, _ = wrist.theta(branch)[:3]
         fore = wrist.theta(branch)[1:3].sum()
@@ -265,7 +254,7 @@ def _branches_of_spherical_wrist(wrist: SphericalWrist, base_from_flange: Transf
         if not turn[2, 2] >= 1.0 - 1e-12:  # also where the branch is NaN
             continue
         a6_deg = float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
-        a6_deg = -a6_deg if wrist.flip_axes[5] else a6_deg
+        a6_deg = -a6_deg if wrist.lengths.flip_axes[5] else a6_deg
         branches_deg.append(np.array([*branch[:3], 0.0, stretched_deg, a6_deg]))
     return branches_deg
 

@@ -22,7 +22,7 @@ from nursery import NURSERY
 from skip_budget import over_budget
 from xdist.scheduler.loadscope import LoadScopeScheduling
 
-from coupole.kernels import kept_in
+from coupole.kernels.kept_code import kept_in
 from sim.world import client
 
 pytest_plugins = ["coupole.testing"]

@@ -48,7 +48,7 @@ def make_run(root: Path, folder: Path, frames: int, size: Size) -> Any:
     """Make a run with frames under `frames` LEDs, spread over the dome, and some dark frames."""
     import trimesh
 
-    from coupole.acquisition.recorder import RunRecorder
+    from coupole.acquisition.recorder import RunRecorder, ViewStart
     from coupole.devices import ArmState, FrameFormat
     from coupole.plan.shot_id import ShotId
     from coupole.storage.journal_events import SessionStarted, SessionStopped, ViewBegun
@@ -70,7 +70,8 @@ def make_run(root: Path, folder: Path, frames: int, size: Size) -> Any:
     recorder.note(SessionStarted(simulated=True))
     recorder.note(ViewBegun(view=VIEW))
     arm = ArmState((0, 0, 0, 0, 0, 0), pose, 1, moving=False)
-    recorder.begin_view(VIEW, len(labels), FrameFormat(height_px, width_px, 12, "GBRG", 64, 4095), arm, pose, {})
+    frame_format = FrameFormat(height_px, width_px, 12, "GBRG", 64, 4095)
+    recorder.begin_view(ViewStart(VIEW, len(labels), frame_format, arm, pose, {}))
     memory = mmap.mmap(-1, 2 * width_px * height_px)
     pixels = np.frombuffer(memory, np.uint16).reshape(height_px, width_px)
     for number, label in enumerate(labels):

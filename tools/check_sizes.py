@@ -25,7 +25,7 @@ COMMANDS = "coupole/commands"
 """Folder of the command line: the parameters of a command are its options."""
 MANY_PARAMETERS = {"coupole/scripting/analyses.py: fit_reflectance"}
 """Functions that may have more parameters: a public name, whose keywords are those of the command's options."""
-MOST_ROOMS, MOST_TOP_FILES = 19, 10
+MOST_ROOMS, MOST_TOP_FILES = 20, 10
 """Greatest numbers of packages and of top-level files in coupole/."""
 SHARED_NAMES = {"__init__", "records", "report", "settings"}
 """Names that modules of several packages may share."""

@@ -28,6 +28,7 @@ CONTRACTS = (
     "kernels",
     "kinematics",
     "supervision",
+    "wrist_lengths",
 )
 BESIDE = ("drivers", "sim")
 _STEP_X, _STEP_Y, _BOX_W, _BOX_H, _MARGIN = 74, 46, 132, 34, 16
@@ -76,10 +77,9 @@ def purpose(room: str) -> str:
 
 def size(room: str) -> int:
     """Lines of Python."""
-    if room == "contracts":
-        files = [ROOT / "coupole" / f"{name}.py" for name in CONTRACTS]
-    else:
-        files = sorted((ROOT / (room if room in BESIDE else f"coupole/{room}")).rglob("*.py"))
+    names = CONTRACTS if room == "contracts" else (room,)
+    places = [ROOT / name if name in BESIDE else ROOT / "coupole" / name for name in names]
+    files = [file for place in places for file in (*place.rglob("*.py"), place.with_suffix(".py")) if file.exists()]
     return sum(path.read_text(encoding="utf-8").count("\n") for path in files)
 
 

@@ -172,7 +172,7 @@ class Bench:
         """Return the exit code of pytest, and the first test that failed."""
         command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--no-header"]
         command += ["-k", mutant.select] if mutant.select else []
-        # what a mutant does not change is compiled once for all of them (coupole/kernels.py)
+        # what a mutant does not change is compiled once for all of them (coupole/kernels/kept_code.py)
         env = {**os.environ, "NUMBA_CACHE_DIR": str(self._scratch / ".numba"), "PYTHONDONTWRITEBYTECODE": "1"}
         env["PYTHONPATH"] = str(self._scratch)  # also for the scripts that tests begin
         try:

@@ -47,7 +47,7 @@ _.writable  # io
 _.writeable  # numpy
 _._LanesModel  # numba, by its decorator
 _._cache, _._py_file  # numba
-_.get_cache_path, _.get_source_stamp, _.get_disambiguator, _.from_function  # numba, of kernels.py
+_.get_cache_path, _.get_source_stamp, _.get_disambiguator, _.from_function  # numba, of kept_code.py
 _.timeout_period_on_update_event_data_call, _.num_buffers  # harvesters
 _.current_position, _.current_velocity, _.current_acceleration, _.control_interface  # ruckig
 _.target_position, _.target_velocity, _.target_acceleration  # ruckig

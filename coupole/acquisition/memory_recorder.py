@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.acquisition.frame_samples import FrameSamples
-from coupole.devices import ArmState, Frame, FrameFormat
-from coupole.geometry import Transform
+from coupole.acquisition.recorder import ViewStart
+from coupole.devices import Frame, FrameFormat
 from coupole.plan.bursts import Burst
 from coupole.plan.choices import FrameSample
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.exposure_advice import Metered, sample_of
-from coupole.storage.frame_file_creation import Collections
 from coupole.storage.journal_events import Event
 from coupole.viewing.progress import ViewExposure
 
@@ -46,17 +45,9 @@ class MemoryRecorder:
         """Always true: nothing is stored."""
         return True
 
-    def begin_view(
-        self,
-        view: str,
-        frames: int,
-        frame_format: FrameFormat,
-        arm: ArmState,
-        base_from_camera: Transform,
-        collections: Collections,
-    ) -> None:
-        self._view, self._format = view, frame_format
-        self._samples.begin(frame_format)
+    def begin_view(self, start: ViewStart) -> None:
+        self._view, self._format = start.view, start.frame_format
+        self._samples.begin(start.frame_format)
 
     def sample_frames(self, *, is_wanted: bool) -> None:
         self._samples.is_wanted = is_wanted

@@ -6,6 +6,7 @@ import contextlib
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -38,6 +39,23 @@ _SLOWEST_SYNC_BYTES_S, _SLOWEST_ALLOCATION_BYTES_S = 5e6, 50e6
 """Speeds of the slowest disks that still answer. An allocation may be written out."""
 
 
+@dataclass(frozen=True)
+class ViewStart:
+    """A view before its first frame."""
+
+    view: str
+    """Name of the view."""
+    frames: int
+    """Number of its frames, at most."""
+    frame_format: FrameFormat
+    arm: ArmState
+    """State of the arm, which is at rest."""
+    base_from_camera: Transform
+    """Pose of the camera, mm."""
+    collections: Collections
+    """Arrays to be stored with the frames: by group name, then by array name."""
+
+
 class Recorder(Protocol):
     """The recorder that the sequencer needs. Several threads may call `store`; all other methods are called by
     only one thread."""
@@ -57,19 +75,8 @@ class Recorder(Protocol):
         """Tell whether the disk has room for a view that is about to begin. Raises DiskFull if it never will."""
         ...
 
-    def begin_view(
-        self,
-        view: str,
-        frames: int,
-        frame_format: FrameFormat,
-        arm: ArmState,
-        base_from_camera: Transform,
-        collections: Collections,
-    ) -> None:
-        """Begin a view: the next frames belong to it. It may be called again after a new measurement of the pose.
-
-        `collections` are arrays to be stored with the frames: by group name, then by array name.
-        """
+    def begin_view(self, start: ViewStart) -> None:
+        """Begin a view: the next frames belong to it. May be called again after a new measurement of the pose."""
         ...
 
     def store(self, frame: Frame, exposure_us: int) -> int:
@@ -157,39 +164,29 @@ class RunRecorder:
     def has_room(self, view: str) -> bool:
         return self.has_room_for(view)
 
-    def begin_view(
-        self,
-        view: str,
-        frames: int,
-        frame_format: FrameFormat,
-        arm: ArmState,
-        base_from_camera: Transform,
-        collections: Collections,
-    ) -> None:
+    def begin_view(self, start: ViewStart) -> None:
         self._refuse_moved()
-        self._samples.begin(frame_format)
-        path = self._run.view_path(view)
-        allocated_bytes = (frames + SPARE_SLOTS) * frame_format.frame_bytes
+        self._samples.begin(start.frame_format)
+        path = self._run.view_path(start.view)
+        allocated_bytes = (start.frames + SPARE_SLOTS) * start.frame_format.frame_bytes
         with under_way(DISK, str(path), allocated_bytes / _SLOWEST_ALLOCATION_BYTES_S):
-            self._open_view(path, view, frames, frame_format, collections)
-            self._pose = self._view.add_pose(arm, base_from_camera)
+            self._open_view(path, start)
+            self._pose = self._view.add_pose(start.arm, start.base_from_camera)
 
-    def _open_view(
-        self, path: Path, view: str, frames: int, frame_format: FrameFormat, collections: Collections
-    ) -> None:
+    def _open_view(self, path: Path, start: ViewStart) -> None:
         self._file = str(path.relative_to(self._run.folder))
         if self._writer is None:
-            view_slots = {str(shot): slot for shot, slot in self._proven.items() if shot.view == view}
+            view_slots = {str(shot): slot for shot, slot in self._proven.items() if shot.view == start.view}
             if not path.exists():
                 if view_slots:
                     raise StorageError(f"{path}: the journal lists proven frames of it, but the file is missing")
-                metadata = {**self._metadata, "title": view}
+                metadata = {**self._metadata, "title": start.view}
                 create(
                     path,
-                    frames + SPARE_SLOTS,
-                    frame_format,
+                    start.frames + SPARE_SLOTS,
+                    start.frame_format,
                     metadata,
-                    {**self._described, **collections},
+                    {**self._described, **start.collections},
                     is_packed=self._packed,
                 )
             self._writer = ViewWriter(path, view_slots)

@@ -22,7 +22,7 @@ from coupole.acquisition.frame_matching import compile_now
 from coupole.acquisition.host_burst import Overseer
 from coupole.acquisition.observer import Control, Held, Observer, Unwatched
 from coupole.acquisition.opened_cell import OpenedCell
-from coupole.acquisition.recorder import Recorder
+from coupole.acquisition.recorder import Recorder, ViewStart
 from coupole.acquisition.verdict import NOTHING_TO_MATCH, Verdict
 from coupole.acquisition.visits_in_order import NextVisit, chosen_visits, planned_visits
 from coupole.acquisition.watching.watched_run import WatchedRecorder
@@ -180,8 +180,9 @@ class Sequencer:
                     base_from_camera=tuple(map(tuple, np.round(settled_pose.base_from_camera, 6).tolist())),
                 )
             )
+            arm, base_from_camera = settled_pose.arm, settled_pose.base_from_camera
             self._recorder.begin_view(
-                view.name, frames, frame_format, settled_pose.arm, settled_pose.base_from_camera, collections
+                ViewStart(view.name, frames, frame_format, arm, base_from_camera, collections)
             )
 
         begin(settled_pose)

@@ -145,17 +145,17 @@ def _by_runs(runs: list[Path], options: _GivenOptions) -> Work:
             calibrations.camera,
         )
         setting = ChartSetting(
-            patches.chart,
-            cell.rig.support.base_from_support.matrix(),
-            by_table if calibrations.leds is None else calibrated_positions(calibrations.leds),
-            lens_of(calibrations.camera, frames),
-            corners_of(options.corners),
-            calibrations.dark_record,
-            calibrations.response_record,
-            calibrations.flat,
-            calibrations.glare,
-            emission_of(calibrations.emission),
-            tuple(path for path in files if path is not None),
+            chart=patches.chart,
+            base_from_support=cell.rig.support.base_from_support.matrix(),
+            positions=by_table if calibrations.leds is None else calibrated_positions(calibrations.leds),
+            lens=lens_of(calibrations.camera, frames),
+            corners_px=corners_of(options.corners),
+            dark=calibrations.dark_record,
+            response=calibrations.response_record,
+            flat=calibrations.flat,
+            glare=calibrations.glare,
+            emission=emission_of(calibrations.emission),
+            files=tuple(path for path in files if path is not None),
         )
         with bar(console, "frames of the chart") as progress:
             sightings = see_in_runs(frames, setting, whites, progress)

@@ -217,17 +217,17 @@ def setting_of(frames: LightFrames, tile: Path, rig: Path, calibrations: TargetC
     spectrum = None if cell.rig.dome.spectrum is None else cell.document.resolve(cell.rig.dome.spectrum)
     files = (tile, rig, calibrations.leds or cell.leds_path, spectrum, calibrations.hand_eye, calibrations.camera)
     return Setting(
-        read_tile(tile),
-        cell.rig.support.base_from_support.matrix(),
-        by_table if calibrations.leds is None else calibrated_positions(calibrations.leds),
-        lens_of(calibrations.camera, frames),
-        calibrations.dark_record,
-        calibrations.response_record,
-        calibrations.flat,
-        calibrations.glare,
-        emission_of(calibrations.emission),
-        tuple(path for path in files if path is not None),
-        light_of(cell),
+        tile=read_tile(tile),
+        base_from_support=cell.rig.support.base_from_support.matrix(),
+        positions=by_table if calibrations.leds is None else calibrated_positions(calibrations.leds),
+        lens=lens_of(calibrations.camera, frames),
+        dark=calibrations.dark_record,
+        response=calibrations.response_record,
+        flat=calibrations.flat,
+        glare=calibrations.glare,
+        emission=emission_of(calibrations.emission),
+        files=tuple(path for path in files if path is not None),
+        light=light_of(cell),
     )
 
 

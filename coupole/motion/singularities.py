@@ -48,14 +48,15 @@ def distances(arm: Arm, joints_deg: ArrayLike) -> tuple[NDArray[np.float64], ...
     theta = structure.theta(joints_deg)
     _, t2, t3, t4, t5, _ = np.moveaxis(theta, -1, 0)
     if isinstance(structure, SphericalWrist):
-        bend, fore = t3 + np.arctan2(structure.a2_mm, structure.c3_mm), t2 + t3
+        lengths = structure.lengths
+        bend, fore = t3 + np.arctan2(lengths.a2_mm, lengths.c3_mm), t2 + t3
         out_mm = (
-            structure.c2_mm * np.sin(t2)
-            + structure.c3_mm * np.sin(fore)
-            + structure.a2_mm * np.cos(fore)
-            + structure.a1_mm
+            lengths.c2_mm * np.sin(t2)
+            + lengths.c3_mm * np.sin(fore)
+            + lengths.a2_mm * np.cos(fore)
+            + lengths.a1_mm
         )
-        shoulder_mm = np.hypot(out_mm, structure.b_mm)
+        shoulder_mm = np.hypot(out_mm, lengths.b_mm)
     else:
         bend = t3
         out_mm = (

@@ -12,9 +12,9 @@ import math
 import numpy as np
 
 from coupole.kernels import kernel
+from coupole.kernels.lanes import LANES, if_less, lanes, larger, load_row, root, store, total
 from coupole.reflectance.ggx import UNKNOWNS, tangents
 from coupole.reflectance.kernel_arrays import assign, assign_rows
-from coupole.reflectance.lanes import LANES, if_less, lanes, larger, load_row, root, store, total
 from coupole.reflectance.normal_fit import (
     _MOST_STEPS,
     CAUCHY,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.kernels.lanes import LANES
 from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.fits import (
     ANYWHERE,
@@ -24,7 +25,6 @@ from coupole.reflectance.fits import (
     TEXELS,
     ViewFit,
 )
-from coupole.reflectance.lanes import LANES
 from coupole.reflectance.new_light.beams import Beam, Lighting, lighting_of
 from coupole.reflectance.new_light.light_kinds import AnyLight
 from coupole.reflectance.new_light.mirrored import add_mirrored

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.kernels import kernel
+from coupole.kernels.lanes import LANES
 from coupole.reflectance.ggx import lobe, tangents
 from coupole.reflectance.ggx_fit import ROWS, fit_packs, pack
 from coupole.reflectance.kernel_arrays import assign
-from coupole.reflectance.lanes import LANES
 from coupole.reflectance.normal_fit import SPREAD_KS, USUAL_ALPHA, USUAL_KS, colours_from
 from coupole.reflectance.parts_in_threads import in_threads
 

@@ -43,6 +43,14 @@ class JournalEvent(BaseModel):
     """Time, UTC, ISO 8601."""
 
 
+class ViewEvent(JournalEvent):
+    """Something happened in a view."""
+
+    event: str
+    view: str
+    """Name of the view."""
+
+
 class JournalBegun(JournalEvent):
     """The first line of a journal; journals of 0.1 (version 1) do not have it."""
 
@@ -51,10 +59,10 @@ class JournalBegun(JournalEvent):
     """Version of the journal's format."""
 
 
-class SessionStarted(JournalEvent):
-    """The run's first session has opened its devices."""
+class SessionBegun(JournalEvent):
+    """A session of the run has opened its devices."""
 
-    event: Literal["start"] = "start"
+    event: str
     simulated: bool = False
     """True if the devices are those of a simulated cell."""
     room_c: float | None = None
@@ -69,21 +77,16 @@ class SessionStarted(JournalEvent):
     words."""
 
 
-class SessionResumed(JournalEvent):
+class SessionStarted(SessionBegun):
+    """The run's first session has opened its devices."""
+
+    event: Literal["start"] = "start"
+
+
+class SessionResumed(SessionBegun):
     """A later session of the run has opened its devices (`--resume`)."""
 
     event: Literal["resume"] = "resume"
-    simulated: bool = False
-    """True if the devices are those of a simulated cell."""
-    room_c: float | None = None
-    """Temperature of the coolest LED board, C; None if the box knows none."""
-    acknowledged: str = ""
-    """The fault of the arm that the operator confirmed to be repaired."""
-    dose_budget_lux_h: float | None = None
-    """Light that the object may receive in its life, by its ledger and the plan, at the session's begin; None: no
-    budget."""
-    trusted: tuple[str, ...] = ()
-    """Permissions that a person gives by name in the rig, in words."""
 
 
 class ProcessingAsked(JournalEvent):
@@ -94,32 +97,26 @@ class ProcessingAsked(JournalEvent):
     """Folder of the result, an absolute path."""
 
 
-class ViewBegun(JournalEvent):
+class ViewBegun(ViewEvent):
     """The arm is about to move to a view."""
 
     event: Literal["view"] = "view"
-    view: str
-    """Name of the view."""
     hidden_leds: tuple[int, ...] = ()
     """LEDs that are occluded from everything that this view shows."""
 
 
-class MoveBegun(JournalEvent):
+class MoveBegun(ViewEvent):
     """A motion of the arm begins."""
 
     event: Literal["move"] = "move"
-    view: str
-    """Name of the view."""
     joints_deg: tuple[Joints, ...]
     """[waypoints, 6] angles of the axes, degrees. The last waypoint is the view's posture."""
 
 
-class ArmSettled(JournalEvent):
+class ArmSettled(ViewEvent):
     """The arm is at rest, at this measured pose."""
 
     event: Literal["settled"] = "settled"
-    view: str
-    """Name of the view."""
     joints_deg: Joints
     """[6] measured angles of the axes, degrees."""
     base_from_camera: tuple[tuple[float, ...], ...]
@@ -142,13 +139,11 @@ class FrameProven(JournalEvent):
     """Checksum of the frame's bytes, 16 hexadecimal digits."""
 
 
-class BurstsChosen(JournalEvent):
+class BurstsChosen(ViewEvent):
     """The next bursts of a view were chosen. The line is synced before the first of them gives light. A resumed
     run repeats these bursts."""
 
     event: Literal["chosen"] = "chosen"
-    view: str
-    """Name of the view."""
     bursts: tuple[ChosenBurst, ...]
     """The bursts in their order. An empty list means that the view has enough."""
     reason: str
@@ -170,22 +165,18 @@ class ViewChosen(JournalEvent):
     """Numbers behind the reason, and the best alternatives with theirs."""
 
 
-class BurstBegun(JournalEvent):
+class BurstBegun(ViewEvent):
     """A burst is about to give light. The line is synced before the light."""
 
     event: Literal["begin"] = "begin"
-    view: str
-    """Name of the view."""
     planned_lux_h: tuple[float, ...]
     """Largest light at each of the object's dose points, lux h."""
 
 
-class BurstEnded(JournalEvent):
+class BurstEnded(ViewEvent):
     """A burst has ended, complete or not. The line has the light that it gave."""
 
     event: Literal["burst"] = "burst"
-    view: str
-    """Name of the view."""
     steps: int
     """Number of steps that the box has run."""
     on_s: float
@@ -208,12 +199,10 @@ class BurstEnded(JournalEvent):
     """Light at each of the object's dose points, lux h. It replaces the planned light; None in version 0.1."""
 
 
-class GapFound(JournalEvent):
+class GapFound(ViewEvent):
     """Frames of a burst are not proven."""
 
     event: Literal["gap"] = "gap"
-    view: str
-    """Name of the view."""
     shots: tuple[Shot, ...]
     """Shots that are not proven."""
     missing: int
@@ -228,19 +217,17 @@ class GapFound(JournalEvent):
     """Reason why nothing, or not everything, could be proven. It is empty if all frames that came were proven."""
 
 
-class ReshootBegun(JournalEvent):
+class ReshootBegun(ViewEvent):
     """Shots are taken again."""
 
     event: Literal["reshoot"] = "reshoot"
-    view: str
-    """Name of the view."""
     attempt: int
     """Number of this attempt, from 1."""
     shots: tuple[Shot, ...]
     """Shots that are taken again."""
 
 
-class FindingNoted(JournalEvent):
+class FindingNoted(ViewEvent):
     """Something changed in a burst but should not have changed. This line marks the shots; they may be taken
     again."""
 
@@ -248,8 +235,6 @@ class FindingNoted(JournalEvent):
     kind: str
     """Name of the finding: `ambient light`, `LED`, `drift`, `moved`, `smudge`, `exposure step` or `thing in the
     field`. It is `not watched` if the watching itself has failed and ended."""
-    view: str
-    """Name of the view."""
     shots: tuple[Shot, ...]
     """Shots that it concerns."""
     figure: float
@@ -264,13 +249,11 @@ class FindingNoted(JournalEvent):
     """A PNG file with the light before, after, and their difference, relative to the run's folder."""
 
 
-class FramesDiscarded(JournalEvent):
+class FramesDiscarded(ViewEvent):
     """Frames of a view are discarded, as its plan says, because their samples are safe. The line is synced before
     the first frame is changed."""
 
     event: Literal["discard"] = "discard"
-    view: str
-    """Name of the view."""
     frames: tuple[tuple[Shot, str], ...]
     """Each frame with the checksum of its bytes, 16 hexadecimal digits, as in its `frame` line."""
     result: str
@@ -336,12 +319,10 @@ class TextUnread(JournalEvent):
     """Time for which no text had been taken, s."""
 
 
-class ViewSealed(JournalEvent):
+class ViewSealed(ViewEvent):
     """The session has finished a view, complete or not."""
 
     event: Literal["seal"] = "seal"
-    view: str
-    """Name of the view."""
 
 
 class SessionStopped(JournalEvent):

@@ -25,6 +25,7 @@ from drivers.ledbox.serial_link import no_port, open_serial
 from drivers.ledbox.settings import BLOCK_BYTES, Settings
 from drivers.ledbox.usbtmc import UsbtmcLink
 from drivers.ledbox.wire import RECORD_BYTES, pack, unpack_log
+from drivers.opening import closed_on_failure
 
 _BLOCK_TIMEOUT_S = 2.2
 """Silence after which the box has discarded an incomplete block (its own limit is 2 s)."""
@@ -61,14 +62,11 @@ class LedBox:
         self._next_record = 0
         self._protocol = _FIRST_PROTOCOL
         self._scpi = ScpiSession(settings.name, settings.port, self._open(), clock)
-        try:
+        with closed_on_failure(self.close):
             self._identity = self._greet()
             self._protocol = self._ask_protocol()
             self._has_enabling_switch = self._ask_enabling_switch()
             self.led_count = self._set_up()
-        except BaseException:
-            self.close()
-            raise
 
     def identify(self) -> Identity:
         return self._identity

@@ -24,6 +24,7 @@ from coupole.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.host_checks import serial_port
 from drivers.ledbox.link import CallEnded, Cleared
 from drivers.ledbox.serial_link import SerialLink, open_serial
+from drivers.opening import closed_on_failure
 
 _REPLY_MARGIN_S = 2.0
 """Time that a box may take to answer, not counting the transmission of the bytes."""
@@ -153,13 +154,10 @@ class TextLineBox:
         self._in_step = False
         """True if the next line from the box is the answer to the next command."""
         self._link: SerialLink = open_serial(settings.name, settings.port, settings.baud, clock)
-        try:
+        with closed_on_failure(self.close):
             clock.sleep(settings.settle_ms * 1e-3)
             self.lights_off()
             self._identity = self._greet()
-        except BaseException:
-            self.close()
-            raise
 
     def identify(self) -> Identity:
         return self._identity

@@ -38,6 +38,7 @@ from drivers.arm_motion import (
 )
 from drivers.fair_lock import FairLock
 from drivers.host_checks import package
+from drivers.opening import closed_on_failure
 from drivers.ur.messages import (
     BACKDRIVE,
     EMERGENCY_STOP_BITS,
@@ -145,13 +146,10 @@ class UrRobot:
         """Number of lapses that the process had counted when the last motion began."""
         config = {field.name: getattr(settings, field.name) for field in fields(Config)}
         self._process = UrProcess(Config(**config))
-        try:
+        with closed_on_failure(self.close):
             self._last = self._process.first_state(settings.connect_timeout_s)
             raise_fault(self._last)
             self._check_model(self._last.model)
-        except BaseException:
-            self.close()
-            raise
 
     def _check_model(self, reported_model: str) -> None:
         """Check the arm model, because plans are computed for one model. The dashboard calls a UR10e `UR10`."""

@@ -70,7 +70,9 @@ def test_a_constant_frame_gives_dn_per_second(exposure_us: float) -> None:
     )
     positions = Positions(np.array([5]), CENTRE_MM, DOWN)
     lens = Intrinsics(FOCAL_PX, FOCAL_PX, (FORMAT.width_px - 1) / 2, (FORMAT.height_px - 1) / 2)
-    read = TileReader(frames, Setting(TILE, np.eye(4), positions, lens), pixels.shape)
+    read = TileReader(
+        frames, Setting(tile=TILE, base_from_support=np.eye(4), positions=positions, lens=lens), pixels.shape
+    )
     views = read.view([frame], lambda: None)
     assert sorted(views) == ["B", "G", "R"]
     for view in views.values():

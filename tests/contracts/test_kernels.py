@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from places import REPO
 
-from coupole.kernels import PACKAGES, UNUSED_S, digest_of, imported_names, kept_in
+from coupole.kernels.kept_code import PACKAGES, UNUSED_S, digest_of, imported_names, kept_in
 
 BASE = "FACTOR = 2.0\n"
 HELPER = """

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from coupole.kinematics import structure_of
 from drivers.kuka.rsi import shared_state
-from drivers.kuka.rsi.pose import Geometry
 from drivers.kuka.rsi.rsi_session import Config, RsiSession
 from drivers.kuka.rsi.wire import controller_type, packet_parser
 from sim.devices.kuka_controller import Settings as ControllerSettings
@@ -32,7 +31,7 @@ CONFIG = Config(
     stop_tag="",
     corrects="axes",
     mode="absolute",
-    geometry=Geometry(*(getattr(structure_of(KR10_R1100_SIXX), name) for name in Geometry._fields)),
+    geometry=structure_of(KR10_R1100_SIXX).lengths,
     velocity_deg_s=(100.0,) * 6,
     acceleration_deg_s2=(300.0,) * 6,
     jerk_deg_s3=(3000.0,) * 6,

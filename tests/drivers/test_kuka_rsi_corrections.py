@@ -15,11 +15,11 @@ from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.corrections import Corrections
 from drivers.kuka.rsi.driver import Settings
 from drivers.kuka.rsi.limits import correction_violations
-from drivers.kuka.rsi.pose import Geometry, Pose, corrected_pose, correction, flange_pose
+from drivers.kuka.rsi.pose import Pose, corrected_pose, correction, flange_pose
 from drivers.kuka.rsi.trajectory import Motion
 
 HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
-GEOMETRY = Geometry(*(getattr(structure_of(KR10_R1100_SIXX), name) for name in Geometry._fields))
+GEOMETRY = structure_of(KR10_R1100_SIXX).lengths
 joints = st.tuples(*[st.floats(low, high) for low, high in KR10_R1100_SIXX.limits_deg])
 
 

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from coupole.acquisition.conclusion import conclude, open_for_session
-from coupole.acquisition.recorder import RunRecorder
+from coupole.acquisition.recorder import RunRecorder, ViewStart
 from coupole.devices import ArmState, Frame, FrameFormat
 from coupole.plan.shot_id import ShotId
 from coupole.storage.archive import archive_run
@@ -46,7 +46,8 @@ def picture(number: int) -> Frame:
 
 def begin_view(recorder: RunRecorder, view: str) -> None:
     arm = ArmState(JOINTS_DEG, np.eye(4), 7, moving=False)
-    recorder.begin_view(view, len(LABELS), FORMAT, arm, np.eye(4), {"shadow": {"leds": np.arange(5)}})
+    collections = {"shadow": {"leds": np.arange(5)}}
+    recorder.begin_view(ViewStart(view, len(LABELS), FORMAT, arm, np.eye(4), collections))
 
 
 def take(recorder: RunRecorder, shot: str) -> None:

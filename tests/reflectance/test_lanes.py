@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 
-from coupole.reflectance.lanes import (
+from coupole.kernels.lanes import (
     absolute,
     add_in_turns,
     four_gathered,

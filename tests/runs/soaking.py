@@ -26,6 +26,7 @@ from cells import LOW, SIDE, TOP, CellFolder
 from coupole.acquisition.memory_recorder import MemoryRecorder
 from coupole.acquisition.opened_cell import open_cell
 from coupole.acquisition.operator import UNLIMITED_BYTES
+from coupole.acquisition.recorder import ViewStart
 from coupole.acquisition.sequencer import Sequencer
 from coupole.devices import Frame
 from coupole.errors import DeviceError, UnprovenError
@@ -128,9 +129,9 @@ class CheckedRecorder(MemoryRecorder):
         self.labelled: list[tuple[ShotId, tuple[int, int]]] = []
         """Shots with id and timestamp of their frames, since the world was last asked."""
 
-    def begin_view(self, view: str, *pose: Any) -> None:
-        super().begin_view(view, *pose)
-        self._before_view(view)
+    def begin_view(self, start: ViewStart) -> None:
+        super().begin_view(start)
+        self._before_view(start.view)
 
     def store(self, frame: Frame, exposure_us: int) -> int:
         slot = len(self._frames)

@@ -47,7 +47,7 @@ def test_what_is_just_small_enough_passes(tmp_path: Path) -> None:
         ({"coupole__commands__run": f"def _f({parameters(8)}): ..."}, "_f has 8 parameters"),
         ({"coupole__plan__run": f"@cache\ndef f({parameters(8)}): ..."}, "f has 8 parameters"),
         ({"coupole__plan__shots": "", "coupole__scan__shots": ""}, "plan, scan each have a module shots"),
-        ({f"coupole__room{number}__m{number}": "" for number in range(20)}, "20 rooms"),
+        ({f"coupole__room{number}__m{number}": "" for number in range(21)}, "21 rooms"),
         ({f"coupole__file{number}": "" for number in range(11)}, "11 files"),
     ],
 )

@@ -13,7 +13,7 @@ import pytest
 from places import REPO
 
 from coupole.commands.extras import EXTRA_OF
-from coupole.kernels import kept_in
+from coupole.kernels.kept_code import kept_in
 
 DEPENDENCIES = next(path for path in map(Path, sys.path) if path.name == "site-packages")
 MOST_BYTES, MOST_INSTALLED_BYTES = 15_000_000, 700_000_000

@@ -14,22 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.acquisition.observer import Control, Observer
-from coupole.acquisition.recorder import Recorder
+from coupole.acquisition.recorder import Recorder, ViewStart
 from coupole.acquisition.watching.burst_judge import BurstJudge, FirstFrames, LightTable
 from coupole.acquisition.watching.camera_noise import CameraNoise
 from coupole.acquisition.watching.finding_picture import finding_picture
 from coupole.acquisition.watching.findings import FOR_A_PERSON, NOT_WATCHED, TAKEN_AGAIN, Found, SeenFrame
 from coupole.acquisition.watching.frame_look import FrameLook, LookGrid, compile_now
-from coupole.devices import ArmState, Frame, FrameFormat
+from coupole.devices import Frame
 from coupole.errors import StorageError
-from coupole.geometry import Transform, apply
+from coupole.geometry import apply
 from coupole.plan.bursts import Burst
 from coupole.plan.choices import FrameSample
 from coupole.plan.schedule import ViewPose
 from coupole.plan.shot_id import Dark, Led, Sentinel, ShotId, ShotLabel
 from coupole.plan.watch import NOTHING
 from coupole.preflight.job import Job
-from coupole.storage.frame_file_creation import Collections
 from coupole.storage.journal_events import Event, FindingNoted
 
 _MOST_PICTURES = 200
@@ -103,23 +102,15 @@ class WatchedRecorder:
     def has_room(self, view: str) -> bool:
         return self._recorder.has_room(view)
 
-    def begin_view(
-        self,
-        view: str,
-        frames: int,
-        frame_format: FrameFormat,
-        arm: ArmState,
-        base_from_camera: Transform,
-        collections: Collections,
-    ) -> None:
-        self._recorder.begin_view(view, frames, frame_format, arm, base_from_camera, collections)
+    def begin_view(self, start: ViewStart) -> None:
+        self._recorder.begin_view(start)
         self._first.begin_view()
         self._seen.clear()
         self._timeline = []
-        self._grid = LookGrid(frame_format, is_sparse=self._watch.frames == "darks")
+        self._grid = LookGrid(start.frame_format, is_sparse=self._watch.frames == "darks")
         self._judge = None
         if self._watch.frames == "all":
-            self._compare_with_earlier(view)
+            self._compare_with_earlier(start.view)
 
     def _compare_with_earlier(self, view: str) -> None:
         """Compare this session's sentinels with the first sentinels of an earlier session."""

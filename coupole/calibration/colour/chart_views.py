@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -14,9 +13,9 @@ from coupole.calibration.colour.chart import Chart
 from coupole.calibration.colour.chart_signals import MONO, ChartPicture
 from coupole.calibration.light.frames import CHANNELS, LightFrame, LightFrames, channel_mask
 from coupole.calibration.light.glare_correction import read_glare
-from coupole.calibration.light.irradiance import Emission, irradiance_per_flux
-from coupole.calibration.light.records import dark_signal, linearise, map_beside, record_input
-from coupole.calibration.light.tile_views import Positions
+from coupole.calibration.light.irradiance import irradiance_per_flux
+from coupole.calibration.light.lit_cell import LitCell
+from coupole.calibration.light.records import dark_signal, linearise, map_beside
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
@@ -28,29 +27,13 @@ _GLOSS_DEG = 25.0
 avoids it)."""
 
 
-@dataclass(frozen=True)
-class ChartSetting:
+@dataclass(frozen=True, kw_only=True)
+class ChartSetting(LitCell):
     """Descriptions and calibrations for reading the chart's frames."""
 
     chart: Chart
-    base_from_support: Floats
-    positions: Positions
-    lens: optics.Intrinsics
     corners_px: Floats | None = None
     """[4, 2] middles of the corner patches in the picture, from the top left of the chart around it."""
-    dark: Path | None = None
-    response: Path | None = None
-    flat: Path | None = None
-    glare: Path | None = None
-    emission: Emission = "lambertian"
-    files: tuple[Path, ...] = ()
-    """Files of chart, support and LEDs: inputs of the record."""
-
-    @property
-    def inputs(self) -> tuple[tuple[str, str], ...]:
-        """Name and SHA-256 of all these files."""
-        made_with = (*self.files, self.dark, self.response, self.flat, self.glare)
-        return tuple(pair for path in made_with for pair in record_input(path))
 
 
 class ChartReader:

@@ -16,8 +16,8 @@ from coupole.calibration.artefact import LightSpectrum, UsedArtefact, used_as
 from coupole.calibration.earlier import read_accepted
 from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask, channels_of
 from coupole.calibration.light.glare_correction import read_glare
-from coupole.calibration.light.irradiance import Emission
-from coupole.calibration.light.records import dark_signal, linearise, map_beside, record_input
+from coupole.calibration.light.lit_cell import LitCell
+from coupole.calibration.light.records import dark_signal, linearise, map_beside
 from coupole.calibration.light.spectralon import Tile
 from coupole.calibration.light.tile_views import Positions, TileView
 from coupole.calibration.rotations import Floats
@@ -29,21 +29,11 @@ _PATCHES = 4
 _LEAST_PIXELS = 6
 
 
-@dataclass(frozen=True)
-class Setting:
+@dataclass(frozen=True, kw_only=True)
+class Setting(LitCell):
     """Calibrations and descriptions for reading the tile's frames."""
 
     tile: Tile
-    base_from_support: Floats
-    positions: Positions
-    lens: optics.Intrinsics
-    dark: Path | None = None
-    response: Path | None = None
-    flat: Path | None = None
-    glare: Path | None = None
-    emission: Emission = "lambertian"
-    files: tuple[Path, ...] = ()
-    """Files of tile, support and LEDs: inputs of the record."""
     light: LightSpectrum | None = None
     """Spectrum of the LEDs, if the rig names one. It weights a certificate's wavelengths."""
 
@@ -62,12 +52,6 @@ class Setting:
             tile = self.tile_of(channel)
             figures |= {f"reflectance.{channel}": tile.reflectance, f"u_reflectance.{channel}": tile.u_reflectance}
         return used_as("tile", self.tile.artefact, figures)
-
-    @property
-    def inputs(self) -> tuple[tuple[str, str], ...]:
-        """Name and SHA-256 of all these files."""
-        made_with = (*self.files, self.dark, self.response, self.flat, self.glare)
-        return tuple(pair for path in made_with for pair in record_input(path))
 
 
 def calibrated_positions(leds: Path) -> Positions:

@@ -7,8 +7,6 @@ that the page loads by script tags. A page that is opened from a disk can load n
 from __future__ import annotations
 
 import json
-import re
-from html import escape
 from importlib import resources
 from itertools import accumulate
 from pathlib import Path
@@ -17,10 +15,12 @@ from urllib.parse import quote
 
 from coupole.errors import InputError, StorageError
 from coupole.exchange.look.look_blocks import SCRIPT_BEGINS, Block, Look, in_script
+from coupole.exchange.look.page_template import filled
 from coupole.storage.durable import make_folder, sync_folder, write_synced
 
 MOST_BYTES = 25_000_000
 """Greatest size of a page with all data inside, bytes."""
+_POLICY = "script-src 'unsafe-inline' 'self' file:; style-src 'unsafe-inline'; img-src blob:"
 _EARLY_BYTES = 3_000_000
 SCRIPTS = (
     "vectors.js",
@@ -116,15 +116,13 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
         f'<script src="{quote(f"{data}/{name}.js")}"></script>\n' for name in names if name not in inside_names
     ]
     parts = {
-        "TITLE": escape(title),
-        "STYLE": _part("page.css"),
         "ABOUT": in_script(about),
         "SHADERS": in_script(shaders),
         "SCRIPTS": scripts,
         "FIRST": "".join(f"<script>{block.script}</script>\n" for block in (*look.first, *inside[:early])),
         "BLOCKS": "".join(tags),
     }
-    return re.sub(f"%({'|'.join(parts)})%", lambda found: parts[found[1]], _part("page.html"))
+    return filled(_part("page.html"), title, _part("page.css"), _POLICY, parts)
 
 
 def _early(look: Look, inside: list[Block]) -> int:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import base64
-import re
 from collections.abc import Sequence
-from html import escape
 from importlib import resources
 from pathlib import Path
 
@@ -14,12 +12,14 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError, StorageError, reason
 from coupole.exchange.look.look_blocks import in_script
+from coupole.exchange.look.page_template import filled
 from coupole.scan.simplify import simplified_mesh
 
 MOST_TRIANGLES = 100_000
 """Greatest number of triangles of a page. A finer mesh is simplified; each of its triangles then gets the part of
 the nearest simplified triangle."""
 SCRIPTS = ("surface.js", "brush.js", "parts.js", "pick.js")
+_POLICY = "script-src 'unsafe-inline'; style-src 'unsafe-inline'"
 _SHARED = ("vectors.js", "camera.js")
 """Scripts shared with the page to relight."""
 
@@ -67,10 +67,8 @@ def page_text(
     scripts = [(look / name).read_text(encoding="utf-8") for name in _SHARED]
     scripts += [(folder / name).read_text(encoding="utf-8") for name in SCRIPTS]
     contents = {
-        "TITLE": escape(title),
-        "STYLE": (folder / "pick.css").read_text(encoding="utf-8"),
         "MESH": in_script(mesh),
         "SCRIPTS": "\n".join(scripts),
     }
-    page = (folder / "pick.html").read_text(encoding="utf-8")
-    return re.sub(f"%({'|'.join(contents)})%", lambda found: contents[found[1]], page)
+    page, style = ((folder / name).read_text(encoding="utf-8") for name in ("pick.html", "pick.css"))
+    return filled(page, f"Parts of {title}", style, _POLICY, contents)

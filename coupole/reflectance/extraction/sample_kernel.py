@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.kernels import kernel
-from coupole.reflectance.extraction.frame_veils import NO_VEILS, Veils
-from coupole.reflectance.extraction.sample_codes import REACHED
-from coupole.reflectance.lanes import (
+from coupole.kernels.lanes import (
     absolute,
     gather_lanes,
     if_less,
@@ -24,6 +22,8 @@ from coupole.reflectance.lanes import (
     root,
     store_halves,
 )
+from coupole.reflectance.extraction.frame_veils import NO_VEILS, Veils
+from coupole.reflectance.extraction.sample_codes import REACHED
 
 Singles = NDArray[np.float32]
 

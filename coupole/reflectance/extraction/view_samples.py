@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.light.frames import LightFrame
+from coupole.kernels.lanes import LANES
 from coupole.reflectance.extraction.frame_ring import FrameRing
 from coupole.reflectance.extraction.frame_veils import NO_VEILS, Veils
 from coupole.reflectance.extraction.lamp_sight import Facets
@@ -27,7 +28,6 @@ from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredVie
 from coupole.reflectance.extraction.radiance import SignalReader
 from coupole.reflectance.extraction.sample_codes import AWAY
 from coupole.reflectance.extraction.sample_kernel import NO_VALUE, Lamps, Shots, fill_samples
-from coupole.reflectance.lanes import LANES
 from coupole.reflectance.parts_in_threads import first_alone
 
 BLOCK = 4096

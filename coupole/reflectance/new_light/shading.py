@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.kernels import kernel
-from coupole.reflectance.ggx import lobe_density
-from coupole.reflectance.lanes import (
+from coupole.kernels.lanes import (
     LANES,
     absolute,
     add_in_turns,
@@ -34,6 +33,7 @@ from coupole.reflectance.lanes import (
     store,
     total,
 )
+from coupole.reflectance.ggx import lobe_density
 from coupole.reflectance.new_light.beams import Beam
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 from coupole.reflectance.new_light.shadow_edges import LIT, Codes

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.kernels import kernel
+from coupole.kernels.embree import COHERENT, FAR, LANES, packet
 from coupole.motion.occlusion import RAY_START_MM
-from coupole.motion.packet_rays import ARGUMENTS, FAR, LANES, PacketMesh, blocked16, packet, trace
+from coupole.motion.packet_rays import PacketMesh, blocked16, trace
 from coupole.reflectance.new_light.beams import Beam
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 from coupole.reflectance.parts_in_threads import in_threads
@@ -47,7 +48,7 @@ def trace_beam(mesh: PacketMesh, surface: Surface, beam: Beam, codes: Codes) -> 
 
 def _trace(mesh: PacketMesh, surface: Surface, beam: Beam, pixels: NDArray[np.int64], codes: Codes) -> None:
     on = surface.triangle_of_pixel.reshape(-1), surface.places_mm.reshape(-1, 3), surface.normals
-    how, flat = (blocked16(), mesh.scene, ARGUMENTS), codes.reshape(-1)
+    how, flat = (blocked16(), mesh.scene, COHERENT), codes.reshape(-1)
 
     def some(first: int) -> None:
         _trace_rays(*how, pixels[first : first + _RAYS], *on, beam.near, beam.place, flat)

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.kernels import kernel
+from coupole.kernels.lanes import LANES
 from coupole.reflectance.ggx import UNKNOWNS, lobe, root_by_unknowns, tangents
 from coupole.reflectance.ggx_fit import ROWS, fit_packs, pack
 from coupole.reflectance.kernel_arrays import assign
-from coupole.reflectance.lanes import LANES
 from coupole.reflectance.material_uncertainty import FEWEST_GROUPS
 from coupole.reflectance.normal_fit import CAUCHY
 from coupole.reflectance.parts_in_threads import in_threads

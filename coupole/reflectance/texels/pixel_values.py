@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.kernels.lanes import LANES
 from coupole.reflectance.extraction.extraction import Geometry
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import Radiometry, Response, SignalReader
@@ -21,7 +22,6 @@ from coupole.reflectance.extraction.sample_codes import AWAY
 from coupole.reflectance.extraction.sample_kernel import NO_VALUE, Lamps, Shots, fill_pixels
 from coupole.reflectance.extraction.seen_surface import SeenSurface
 from coupole.reflectance.extraction.view_samples import ViewPass
-from coupole.reflectance.lanes import LANES
 from coupole.reflectance.new_light.pictured_surface import Surface
 from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.run_result import INTER_REFLECTION, ViewSamples

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import DiskFull, InputError
+from coupole.kernels.lanes import LANES
 from coupole.reflectance.extraction.extraction import MOST_BLUR_PX, Geometry, view_pass
 from coupole.reflectance.extraction.frames_for_check import MOST_FRAMES
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
@@ -29,7 +30,6 @@ from coupole.reflectance.extraction.radiance import Radiometry
 from coupole.reflectance.extraction.sample_codes import REACHED
 from coupole.reflectance.extraction.sample_kernel import NO_VALUE
 from coupole.reflectance.extraction.seen_surface import seen_surface
-from coupole.reflectance.lanes import LANES
 from coupole.reflectance.material_uncertainty import groups_of_leds
 from coupole.reflectance.run_job import RunRequest, forget, prepare_run, read_runs, settings_of, view_file_name
 from coupole.reflectance.texels.neighbours import settle

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.kernels import kernel
+from coupole.kernels.lanes import LANES
 from coupole.reflectance.extraction.extraction import Geometry
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
@@ -23,7 +24,6 @@ from coupole.reflectance.extraction.sample_codes import REACHED
 from coupole.reflectance.extraction.sample_kernel import NO_VALUE
 from coupole.reflectance.extraction.seen_surface import SeenSurface
 from coupole.reflectance.extraction.view_samples import ViewPass
-from coupole.reflectance.lanes import LANES
 from coupole.reflectance.new_light.pictured_surface import Surface
 from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.run_result import ViewSamples

@@ -26,8 +26,9 @@ from drivers.camera.aravis.settings import Settings
 from drivers.camera.aravis.stream import Pool, Stream
 from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_up
 from drivers.camera.genicam_trigger import counts, frame_id_range, set_exposure, since
-from drivers.camera.misuse import misuse_error
+from drivers.camera.misuse import format_for_arming, misuse_error, refuse_while_armed
 from drivers.camera.pixel_formats import widen
+from drivers.opening import closed_on_failure
 
 __all__ = ["AravisCamera", "Settings"]
 
@@ -60,12 +61,9 @@ class AravisCamera:
             self._handle, b"control-lost", self._on_lost, None, None, 0
         )
         self._features = Features(self._library, self._handle, self._name)
-        try:
+        with closed_on_failure(self.close):
             self._set_up()
             self.id_modulus = frame_id_range(self._features, gige=self._is_gige)
-        except BaseException:
-            self.close()
-            raise
 
     # -- opening and closing ------------------------------------------------------------------------------
 
@@ -130,8 +128,7 @@ class AravisCamera:
     # -- exposure -----------------------------------------------------------------------------------------
 
     def configure(self, exposure: Exposure) -> FrameFormat:
-        if self._stream is not None:
-            raise misuse_error(self._name, "a disarmed camera", "configure() was called while it is armed")
+        refuse_while_armed(self._name, is_armed=self._stream is not None)
         self._check_link()
         set_exposure(self._features, self._settings, exposure)
         self._exposure = exposure
@@ -146,19 +143,15 @@ class AravisCamera:
     # -- acquisition --------------------------------------------------------------------------------------
 
     def arm(self, buffers: int) -> None:
-        if self._format is None:
-            raise misuse_error(self._name, "configure() before arm()", "no exposure is set")
+        format_for_arming(self._name, self._format)
         self.disarm()
         self._check_link()
         self._allocate(max(buffers, self._settings.buffers))
         retention_us = self._settings.frame_retention_ms * 1000
         stream = Stream(self._library, self._handle, self._name, self._raw, frame_retention_us=retention_us)
-        try:
+        with closed_on_failure(stream.close):
             self._counted_before = counts(self._features, self._settings)
             self._features.execute("AcquisitionStart")
-        except BaseException:
-            stream.close()
-            raise
         self._stream = stream
         self._armed.set()
 

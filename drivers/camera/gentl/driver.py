@@ -26,8 +26,9 @@ from drivers.camera.gentl.features import Features
 from drivers.camera.gentl.image import copy_pixels, timestamp_ns
 from drivers.camera.gentl.producer import Gaps, open_camera, optional_int, reporting, when_incomplete
 from drivers.camera.gentl.settings import Settings
-from drivers.camera.misuse import misuse_error
+from drivers.camera.misuse import format_for_arming, misuse_error, refuse_while_armed
 from drivers.fair_lock import FairLock
+from drivers.opening import closed_on_failure
 
 _A_LOOK_S = 1e-4
 """Shortest time-out that harvesters accepts. With a shorter one it may not poll at all, because its clock has
@@ -57,7 +58,7 @@ class GenTLCamera:
         self._heard_s = 0.0
         self._last = CameraStatistics(-1, 0, 0, -1, 0)
         self._harvester, self._acquirer, self._info = open_camera(settings)
-        try:
+        with closed_on_failure(self.close):
             self._features = Features(self._acquirer.remote_device.node_map, self._name)
             self._acquirer.add_callback(
                 self._acquirer.Events.INCOMPLETE_BUFFER, when_incomplete(self._gaps.incomplete)
@@ -66,9 +67,6 @@ class GenTLCamera:
             self._stop_what_runs()
             self._state = set_up(self._features, settings, is_triggered=not settings.free_running)
             self.id_modulus = frame_id_range(self._features, gige=self._info["tl_type"] == "GEV")
-        except BaseException:
-            self.close()
-            raise
 
     # -- opening and closing ------------------------------------------------------------------------------
 
@@ -106,8 +104,7 @@ class GenTLCamera:
     # -- exposure -----------------------------------------------------------------------------------------
 
     def configure(self, exposure: Exposure) -> FrameFormat:
-        if self._armed.is_set():
-            raise misuse_error(self._name, "a disarmed camera", "configure() was called while it is armed")
+        refuse_while_armed(self._name, is_armed=self._armed.is_set())
         with self._lock:
             if not self._settings.free_running:
                 self._expect_trigger()
@@ -133,13 +130,12 @@ class GenTLCamera:
     # -- acquisition --------------------------------------------------------------------------------------
 
     def arm(self, buffers: int) -> None:
-        if self._format is None:
-            raise misuse_error(self._name, "configure() before arm()", "no exposure is set")
+        frame_format = format_for_arming(self._name, self._format)
         self.disarm()
         buffer_count = max(buffers, self._settings.buffers, self._acquirer.min_num_buffers)
         slots = min(buffer_count, _IN_HAND)
-        if (self._pool.slots, self._pool.slot_bytes) != (slots, self._format.frame_bytes):
-            self._pool = FramePool(slots, self._format.frame_bytes)
+        if (self._pool.slots, self._pool.slot_bytes) != (slots, frame_format.frame_bytes):
+            self._pool = FramePool(slots, frame_format.frame_bytes)
         self._pool.begin()
         with self._lock:
             self._wire_format = pixel_format(self._features, self._name)

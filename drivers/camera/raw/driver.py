@@ -29,7 +29,7 @@ from coupole.clock import Clock
 from coupole.devices import CameraStatistics, Exposure, Frame, FrameFormat, HostNeed, Identity
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.camera.frame_pool import FramePool
-from drivers.camera.misuse import misuse_error
+from drivers.camera.misuse import format_for_arming, misuse_error, refuse_while_armed
 from drivers.camera.raw.exif import Exif
 from drivers.camera.raw.order import Order, file_number
 from drivers.camera.raw.picture import RawPicture, read_picture
@@ -155,8 +155,7 @@ class RawFiles:
 
     def configure(self, exposure: Exposure) -> FrameFormat:
         """Return the format. The exposure is set on the camera by hand, and each picture is checked for it."""
-        if self._armed.is_set():
-            raise misuse_error(self._name, "a disarmed camera", "configure() was called while it is armed")
+        refuse_while_armed(self._name, is_armed=self._armed.is_set())
         if exposure.gain_db:
             raise DeviceRefused(
                 self._name,
@@ -183,13 +182,12 @@ class RawFiles:
     def arm(self, buffers: int) -> None:
         """Begin a burst. Files already in the folder do not belong to it. `buffers` is not used, because files
         wait on the disk."""
-        if self._format is None:
-            raise misuse_error(self._name, "configure() before arm()", "no exposure is set")
+        frame_format = format_for_arming(self._name, self._format)
         self.disarm()
         self._order.begin()
         self._last_taken = None
-        if self._pool.slot_bytes != self._format.frame_bytes:
-            self._pool = FramePool(_IN_HAND, self._format.frame_bytes)
+        if self._pool.slot_bytes != frame_format.frame_bytes:
+            self._pool = FramePool(_IN_HAND, frame_format.frame_bytes)
         self._pool.begin()
         self._armed.set()
 

@@ -27,7 +27,7 @@ from coupole.clock import Clock
 from coupole.devices import CameraStatistics, Exposure, Frame, FrameFormat, Identity
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.camera.frame_pool import FramePool, Slot
-from drivers.camera.misuse import misuse_error
+from drivers.camera.misuse import format_for_arming, misuse_error, refuse_while_armed
 from drivers.camera.xiapi.device import XiDevice
 from drivers.camera.xiapi.library import (
     API_SKIPPED,
@@ -50,6 +50,7 @@ from drivers.camera.xiapi.library import (
 )
 from drivers.camera.xiapi.settings import Region, Settings
 from drivers.camera.xiapi.state import AT_OPENING, FRAME_TRIGGER, State
+from drivers.opening import closed_on_failure
 
 _SLICE_S = 0.05
 """Longest wait for an image in one call. Other calls may have to wait this long."""
@@ -78,12 +79,9 @@ class XiCamera:
         self._last = CameraStatistics(-1, 0, -1, -1, -1)
         self._device = XiDevice(settings.library, settings.serial, settings.device)
         self._state = State(self._device, {*settings.parameters, *settings.leave})
-        try:
+        with closed_on_failure(self.close):
             self._set_up()
             self._readout_us = settings.readout_us or self._measure_readout_us()
-        except BaseException:
-            self.close()
-            raise
 
     # -- opening and closing ------------------------------------------------------------------------------
 
@@ -184,8 +182,7 @@ class XiCamera:
     # -- exposure -----------------------------------------------------------------------------------------
 
     def configure(self, exposure: Exposure) -> FrameFormat:
-        if self._armed.is_set():
-            raise misuse_error(self._name, "a disarmed camera", "configure() was called while it is armed")
+        refuse_while_armed(self._name, is_armed=self._armed.is_set())
         device, settings = self._device, self._settings
         edge = TRIGGER_RISING if settings.trigger_edge == "rising" else TRIGGER_FALLING
         device.set("trigger_source", edge if exposure.hardware_trigger else TRIGGER_SOFTWARE)
@@ -240,8 +237,7 @@ class XiCamera:
     # -- acquisition --------------------------------------------------------------------------------------
 
     def arm(self, buffers: int) -> None:
-        if self._format is None:
-            raise misuse_error(self._name, "configure() before arm()", "no exposure is set")
+        format_for_arming(self._name, self._format)
         self.disarm()
         self._check_presence()
         buffer_count = max(buffers, self._settings.buffers)

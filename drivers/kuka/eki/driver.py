@@ -35,6 +35,7 @@ from drivers.kuka.eki.link import Link, connect
 from drivers.kuka.eki.settings import Settings
 from drivers.kuka.eki.watch import Tolerances, Watch
 from drivers.kuka.eki.wire import Command, Six, Status
+from drivers.opening import closed_on_failure
 
 _SAME_POSE_MM, _SAME_ROTATION = 1.0, 0.005
 """Largest allowed difference between the controller's flange pose and the pose computed from its axes."""
@@ -80,11 +81,8 @@ class KukaEki:
                 remedy="Start the controller's programs (configs/kuka/eki), and check its IP and PORT",
             ) from error
         self._link = Link(link, self._watch, settings.link_timeout_s)
-        try:
+        with closed_on_failure(self.close):
             self._begin_session()
-        except BaseException:
-            self.close()
-            raise
 
     def identify(self) -> Identity:
         status = self._status()

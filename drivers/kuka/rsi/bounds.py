@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from math import degrees, hypot, radians
 
-from drivers.kuka.rsi.pose import Geometry
+from coupole.wrist_lengths import WristLengths
 
 Six = tuple[float, ...]
 
@@ -31,7 +31,7 @@ class StepBounds:
     """Checks the invariant. `step` is six numbers: degrees of the axes, or mm and degrees of the flange."""
 
     def __init__(
-        self, corrects: str, cycle_s: float, velocity_deg_s: Six, acceleration_deg_s2: Six, geometry: Geometry
+        self, corrects: str, cycle_s: float, velocity_deg_s: Six, acceleration_deg_s2: Six, geometry: WristLengths
     ) -> None:
         if corrects == "axes":
             self.farthest: Six = tuple(_SLACK * speed * cycle_s + _ROUNDING for speed in velocity_deg_s)
@@ -63,12 +63,12 @@ class StepBounds:
         return ""
 
 
-def follow_bounds(corrects: str, follow_deg: float, geometry: Geometry) -> Six:
+def follow_bounds(corrects: str, follow_deg: float, geometry: WristLengths) -> Six:
     """Return the greatest allowed distance of a place from another, if each axis is within `follow_deg`."""
     return (follow_deg,) * 6 if corrects == "axes" else _pose_bounds(6.0 * radians(follow_deg), geometry)
 
 
-def _pose_bounds(turn: float, geometry: Geometry) -> Six:
+def _pose_bounds(turn: float, geometry: WristLengths) -> Six:
     """Return the largest step of a pose while all axes together turn by `turn` radians."""
     reach_mm = geometry.a1_mm + abs(geometry.b_mm) + geometry.c2_mm + hypot(geometry.a2_mm, geometry.c3_mm)
     return ((reach_mm + geometry.c4_mm) * turn + _ROUNDING,) * 3 + (degrees(turn) + _ROUNDING,) * 3

@@ -11,7 +11,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from drivers.kuka.rsi.pose import Geometry, corrected_pose, correction, flange_pose
+from coupole.wrist_lengths import WristLengths
+from drivers.kuka.rsi.pose import corrected_pose, correction, flange_pose
 
 Six = tuple[float, ...]
 
@@ -27,7 +28,7 @@ _NOTHING: Six = (0.0,) * 6
 class Corrections:
     """Computes corrections. A `place` is the arm's position: its axes, or the flange's pose."""
 
-    def __init__(self, corrects: str, mode: str, geometry: Geometry) -> None:
+    def __init__(self, corrects: str, mode: str, geometry: WristLengths) -> None:
         self._relative = mode == "relative"
         self.place: Callable[[Six], Any] = tuple
         """The place at given axes."""

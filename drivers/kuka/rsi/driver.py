@@ -39,10 +39,10 @@ from drivers.arm_motion import (
 )
 from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.limits import correction_violations
-from drivers.kuka.rsi.pose import Geometry
 from drivers.kuka.rsi.realtime import how_to_give_the_right, may_be_realtime
 from drivers.kuka.rsi.rsi_session import Config
 from drivers.kuka.rsi.settings import Settings
+from drivers.opening import closed_on_failure
 from drivers.senders import only_here
 
 __all__ = ["KukaRsi", "Settings"]
@@ -82,11 +82,8 @@ class KukaRsi:
         self._lapses = 0
         """Number of lapses that the loop had counted when the last motion began."""
         self._process, self._block = _spawn(settings, self.arm)
-        try:
+        with closed_on_failure(self.close):
             self._wait_for_session()
-        except BaseException:
-            self.close()
-            raise
 
     def identify(self) -> Identity:
         controller = self._state().controller.decode(errors="replace")
@@ -355,7 +352,7 @@ def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], share
         "declared_cycle_s": settings.declared_cycle_ms and settings.declared_cycle_ms / 1e3,
         "controller": str(settings.controller),
         "correction_tag": settings.tag,
-        "geometry": Geometry(*(getattr(settings.wrist, name) for name in Geometry._fields)),
+        "geometry": settings.wrist.lengths,
         "velocity_deg_s": arm.velocity_deg_s,
         "acceleration_deg_s2": arm.acceleration_deg_s2,
         "jerk_deg_s3": arm.jerk_deg_s3,

@@ -74,8 +74,8 @@ def _singular(settings: Settings, paths_deg: NDArray[np.float64]) -> str:
     """Return why paths come too near to a singularity. At a singularity a pose does not determine the axes, or
     needs unlimited axis speeds. Beyond it the controller may choose other axes than the planned ones.
     """
-    arm, margin_deg = settings.wrist, settings.singularity_margin_deg
-    theta = arm.theta(paths_deg)
+    arm, margin_deg = settings.wrist.lengths, settings.singularity_margin_deg
+    theta = settings.wrist.theta(paths_deg)
     upper, fore = theta[:, 1], theta[:, 1] + theta[:, 2]
     elbow = theta[:, 2] + np.arctan2(arm.a2_mm, arm.c3_mm)
     out_mm = arm.c2_mm * np.sin(upper) + arm.c3_mm * np.sin(fore) + arm.a2_mm * np.cos(fore) + arm.a1_mm

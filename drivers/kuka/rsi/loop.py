@@ -18,8 +18,8 @@ import struct
 import sys
 import time
 
+from coupole.wrist_lengths import WristLengths
 from drivers.kuka.rsi import shared_state
-from drivers.kuka.rsi.pose import Geometry
 from drivers.kuka.rsi.realtime import become_realtime
 from drivers.kuka.rsi.rsi_session import Config, RsiSession
 
@@ -146,5 +146,5 @@ if __name__ == "__main__":
     gc.disable()
     socket_fd, block_fd, parent_pid = map(int, sys.argv[1:4])
     settings = json.loads(sys.argv[4])
-    settings["geometry"] = Geometry(*settings["geometry"])
+    settings["geometry"] = WristLengths(*settings["geometry"])
     serve(socket.socket(fileno=socket_fd), shared_state.Block(block_fd), parent_pid, Config(**settings))

@@ -11,25 +11,13 @@ from __future__ import annotations
 from math import atan2, cos, degrees, hypot, radians, sin
 from typing import NamedTuple
 
+from coupole.wrist_lengths import WristLengths
+
 Six = tuple[float, ...]
 Rotation = tuple[float, ...]
 """Row by row, nine numbers."""
 
 _GIMBAL_LOCK = 1e-9
-
-
-class Geometry(NamedTuple):
-    """The lengths and joint conventions of `coupole.joint_chain.SphericalWrist`, which explains them."""
-
-    a1_mm: float
-    a2_mm: float
-    b_mm: float
-    c1_mm: float
-    c2_mm: float
-    c3_mm: float
-    c4_mm: float
-    offsets_deg: Six
-    flip_axes: tuple[bool, ...]
 
 
 class Pose(NamedTuple):
@@ -39,7 +27,7 @@ class Pose(NamedTuple):
     rotation: Rotation
 
 
-def flange_pose(arm: Geometry, joints_deg: Six) -> Pose:
+def flange_pose(arm: WristLengths, joints_deg: Six) -> Pose:
     """Pose at joint angles [6]; Brandstoetter 2014, eq. 1 to 5 (`SphericalWrist`)."""
     t1, t2, t3, t4, t5, t6 = (
         radians((-angle if flip else angle) - offset)

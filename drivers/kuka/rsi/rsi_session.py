@@ -15,11 +15,11 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
+from coupole.wrist_lengths import WristLengths
 from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.bounds import StepBounds, follow_bounds
 from drivers.kuka.rsi.corrections import NAMES, Corrections
 from drivers.kuka.rsi.cycle import CycleMeter
-from drivers.kuka.rsi.pose import Geometry
 from drivers.kuka.rsi.trajectory import Motion
 from drivers.kuka.rsi.wire import Packet, answer_template, controller_type, packet_parser, stop_element
 from drivers.kuka.rsi.witness import ArmWitness, LagBounds
@@ -61,7 +61,7 @@ class Config:
     stop_tag: str
     corrects: str
     mode: str
-    geometry: Geometry
+    geometry: WristLengths
     velocity_deg_s: tuple[float, ...]
     acceleration_deg_s2: tuple[float, ...]
     jerk_deg_s3: tuple[float, ...]

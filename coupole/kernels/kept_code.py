@@ -41,7 +41,7 @@ UNUSED_S = 30 * 86400.0
 _LOCKED_S = 2.0
 """Longest wait for another process that keeps code in the same folder. It may have been stopped meanwhile."""
 _DAY_S = 86400.0
-_ROOT = Path(__file__).parent.parent
+_ROOT = Path(__file__).parent.parent.parent
 _IMPORT = re.compile(r"^(?:from ([\w.]+) import (\([^)]*\)|[^\n]*)|import ([^\n]+))", re.MULTILINE)
 _COMMENT = re.compile(r"#[^\n]*")
 

@@ -16,7 +16,7 @@ from llvmlite import ir
 from numba import errors, types
 from numba.extending import intrinsic, models, overload, register_model
 
-from coupole.kernels import digest_of
+from coupole.kernels.kept_code import digest_of
 
 LANES = 8
 _HALF, _INT = ir.HalfType(), ir.IntType(32)
@@ -79,17 +79,17 @@ def _made_of(build: Any) -> Any:
 
 
 def _operate(name: str) -> Any:
-    def kind_of(_context, left, right):  # type: ignore[no-untyped-def]
-        return _kind(left, right)(left, right), _made_of(lambda builder, a, b: getattr(builder, name)(a, b))
+    def kind_of(_context, first, second):  # type: ignore[no-untyped-def]
+        return _kind(first, second)(first, second), _made_of(lambda builder, a, b: getattr(builder, name)(a, b))
 
     return _compiled_function(kind_of)
 
 
 def _give_operator(function: Any, lane_operator: Any) -> None:
     @overload(function)
-    def choose(left, right):  # type: ignore[no-untyped-def]
-        if isinstance(left, _Lanes) or isinstance(right, _Lanes):
-            return lambda left, right: lane_operator(left, right)  # noqa: PLW0108  numba wants a function of Python
+    def choose(first, second):  # type: ignore[no-untyped-def]
+        if isinstance(first, _Lanes) or isinstance(second, _Lanes):
+            return lambda first, second: lane_operator(first, second)  # noqa: PLW0108  numba wants a function of Python
         return None
 
 
@@ -99,9 +99,9 @@ for _function, _in_place, _name in (
     (operator.mul, operator.imul, "fmul"),
     (operator.truediv, operator.itruediv, "fdiv"),
 ):
-    _made = _operate(_name)
-    _give_operator(_function, _made)
-    _give_operator(_in_place, _made)
+    _lane_operator = _operate(_name)
+    _give_operator(_function, _lane_operator)
+    _give_operator(_in_place, _lane_operator)
 
 
 @_compiled_function

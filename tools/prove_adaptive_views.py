@@ -34,6 +34,7 @@ from coupole.plan.view_choices import ChosenView  # noqa: E402
 from coupole.preflight.job import Job, read_job  # noqa: E402
 from coupole.reflectance.next_views.next_views import NextViews  # noqa: E402
 from coupole.reflectance.next_views.supposed_surface import supposed_surface  # noqa: E402
+from coupole.reflectance.suggestion.drawn_triangles import MeshParts  # noqa: E402
 from coupole.reflectance.suggestion.rehearsal import drawn_samples  # noqa: E402
 from coupole.reflectance.suggestion.supposed_materials import SUPPOSED, SupposedMaterial  # noqa: E402
 from coupole.reflectance.suggestion.supposed_signal import SeenParts, seen_by  # noqa: E402
@@ -45,7 +46,7 @@ Floats = NDArray[np.float64]
 OBJECTS = {"relief": ("objects/relief.ply", [0, 0, 30]), "bust": ("restorations/bust.ply", [0, 0, 90])}
 AZIMUTHS_DEG, ELEVATIONS_DEG = [-150, -120, -90, -60, -30, 0, 60, 120], [35, 55, 80]
 MOST_WORSE = 1.05
-_NORMAL_DEG, _MESH_NOISE_UM = 2.0, 30.0
+_NORMAL_DEG, _MESH_NOISE_UM, _TRIANGLES = 2.0, 30.0, 400
 
 
 def job_of(folder: Path, name: str, every: int) -> Job:
@@ -84,23 +85,31 @@ class Judge:
             self.seen_parts[view.name] = seen_by(
                 job.motion.occlusions, self._surface, joints_deg, view.support_from_camera
             )
-        is_shown = np.any([parts.pixels > 0.0 for parts in self.seen_parts.values()], axis=0)
-        self._weights = np.where(is_shown, job.motion.occlusions.patches.areas_mm2, 0.0)
+        corners_mm = job.shape.corners_mm
+        mesh = MeshParts(corners_mm, job.motion.occlusions.patches.of_triangles(len(corners_mm)))
+        self._triangles = mesh.drawn(_TRIANGLES, np.random.default_rng(0))
+        self._pixels = {
+            name: self._triangles.pixels(self._surface, parts) for name, parts in self.seen_parts.items()
+        }
+        is_shown = np.any([pixels > 0.0 for pixels in self._pixels.values()], axis=0)
+        self._weights = np.where(is_shown, self._triangles.areas_mm2, 0.0)
         self._weights /= self._weights.sum()
 
     def error(self, names: Sequence[str], material: SupposedMaterial, seed: int) -> float:
         """Return the mean error over the surface after these views."""
+        random, noise = np.random.default_rng(seed), self._surface.noise
         samples = drawn_samples(
             self._surface,
+            self._triangles,
+            np.stack([noise.drawn_pixels(self._pixels[name], random) for name in names]),
             [self.seen_parts[name] for name in names],
             material,
             self._job.plan.exposure.exposures_us,
             self._rows,
-            np.arange(len(self._weights)),
-            np.random.default_rng(seed),
+            random,
         )
         materials = fit_triangles(samples, np.ones(len(samples.led_mm), np.bool_), _MESH_NOISE_UM)
-        cosines = np.clip(np.sum(materials.normals * self._surface.normals, axis=1), -1.0, 1.0)
+        cosines = np.clip(np.sum(materials.normals * self._triangles.normals, axis=1), -1.0, 1.0)
         errors = np.stack(
             [
                 np.abs(materials.kd[:, 0] / material.kd - 1.0),

@@ -67,8 +67,8 @@ def close_complete(run: Run, console: Console, result: Path | None = None) -> fl
 
 
 def conclude(run: Run, console: Console) -> None:
-    """Write the report and enter the complete files in the manifest. Never raises, because the run itself has
-    ended. A disk that hung in the session is not used again. If the folder is lost, nothing is done.
+    """Write the report and enter the complete files in the manifest. Raises only signals, because the run itself
+    has ended. A disk that hung in the session is not used again. If the folder is lost, nothing is done.
     """
     if run.is_lost:
         return
@@ -86,6 +86,7 @@ def conclude(run: Run, console: Console) -> None:
             run_bounded(lambda: _enter(run, views, size))
     except (KeyboardInterrupt, SignalReceived):
         console.print(f"  {manifest.NAME} is not complete: `coupole verify {run.folder} --manifest` completes it")
+        raise
     except Exception as error:  # noqa: BLE001  it must not hide what ended the run
         message = f"the report or {manifest.NAME} could not be written:"
         if left_behind():

@@ -235,10 +235,24 @@ def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float | None:
 def _acquire(
     job: Job, session: _Session, console: Console, light: Mapping[str, float], figures: dict[str, Any]
 ) -> None:
-    """Run the session itself. At its end the objects will have received `light`, lux hours by id. However the
-    session ends, the cell is made safe first; then the end is written to the disk."""
-    cell, run, recorder, faults = session.cell, session.run, session.recorder, session.faults
+    """Run the session itself. At its end the objects will have received `light`, lux hours by id. A stop that
+    comes after the last frame leaves the run complete, but it is raised too, because nothing may follow."""
     control = Control()
+    _acquire_under(control, job, session, console, light, figures)
+    if control.stop.is_set():
+        raise control.interruption()
+
+
+def _acquire_under(
+    control: Control,
+    job: Job,
+    session: _Session,
+    console: Console,
+    light: Mapping[str, float],
+    figures: dict[str, Any],
+) -> None:
+    """Run the session. However it ends, the cell is made safe first; then the end is written to the disk."""
+    cell, run, recorder, faults = session.cell, session.run, session.recorder, session.faults
     observer = RunObserver(console, job.cell.rig.frame_bytes, len(recorder.proven()))
     sequencer = run_bounded(partial(Sequencer, job, cell, recorder, observer=observer, control=control))
     outcome: Literal["done", "interrupted", "failed"] = "failed"

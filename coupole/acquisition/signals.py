@@ -36,6 +36,12 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _heard_s = deque([-math.inf], maxlen=1)
 """Time when the main thread last received a signal, outside sessions."""
 
+_raised_s = deque([-math.inf], maxlen=1)
+"""Time when a SignalReceived was last raised."""
+_SAME_S = 1.0
+"""Signals outside sessions within this time after another one are the same wish: a terminal that closes may send
+two. They are dropped, because an exception within the handling of the first would hide it."""
+
 _PULSE_S, _TOLD_WITHIN_S = 0.25, 0.1
 _AGAIN_AFTER_S = 0.02
 """Time after which a signal that Python has dropped is sent again."""
@@ -60,9 +66,29 @@ class SignalReceived(BaseException):
 def raise_outside_sessions() -> None:
     """Have each signal raise SignalReceived from now on. A hang-up that is ignored (`nohup`) stays ignored. Ctrl-C
     and SIGTERM always count, even in the background of a script."""
+    _raised_s.append(-math.inf)
     for number in ENDING:
         if not _stays_ignored(number):
             signal.signal(number, _raise)
+
+
+def ignore_from_now() -> None:
+    """Ignore signals from now on, because the process is about to exit with its code."""
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def signal_behind(error: BaseException) -> SignalReceived | None:
+    """Return the SignalReceived that caused an error, if there is one. Compiled code that is interrupted raises a
+    SystemError in its place."""
+    seen: list[BaseException] = []
+    cause: BaseException | None = error
+    while cause is not None and cause not in seen:
+        if isinstance(cause, SignalReceived):
+            return cause
+        seen.append(cause)
+        cause = cause.__cause__ or cause.__context__
+    return None
 
 
 def _stays_ignored(number: int) -> bool:
@@ -70,8 +96,11 @@ def _stays_ignored(number: int) -> bool:
 
 
 def _raise(number: int, _: Any) -> None:
-    _heard_s.append(time.monotonic())
-    raise SignalReceived(number)
+    now_s = time.monotonic()
+    _heard_s.append(now_s)
+    if now_s > _raised_s[-1] + _SAME_S:
+        _raised_s.append(now_s)
+        raise SignalReceived(number)
 
 
 def _drop(number: int, _: Any) -> None:
@@ -108,6 +137,7 @@ def _send_again(otherwise: Callable[[Any], object], dropped: Any) -> None:
     """Send the signal behind an exception that Python drops again, a moment later and thus elsewhere in the main
     thread. `otherwise` gets all other exceptions."""
     if isinstance(dropped.exc_value, SignalReceived):
+        _raised_s.append(-math.inf)
         threading.Timer(_AGAIN_AFTER_S, os.kill, (os.getpid(), dropped.exc_value.number)).start()
     else:
         otherwise(dropped)

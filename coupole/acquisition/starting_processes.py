@@ -14,7 +14,7 @@ from coupole.acquisition.sessions_without_run import socket_of
 YOUNG_S = 20.0
 """A process that is older than this, s, and has no socket is not starting: it needs none. A busy machine loads the
 modules in 5 s."""
-_HOLD = {"acquire", "commission", "meter", "live", "bench", "arm", "devices"}
+_HOLD = {"acquire", "demo", "commission", "meter", "live", "bench", "arm", "devices"}
 _MODULE = "coupole.commands.cli"
 
 

@@ -17,7 +17,13 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 import coupole
-from coupole.acquisition.signals import SignalReceived, raise_outside_sessions, unheard_end
+from coupole.acquisition.signals import (
+    SignalReceived,
+    ignore_from_now,
+    raise_outside_sessions,
+    signal_behind,
+    unheard_end,
+)
 from coupole.bounded import leave
 from coupole.commands.common import fail
 from coupole.commands.examples import add_examples
@@ -209,9 +215,12 @@ def _about_version() -> dict[str, Any]:
 def main() -> None:
     """Entry point: runs a command and turns Coupole's errors into messages and exit codes."""
     text_outlet.keep_standard_places()
+    if "--json" in sys.argv:
+        text_outlet.notice_stdout()
     raise_outside_sessions()
     with unheard_end():
         code = _exit_code_of_command()
+        ignore_from_now()
     leave(code)
 
 
@@ -223,10 +232,7 @@ def _exit_code_of_command() -> int:
         _say(error)
         code = error.exit_code
     except SignalReceived as received:
-        interruption = Interrupted("stopped", received.number)
-        text_outlet.lead_blocked_nowhere(text_outlet.PATIENCE_S)
-        _say(interruption)
-        code = interruption.exit_code
+        code = _code_of_signal(received)
     except typer.Abort:
         code = Interrupted.exit_code
     except ImportError as error:
@@ -235,6 +241,8 @@ def _exit_code_of_command() -> int:
         if hasattr(error, "exit_code") and hasattr(error, "show"):
             error.show()
             code = error.exit_code
+        elif interrupted := signal_behind(error):
+            code = _code_of_signal(interrupted)
         elif isinstance(error, OSError) and (why := text_outlet.full_stdout()):
             code = _not_taken(why)
         else:
@@ -244,6 +252,17 @@ def _exit_code_of_command() -> int:
     with contextlib.suppress(SignalReceived):  # if another signal comes, nothing more is waited for
         text_outlet.finish()
     return int(code or 0)
+
+
+def _code_of_signal(received: SignalReceived) -> int:
+    """Print that a signal has stopped the command; return the exit code. With `--json` the document says it too,
+    unless the command has printed one."""
+    interruption = Interrupted("stopped", received.number)
+    text_outlet.lead_blocked_nowhere(text_outlet.PATIENCE_S)
+    if "--json" in sys.argv and not text_outlet.has_written_stdout():
+        fail(interruption, as_json=True)
+    _say(interruption)
+    return interruption.exit_code
 
 
 def _code_of_missing(error: ImportError) -> int:

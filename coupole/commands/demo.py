@@ -15,6 +15,8 @@ from coupole.errors import CoupoleError, InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from coupole.acquisition.sessions_without_run import SessionWithoutRun
+
 RUNS, RESULT, PAGE = "runs", "reflectance", "page.html"
 """Contents of the demo's folder."""
 _BESIDE_THE_PAGE = "page.data"
@@ -43,13 +45,15 @@ def demo(
 
     No device is needed. An interrupted demo continues when it is called again.
     """
+    from coupole.acquisition.sessions_without_run import ACQUIRE, SessionWithoutRun
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
     try:
         plan_name = "demo-short" if short else "demo"
         _refuse_foreign(folder, plan_name)
-        made = _make(folder, plan_name, console)
+        with SessionWithoutRun(ACQUIRE, None) as starting:
+            made = _make(folder, plan_name, console, starting)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -72,10 +76,11 @@ def _refuse_foreign(folder: Path, plan_name: str) -> None:
             raise InputError(f"{folder}: holds another run ({run.name}); name another folder for this demo")
 
 
-def _make(folder: Path, plan_name: str, console: Console) -> Demo:
+def _make(folder: Path, plan_name: str, console: Console, starting: SessionWithoutRun) -> Demo:
     """Take the steps that are still missing."""
     console.print(f"1 of 3: the plan {plan_name} is acquired on the simulated cell")
-    run = _acquire(folder / RUNS, plan_name, console)
+    run = _acquire(folder / RUNS, plan_name, console, starting)
+    starting.end()
     console.print("2 of 3: the reflectance of the relief is found from the frames")
     result = _find_reflectance(run, folder / RESULT, console)
     console.print("3 of 3: a page shows it under any light")
@@ -83,7 +88,7 @@ def _make(folder: Path, plan_name: str, console: Console) -> Demo:
     return Demo(*(str(path.resolve()) for path in (run, result, page)))
 
 
-def _acquire(parent: Path, plan_name: str, console: Console) -> Path:
+def _acquire(parent: Path, plan_name: str, console: Console, starting: SessionWithoutRun) -> Path:
     """Return the complete run of the plan; acquire or resume it first if it is not complete."""
     from coupole.acquisition.session import SessionRequest, acquire_plan
     from coupole.plan.shipped_files import shipped_folder
@@ -96,7 +101,9 @@ def _acquire(parent: Path, plan_name: str, console: Console) -> Path:
     if run is not None and is_complete(run):
         return run
     figures: dict[str, Any] = {}
-    acquire_plan(job, console, SessionRequest(parent, run, confirm=False), figures)
+    starting.know(job.document.path, job.cell.document.path)
+    request = SessionRequest(parent, run, confirm=False, when_served=starting.begin_run)
+    acquire_plan(job, console, request, figures)
     return Path(figures["run"])
 
 

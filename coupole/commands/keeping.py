@@ -176,7 +176,7 @@ def _show_verified(console: Console, run: Run, verification: Verification) -> No
     if verification.unlisted:
         console.print(
             f"not listed in manifest.sha256: {', '.join(verification.unlisted[:5])}"
-            f"{' ...' if verification.unlisted[5:] else ''}"
+            f"{' ...' if verification.unlisted[5:] else ''} (views that are not complete are not listed yet)"
         )
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from coupole.acquisition.signals import SignalReceived
 from coupole.commands.common import (
     JsonOption,
     PlanPath,
@@ -23,7 +24,7 @@ from coupole.commands.common import (
     served_cell,
 )
 from coupole.commands.completion import runs
-from coupole.errors import CoupoleError
+from coupole.errors import CoupoleError, Interrupted
 from coupole.plan.shipped_files import SIMULATED_CELL, file_of
 
 if TYPE_CHECKING:
@@ -106,6 +107,9 @@ def acquire(
                 _acquire_here(job, console, wanted_session, (result, reflectance), summary, starting)
     except CoupoleError as error:
         fail(error, as_json=as_json, figures=summary)
+        raise
+    except SignalReceived as received:
+        fail(Interrupted("stopped", received.number), as_json=as_json, figures=summary)
         raise
     if as_json:
         print(json.dumps(summary))

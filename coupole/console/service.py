@@ -101,9 +101,7 @@ def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cooki
         runs = RunFiles(cell.storage_folder, folder / "verified")
         plan_files = PlanFiles(plans, cell.document.path, folder / "drawings")
 
-        bench = parts.enter_context(
-            Bench(cell, acquisitions, plan_files, folder / "bench", in_control=lambda: control.now.name)
-        )
+        bench = parts.enter_context(Bench(cell, acquisitions, plan_files, folder / "bench", control=control))
         entering = parts.enter_context(contextlib.closing(Entering(cell, plans, queue, acquisitions)))
 
         def state() -> StateNow:

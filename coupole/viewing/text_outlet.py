@@ -110,6 +110,16 @@ class _Stream(io.RawIOBase):
         return os.isatty(self._outlet.reader_fd)
 
 
+class _Noticed(io.TextIOWrapper):
+    """A standard stream that knows whether anything was written to it."""
+
+    has_text = False
+
+    def write(self, text: str) -> int:
+        self.has_text = self.has_text or bool(text)
+        return super().write(text)
+
+
 _outlets: dict[str, Outlet] = {}
 
 
@@ -127,6 +137,19 @@ def keep_standard_places() -> None:
             setattr(sys, name, stream)
 
 
+def notice_stdout() -> None:
+    """Notice from now on whether anything is written to standard output (`has_written_stdout`)."""
+    before = sys.stdout
+    if _is(before, 1):
+        file = open(1, "wb", closefd=False)  # noqa: SIM115
+        sys.stdout = _Noticed(file, before.encoding, before.errors, line_buffering=before.isatty())
+
+
+def has_written_stdout() -> bool:
+    """Tell whether this process has written to standard output; True if that is not known."""
+    return not isinstance(sys.stdout, _Noticed) or sys.stdout.has_text
+
+
 def install() -> None:
     """Let no output of this process wait for a reader, from now to its end. Streams that somebody has replaced
     (tests) stay as they are."""
@@ -141,8 +164,8 @@ def install() -> None:
         setattr(
             sys,
             name,
-            io.TextIOWrapper(
-                _Stream(outlet),
+            _Noticed(
+                _Stream(outlet),  # type: ignore[arg-type]
                 encoding=encoding,
                 errors=errors,
                 line_buffering=True,

@@ -20,6 +20,7 @@ from coupole.acquisition.signals import (
     drop_signals,
     obeyed_by,
     raise_outside_sessions,
+    signal_behind,
     unheard_end,
 )
 from coupole.errors import Interrupted
@@ -128,8 +129,8 @@ def test_sigusr1_pauses_and_continues_and_stops_nothing() -> None:
 
 @pytest.mark.parametrize("number", ENDING)
 def test_outside_sessions_a_signal_raises_and_after_one_again(number: signal.Signals) -> None:
-    raise_outside_sessions()
     for _ in range(2):
+        raise_outside_sessions()
         with pytest.raises(SignalReceived) as received:
             os.kill(os.getpid(), number)
         assert received.value.number == number
@@ -137,6 +138,25 @@ def test_outside_sessions_a_signal_raises_and_after_one_again(number: signal.Sig
             os.kill(os.getpid(), number)
         with drop_signals():
             os.kill(os.getpid(), number)
+
+
+def test_a_second_signal_at_once_is_the_same_wish() -> None:
+    """A terminal that closes may send two; an exception within the handling of the first would hide it."""
+    raise_outside_sessions()
+    with pytest.raises(SignalReceived) as received:
+        signal.raise_signal(signal.SIGTERM)
+    signal.raise_signal(signal.SIGHUP)
+    assert received.value.number == signal.SIGTERM
+
+
+def test_a_signal_within_compiled_code_is_known_behind_its_error() -> None:
+    """numba calls back into Python; an exception there comes out of the compiled code as a SystemError."""
+    error = SystemError("returned a result with an exception set")
+    error.__cause__ = SignalReceived(signal.SIGTERM)
+    behind = signal_behind(error)
+    assert behind is not None
+    assert behind.number == signal.SIGTERM
+    assert signal_behind(ValueError("a defect")) is None
 
 
 def test_a_hang_up_that_is_ignored_stays_ignored() -> None:

@@ -18,6 +18,7 @@ from coupole.preflight.job import Job, read_job
 from coupole.reflectance.next_views.next_views import NextViews
 from coupole.reflectance.next_views.supposed_surface import supposed_surface
 from coupole.reflectance.next_views.view_trials import Trials, trials_of
+from coupole.reflectance.suggestion.drawn_triangles import MeshParts
 from coupole.reflectance.suggestion.rehearsal import drawn_samples
 from coupole.reflectance.suggestion.supposed_materials import SUPPOSED
 from coupole.reflectance.suggestion.supposed_signal import seen_by
@@ -87,13 +88,17 @@ def test_fits_to_chosen_views_are_at_most_a_little_worse_than_to_spread_ones(job
         )
         for view in job.schedule.views
     }
-    weights = np.where(np.any([of_view.pixels > 0.0 for of_view in seen.values()], axis=0), 1.0, 0.0)
-    truth = SUPPOSED[material]
+    corners_mm, truth = job.shape.corners_mm, SUPPOSED[material]
+    mesh = MeshParts(corners_mm, job.motion.occlusions.patches.of_triangles(len(corners_mm)))
+    triangles = mesh.drawn(400, np.random.default_rng(2))
+    pixels = {name: triangles.pixels(surface, of_view) for name, of_view in seen.items()}
+    weights = np.where(np.any([of_view > 0.0 for of_view in pixels.values()], axis=0), 1.0, 0.0)
 
     def error(names: Sequence[str]) -> float:
-        parts = np.arange(len(weights))
         random = np.random.default_rng(1)
-        samples = drawn_samples(surface, [seen[name] for name in names], truth, (8000,), rows, parts, random)
+        drawn = np.stack([surface.noise.drawn_pixels(pixels[name], random) for name in names])
+        views = [seen[name] for name in names]
+        samples = drawn_samples(surface, triangles, drawn, views, truth, (8000,), rows, random)
         fitted = fit_triangles(samples, np.ones(len(samples.led_mm), np.bool_), 30.0)
         wrong = [fitted.kd[:, 0] / truth.kd, fitted.ks[:, 0] / truth.ks, fitted.alpha / truth.alpha]
         errors = np.abs(np.array(wrong) - 1.0)

@@ -43,6 +43,8 @@ class Acquisitions:
         self._rig = str(cell.document.path.resolve())
         self._ended = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
+        self._stopped_ids = set[str]()
+        """Entries that a person has stopped. The queue halts after them even if they were complete by then."""
         self.state: State | None = None
         """State of the present run, as its process reports it; None if there is no run."""
         self.lending = Lending()
@@ -74,6 +76,8 @@ class Acquisitions:
         raise InputError(f"{run}: is not being acquired in this cell")
 
     def _send_command(self, state: State, command: Command) -> State:
+        if command == "stop" and self._queue.running:
+            self._stopped_ids.add(self._queue.running.id)
         try:
             return ask(Path(state["run"]), command)
         except InputError:
@@ -87,6 +91,7 @@ class Acquisitions:
         """Interrupt the process of an entry as by Ctrl-C, also before its run has a name. Raises InputError."""
         if entry.state != "running" or not entry.pid or not self._is_alive(entry):
             raise InputError(f"queue: {entry.id} is not running")
+        self._stopped_ids.add(entry.id)
         os.kill(entry.pid, signal.SIGINT)
 
     def begin_at_once(self, by: str, **fields: Any) -> Entry:
@@ -227,7 +232,9 @@ class Acquisitions:
         state = "done" if code == 0 else "stopped" if code in _STOPPED else "failed"
         last = _last_line(output_path) if code is not None else ""
         why = "" if code == 0 else last_figures.get("error") or last or "its process was killed"
-        halt = "" if code == 0 else f"{entry.words}: {why}"
+        if code == 0 and entry.id in self._stopped_ids:
+            why = "stopped when it was complete"
+        halt = f"{entry.words}: {why}" if why else ""
         run = str(last_figures.get("run", entry.run))
         self._queue.conclude(entry.id, halt=halt, state=state, ended=utc_now(), exit_code=code, run=run, said=why)
         self._forget_old()

@@ -15,6 +15,7 @@ from typing import Any, Literal
 from coupole.acquisition.cell_bench.bench_client import ask_bench, bench_socket, checked_answer
 from coupole.acquisition.runtime_folder import named_after
 from coupole.console.cell.acquisitions import Acquisitions
+from coupole.console.people.sessions import Control
 from coupole.console.plans.plan_files import PlanFiles
 from coupole.console.processes.tasks import Task, Tasks
 from coupole.errors import CoupoleError, InputError
@@ -39,11 +40,10 @@ class Bench:
         plans: PlanFiles,
         folder: Path,
         now_s: Callable[[], float] = time.monotonic,
-        in_control: Callable[[], str] = lambda: "",
+        control: Control | None = None,
     ) -> None:
-        """`folder`: for the output of its process. `in_control` returns the name of the person in control, empty
-        if nobody is."""
-        self._in_control, self._driver = in_control, ""
+        """`folder`: for the output of its process. `control` tells who is in control of the cell."""
+        self._control, self._driver, self._taken_count = control or Control(), "", 0
         self._cell, self._acquisitions, self._plans, self._now_s = cell, acquisitions, plans, now_s
         self._tasks = Tasks(folder)
         self._task: Task | None = None
@@ -156,10 +156,11 @@ class Bench:
         return checked_answer(ask_bench(self._cell, command, **fields))
 
     def drive(self, path: str, person: str) -> dict[str, Any]:
-        """Begin to drive the arm along a path for a person; return the work. It ends when another person is in
-        control. Raises InputError."""
+        """Begin to drive the arm along a path for a person; return the work. It ends when another person comes
+        into control. Raises InputError."""
+        taken_count = self._control.taken_count
         work = self.ask("drive", path=path)
-        self._driver = person
+        self._driver, self._taken_count = person, taken_count
         return work
 
     def views(self) -> list[str]:
@@ -207,14 +208,13 @@ class Bench:
                 self._look()
 
     def _end_drive_of_another(self) -> None:
-        """Stop the arm if it is driven for a person, and another one is in control now."""
-        name = self._in_control()
-        if not self._driver or name in ("", self._driver):
+        """Stop the arm if it is driven for a person, and another one has come into control since it began."""
+        if not self._driver or not (name := self._control.taken_since(self._taken_count, self._driver)):
             return
         try:
             work = self.ask("state")["work"] or {}
             if work.get("kind") == "drive" and work["state"] == "running":
-                self.ask("stop", why=f"{name} is in control")
+                self.ask("stop", why=f"{name} took control")
         except InputError:
             if bench_socket(self._cell).exists():
                 return  # it does not answer: asked again in the next round

@@ -49,15 +49,17 @@ def kept_control(cell: Cell, action: str) -> Iterator[KeptControl]:
 
 
 def _watch(cell: Cell, action: str, control: KeptControl, over: threading.Event) -> None:
+    query = ""
     while not (over.wait(_LOOK_EVERY_S) or control.lost_because):
         with contextlib.suppress(InputError):  # nobody answers
             now = call(
                 cell,
                 "GET",
-                "/api/v1/bench/permission",
+                f"/api/v1/bench/permission{query}",
                 given_up=over.is_set,
                 meanwhile="; the motion goes on, as nobody can take control there meanwhile",
             )
+            query = query or f"?taken_count={now['taken_count']}"
             if not now["may_act"]:
-                control.lose(f"{now['in_control']} is in control at the console")
+                control.lose(f"{now['in_control']} took control at the console")
                 ask_permission(cell, f"{action}, under way")  # its refusal is logged

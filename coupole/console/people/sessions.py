@@ -108,6 +108,18 @@ class Control:
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s, self._lock = now_s, threading.Lock()
         self._now, self._acted_s = InControl(), 0.0
+        self._taken: list[str] = []
+        """Names of the persons who came into control, in this order."""
+
+    @property
+    def taken_count(self) -> int:
+        """Number of times that somebody came into control."""
+        return len(self._taken)
+
+    def taken_since(self, count: int, holder: str) -> str:
+        """Return the name of a person other than `holder` who came into control after the first `count` times,
+        even if only for a moment; empty if there was none."""
+        return next((name for name in self._taken[count:] if name != holder), "")
 
     @property
     def now(self) -> InControl:
@@ -124,7 +136,7 @@ class Control:
             holder = self._now.name
             absent = self._now_s() - self._acted_s > ABSENT_S
             if holder in ("", account.name) or absent or account.role is Role.ENGINEER:
-                self._now, self._acted_s = InControl(account.name), self._now_s()
+                self._change(InControl(account.name))
             else:
                 self._now = replace(self._now, asked_by=account.name)
             return self._now
@@ -136,7 +148,7 @@ class Control:
                 raise InputError(f"{account.name} is not in control")
             if to and to != self._now.asked_by:
                 raise InputError(f"{to} has not asked for control")
-            self._now, self._acted_s = InControl(to), self._now_s()
+            self._change(InControl(to))
             return self._now
 
     def act(self, account: Account, *, keep: bool = True) -> bool:
@@ -147,5 +159,10 @@ class Control:
                 return False
             if not keep and not self._now.name:
                 return True
-            self._now, self._acted_s = replace(self._now, name=account.name), self._now_s()
+            self._change(replace(self._now, name=account.name))
             return True
+
+    def _change(self, now: InControl) -> None:
+        if now.name not in ("", self._now.name):
+            self._taken.append(now.name)
+        self._now, self._acted_s = now, self._now_s()

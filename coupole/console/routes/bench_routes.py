@@ -59,9 +59,14 @@ def add_bench_routes(app: FastAPI, service: Service) -> None:
         return {"in_control": service.control.now.name}
 
     @app.get("/api/v1/bench/permission", responses=REFUSALS)
-    def still_permitted(person: Who) -> Permitted:
-        """Tell a command that drives the arm whether this person may still do so. It stops the arm if not."""
-        return Permitted(in_control=service.control.now.name, may_act=service.control.may_act(person))
+    def still_permitted(person: Who, taken_count: int | None = None) -> Permitted:
+        """Tell a command that drives the arm whether this person may still do so. It stops the arm if not.
+        `taken_count` is that of the first answer: another person who came into control since then, even for a
+        moment, ends the permission."""
+        control, count = service.control, service.control.taken_count
+        taker = "" if taken_count is None else control.taken_since(taken_count, person.name)
+        may_act = not taker and control.may_act(person)
+        return Permitted(in_control=taker or control.now.name, may_act=may_act, taken_count=count)
 
     @app.websocket(HOLD)
     async def hold(socket: WebSocket) -> None:

@@ -10,12 +10,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.calibration.light.irradiance import irradiance_per_flux
 from coupole.geometry import apply, inverse
 from coupole.plan.rig import Sensor
 from coupole.preflight.job import Job
 from coupole.reflectance.extraction.radiance import RANGE_LEFT_OUT
-from coupole.reflectance.suggestion.supposed_signal import CameraNoise, Surface, triangles_of_parts
+from coupole.reflectance.suggestion.supposed_signal import (
+    CameraNoise,
+    Surface,
+    triangles_of_parts,
+    upright_per_flux,
+)
 
 Floats = NDArray[np.float64]
 
@@ -33,14 +37,9 @@ def supposed_surface(job: Job) -> Surface:
     support_from_base = inverse(rig.support.base_from_support.matrix())
     leds_mm = apply(support_from_base, leds.positions_mm)
     axes = leds.normals @ support_from_base[:3, :3].T
-    irradiance = np.stack(
-        [
-            irradiance_per_flux(point, normal, leds_mm, axes, emission=rig.dome.emission) * leds.flux_lm
-            for point, normal in zip(patches.points_mm, patches.normals, strict=True)
-        ]
-    )
+    upright = upright_per_flux(patches.points_mm, leds_mm, axes, rig.dome.emission) * leds.flux_lm
     noise = _usual_noise(rig.sensor)
-    brightest = float(np.quantile(irradiance, 0.99))
+    brightest = float(np.quantile(upright, 0.99))
     longest_s = max(job.plan.exposure.exposures_us) * 1e-6
     dn_per_s = _WHITE_REACHES * (rig.sensor.white_dn - rig.sensor.black_dn) * np.pi / (brightest * longest_s)
     triangles, areas_mm2 = triangles_of_parts(patches, job.shape.corners_mm)
@@ -50,7 +49,7 @@ def supposed_surface(job: Job) -> Surface:
         areas_mm2,
         triangles,
         leds_mm,
-        (irradiance * dn_per_s)[:, :, None],
+        (upright * dn_per_s)[:, :, None],
         np.full(len(leds_mm), _U_LED_POWER),
         0.0,
         _U_LED_MM,

@@ -13,7 +13,7 @@ from coupole.pages.maps import shaded_map
 from coupole.pages.page_parts import Code, Map, Page, Section, Table
 from coupole.pages.page_rendering import write_page
 from coupole.reflectance.suggestion.plan_suggestion import Suggestion
-from coupole.reflectance.suggestion.rehearsal import NORMAL_DEG
+from coupole.reflectance.suggestion.rehearsal import NORMAL_DEG, Rehearsal
 
 Floats = NDArray[np.float64]
 
@@ -76,18 +76,18 @@ def _page(name: str, suggestion: Suggestion) -> Page:
 
 _LIMITS = (
     "The figures are those of the fits themselves, made of drawn samples: the frames' noise, each LED's own power "
-    "and place, and a highlight with Fresnel's term.",
-    "Not in them: light from surface to surface, edges of shadows, translucency, errors of the mesh and of poses, "
-    "and materials that are no sum of a matt part and a highlight. Where these matter, the uncertainties will be "
-    "larger.",
+    "and place, the noise of the arm's poses, and a highlight with Fresnel's term.",
+    "Not in them: light from surface to surface, edges of shadows, translucency, errors of the mesh, the light of "
+    "two triangles in one pixel, and materials that are no sum of a matt part and a highlight. With these, "
+    "uncertainties are larger.",
 )
 
 
 def _expectation_table(suggestion: Suggestion) -> Table:
     rows = []
-    for name, uncertainty in suggestion.uncertainties.items():
+    for name, rehearsal in suggestion.rehearsals.items():
         for words, share in (("half of the triangles", 0.5), ("19 of 20", _HIGH_QUANTILE)):
-            values = {key: _quantile(values, suggestion, share) for key, values in uncertainty.items()}
+            values = {key: _quantile(values, share) for key, values in rehearsal.uncertainty.items()}
             percents = (_percent(values[f"{key}_percent"]) for key in _KEYS)
             rows.append((name, words, f"{values['normal_deg']:.2g}", *percents))
     return Table("Standard uncertainty, not more than", ("if", "for", "normal, degrees", *_KEYS), rows)
@@ -97,7 +97,7 @@ def _percent(value: float) -> str:
     return f"{value:.2g} %" if value <= 100.0 else "not told"
 
 
-def _quantile(values: Floats, suggestion: Suggestion, share: float) -> float:
+def _quantile(values: Floats, share: float) -> float:
     is_known = np.isfinite(values)
     return float(np.quantile(values[is_known], share)) if is_known.any() else np.nan
 
@@ -118,7 +118,8 @@ def _views(suggestion: Suggestion) -> Table:
 def _map_of_normals(suggestion: Suggestion, title: str, azimuth_deg: float, elevation_deg: float) -> Map:
     """Return the object in a parallel projection, with the expected uncertainty of its normals. The material with
     the least certain normals is shown."""
-    per_part = np.max([uncertainty[NORMAL_DEG] for uncertainty in suggestion.uncertainties.values()], axis=0)
+    least_certain = max(suggestion.rehearsals.values(), key=Rehearsal.normal_deg)
+    per_triangle = least_certain.uncertainty[NORMAL_DEG]
     corners_mm, mesh = suggestion.job.shape.corners_mm, suggestion.job.motion.occlusions.mesh
     to_eye = direction(azimuth_deg, elevation_deg)
     right = np.cross([0.0, 0.0, 1.0], to_eye)
@@ -138,12 +139,12 @@ def _map_of_normals(suggestion: Suggestion, title: str, azimuth_deg: float, elev
     is_object = depth_mm < _NEVER_MM
     values, shade = np.full((2, len(starts_mm)), np.nan)
     places_mm = starts_mm[is_object] - depth_mm[is_object, None] * to_eye
-    values[is_object] = per_part[cKDTree(suggestion.surface.points_mm).query(places_mm)[1]]
+    values[is_object] = per_triangle[cKDTree(least_certain.triangles.points_mm).query(places_mm)[1]]
     across = np.cross(*(corners_mm[hit[is_object], k] - corners_mm[hit[is_object], 0] for k in (1, 2)))
     facing = across @ to_eye / np.maximum(np.linalg.norm(across, axis=1), 1e-12)
     shade[is_object] = 0.35 + 0.65 * np.clip(facing, 0.0, 1.0)
     shape = (_HEIGHT_PX, _WIDTH_PX)
-    high = float(np.nanquantile(per_part, _HIGH_QUANTILE)) if np.isfinite(per_part).any() else 1.0
+    high = float(np.nanquantile(per_triangle, _HIGH_QUANTILE)) if np.isfinite(per_triangle).any() else 1.0
     return shaded_map(
         f"Normals, standard uncertainty, {title}", values.reshape(shape), shade.reshape(shape), "degrees", high
     )

@@ -27,10 +27,11 @@ from coupole.preflight.checking import calibration_refusals, check_job
 from coupole.preflight.job import Job, read_job
 from coupole.preflight.preflight import Report, StorageFacts
 from coupole.reflectance.suggestion.candidate_views import Candidate, candidates_of
+from coupole.reflectance.suggestion.drawn_triangles import MeshParts
 from coupole.reflectance.suggestion.plan_text import PlanText
-from coupole.reflectance.suggestion.rehearsal import NORMAL_DEG, ExpectedUncertainty, rehearse
+from coupole.reflectance.suggestion.rehearsal import Rehearsal, rehearse
 from coupole.reflectance.suggestion.supposed_materials import SupposedMaterial, supposed_materials
-from coupole.reflectance.suggestion.supposed_signal import SupposedCell, Surface, signal_quantile
+from coupole.reflectance.suggestion.supposed_signal import SupposedCell, signal_quantile
 from coupole.reflectance.suggestion.view_choice import ViewChoice, choose_views
 from coupole.reflectance.suggestion.view_information import Information, ViewInformation, information_of
 
@@ -95,24 +96,21 @@ class Suggestion:
     """The views, the most informative one first."""
     exposures_us: tuple[int, ...]
     leds: int
-    surface: Surface
-    uncertainties: dict[str, ExpectedUncertainty]
-    """The figures of each supposed material, by its name."""
+    rehearsals: dict[str, Rehearsal]
+    """The expected uncertainty for each supposed material, by its name."""
     job: Job
 
     @property
     def known_share(self) -> float:
         """Share of the mesh's triangles that get a material, for the supposed material with the smallest share."""
-        weights = self.surface.triangles
-        shares = [weights[np.isfinite(u[NORMAL_DEG])].sum() / weights.sum() for u in self.uncertainties.values()]
-        return float(min(shares))
+        return min(rehearsal.known_share for rehearsal in self.rehearsals.values())
 
     def medians(self) -> dict[str, dict[str, float | None]]:
         """Median standard uncertainties of the triangles that get a material, by supposed material; None without
         such triangles."""
         return {
-            name: {key: _median(values, self.surface.triangles) for key, values in uncertainty.items()}
-            for name, uncertainty in self.uncertainties.items()
+            name: {key: _median(values) for key, values in rehearsal.uncertainty.items()}
+            for name, rehearsal in self.rehearsals.items()
         }
 
     def figures(self) -> dict[str, Any]:
@@ -314,10 +312,13 @@ class _Trial:
         self._say("samples that are drawn, and their fits", 0, len(self._materials))
         parts_of_views = [self._candidates[view].seen_parts for view in choice.views]
         led_rows = self._order[: self._fitted_numbers[settings.leds]]
-        uncertainties = {}
+        corners_mm = job.shape.corners_mm
+        mesh = MeshParts(corners_mm, job.motion.occlusions.patches.of_triangles(len(corners_mm)))
+        rehearsals = {}
         for number, (name, material) in enumerate(self._materials.items(), start=1):
-            uncertainties[name] = rehearse(
+            rehearsals[name] = rehearse(
                 self._surface,
+                mesh,
                 parts_of_views,
                 material,
                 settings.exposures_us,
@@ -327,8 +328,7 @@ class _Trial:
             self._say("samples that are drawn, and their fits", number, len(self._materials))
         views = [self._candidates[view].view for view in choice.views]
         suggestion = Suggestion(
-            "", report, tuple(views), settings.exposures_us, self._numbers[settings.leds], self._surface,
-            uncertainties, job,
+            "", report, tuple(views), settings.exposures_us, self._numbers[settings.leds], rehearsals, job,
         )  # fmt: skip
         remarks = ["Suggested by `coupole plan suggest`.", *_promises(suggestion.medians())]
         return replace(suggestion, text=self._text(views, settings, *remarks))
@@ -348,11 +348,7 @@ def _promises(medians: dict[str, dict[str, float | None]]) -> list[str]:
     return lines
 
 
-def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float | None:
-    """Weighted median of the known values."""
+def _median(values: NDArray[np.float64]) -> float | None:
+    """Median of the known values."""
     is_known = np.isfinite(values)
-    if not is_known.any():
-        return None
-    order = np.argsort(values[is_known])
-    cumulative = np.cumsum(weights[is_known][order])
-    return float(values[is_known][order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
+    return float(np.median(values[is_known])) if is_known.any() else None

@@ -7,6 +7,7 @@ of the mesh, and errors of the records other than the LEDs' own power.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.light.frames import channels_of
-from coupole.calibration.light.irradiance import irradiance_per_flux
+from coupole.calibration.light.irradiance import Emission, irradiance_per_flux
 from coupole.calibration.record import Record
 from coupole.errors import InputError
 from coupole.geometry import apply, inverse
@@ -96,8 +97,8 @@ class Surface:
     """[n] number of triangles that each part represents."""
     leds_mm: Floats
     """[leds, 3] support frame, in the order of the dome's table."""
-    signal_per_f: Floats
-    """[n, leds, channels] DN/s above black for a reflectance of 1/sr, including the cosine of incidence."""
+    signal_upright: Floats
+    """[n, leds, channels] DN/s above black for a reflectance of 1/sr and perpendicular incidence."""
     u_own: Floats
     """[leds] relative standard uncertainty of an LED's own power."""
     u_shared: float
@@ -105,6 +106,18 @@ class Surface:
     u_led_mm: float
     """Standard uncertainty of each coordinate of an LED's centre."""
     noise: CameraNoise
+    u_pose_mm: float = 0.0
+    """Standard uncertainty of a view's place on the object, in each of the two directions across the line of
+    sight."""
+
+    @cached_property
+    def signal_per_f(self) -> Floats:
+        """[n, leds, channels] DN/s above black for a reflectance of 1/sr, including the cosine of incidence."""
+        towards_leds = self.leds_mm[None] - self.points_mm[:, None]
+        towards_leds /= np.linalg.norm(towards_leds, axis=2)[:, :, None]
+        cosines = np.maximum(np.einsum("nlk,nk->nl", towards_leds, self.normals), 0.0)
+        signals: Floats = self.signal_upright * cosines[:, :, None]
+        return signals
 
 
 @dataclass(frozen=True)
@@ -138,6 +151,7 @@ class SupposedCell:
             )
         self._power_path, self._power = records["led-power"].path, records["led-power"].record
         self._response, self._leds = records["response"].record, records["leds"].record
+        self._hand_eye = records["hand-eye"].record if "hand-eye" in records else None
         self._u_signal = u_signal_of({kind: item.path for kind, item in records.items()})
 
     @cached_property
@@ -153,12 +167,7 @@ class SupposedCell:
         axes = leds.normals @ support_from_base[:3, :3].T
         channels, channel_share = _channels(self.rig.sensor)
         powers: Powers = read_powers(self._power_path, channels).of(leds.ids)
-        per_flux = np.stack(
-            [
-                irradiance_per_flux(point, normal, leds_mm, axes, emission=emission_of(self._power))
-                for point, normal in zip(patches.points_mm, patches.normals, strict=True)
-            ]
-        )
+        per_flux = upright_per_flux(patches.points_mm, leds_mm, axes, emission_of(self._power))
         triangles, areas_mm2 = triangles_of_parts(patches, self._job.shape.corners_mm)
         return Surface(
             patches.points_mm,
@@ -171,6 +180,7 @@ class SupposedCell:
             float(np.nanmean(np.hypot(powers.u_shared, self._u_signal))),
             self._leds.value("led_centre_median_u_mm"),
             _camera_noise(self.rig.sensor, self._response, channels, channel_share),
+            _pose_noise_mm(self._hand_eye, self.rig.lens.focus_distance_mm),
         )
 
     def seen_by(self, joints_deg: Floats, support_from_camera: Floats) -> SeenParts:
@@ -212,6 +222,25 @@ def triangles_of_parts(patches: Patches, corners_mm: Floats) -> tuple[Floats, Fl
     triangles: Floats = np.bincount(patches.piece_patch, share, count).astype(np.float64)
     sums_mm2 = np.bincount(patches.piece_patch, share * areas_mm2[patches.piece_triangle], count)
     return triangles, sums_mm2 / triangles
+
+
+def upright_per_flux(points_mm: Floats, leds_mm: Floats, axes: Floats, emission: Emission) -> Floats:
+    """[points, leds] irradiance per flux, m^-2, of surfaces at points [points, 3] that face each LED."""
+    rows = []
+    for point_mm in points_mm:
+        towards = leds_mm - point_mm
+        facing = towards / np.linalg.norm(towards, axis=1)[:, None]
+        rows.append(irradiance_per_flux(point_mm, facing, leds_mm, axes, emission=emission))
+    return np.stack(rows)
+
+
+def _pose_noise_mm(hand_eye: Record | None, distance_mm: float) -> float:
+    """Return the robot's noise, by the hand-eye record, at the object: of position, and of orientation at its
+    distance."""
+    if hand_eye is None:
+        return 0.0
+    noise = {line.name: line.found for line in hand_eye.noise}
+    return math.hypot(noise["robot position"], math.radians(noise["robot orientation"]) * distance_mm)
 
 
 def _channels(sensor: Sensor) -> tuple[Sequence[str], Floats]:
@@ -264,8 +293,15 @@ def signal_quantile(
 
 
 @kernel
-def _fill_reflectances(points_mm, normals, camera_mm, pixels, leds_mm, is_lit, material, f, cosines):  # type: ignore[no-untyped-def]
+def _reflectance(nl, nv, nh, vh, material):  # type: ignore[no-untyped-def]
+    """Return the reflectance, 1/sr, for cosines of the normal with light, view and half vector, and of view with
+    half vector."""
     kd, ks, alpha = material
+    return kd + (ks + (1.0 - ks) * (1.0 - vh) ** 5) * lobe(nl, nv, nh, alpha)[0]
+
+
+@kernel
+def _fill_reflectances(points_mm, normals, camera_mm, pixels, leds_mm, is_lit, material, f, cosines):  # type: ignore[no-untyped-def]
     light, view, half = np.empty(3), np.empty(3), np.empty(3)
     for part in range(len(points_mm)):
         if pixels[part] <= 0.0:
@@ -281,6 +317,44 @@ def _fill_reflectances(points_mm, normals, camera_mm, pixels, leds_mm, is_lit, m
             between(light, view, half)
             nh = normal[0] * half[0] + normal[1] * half[1] + normal[2] * half[2]
             vh = view[0] * half[0] + view[1] * half[1] + view[2] * half[2]
-            fresnel = ks + (1.0 - ks) * (1.0 - vh) ** 5
-            f[part, led] = kd + fresnel * lobe(nl, nv, nh, alpha)[0]
+            f[part, led] = _reflectance(nl, nv, nh, vh, material)
             cosines[part, led] = nl
+
+
+def seen_samples(
+    points_mm: Floats,
+    normals: Floats,
+    camera_mm: Floats,
+    leds_mm: Floats,
+    is_lit: NDArray[np.bool_],
+    material: SupposedMaterial,
+) -> Floats:
+    """[n, leds] reflectance times cosine of incidence, 1/sr: the mean over the normals [n, places, 3] that pixels
+    at points [n, 3] see. NaN where no light reaches a point (`is_lit` [n, leds])."""
+    samples = np.full(is_lit.shape, np.nan)
+    _fill_samples(
+        points_mm, normals, camera_mm, leds_mm, is_lit, (material.kd, material.ks, material.alpha), samples
+    )
+    return samples
+
+
+@kernel
+def _fill_samples(points_mm, normals, camera_mm, leds_mm, is_lit, material, samples):  # type: ignore[no-untyped-def]
+    light, view, half = np.empty(3), np.empty(3), np.empty(3)
+    for n in range(len(points_mm)):
+        towards(points_mm[n], camera_mm, view)
+        for led in range(len(leds_mm)):
+            if not is_lit[n, led]:
+                continue
+            towards(points_mm[n], leds_mm[led], light)
+            between(light, view, half)
+            vh = view[0] * half[0] + view[1] * half[1] + view[2] * half[2]
+            total = 0.0
+            for place in range(normals.shape[1]):
+                normal = normals[n, place]
+                nl = normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2]
+                nv = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
+                if nl > 0.0 and nv > 0.0:
+                    nh = normal[0] * half[0] + normal[1] * half[1] + normal[2] * half[2]
+                    total += _reflectance(nl, nv, nh, vh, material) * nl
+            samples[n, led] = total / normals.shape[1]

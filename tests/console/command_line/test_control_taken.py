@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +19,8 @@ from served import Browser, served
 from coupole.acquisition.cell_bench.bench_client import ask_bench
 from coupole.console.cell.acquisitions import Acquisitions
 from coupole.console.cell.bench_keeper import Bench
+from coupole.console.people.accounts import Account, Role
+from coupole.console.people.sessions import Control
 from coupole.console.plans.plan_files import PlanFiles
 from coupole.console.plans.plan_queue import PlanQueue
 from coupole.plan.cell import read_cell
@@ -104,7 +107,7 @@ def test_an_arm_that_is_driven_stops_when_another_person_takes_control(driven: D
     with driven.driving("park") as drive:
         driven.takes_control(by)
     ended = cells.finish(drive)
-    assert (ended.code, "first engineer is in control" in ended.err) == (130, True), ended
+    assert (ended.code, "first engineer took control" in ended.err) == (130, True), ended
     assert driven.off_deg("park") > NOT_THERE_DEG
     assert driven.ending_is_logged()
 
@@ -113,28 +116,50 @@ def test_an_arm_of_an_open_bench_stops_when_another_person_takes_control(driven:
     with driven.driving("park") as drive:
         driven.takes_control("taking it")
     ended = cells.finish(drive)
-    assert (ended.code, "first engineer is in control" in ended.err) == (130, True), ended
+    assert (ended.code, "first engineer took control" in ended.err) == (130, True), ended
     assert driven.off_deg("park") > NOT_THERE_DEG
     assert driven.ending_is_logged()
     work = ask_bench(read_cell(driven.cell.rig), "state")["work"]
-    assert (work["state"], "first engineer is in control" in work["why"]) == ("stopped", True), work
+    assert (work["state"], "first engineer took control" in work["why"]) == ("stopped", True), work
+
+
+def test_an_arm_that_is_driven_stops_though_control_is_given_back_at_once(driven: Driven) -> None:
+    """Between two questions of the command: it asks every 0.1 s who is in control."""
+    with driven.driving("park") as drive:
+        time.sleep(0.3)  # it has asked once
+        driven.takes_control("taking it")
+        assert driven.engineer.post("/api/v1/control/give", {}).status == 200
+    ended = cells.finish(drive)
+    assert (ended.code, "first engineer took control" in ended.err) == (130, True), ended
+    assert driven.off_deg("park") > NOT_THERE_DEG
+
+
+ADA, MAX = (Account(name, Role.ENGINEER) for name in ("Ada", "Max"))
 
 
 @pytest.mark.parametrize(
-    ("in_control", "state"), [("Max", "stopped"), ("Ada", "done"), ("", "done")], ids=["other", "same", "nobody"]
+    ("taken_by", "gives_back", "state"),
+    [(MAX, False, "stopped"), (MAX, True, "stopped"), (ADA, False, "done"), (None, False, "done")],
+    ids=["other", "other for a moment", "same", "nobody"],
 )
 def test_a_drive_that_a_person_began_at_the_page_ends_when_another_one_takes_control(
-    driven: Driven, opened: None, tmp_path: Path, in_control: str, state: str
+    driven: Driven, opened: None, tmp_path: Path, taken_by: Account | None, gives_back: bool, state: str
 ) -> None:
-    cell, controls = read_cell(driven.cell.rig), ["Ada"]
+    cell, control = read_cell(driven.cell.rig), Control()
+    control.take(ADA)
     acquisitions = Acquisitions(PlanQueue(tmp_path / "queue.json"), cell, tmp_path / "output")
     plans = PlanFiles(tmp_path, driven.cell.rig, tmp_path / "drawings")
-    with Bench(cell, acquisitions, plans, tmp_path, in_control=lambda: controls[-1]) as bench:
+    with Bench(cell, acquisitions, plans, tmp_path, control=control) as bench:
         bench.drive(bench.ask("plan_path", to="park")["path"], "Ada")
         cells.wait_until(driven.is_moving, "the arm under way")
-        controls.append(in_control)
+        if taken_by is None:
+            control.give(ADA, "")
+        else:
+            control.take(taken_by)
+        if gives_back and taken_by is not None:
+            control.give(taken_by, "")
         work = cells.wait_until(
             lambda: (now := bench.ask("state")["work"])["state"] != "running" and now, "its end"
         )
-    assert (work["state"], "Max is in control" in work["why"]) == (state, in_control == "Max"), work
-    assert (driven.off_deg("park") > NOT_THERE_DEG) is (in_control == "Max")
+    assert (work["state"], "Max took control" in work["why"]) == (state, taken_by is MAX), work
+    assert (driven.off_deg("park") > NOT_THERE_DEG) is (taken_by is MAX)

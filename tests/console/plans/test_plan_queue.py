@@ -210,6 +210,30 @@ def test_a_run_that_falls_silent_is_still_at_work_and_a_stop_interrupts_its_proc
         assert process.wait(10.0) == -signal.SIGINT
 
 
+def test_the_queue_halts_after_a_stop_that_came_when_the_run_was_complete(
+    queue: PlanQueue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process ends with 0 then; the person believes that all stands."""
+    found = Acquisitions(queue, read_cell(CellFolder(tmp_path).rig), tmp_path / "output")
+    entry = queue.add("Ada", plan="one.yaml")
+    with subprocess.Popen(["python3", "-c", COMPLETE], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline()
+        found._process = process
+        queue.change(entry.id, state="running", pid=process.pid)
+        monkeypatch.setattr(found, "_is_alive", lambda _: process.poll() is None)
+        found.stop(queue.entry(entry.id))
+        process.wait()
+    found._look_after(queue.entry(entry.id))
+    assert (queue.entry(entry.id).state, queue.entry(entry.id).exit_code) == ("done", 0)
+    assert "stopped when it was complete" in queue.halt_reason
+
+
+COMPLETE = (
+    "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); print(1, flush=True); import time; time.sleep(1)"
+)
+
+
 def test_a_hundred_ended_entries_are_kept_and_what_others_printed_is_taken_away(
     queue: PlanQueue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,6 +19,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import trimesh
 from rich.console import Console
 from rich.table import Table
@@ -27,16 +28,19 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
 from coupole.reflectance.suggestion.supposed_materials import SUPPOSED  # noqa: E402
+from coupole.scan.simplify import simplified_mesh  # noqa: E402
 from smallest import add_smallest  # noqa: E402
 
-CASES = (("relief", "objects/relief.ply", "glossy"), ("plaque", "objects/plaque.ply", "metal"),
-         ("bust", "restorations/bust.ply", "matt"))  # fmt: skip
+CASES = (("relief", "objects/relief.ply", "glossy", None), ("plaque", "objects/plaque.ply", "metal", 15_000),
+         ("bust", "restorations/bust.ply", "matt", None))  # fmt: skip
+"""Name, mesh, material, and largest number of triangles. The plaque's triangles are smaller than the pixels of the
+simulated cell, so its mesh is simplified."""
 MOST_OFF = 0.2
 CONFIGS = ROOT / "configs"
 FIGURES = ("normal_deg", "kd_percent", "ks_percent", "alpha_percent")
 
 
-def write_cell(folder: Path, mesh: str, material: str) -> None:
+def write_cell(folder: Path, mesh: str, material: str, most_triangles: int | None) -> None:
     """Write the simulated cell with an object of one material, and the object's mesh without colours."""
     material_values, pi = SUPPOSED[material], 3.141592653589793
     colour, f0 = [round(material_values.kd * pi, 4)] * 3, [material_values.ks] * 3
@@ -46,7 +50,10 @@ def write_cell(folder: Path, mesh: str, material: str) -> None:
     place = text.index("    white_at_us:")
     (folder / "rig.yaml").write_text(text[:place] + settings + text[place:])
     whole = trimesh.load(CONFIGS / mesh, process=False)
-    trimesh.Trimesh(whole.vertices, whole.faces, process=False).export(folder / "object.ply")
+    vertices_mm, triangles = np.asarray(whole.vertices, np.float64), np.asarray(whole.faces, np.int64)
+    if most_triangles is not None:
+        vertices_mm, triangles = simplified_mesh(vertices_mm, triangles, most_triangles)
+    trimesh.Trimesh(vertices_mm, triangles, process=False).export(folder / "object.ply")
 
 
 def coupole(folder: Path, *arguments: str) -> dict[str, Any]:
@@ -61,11 +68,11 @@ def coupole(folder: Path, *arguments: str) -> dict[str, Any]:
 
 
 def rehearse(
-    folder: Path, mesh: str, material: str, budget: str, *options: str
+    folder: Path, mesh: str, material: str, most_triangles: int | None, budget: str, *options: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the promised figures of one case, and the content of `result.json`."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_cell(folder, mesh, material)
+    write_cell(folder, mesh, material, most_triangles)
     promised_figures = coupole(
         folder, "plan", "suggest", "object.ply", "--rig", "rig.yaml", "--calibrations",
         str(CONFIGS / "calibrations"),
@@ -86,10 +93,10 @@ def main() -> int:
     options = parser.parse_args()
     table, is_off = Table("object", "material", "views, LEDs", "known", *FIGURES, box=None), False
     with tempfile.TemporaryDirectory(prefix="coupole-suggested-") as folder:
-        for name, mesh, material in CASES[: options.cases]:
+        for name, mesh, material, most_triangles in CASES[: options.cases]:
             of_case = (options.keep or Path(folder)) / name
             promised_figures, result_figures = rehearse(
-                of_case, mesh, material, options.budget, "--views", str(options.views)
+                of_case, mesh, material, most_triangles, options.budget, "--views", str(options.views)
             )
             stated_figures = result_figures["material_uncertainty"]["ggx_normal"]
             triangles = len(trimesh.load(of_case / "object.ply", process=False).faces)

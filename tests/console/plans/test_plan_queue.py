@@ -221,6 +221,7 @@ def test_the_queue_halts_after_a_stop_that_came_when_the_run_was_complete(
         assert process.stdout.readline()
         found._process = process
         queue.change(entry.id, state="running", pid=process.pid)
+        (tmp_path / "output").mkdir()
         monkeypatch.setattr(found, "_is_alive", lambda _: process.poll() is None)
         found.stop(queue.entry(entry.id))
         process.wait()

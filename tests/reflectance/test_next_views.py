@@ -92,7 +92,8 @@ def test_fits_to_chosen_views_are_at_most_a_little_worse_than_to_spread_ones(job
     mesh = MeshParts(corners_mm, job.motion.occlusions.patches.of_triangles(len(corners_mm)))
     triangles = mesh.drawn(400, np.random.default_rng(2))
     pixels = {name: triangles.pixels(surface, of_view) for name, of_view in seen.items()}
-    weights = np.where(np.any([of_view > 0.0 for of_view in pixels.values()], axis=0), 1.0, 0.0)
+    is_seen = np.any([of_view > 0.0 for of_view in pixels.values()], axis=0)
+    weights = np.where(is_seen, triangles.areas_mm2, 0.0)
 
     def error(names: Sequence[str]) -> float:
         random = np.random.default_rng(1)

@@ -115,6 +115,23 @@ def test_a_mesh_elsewhere_is_put_on_the_middle_and_one_view_tells_less_of_it(
     np.testing.assert_allclose([*(low + high)[:2], low[2]], 0.0, atol=2e-3)
 
 
+def test_a_mesh_that_the_camera_does_not_resolve_is_told_with_a_remedy(tmp_path: Path) -> None:
+    import trimesh
+
+    mesh = trimesh.load(RELIEF, process=False)
+    for _ in range(3):
+        mesh = mesh.subdivide()
+    mesh.export(tmp_path / "fine.ply")
+    options = ("--calibrations", RECORDS, "--material", "matt", "--views", "1", "--budget", "8s")
+    ended = suggest(tmp_path, *options, mesh=tmp_path / "fine.ply")
+    assert ended.code == 0, ended.err
+    assert ended.document["known_share"] < 0.3
+    page = (tmp_path / "fine.html").read_text()
+    assert "smaller than the camera's pixels. Simplify the mesh to about" in page.replace("&#39;", "'").replace(
+        "&#x27;", "'"
+    )
+
+
 @pytest.mark.parametrize(("text", "seconds"), [("4h", 14400.0), ("90min", 5400.0), (" 1.5 s ", 1.5)])
 def test_times(text: str, seconds: float) -> None:
     assert seconds_of(text) == seconds

@@ -7,6 +7,8 @@ exposure suits a white surface.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,23 +40,23 @@ def supposed_surface(job: Job) -> Surface:
     leds_mm = apply(support_from_base, leds.positions_mm)
     axes = leds.normals @ support_from_base[:3, :3].T
     upright = upright_per_flux(patches.points_mm, leds_mm, axes, rig.dome.emission) * leds.flux_lm
-    noise = _usual_noise(rig.sensor)
-    brightest = float(np.quantile(upright, 0.99))
-    longest_s = max(job.plan.exposure.exposures_us) * 1e-6
-    dn_per_s = _WHITE_REACHES * (rig.sensor.white_dn - rig.sensor.black_dn) * np.pi / (brightest * longest_s)
     triangles, areas_mm2 = triangles_of_parts(patches, job.shape.corners_mm)
-    return Surface(
+    of_1_dn = Surface(
         patches.points_mm,
         patches.normals,
         areas_mm2,
         triangles,
         leds_mm,
-        (upright * dn_per_s)[:, :, None],
+        upright[:, :, None],
         np.full(len(leds_mm), _U_LED_POWER),
         0.0,
         _U_LED_MM,
-        noise,
+        _usual_noise(rig.sensor),
     )
+    brightest = float(np.quantile(of_1_dn.signal_per_f, 0.99))
+    longest_s = max(job.plan.exposure.exposures_us) * 1e-6
+    dn_per_s = _WHITE_REACHES * (rig.sensor.white_dn - rig.sensor.black_dn) * np.pi / (brightest * longest_s)
+    return replace(of_1_dn, signal_upright=of_1_dn.signal_upright * dn_per_s)
 
 
 def _usual_noise(sensor: Sensor) -> CameraNoise:

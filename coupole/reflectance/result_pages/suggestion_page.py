@@ -38,13 +38,20 @@ def sentences(suggestion: Suggestion) -> list[str]:
     lines = [
         f"{views}, each under {suggestion.leds} LEDs at {exposures} ms: {report.frames:,} frames in "
         f"{report.duration_s / 60:.1f} min, {report.dose_lux_h:.2f} lux h",
-        f"{suggestion.known_share:.0%} of the triangles get a normal and a material",
+        f"{suggestion.known_share:.0%} of the triangles get a normal and a material{_too_fine(suggestion)}",
     ]
     for name, medians in suggestion.medians().items():
         if medians["normal_deg"] is not None:
             shares = ", ".join(f"{key} to {medians[f'{key}_percent']:.2g} %" for key in _KEYS)
             lines.append(f"if {name}: normals to {medians['normal_deg']:.2g} degrees, {shares} (median, standard)")
     return lines
+
+
+def _too_fine(suggestion: Suggestion) -> str:
+    if (count := suggestion.coarser_mesh) is None:
+        return ""
+    words = "its triangles are smaller than the camera's pixels. Simplify the mesh to about"
+    return f": {words} {count:,} triangles, or fit texels"
 
 
 def _page(name: str, suggestion: Suggestion) -> Page:

@@ -48,6 +48,9 @@ _FULL = 0.85
 _ROUNDS = 8
 _TRIAL_VIEWS = 3
 _ENDLESS = StorageFacts(free_bytes=1 << 60)
+_MOST_KNOWN, _ENOUGH_PIXELS = 0.5, 6.0
+"""A mesh is too fine if fewer triangles get a material, and if fewer pixels lie on a triangle. Six adjacent pixels
+nearly always have all three channels of a Bayer pattern."""
 _SAME = 0.02
 """Plans with a smaller difference of value are equally good; the shortest one is taken."""
 
@@ -104,6 +107,16 @@ class Suggestion:
     def known_share(self) -> float:
         """Share of the mesh's triangles that get a material, for the supposed material with the smallest share."""
         return min(rehearsal.known_share for rehearsal in self.rehearsals.values())
+
+    @property
+    def coarser_mesh(self) -> int | None:
+        """Number of triangles of a mesh that the camera resolves, if this mesh is too fine for most of its
+        triangles to get a material; otherwise None."""
+        pixels = max(rehearsal.pixels for rehearsal in self.rehearsals.values())
+        if self.known_share >= _MOST_KNOWN or pixels >= _ENOUGH_PIXELS:
+            return None
+        count = len(self.job.shape.corners_mm) * pixels / _ENOUGH_PIXELS
+        return int(float(f"{max(count, 1.0):.1g}"))
 
     def medians(self) -> dict[str, dict[str, float | None]]:
         """Median standard uncertainties of the triangles that get a material, by supposed material; None without

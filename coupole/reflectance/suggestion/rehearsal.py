@@ -45,6 +45,8 @@ class Rehearsal:
     uncertainty: ExpectedUncertainty
     known_share: float
     """Share of all triangles that get a material."""
+    pixels: float
+    """Median, over the triangles that views show, of the pixels of a triangle in the view that shows it best."""
 
     def normal_deg(self) -> float:
         """Median uncertainty of normals; 0 without any."""
@@ -66,7 +68,9 @@ def rehearse(
     """Return the uncertainty of a mesh after these views under these LEDs (rows of the dome's table)."""
     random, channels = np.random.default_rng(seed), surface.signal_upright.shape[2]
     triangles = mesh.drawn(_MOST_DRAWN, random)
-    pixels = np.stack([surface.noise.drawn_pixels(triangles.pixels(surface, view), random) for view in views])
+    mean_pixels = np.stack([triangles.pixels(surface, view) for view in views])
+    pixels = np.stack([surface.noise.drawn_pixels(pixels_of_view, random) for pixels_of_view in mean_pixels])
+    most_pixels = mean_pixels.max(axis=0)
     shown = np.flatnonzero((pixels > 0).all(axis=2).any(axis=0))
     shown_share = len(shown) / max(len(triangles.numbers), 1)
     most = max(1, min(_MOST_FITTED, _MOST_VALUES // (len(views) * len(led_rows) * channels)))
@@ -85,7 +89,9 @@ def rehearse(
     percents = {f"{name}_percent": 100.0 * deviations[:, 2 + n] for n, name in enumerate(("kd", "ks", "alpha"))}
     normal_deg = np.degrees(np.hypot(deviations[:, 0], deviations[:, 1]))
     known_share = shown_share * float(np.isfinite(normal_deg).mean()) if len(shown) else 0.0
-    return Rehearsal(triangles, {NORMAL_DEG: normal_deg, **percents}, known_share)
+    is_seen = most_pixels > 0.0
+    median_pixels = float(np.median(most_pixels[is_seen])) if is_seen.any() else 0.0
+    return Rehearsal(triangles, {NORMAL_DEG: normal_deg, **percents}, known_share, median_pixels)
 
 
 def drawn_samples(

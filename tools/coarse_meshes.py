@@ -29,24 +29,24 @@ from painted_objects import LENS, PITCH_UM, Floats, mesh_of
 from sim.optics.objective import defocus_px
 
 MOST_WORSE_DB, _SHARP_PX = 1.0, 1.0
-"""What a coarse mesh may lose, and the diameter of the defocus disk up to which a place is in the depth of
-field."""
+"""Pictures on a coarse mesh may be so many dB worse. A place is in the depth of field if its defocus disk has at
+most this diameter."""
 
 
 @dataclass
 class _Compared:
     """Values of the pixels that are compared, view by view and LED by LED."""
 
-    measured: list[Floats]
+    measured_parts: list[Floats]
     fine: list[Floats]
     coarse: list[Floats]
     of_fine: int = 0
     """Number of pixels with a value on the fine mesh, in the depth of field."""
 
     def psnr_db(self, pictures: list[Floats]) -> float:
-        measured = np.concatenate(self.measured)
-        square = np.mean(np.square(np.concatenate(pictures) - measured))
-        return float(10.0 * np.log10(np.quantile(measured, PEAK_QUANTILE) ** 2 / square))
+        measured_values = np.concatenate(self.measured_parts)
+        square = np.mean(np.square(np.concatenate(pictures) - measured_values))
+        return float(10.0 * np.log10(np.quantile(measured_values, PEAK_QUANTILE) ** 2 / square))
 
 
 def judge_coarse(object_run: Acquired, fine_out: Path, edge_mm: float, size: TexelSize) -> dict[str, Any]:
@@ -63,12 +63,12 @@ def judge_coarse(object_run: Acquired, fine_out: Path, edge_mm: float, size: Tex
     forget()
     fine, coarse = RunResult(fine_out), RunResult(out)
     of_views = {view.view: view for view in coarse.views}
-    compared, normals_off_deg = _Compared([], [], []), []
+    comparison, normals_off_deg = _Compared([], [], []), []
     for view in fine.views:
         normals_off_deg.append(_normals_off_deg((fine, view), (coarse, of_views[view.view])))
-        _compare(compared, (fine, view), (coarse, of_views[view.view]), poses[view.view])
+        _compare(comparison, (fine, view), (coarse, of_views[view.view]), poses[view.view])
     shutil.rmtree(out)
-    fine_db, coarse_db = (compared.psnr_db(pictures) for pictures in (compared.fine, compared.coarse))
+    fine_db, coarse_db = (comparison.psnr_db(pictures) for pictures in (comparison.fine, comparison.coarse))
     return {
         "object": object_run.name,
         "size": size.text,
@@ -77,13 +77,13 @@ def judge_coarse(object_run: Acquired, fine_out: Path, edge_mm: float, size: Tex
         "fine_psnr_db": fine_db,
         "coarse_psnr_db": coarse_db,
         "worse_db": fine_db - coarse_db,
-        "compared_share": sum(map(len, compared.measured)) / compared.of_fine,
+        "compared_share": sum(map(len, comparison.measured_parts)) / comparison.of_fine,
         "normals_apart_deg": float(np.median(np.concatenate(normals_off_deg))),
     }
 
 
 def _compare(
-    compared: _Compared,
+    comparison: _Compared,
     of_fine: tuple[RunResult, ViewSamples],
     of_coarse: tuple[RunResult, ViewSamples],
     base_from_camera: Floats,
@@ -91,18 +91,20 @@ def _compare(
     """Add the pictures of a view's left-out LEDs."""
     is_sharp = _sharp(*of_fine, base_from_camera)[::2, ::2]
     fine_maker, coarse_maker = (picture_maker(*of_one, TEXELS) for of_one in (of_fine, of_coarse))
-    for (measured, fine), (_, coarse) in zip(
+    for (measured_picture, fine), (_, coarse) in zip(
         held_out_pictures(*of_fine, {TEXELS: fine_maker}),
         held_out_pictures(*of_coarse, {TEXELS: coarse_maker}),
         strict=True,
     ):
-        height, width = measured.shape[:2]
-        in_fine = np.isfinite(measured) & (fine[TEXELS] > 0.0) & is_sharp[:height, :width, None]
+        height, width = measured_picture.shape[:2]
+        in_fine = np.isfinite(measured_picture) & (fine[TEXELS] > 0.0) & is_sharp[:height, :width, None]
         in_both = in_fine & (coarse[TEXELS] > 0.0)
-        compared.of_fine += int(np.count_nonzero(in_fine))
+        comparison.of_fine += int(np.count_nonzero(in_fine))
         for values, picture in (
-            (compared.measured, measured), (compared.fine, fine[TEXELS]), (compared.coarse, coarse[TEXELS])
-        ):  # fmt: skip
+            (comparison.measured_parts, measured_picture),
+            (comparison.fine, fine[TEXELS]),
+            (comparison.coarse, coarse[TEXELS]),
+        ):
             values.append(picture[in_both].astype(np.float64))
 
 

@@ -37,7 +37,7 @@ def result(tmp_path: Path) -> RunResult:
 def with_two_paints(result: RunResult) -> np.ndarray:
     """Give every third texel another paint, and return which paint each has."""
     texels = read_view_texels(result, result.views[0])
-    paint = (np.arange(len(texels.pixels)) % 3 == 0).astype(int)
+    paint: np.ndarray = (np.arange(len(texels.pixels)) % 3 == 0).astype(int)
     ks = np.repeat(KS[paint][:, None], 3, axis=1)
     rewrite(result, replace(texels, kd=PAINTS[paint].astype(np.float32), ks=ks.astype(np.float32)))
     return paint

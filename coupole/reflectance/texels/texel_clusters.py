@@ -58,15 +58,15 @@ class TexelClusters:
     members: NDArray[np.int64]
     """[clusters]"""
     cluster: dict[str, NDArray[np.int32]]
-    """By the name of a view's files: cluster of each of its texels."""
+    """Key: name of a view's files; value: the cluster of each of its texels."""
 
     def at(self, name: str, texels: TriangleMaterials) -> TriangleMaterials:
         """Return the materials of a view's texels by their clusters, with the texels' own normals. The first of
         `texels` is that of pixels without a texel, as scenes have it, and stays."""
         number = self.cluster[name]
         kd, ks, alpha = (
-            np.concatenate([own[:1], values[number]])
-            for own, values in ((texels.kd, self.kd), (texels.ks, self.ks), (texels.alpha, self.alpha))
+            np.concatenate([own_values[:1], values[number]])
+            for own_values, values in ((texels.kd, self.kd), (texels.ks, self.ks), (texels.alpha, self.alpha))
         )
         return replace(texels, kd=kd, ks=ks, alpha=alpha)
 
@@ -107,7 +107,7 @@ def group_texels(result: RunResult, count: int | None, memory_bytes: int, *, say
     most_rows = max(1, memory_bytes // _BYTES)
     centres = _centres(result, most, count, most_rows)
     sums, numbers = _Sums.empty(len(centres), result.channels), {}
-    done = 0
+    done_count = 0
     for view, total in zip(result.views, totals, strict=True):
         numbers[view.path.stem] = of_view = np.empty(total, np.int32)
         first = 0
@@ -116,22 +116,24 @@ def group_texels(result: RunResult, count: int | None, memory_bytes: int, *, say
             of_view[first : first + len(nearest)] = nearest
             sums.add(nearest, part)
             first += len(nearest)
-            done += len(nearest)
-            say("cluster texels", done, most)
+            done_count += len(nearest)
+            say("cluster texels", done_count, most)
     return sums.clusters(numbers)
 
 
 def _centres(result: RunResult, total: int, count: int, most_rows: int) -> Floats:
     """[clusters, features] centres of the looks of some of all texels, which are drawn from all views."""
     random = np.random.default_rng(0)
-    chosen = np.arange(total)
+    chosen_places = np.arange(total)
     if total > LEARNT_FROM:
-        chosen = np.sort(random.choice(total, LEARNT_FROM, replace=False))
+        chosen_places = np.sort(random.choice(total, LEARNT_FROM, replace=False))
     features, first = [], 0
     for view in result.views:
         for part in read_texel_parts(result, view, most_rows):
             end = first + len(part.materials.alpha)
-            rows = chosen[np.searchsorted(chosen, first) : np.searchsorted(chosen, end)] - first
+            rows = (
+                chosen_places[np.searchsorted(chosen_places, first) : np.searchsorted(chosen_places, end)] - first
+            )
             features.append(looks(part.materials.at(rows)))
             first = end
     return centres_of_points(np.concatenate(features), count, random)
@@ -206,11 +208,10 @@ def _mae(result: RunResult, clusters: TexelClusters, say: Said) -> dict[str, flo
     own materials, and by those of their clusters, in the pixels where both have a value."""
     sums, values = {"own": 0.0, "clustered": 0.0}, 0
     for number, view in enumerate(result.views, start=1):
-        own = scene_of_view(result, view.view, TEXELS)
-        scenes = {"own": own, "clustered": _of_clusters(own, view, clusters)}
+        own_scene = scene_of_view(result, view.view, TEXELS)
+        scenes = {"own": own_scene, "clustered": _of_clusters(own_scene, view, clusters)}
         makers = {
-            name: lambda led, scene=scene: scene.picture([LedLight(number=led)])  # type: ignore[misc]
-            for name, scene in scenes.items()
+            name: lambda led, scene=scene: scene.picture([LedLight(number=led)]) for name, scene in scenes.items()
         }
         for measured_picture, pictures in held_out_pictures(result, view, makers):
             has_both = np.isfinite(measured_picture) & np.logical_and.reduce(

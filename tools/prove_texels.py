@@ -82,7 +82,7 @@ def main() -> int:
     )
     parser.add_argument("--seed", type=int, default=1, help="of the world of the objects")
     parser.add_argument("--json", action="store_true")
-    add_smallest(parser, sizes=["1.6"], every=48, objects=["ridge"], object_sizes=["0.2"])
+    add_smallest(parser, sizes=["1.6"], every=48, objects=["ridge"], object_sizes=["0.2"], coarse=[2.0])
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="coupole-texels-") as folder:
         relief_run = acquire(Path(folder) / "relief", arguments.every) if arguments.sizes else None

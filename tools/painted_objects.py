@@ -116,11 +116,12 @@ def painted_cell(folder: Path, painted_object: Painted, *, every: int, seed: int
     return cell
 
 
-def mesh_of(height_mm: Callable[[Floats, Floats], Floats]) -> trimesh.Trimesh:
-    """Return the surface over a grid of `EDGE_MM`, in the support frame."""
-    columns, rows = (round(extent / EDGE_MM) for extent in EXTENT_MM)
+def mesh_of(height_mm: Callable[[Floats, Floats], Floats], edge_mm: float = EDGE_MM) -> trimesh.Trimesh:
+    """Return the surface over a grid of `edge_mm`, in the support frame. All vertices are on the surface; the
+    grid is as large as the object, up to half an edge."""
+    columns, rows = (round(extent / edge_mm) for extent in EXTENT_MM)
     x, y = np.meshgrid(
-        (np.arange(columns + 1) - columns / 2) * EDGE_MM, (np.arange(rows + 1) - rows / 2) * EDGE_MM
+        (np.arange(columns + 1) - columns / 2) * edge_mm, (np.arange(rows + 1) - rows / 2) * edge_mm
     )
     points = np.stack([x, y, HEIGHT_MM + height_mm(x, y)], axis=-1).reshape(-1, 3)
     corner = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()

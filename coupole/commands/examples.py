@@ -101,7 +101,7 @@ EXAMPLES: dict[str, tuple[str, str]] = {
     "reflectance ablate": ("reflectance ablate RESULT", "reflectance ablate RESULT --json"),
     "reflectance cluster": (
         "reflectance cluster RESULT --clusters 40",
-        "reflectance cluster RESULT --degrees 12 --memory 4GB",
+        "reflectance cluster RESULT --texels --clusters 12",
     ),
     "reflectance choose": (
         "reflectance choose --pictures PICTURES --lights lights.lp --count 16",

@@ -281,7 +281,7 @@ def cluster(
         typer.Option(
             "--clusters",
             min=1,
-            help="Largest number of clusters; by default one for each 400 triangles, 16 to 1000.",
+            help="Largest number of clusters; by default one for each 400 triangles or texels, 16 to 1000.",
         ),
     ] = None,
     degrees: Annotated[
@@ -296,15 +296,21 @@ def cluster(
             "--without-view", help="Leave the samples of this view out, and measure the error with them."
         ),
     ] = None,
+    texels: Annotated[
+        bool,
+        typer.Option("--texels", help="Group the texels of the result instead of its triangles."),
+    ] = False,
     memory: MemoryOption = "2GB",
     as_json: JsonOption = False,
 ) -> None:
     """Find a few materials for all triangles, each from the samples of triangles that look alike. Triangles with
     too few samples borrow a material. Each material also has harmonics of pairs of directions, which assume no
-    model.
+    model. With --texels, find a few materials for all texels: means of the texels that look alike.
     """
 
     def step(say: Said) -> dict[str, Any]:
+        if texels:
+            return _cluster_texels(result, clusters, bytes_of(memory), degrees, without_view, say)
         from coupole.reflectance.result_pages import cluster_page
         from coupole.reflectance.run_clusters import cluster_result
 
@@ -314,6 +320,23 @@ def cluster(
         return {**document, "report": str(cluster_page.write(result, document))}
 
     _do(step, as_json=as_json)
+
+
+def _cluster_texels(
+    result: Path, clusters: int | None, memory_bytes: int, degrees: int, without_view: str | None, say: Said
+) -> dict[str, Any]:
+    """Group texels. Raises InputError for options that only samples of triangles have a meaning for."""
+    from coupole.reflectance.pair_harmonics import USUAL_DEGREES
+    from coupole.reflectance.result_pages import texel_cluster_page
+    from coupole.reflectance.texels.texel_clusters import cluster_texels
+
+    if without_view is not None or degrees != USUAL_DEGREES:
+        raise InputError(
+            "--without-view, --degrees: are for clusters of triangles, which are fitted to samples; clusters of "
+            "texels are means of their materials"
+        )
+    document = cluster_texels(result, clusters, memory_bytes, say=say)
+    return {**document, "report": str(texel_cluster_page.write(result, document))}
 
 
 def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool, closing_words: str = "") -> None:

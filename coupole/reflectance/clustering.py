@@ -30,7 +30,8 @@ _SLANT_COS = math.cos(math.radians(30.0))
 _OFF_DEG = (0.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 """Angles between half vector and normal at which materials are compared; lights and views are 30 degrees from the
 normal."""
-_LEARNT_FROM = 20_000
+LEARNT_FROM = 20_000
+"""Largest number of points from which the centres of clusters are found."""
 _ROUNDS = 10
 _DISTANCES = 1 << 23
 """Number of distances that are computed together."""
@@ -67,15 +68,25 @@ def clusters_of(features: Floats, count: int) -> NDArray[np.int64]:
     gaps."""
     random = np.random.default_rng(0)
     some = features
-    if len(features) > _LEARNT_FROM:
-        some = features[random.choice(len(features), _LEARNT_FROM, replace=False)]
+    if len(features) > LEARNT_FROM:
+        some = features[random.choice(len(features), LEARNT_FROM, replace=False)]
+    numbers = nearest_of(features, centres_of_points(some, count, random))
+    return np.unique(numbers, return_inverse=True)[1].astype(np.int64)
+
+
+def centres_of_points(points: Floats, count: int, random: np.random.Generator) -> Floats:
+    """[at most `count`, n] centres of clusters of the points [b, n], by k-means. A centre may have no point."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of clusters that lost all their points: they are left out
-        centres, _ = kmeans2(some, min(count, len(some)), iter=_ROUNDS, minit="points", rng=random)
+        centres, _ = kmeans2(points, min(count, len(points)), iter=_ROUNDS, minit="points", rng=random)
+    return np.asarray(centres, np.float64)
+
+
+def nearest_of(points: Floats, centres: Floats) -> NDArray[np.int64]:
+    """[b] number of the nearest centre of each of the points [b, n]."""
     step = max(1, _DISTANCES // len(centres))  # vq keeps those of all points to all centres
-    parts = [vq(features[first : first + step], centres)[0] for first in range(0, len(features), step)]
-    numbers = np.concatenate(parts)
-    return np.unique(numbers, return_inverse=True)[1].astype(np.int64)
+    parts = [vq(points[first : first + step], centres)[0] for first in range(0, len(points), step)]
+    return np.concatenate(parts).astype(np.int64)
 
 
 def pool_samples(

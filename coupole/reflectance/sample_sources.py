@@ -147,8 +147,9 @@ class Beside:
 
 
 @lru_cache(maxsize=4)
-def _centres(path: Path) -> tuple[Floats, Floats, cKDTree]:
-    """Return the centres of a view's triangles, mm; the projection centre; and a tree of the centres."""
+def _centres(path: Path, stamp: tuple[int, int]) -> tuple[Floats, Floats, cKDTree]:
+    """Return the centres of a view's triangles, mm; the projection centre; and a tree of the centres. `stamp`, the
+    file's number and time, differs if another result was made in the same folder."""
     with h5py.File(path, "r") as file:
         centres_mm = file["centres_mm"][()]
         return centres_mm, file["camera_mm"][()], cKDTree(centres_mm)
@@ -164,7 +165,8 @@ def triangles_beside(result: RunResult, view: ViewSamples, rows: Integers) -> Be
             raise InputError(f"{view.path}: an earlier version made it; make the result again")
         lateral_u_mm = float(file.attrs["lateral_u_mm"])
     areas_mm2 = result.areas_mm2[view.triangles]
-    centres_mm, camera_mm, tree = _centres(view.path)
+    about_file = view.path.stat()
+    centres_mm, camera_mm, tree = _centres(view.path, (about_file.st_ino, about_file.st_mtime_ns))
     own_centres_mm = centres_mm[rows]
     towards = camera_mm - own_centres_mm
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,10 +10,11 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from relight_cases import waves, write_result
 
 from coupole.errors import InputError
 from coupole.reflectance.extraction.sample_codes import SHADED
-from coupole.reflectance.sample_sources import ChannelSamples, channel_samples
+from coupole.reflectance.sample_sources import ChannelSamples, channel_samples, triangles_beside
 
 SIDE, PITCH_MM = 40, 0.5
 LED_MM = np.array([[0.0, 0.0, 1e6], [3e5, 0.0, 1e6]])
@@ -116,3 +118,14 @@ def test_samples_of_an_earlier_version_are_refused(tmp_path: Path) -> None:
         del file.attrs["lateral_u_mm"]
     with pytest.raises(InputError, match="earlier version"):
         of(made, np.array([0]))
+
+
+def test_a_result_that_is_made_again_in_its_folder_has_its_own_neighbours(tmp_path: Path) -> None:
+    """The second result has fewer triangles; numbers of the first one would not exist in it."""
+    for count in (30, 12):
+        result = write_result(tmp_path / "result", waves(count))
+        (view,) = result.views
+        rows = np.arange(len(view.triangles))
+        neighbours = triangles_beside(result, view, rows).rows
+        assert neighbours.max() < len(rows)
+        shutil.rmtree(tmp_path / "result")

@@ -9,6 +9,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from coupole.pages.maps import colour_picture, eye_map
 from coupole.pages.page_parts import Code, Figure, Page, Section, Table, anchor
@@ -89,20 +90,23 @@ def _notes(document: dict[str, Any]) -> list[str]:
 
 
 def _views(result: RunResult) -> Iterator[tuple[str, Sequence[Figure]]]:
-    """Yield each view's name, its clusters in arbitrary colours on the ground of maps, and their diffuse part."""
+    """Yield each view's name and its `cluster_figures`."""
     clusters = result.clusters
-    colours = np.random.default_rng(5).uniform(0.2, 1.0, (len(clusters.alpha), 3))
-    diffuse = clusters.kd if clusters.kd.shape[1] == 3 else np.repeat(clusters.kd, 3, axis=1)
     for view in result.views:
         with h5py.File(view.path, "r") as file:
             rows = file["seen"][()]
         number = clusters.cluster[np.searchsorted(result.triangles, view.triangles)]
-        numbers = np.where(rows >= 0, number[rows], -1)
-        is_known, name = numbers[..., None] >= 0, view.path.stem
-        yield (
-            name,
-            [
-                colour_picture(f"{name}: clusters, any colours", np.where(is_known, colours[numbers], _GROUND)),
-                eye_map(f"{name}: diffuse kd of the clusters", np.where(is_known, diffuse[numbers], np.nan)),
-            ],
-        )
+        name = view.path.stem
+        yield name, cluster_figures(name, np.where(rows >= 0, number[rows], -1), clusters.kd)
+
+
+def cluster_figures(name: str, numbers: NDArray[np.integer], kd: NDArray[np.floating]) -> Sequence[Figure]:
+    """Return a view's clusters [h, w] (-1 for none) in arbitrary colours on the ground of maps, and their diffuse
+    part; `kd` is [clusters, channels]."""
+    colours = np.random.default_rng(5).uniform(0.2, 1.0, (len(kd), 3))
+    diffuse = kd if kd.shape[1] == 3 else np.repeat(kd, 3, axis=1)
+    is_known = numbers[..., None] >= 0
+    return [
+        colour_picture(f"{name}: clusters, any colours", np.where(is_known, colours[numbers], _GROUND)),
+        eye_map(f"{name}: diffuse kd of the clusters", np.where(is_known, diffuse[numbers], np.nan)),
+    ]

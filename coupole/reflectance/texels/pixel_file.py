@@ -3,6 +3,7 @@ docs/reference/result-folder.md."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,9 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.intake.plain_data import read_json
-from coupole.reflectance.run_result import RunResult, ViewSamples
+from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples
 from coupole.reflectance.texels.texel_size import TexelSize
+from coupole.reflectance.triangle_fit import TriangleMaterials
 
 FOLDER, ABOUT = "texels", "texels.json"
 Singles = NDArray[np.float32]
@@ -142,6 +144,36 @@ def read_view_texels(result: RunResult, view: ViewSamples) -> ViewTexels:
         numbers = file[_OF_PIXEL][()] if _OF_PIXEL in file else None
         texels = ViewTexels(*(file[name][()] for name in _TOLD))
         return replace(texels, texel_of_pixel=numbers, side_px=int(file.attrs.get(_SIDE, 1)))
+
+
+@dataclass(frozen=True)
+class TexelPart:
+    """Materials of some texels of a view, in their order, without their pixels."""
+
+    materials: TriangleMaterials
+    variances: Singles
+    """[n, 3] of the logarithms of kd, ks and alpha."""
+
+
+def count_view_texels(result: RunResult, view: ViewSamples) -> int:
+    """Return the number of a view's texels. Raises InputError if the view has none."""
+    path = texels_path(result, view)
+    if not path.exists():
+        raise _none_of(result, f" of the view {view.view}")
+    with h5py.File(path, "r") as file:
+        return len(file["pixels"])
+
+
+def read_texel_parts(result: RunResult, view: ViewSamples, most_rows: int) -> Iterator[TexelPart]:
+    """Yield a view's texels in parts of at most `most_rows`, so that they never are in memory together."""
+    with h5py.File(texels_path(result, view), "r") as file:
+        for first in range(0, len(file["pixels"]), most_rows):
+            rows = slice(first, first + most_rows)
+            normals, kd, ks, alpha = (
+                file[name][rows].astype(np.float64) for name in ("normals", "kd", "ks", "alpha")
+            )
+            materials = TriangleMaterials(normals, kd, ks, alpha, np.zeros_like(alpha))
+            yield TexelPart(materials, file["covariance"][rows][:, VARIANCES[2:]])
 
 
 def size_of_texels(folder: Path) -> TexelSize | None:

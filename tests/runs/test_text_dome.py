@@ -81,7 +81,7 @@ def test_triggers_are_timed_on_the_hosts_clock(done: tuple[CellFolder, Ended]) -
     triggers_ns = np.array([int(frame.record["t_trigger_ns"]) for frame in frames])
     camera_ns = np.array([int(frame.record["camera_ns"]) for frame in frames])
     assert np.diff(triggers_ns).min() > 20_000_000  # late ones are followed sooner on a busy machine
-    assert np.diff(camera_ns - triggers_ns) == pytest.approx(0, abs=30e6)
+    assert np.ptp(camera_ns - triggers_ns) < 70e6, "a frame is proven only within its light, of 70 ms"
 
 
 def test_the_light_given_is_what_the_lamps_really_shone(done: tuple[CellFolder, Ended]) -> None:

@@ -260,7 +260,7 @@ def test_the_metered_exposure_is_put_into_the_plan(room: Room) -> None:
     assert (work["kind"], work["state"]) == ("meter", "done")
     assert YAML(typ="safe", pure=True).load(room.cell.plan)["exposure"] == {"kind": "fixed", "exposure_us": 8000}
     ada.clicks("[data-name=put]")
-    ada.sees(".q-notification", "plan.yaml has")
+    ada.is_told("plan.yaml has")
     assert YAML(typ="safe", pure=True).load(room.cell.plan)["exposure"] == work["exposure"]
     assert YAML(typ="safe", pure=True).load(room.cell.plan)["object"]["id"] == "relief"
 

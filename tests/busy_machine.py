@@ -6,7 +6,7 @@ import time
 
 _WORK_S = 0.05
 """CPU time of the piece of work: several times as long as a process may run before another one has its turn."""
-_MOST = 8.0
+_MOST = 4.0
 """A world that is slowed down more than this would make a test take minutes."""
 
 

@@ -24,8 +24,8 @@ BOX = {
 
 
 def text_cell(folder: Path, **plan: Any) -> CellFolder:
-    """The small cell with a box of text lines and its 64 LEDs. The host must answer while a light shines, within 60 ms
-    of the world's time. So its world runs at half the pace of life, and slower the busier the machine is."""
+    """The small cell with a box of text lines and its 64 LEDs. The host must answer while a light shines, within
+    60 ms of the world's time. So its world runs at half the pace of life, and slower the busier the machine is."""
     cell = CellFolder(folder, speed=0.5 / slowness(), write_now=False)
     cell.rig_data["ledbox"] = copy.deepcopy(BOX)
     cell.rig_data["dome"]["leds"] = str(cells.REPO / "configs/domes/text-dome.csv")

@@ -178,6 +178,7 @@ def test_without_its_last_mark_a_burst_is_not_proven(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("fault", ["mute_box", pytest.param("cut_wire", marks=pytest.mark.full)])
 def test_a_box_that_is_lost_ends_the_run_with_four_and_names_it(cell: CellFolder, fault: str) -> None:
+    cell.speed = 1.0  # its time-out must come before the session's, on the machine's clock
     cell.join()
     with cell.world() as world:
         process = cell.start_acquire()

@@ -15,6 +15,7 @@ from at_the_console import WIDE, Visitor, assert_usable
 from bench_room import PASSWORD, Room, kill_browser
 from browser import Browser as Window
 from browser import needs_chromium
+from busy_machine import slowness
 from cells import CellFolder
 from ruamel.yaml import YAML
 from selenium.webdriver.common.action_chains import ActionChains
@@ -30,7 +31,9 @@ pytestmark = needs_chromium
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Room]:
-    cell = CellFolder(tmp_path_factory.mktemp("devices"), speed=1.0)
+    """The browser renews a held button within 300 ms of the world's time, so this passes as slowly as the machine is
+    busy."""
+    cell = CellFolder(tmp_path_factory.mktemp("devices"), speed=0.5 / slowness())
     cell.rig_data["console"] = {"at_the_cell": ["127.0.0.1"]}
     cell.rig_data["motion"]["park_joints_deg"] = PARK_DEG
     cell.plan_data["object"]["dose_budget_lux_h"] = BUDGET_LUX_H

@@ -28,8 +28,8 @@ from coupole.preflight.job import Job
 from coupole.storage.arm_faults import faults_of
 
 HOLD_S = 0.3
-"""Time from the last renewal of a motion by hand until it ends, on the machine's clock and on the rig's. They are the
-same, except in a simulated cell: in one that is slow, the arm moves slowly too."""
+"""Time from the last renewal of a motion by hand until it ends, on the machine's clock and on the rig's. They are
+the same, except in a simulated cell: in a slow one the arm moves slowly too."""
 _KEPT_PATHS = 16
 _SAME_PLACE_DEG = 0.05
 

@@ -31,8 +31,7 @@ pytestmark = needs_chromium
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Room]:
-    """The browser renews a held button within 300 ms of the world's time, so the world is as slow as the machine is
-    busy."""
+    """A held button is renewed within 300 ms of the world's time: the world is as slow as the machine is busy."""
     cell = CellFolder(tmp_path_factory.mktemp("devices"), speed=0.5 / slowness())
     cell.rig_data["console"] = {"at_the_cell": ["127.0.0.1"]}
     cell.rig_data["motion"]["park_joints_deg"] = PARK_DEG

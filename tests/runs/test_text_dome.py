@@ -110,7 +110,7 @@ def test_a_dry_run_rehearses_with_the_same_kind_of_box(cell: CellFolder) -> None
     cell.rig_data["robot"]["settings"] = {"listen": "192.0.2.1:49152", "controller": "192.0.2.7"}
     cell.rig_data["world"] = {"serves": "dry_run"}
     cell.write()
-    ended = cell.acquire("--dry-run")
+    ended = cell.acquire("--dry-run", "--speed", str(cell.speed))
     assert ended.code == 0, ended.err
     assert ended.document["proven"] == 8
 

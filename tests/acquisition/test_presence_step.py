@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cells
 import pytest
 from cells import CellFolder, here
 from commissioned_cells import Onlooker
 
+from coupole.acquisition.cell_bench import enabling_switch
 from coupole.acquisition.cell_bench.enabling_switch import EnablingSwitch, ReleasedError
 from coupole.acquisition.commissioning import presence_step
 from coupole.acquisition.commissioning.bench import Bench, Findings, StepFailedError
@@ -92,25 +92,43 @@ def test_the_command_sees_the_simulated_switch_held_and_released(tmp_path: Path)
     assert "the switch was not seen to be released within 30 s" in record
 
 
-def check_for(check: Callable[[], None], seconds: float) -> None:
-    end_s = time.monotonic() + seconds
-    while time.monotonic() < end_s:
-        check()
-        time.sleep(0.005)
+class ClockByHand:
+    """For `enabling_switch.time`: it goes on only when it is told to, and counts who looks at it."""
+
+    def __init__(self) -> None:
+        self.now_s, self.looks = 0.0, 0
+
+    def monotonic(self) -> float:
+        self.looks += 1
+        return self.now_s
+
+    def wait_for_looks(self, count: int) -> None:
+        until = self.looks + count
+        cells.wait_until(lambda: self.looks >= until, "looks at the clock")
 
 
-def test_the_box_is_not_asked_for_a_caller_that_hangs_and_the_motion_goes_on_after_a_rest() -> None:
-    box: Any = Box(held=True)
-    with EnablingSwitch(box, must_exist=True).release_check() as check:
+def test_the_box_is_not_asked_for_a_caller_that_hangs_and_the_motion_goes_on_after_a_rest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock, box = ClockByHand(), Box(held=True)
+    monkeypatch.setattr(enabling_switch, "time", clock)
+    switch: Any = box
+    with EnablingSwitch(switch, must_exist=True).release_check() as check:
         check()
-        time.sleep(0.5)
+        cells.wait_until(lambda: box.asked > 1, "a question for a caller that looks")
+        clock.now_s = 10.0
+        clock.wait_for_looks(3)  # a question may have been under way
         before = box.asked
-        time.sleep(0.2)
+        clock.wait_for_looks(5)
         assert box.asked == before, "a helper must not beat for a thread that hangs"
         check()
-        while box.asked == before:
-            check()
-            time.sleep(0.005)
+        cells.wait_until(lambda: box.asked > before, "a question after a rest")
+        check()
         box.held = False
+
+        def is_unheard_of() -> bool:
+            check()
+            return False
+
         with pytest.raises(ReleasedError, match="was released"):
-            check_for(check, 10.0)
+            cells.wait_until(is_unheard_of, "the news")

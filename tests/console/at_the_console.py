@@ -24,6 +24,19 @@ LOOK_EVERY_S = 0.15
 WIDE, NARROW = (1400, 900), (400, 800)
 _SETTLES_S = 3.0
 _SERIOUS = ("serious", "critical")
+_LISTENS = """
+window.notified = [];
+const heard = new WeakMap();
+new MutationObserver(() => {
+    for (const one of document.querySelectorAll(".q-notification")) {
+        if (one.innerText && heard.get(one) !== one.innerText) {
+            heard.set(one, one.innerText);
+            window.notified.push(one.innerText);
+        }
+    }
+}).observe(document, {childList: true, subtree: true, characterData: true});
+"""
+"""In every page: notes each message at the foot of the screen, which is gone after seconds."""
 
 
 class Visitor:
@@ -32,6 +45,7 @@ class Visitor:
     def __init__(self, browser: Browser, url: str) -> None:
         self.browser, self.driver, self.url = browser, browser.driver, url
         self.prefers("light")
+        self.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": _LISTENS})
 
     def goes_to(self, path: str) -> None:
         self.driver.get(self.url + path)
@@ -63,6 +77,16 @@ class Visitor:
             return ""
 
         return str(cells.wait_until(there, f"{words!r} in {selector}"))
+
+    def is_told(self, words: str) -> None:
+        """Wait for a message at the foot of the screen with these words; it and those before it are done with."""
+        told: list[str] = []
+
+        def there() -> bool:
+            told.extend(self.driver.execute_script("return window.notified.splice(0)"))
+            return any(words in one for one in told)
+
+        cells.wait_until(there, f"the message {words!r}")
 
     def clicks(self, selector: str, words: str = "") -> None:
         """On the first such element that says these words, as soon as it can be clicked."""

@@ -138,7 +138,7 @@ def _writes_a_plan(day: Day) -> None:
     ada.sees(".cell img")
     day.picture("a-plan-drawn")
     ada.clicks("[data-name=save]")
-    ada.sees(".q-notification", "saved")
+    ada.is_told("saved")
     text = (day.folder / "vase.yaml").read_text()
     assert "azimuths_deg: [-90, 90]" in text
     assert "every: 5" in text
@@ -211,7 +211,7 @@ def _goes_on(day: Day) -> None:
 def _stops(day: Day) -> None:
     ada = day.visitor
     ada.clicks("[data-name=stop]")
-    ada.sees(".q-notification", "lights off")
+    ada.is_told("lights off")
     now = day.until("halted")
     assert [entry["state"] for entry in now["queue"]] == ["done", "stopped", "waiting"]
     assert cells.safe(day.world)

@@ -9,9 +9,11 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import cells
 import pytest
+from watchers_clock import WatchersClock
 
 from coupole import bounded
 from coupole.bounded import DISK, NOW, Workers, left_behind, on_disk, under_way
@@ -62,15 +64,23 @@ def test_a_call_that_never_returns_is_given_up_with_its_name(never: threading.Ev
     assert bounded.hangs("robot") == ""
 
 
-def test_who_waits_for_something_else_hears_of_a_call_that_is_given_up(never: threading.Event) -> None:
+def test_who_waits_for_something_else_hears_of_a_call_that_is_given_up(
+    never: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, is_under_way = WatchersClock(), threading.Event()
+    monkeypatch.setattr(bounded, "time", clock)
+
     def hang() -> None:
         with under_way("camera", "next_frame"):
+            is_under_way.set()
             never.wait()
 
-    since_s = time.monotonic()
+    since_s = clock.now_s
     threading.Thread(target=hang, daemon=True).start()
+    assert is_under_way.wait(cells.PATIENCE_S)
+    clock.now_s += 0.9 * bounded.DEVICE_S
     bounded.refuse_overdue(since_s)
-    time.sleep(0.3)
+    clock.now_s += 0.2 * bounded.DEVICE_S
     with pytest.raises(DeviceTimeout, match="next_frame"):
         bounded.refuse_overdue(since_s)
     assert left_behind()
@@ -98,20 +108,6 @@ def test_what_takes_its_time_by_the_work_asked_is_waited_for() -> None:
         return "synced"
 
     assert on_disk("views/top.h5", sync, work_s=20.0) == "synced"
-
-
-class WatchersClock:
-    """For `bounded.time`: it goes on when it is told to, and not before the watcher has looked at it."""
-
-    def __init__(self) -> None:
-        self._now_s = time.monotonic()
-
-    def monotonic(self) -> float:
-        return self._now_s
-
-    def advance(self, seconds: float) -> None:
-        self._now_s += seconds
-        cells.wait_until(lambda: bounded._looked_s[-1] >= self._now_s, "a look at the calls under way")
 
 
 @pytest.mark.parametrize("goes_on", [True, False])
@@ -143,7 +139,8 @@ def test_once_a_session_is_to_end_a_device_has_less_time(never: threading.Event)
         bounded.run_bounded(hang, stop=NOW)
 
 
-def test_a_rescue_may_bring_a_call_back() -> None:
+def test_a_rescue_may_bring_a_call_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bounded, "_BACK_S", cells.PATIENCE_S)
     back = threading.Event()
 
     def hang() -> str:
@@ -206,7 +203,7 @@ def test_a_signal_ends_the_work_as_it_ends_who_waits_for_it() -> None:
             bounded.run_bounded(work)
     finally:
         signal.signal(signal.SIGUSR2, before)
-    assert cleaned.is_set()
+    assert cleaned.wait(cells.PATIENCE_S)
 
 
 def test_workers_do_all_in_turn_and_end() -> None:
@@ -239,26 +236,27 @@ def test_a_process_leaves_with_its_code_and_words_whatever_hangs(what: str) -> N
 
 
 STANDS = """
-import time
+import sys, time
 from coupole import bounded
-bounded.DEVICE_S = 1.0
+bounded.DEVICE_S = 5.0
 def take():
     with bounded.under_way("camera", "next_frame"):
         print("takes", flush=True)
-        for _ in range(12):
-            time.sleep(0.05)
+        sys.stdin.readline()
+        time.sleep(0.3)  # several looks at it
 bounded.run_bounded(take, rescue=lambda: print("given up"))
 """
 
 
 def test_time_in_which_the_process_itself_stood_is_no_hang() -> None:
-    with subprocess.Popen([sys.executable, "-c", STANDS], stdout=subprocess.PIPE, text=True) as process:
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", STANDS], **pipes) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "takes\n"
         process.send_signal(signal.SIGSTOP)
-        time.sleep(2.0)
+        time.sleep(6.0)
         process.send_signal(signal.SIGCONT)
-        assert process.stdout.read() == ""
+        assert process.communicate("\n", timeout=cells.PATIENCE_S)[0] == ""
 
 
 UNHEARD = """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 
+import cells
 import pytest
 
 from coupole.reflectance.parts_in_threads import in_threads
@@ -28,7 +29,7 @@ def test_the_first_part_is_done_before_the_others_begin() -> None:
     def work(first: int) -> None:
         begun_s = time.monotonic()
         if meet:
-            all_at_once.wait(10.0)
+            all_at_once.wait(cells.PATIENCE_S)
         time.sleep(0.02)
         spans.append((first, begun_s, time.monotonic()))
 

@@ -10,6 +10,7 @@ import cells
 import h5py
 import numpy as np
 import pytest
+from busy_machine import slowness
 from cells import SIDE, TOP, CellFolder, Ended
 from expected_pictures import mislabelled
 from text_cells import text_cell
@@ -33,8 +34,14 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellFolder, Ended]:
 
 
 def test_the_plan_that_is_shipped_is_run_to_completeness(tmp_path: Path) -> None:
+    """In a world as slow as the machine is busy."""
+    configs, rig = cells.REPO / "configs", tmp_path / "rig.yaml"
+    words = (configs / "rigs/sim-text-dome.yaml").read_text()
+    words = words.replace("../../runs", str(tmp_path)).replace("../domes", str(configs / "domes"))
+    rig.write_text(words.replace("settings: {seed: 1,", f"settings: {{speed: {0.5 / slowness()}, seed: 1,"))
+    assert "speed: 0." in rig.read_text()
     ended = cells.here(
-        "acquire", cells.REPO / "configs/plans/text-dome.yaml", "--json", "--yes", "--output", tmp_path
+        "acquire", configs / "plans/text-dome.yaml", "--rig", rig, "--json", "--yes", "--output", tmp_path
     )
     assert ended.code == 0, ended.err
     assert (ended.document["shots"], ended.document["proven"], ended.document["frames"]) == (64, 64, 68)
@@ -81,7 +88,7 @@ def test_triggers_are_timed_on_the_hosts_clock(done: tuple[CellFolder, Ended]) -
     triggers_ns = np.array([int(frame.record["t_trigger_ns"]) for frame in frames])
     camera_ns = np.array([int(frame.record["camera_ns"]) for frame in frames])
     assert np.diff(triggers_ns).min() > 20_000_000  # late ones are followed sooner on a busy machine
-    assert np.diff(camera_ns - triggers_ns) == pytest.approx(0, abs=30e6)
+    assert np.ptp(camera_ns - triggers_ns) < 70e6, "a frame is proven only within its light, of 70 ms"
 
 
 def test_the_light_given_is_what_the_lamps_really_shone(done: tuple[CellFolder, Ended]) -> None:
@@ -110,7 +117,7 @@ def test_a_dry_run_rehearses_with_the_same_kind_of_box(cell: CellFolder) -> None
     cell.rig_data["robot"]["settings"] = {"listen": "192.0.2.1:49152", "controller": "192.0.2.7"}
     cell.rig_data["world"] = {"serves": "dry_run"}
     cell.write()
-    ended = cell.acquire("--dry-run")
+    ended = cell.acquire("--dry-run", "--speed", str(cell.speed))
     assert ended.code == 0, ended.err
     assert ended.document["proven"] == 8
 
@@ -178,6 +185,7 @@ def test_without_its_last_mark_a_burst_is_not_proven(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("fault", ["mute_box", pytest.param("cut_wire", marks=pytest.mark.full)])
 def test_a_box_that_is_lost_ends_the_run_with_four_and_names_it(cell: CellFolder, fault: str) -> None:
+    cell.speed = 1.0  # its time-out must come before the session's, on the machine's clock
     cell.join()
     with cell.world() as world:
         process = cell.start_acquire()

@@ -6,13 +6,13 @@ import hashlib
 import shutil
 import subprocess
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import cells
 import pytest
 from archives import MadeRun, make_run
+from watchers_clock import WatchersClock
 
 from coupole import bounded
 from coupole.acquisition import conclusion
@@ -66,6 +66,8 @@ def test_verify_names_a_file_that_was_changed_or_is_gone(made: MadeRun, name: st
 
 def test_a_slow_disk_that_answers_is_waited_for(made: MadeRun, monkeypatch: pytest.MonkeyPatch) -> None:
     """Hashing a run's views took 194 s beside other work, and was called a disk that does not answer."""
+    clock = WatchersClock()
+    monkeypatch.setattr(bounded, "time", clock)
     monkeypatch.setattr(bounded, "DISK_S", 0.8)
     monkeypatch.setattr(conclusion, "_SLOWEST_BYTES_S", 1e12)
     size = max(path.stat().st_size for path in (made.run.folder / manifest.VIEWS).iterdir())
@@ -74,7 +76,7 @@ def test_a_slow_disk_that_answers_is_waited_for(made: MadeRun, monkeypatch: pyte
 
     def slowly(path: Path, stop: threading.Event, on_read: Callable[[], None]) -> str:
         def read() -> None:
-            time.sleep(0.2)
+            clock.advance(0.2)
             on_read()
 
         return hashed(path, stop, read)

@@ -6,7 +6,6 @@ import os
 import pty
 import sys
 import termios
-import time
 from collections.abc import Iterator
 
 import cells
@@ -25,16 +24,27 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
     os.close(outer)
 
 
-def test_a_key_alone_is_obeyed_and_function_keys_and_pasted_text_are_not(terminal: tuple[int, int]) -> None:
+def test_a_key_alone_is_obeyed_and_function_keys_and_pasted_text_are_not(
+    terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     outer, inner = terminal
     modes = termios.tcgetattr(inner)
     pressed: list[str] = []
+    taken: list[bytes] = []
+    read_from = os.read
+
+    def read_and_tell(source: int, most: int) -> bytes:
+        typing = read_from(source, most)
+        taken.extend([typing] if source == inner else [])
+        return typing
+
+    monkeypatch.setattr(os, "read", read_and_tell)
     with keys.key_actions({"p": lambda: pressed.append("p"), "q": lambda: pressed.append("q")}) as read:
         assert read
         assert termios.tcgetattr(inner) != modes
         for typed in (b"\x1bOP", b"\x1bOQ", b"quick\n", b"x", b"pq"):
             os.write(outer, typed)
-            time.sleep(0.1)
+            cells.wait_until(lambda typed=typed: typed in taken, "its being read, before the next is typed")
         assert pressed == []
         for count, typed in enumerate((b"p", b"P", b"q\n"), start=1):
             os.write(outer, typed)

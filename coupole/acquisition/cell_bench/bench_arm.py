@@ -21,13 +21,15 @@ from coupole.acquisition.cell_bench.jog_steps import jog_step
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.operator import refuse_uncommissioned
+from coupole.clock import Clock
 from coupole.errors import DeviceError, DeviceRefused, InputError, Interrupted, PreflightRefused
 from coupole.plan.cell import Cell
 from coupole.preflight.job import Job
 from coupole.storage.arm_faults import faults_of
 
 HOLD_S = 0.3
-"""Time from the last renewal of a motion by hand until it ends."""
+"""Time from the last renewal of a motion by hand until it ends, on the machine's clock and on the rig's. They are
+the same, except in a simulated cell: in a slow one the arm moves slowly too."""
 _KEPT_PATHS = 16
 _SAME_PLACE_DEG = 0.05
 
@@ -122,7 +124,7 @@ class BenchArm:
             return self._renew(request, asking_pid)
         self.refuse_motion()
         self._switch.refuse_released()
-        hold = _Hold(next(self._numbers), request, asking_pid)
+        hold = _Hold(next(self._numbers), request, asking_pid, self._opened.clock)
         about = {"hold": hold.number, "axis": request.axis, "direction": request.direction}
         work = Work(self._control, "jog", about, lambda control: self._go_on(hold, control))
         self._works.begin(work, stops, asking_pid)
@@ -207,18 +209,20 @@ class BenchArm:
 class _Hold:
     """A button that is held."""
 
-    def __init__(self, number: int, request: JogAsked, asking_pid: int) -> None:
+    def __init__(self, number: int, request: JogAsked, asking_pid: int, clock: Clock) -> None:
+        """`clock`: the rig's."""
         self.number, self.asked, self.asking_pid = number, request, asking_pid
         self.work: Work | None = None
         self._ended = ""
-        self._renewed_s = time.monotonic()
+        self._clock = clock
+        self._renewed_s = self._now_s()
 
     def renew(self) -> None:
         """Hold on, unless the hold has lapsed: a request that reaches the bench late, after a freeze, must not
         begin a motion again.
         """
         self._note_lapse()
-        self._renewed_s = time.monotonic()
+        self._renewed_s = self._now_s()
 
     def let_go(self, why: str) -> None:
         """End the hold for this reason, unless it has ended for another."""
@@ -231,5 +235,9 @@ class _Hold:
             raise HoldLostError(self._ended)
 
     def _note_lapse(self) -> None:
-        if not self._ended and time.monotonic() - self._renewed_s > HOLD_S:
+        lasts_s = min(now_s - then_s for now_s, then_s in zip(self._now_s(), self._renewed_s, strict=True))
+        if not self._ended and lasts_s > HOLD_S:
             self._ended = f"it was not renewed for {1e3 * HOLD_S:g} ms"
+
+    def _now_s(self) -> tuple[float, float]:
+        return time.monotonic(), self._clock.now_ns() / 1e9

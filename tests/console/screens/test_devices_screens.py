@@ -15,6 +15,7 @@ from at_the_console import WIDE, Visitor, assert_usable
 from bench_room import PASSWORD, Room, kill_browser
 from browser import Browser as Window
 from browser import needs_chromium
+from busy_machine import slowness
 from cells import CellFolder
 from ruamel.yaml import YAML
 from selenium.webdriver.common.action_chains import ActionChains
@@ -23,14 +24,15 @@ from served import served
 
 HOME_DEG = [0.0, -170.0, 150.0, 0.0, -70.0, 0.0]
 PARK_DEG = [60.0, -170.0, 150.0, 0.0, -70.0, 0.0]
-BUDGET_LUX_H = 0.2
+BUDGET_LUX_H = 0.06
 EXPOSURE_MS = 8.0
 pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Room]:
-    cell = CellFolder(tmp_path_factory.mktemp("devices"), speed=1.0)
+    """A held button is renewed within 300 ms of the world's time: the world is as slow as the machine is busy."""
+    cell = CellFolder(tmp_path_factory.mktemp("devices"), speed=0.5 / slowness())
     cell.rig_data["console"] = {"at_the_cell": ["127.0.0.1"]}
     cell.rig_data["motion"]["park_joints_deg"] = PARK_DEG
     cell.plan_data["object"]["dose_budget_lux_h"] = BUDGET_LUX_H
@@ -260,7 +262,7 @@ def test_the_metered_exposure_is_put_into_the_plan(room: Room) -> None:
     assert (work["kind"], work["state"]) == ("meter", "done")
     assert YAML(typ="safe", pure=True).load(room.cell.plan)["exposure"] == {"kind": "fixed", "exposure_us": 8000}
     ada.clicks("[data-name=put]")
-    ada.sees(".q-notification", "plan.yaml has")
+    ada.is_told("plan.yaml has")
     assert YAML(typ="safe", pure=True).load(room.cell.plan)["exposure"] == work["exposure"]
     assert YAML(typ="safe", pure=True).load(room.cell.plan)["object"]["id"] == "relief"
 
@@ -272,7 +274,7 @@ def test_live_pictures_end_at_a_stop_and_light_beyond_the_budget_is_refused(room
     first = ada.sees("[data-name=picture]", "Picture")
     cells.wait_until(lambda: ada.sees("[data-name=picture]") != first, "the next picture by itself")
     ada.clicks("[data-name=stop]")
-    ada.sees("[data-name=picture]", "Live is off: stopped")
+    assert "Live is off: stopped" in ada.sees("[data-name=picture]", "Live is off")
     lit_s = room.lit_s(500)
     time.sleep(0.4)
     assert room.lit_s(500) == lit_s

@@ -214,7 +214,7 @@ def test_an_engineer_keeps_people_and_makes_a_bundle(house: House) -> None:
     assert roles == {"Ada": "operator", "Eve": "operator", "Grace": "engineer"}
     ada.clicks("[data-name=remove-Grace]")
     ada.clicks("[role=dialog] [data-name=yes]")
-    ada.sees(".q-notification", "last engineer")
+    ada.is_told("last engineer")
     ada.clicks(".q-notification.bg-negative button")
     ada.clicks("[data-name=make-bundle]")
     name = ada.sees("[data-name=bundle]", "zip")

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from coupole.kernels.lanes import LANES
 from coupole.reflectance.extraction.extraction import Geometry
+from coupole.reflectance.extraction.lamp_sight import Facets
 from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import Radiometry, Response, SignalReader
 from coupole.reflectance.extraction.sample_codes import AWAY
@@ -47,26 +48,39 @@ class PixelBlock:
     (`fill_pixels`); NaN for pixels that are clipped or in shadow."""
 
 
-class PixelReader:
-    """A view's pixels, ready for its frames; `samples` is its file in a result that has its fits."""
+@dataclass(frozen=True)
+class FittedView:
+    """A view of a run whose triangles have fits, for reading its frames again."""
 
-    def __init__(
-        self,
-        measured_run: MeasuredRun,
-        geometry: Geometry,
-        radiometry: Radiometry,
-        view: MeasuredView,
-        surface: Surface,
-        samples: ViewSamples,
-    ) -> None:
+    measured_run: MeasuredRun
+    geometry: Geometry
+    radiometry: Radiometry
+    view: MeasuredView
+    surface: Surface
+    samples: ViewSamples
+    """Its file in the result that has the fits."""
+
+    @property
+    def facets(self) -> Facets:
+        """The triangles that the view sees."""
+        return self.geometry.of(self.samples.triangles)
+
+
+class PixelReader:
+    """A view's pixels, ready for its frames."""
+
+    def __init__(self, fitted_view: FittedView) -> None:
+        surface, samples = fitted_view.surface, fitted_view.samples
         self._samples = samples
         self.triangle_of_pixel = surface.triangle_of_pixel
         """[h, w] for each pixel the row, in the view's file, of the triangle that it sees; -1 for none."""
         self.mesh_normals = surface.normals
         """[triangles, 3]"""
         self._places_mm = surface.places_mm.reshape(-1, 3)
-        self._reader = SignalReader(radiometry, SeenSurface(surface.triangle_of_pixel, samples.triangles))
-        self._pass = ViewPass(measured_run, view, geometry.of(samples.triangles), self._reader)
+        self._reader = SignalReader(
+            fitted_view.radiometry, SeenSurface(surface.triangle_of_pixel, samples.triangles)
+        )
+        self._pass = ViewPass(fitted_view.measured_run, fitted_view.view, fitted_view.facets, self._reader)
         self._response = self._reader.response._replace(least_dn=np.float32(-np.inf))
         """Response without a lower limit: if pixels that noise has darkened were left out, the mean would be too
         bright."""

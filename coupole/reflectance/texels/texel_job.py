@@ -38,7 +38,7 @@ from coupole.reflectance.texels.pixel_file import (
     texels_path,
     write_view_texels,
 )
-from coupole.reflectance.texels.pixel_values import PixelReader
+from coupole.reflectance.texels.pixel_values import FittedView, PixelReader
 from coupole.reflectance.texels.texel_check import check_texels
 from coupole.reflectance.texels.texel_grid import pixel_mm, texel_grid
 from coupole.reflectance.texels.texel_size import TexelSize
@@ -131,9 +131,9 @@ def _texels_of_one(token: str, sources: Sources, threads: int | None, say: Said,
     )  # fmt: skip
     of_run, u_pixel = (measured_run, geometry, radiometry, view), radiometry.u_pixel
     if side_px == 1:
-        texels = texels_of_view(result, samples, PixelReader(*of_run, surface, samples), *fit_with)
+        texels = texels_of_view(result, samples, PixelReader(FittedView(*of_run, surface, samples)), *fit_with)
     else:
-        reader = TexelReader(*of_run, surface, samples, texel_grid(surface, side_px))
+        reader = TexelReader(FittedView(*of_run, surface, samples), texel_grid(surface, side_px))
         texels = texels_of_grid(result, samples, reader, *fit_with)
         u_pixel = u_pixel / np.sqrt(reader.pixels_of_channels)
     head = TexelFileHead(

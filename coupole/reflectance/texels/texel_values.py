@@ -17,17 +17,13 @@ from numpy.typing import NDArray
 
 from coupole.kernels import kernel
 from coupole.kernels.lanes import LANES
-from coupole.reflectance.extraction.extraction import Geometry
-from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
 from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
 from coupole.reflectance.extraction.sample_codes import REACHED
 from coupole.reflectance.extraction.sample_kernel import NO_VALUE
 from coupole.reflectance.extraction.seen_surface import SeenSurface
 from coupole.reflectance.extraction.view_samples import ViewPass
-from coupole.reflectance.new_light.pictured_surface import Surface
 from coupole.reflectance.parts_in_threads import first_alone
-from coupole.reflectance.run_result import ViewSamples
-from coupole.reflectance.texels.pixel_values import LitPixels, fill_rows, light_of
+from coupole.reflectance.texels.pixel_values import FittedView, LitPixels, fill_rows, light_of
 from coupole.reflectance.texels.texel_grid import TexelGrid
 
 _TEXELS = 1 << 13
@@ -51,21 +47,13 @@ class TexelBlock:
 
 
 class TexelReader:
-    """A view's texels, ready for its frames; `samples` is its file in a result that has its fits."""
+    """A view's texels, ready for its frames."""
 
-    def __init__(
-        self,
-        measured_run: MeasuredRun,
-        geometry: Geometry,
-        radiometry: Radiometry,
-        view: MeasuredView,
-        surface: Surface,
-        samples: ViewSamples,
-        grid: TexelGrid,
-    ) -> None:
-        self._run, self._view, self._radiometry = measured_run, view, radiometry
-        self._facets = geometry.of(samples.triangles)
-        self._triangle_of_pixel, self._samples = surface.triangle_of_pixel, samples
+    def __init__(self, fitted_view: FittedView, grid: TexelGrid) -> None:
+        self._run, self._view, surface = fitted_view.measured_run, fitted_view.view, fitted_view.surface
+        self._radiometry = radiometry = fitted_view.radiometry
+        self._facets, self._samples = fitted_view.facets, fitted_view.samples
+        self._triangle_of_pixel = surface.triangle_of_pixel
         self._seen_mm = surface.places_mm.reshape(-1, 3)
         self.mesh_normals = surface.normals
         """[triangles, 3]"""

@@ -35,7 +35,7 @@ from coupole.preflight.job import Job, read_job  # noqa: E402
 from coupole.reflectance.next_views.next_views import NextViews  # noqa: E402
 from coupole.reflectance.next_views.supposed_surface import supposed_surface  # noqa: E402
 from coupole.reflectance.suggestion.drawn_triangles import MeshParts  # noqa: E402
-from coupole.reflectance.suggestion.rehearsal import drawn_samples  # noqa: E402
+from coupole.reflectance.suggestion.rehearsal import PlannedFrames, drawn_samples  # noqa: E402
 from coupole.reflectance.suggestion.supposed_materials import SUPPOSED, SupposedMaterial  # noqa: E402
 from coupole.reflectance.suggestion.supposed_signal import SeenParts, seen_by  # noqa: E402
 from coupole.reflectance.triangle_fit import fit_triangles  # noqa: E402
@@ -102,10 +102,10 @@ class Judge:
             self._surface,
             self._triangles,
             np.stack([noise.drawn_pixels(self._pixels[name], random) for name in names]),
-            [self.seen_parts[name] for name in names],
+            PlannedFrames(
+                [self.seen_parts[name] for name in names], self._job.plan.exposure.exposures_us, self._rows
+            ),
             material,
-            self._job.plan.exposure.exposures_us,
-            self._rows,
             random,
         )
         materials = fit_triangles(samples, np.ones(len(samples.led_mm), np.bool_), _MESH_NOISE_UM)

@@ -81,12 +81,12 @@ def ignore_from_now() -> None:
 def signal_behind(error: BaseException) -> SignalReceived | None:
     """Return the SignalReceived that caused an error, if there is one. Compiled code that is interrupted raises a
     SystemError in its place."""
-    seen: list[BaseException] = []
+    causes: list[BaseException] = []
     cause: BaseException | None = error
-    while cause is not None and cause not in seen:
+    while cause is not None and cause not in causes:
         if isinstance(cause, SignalReceived):
             return cause
-        seen.append(cause)
+        causes.append(cause)
         cause = cause.__cause__ or cause.__context__
     return None
 

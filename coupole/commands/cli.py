@@ -231,8 +231,8 @@ def _exit_code_of_command() -> int:
     except CoupoleError as error:
         _say(error)
         code = error.exit_code
-    except SignalReceived as received:
-        code = _code_of_signal(received)
+    except SignalReceived as signal_error:
+        code = _code_of_signal(signal_error)
     except typer.Abort:
         code = Interrupted.exit_code
     except ImportError as error:
@@ -241,8 +241,8 @@ def _exit_code_of_command() -> int:
         if hasattr(error, "exit_code") and hasattr(error, "show"):
             error.show()
             code = error.exit_code
-        elif interrupted := signal_behind(error):
-            code = _code_of_signal(interrupted)
+        elif cause := signal_behind(error):
+            code = _code_of_signal(cause)
         elif isinstance(error, OSError) and (why := text_outlet.full_stdout()):
             code = _not_taken(why)
         else:
@@ -254,10 +254,10 @@ def _exit_code_of_command() -> int:
     return int(code or 0)
 
 
-def _code_of_signal(received: SignalReceived) -> int:
+def _code_of_signal(error: SignalReceived) -> int:
     """Print that a signal has stopped the command; return the exit code. With `--json` the document says it too,
     unless the command has printed one."""
-    interruption = Interrupted("stopped", received.number)
+    interruption = Interrupted("stopped", error.number)
     text_outlet.lead_blocked_nowhere(text_outlet.PATIENCE_S)
     if "--json" in sys.argv and not text_outlet.has_written_stdout():
         fail(interruption, as_json=True)

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import typer
 from typer.core import TyperGroup
 
+from coupole.acquisition.signals import SignalReceived
 from coupole.commands.completion import plans, runs
-from coupole.errors import CoupoleError, InputError
+from coupole.errors import CoupoleError, InputError, Interrupted
 
 if TYPE_CHECKING:
     from coupole.plan.cell import Cell
@@ -104,8 +105,10 @@ def person_named(name: str, person_role: str) -> str:
     return person
 
 
-def fail(error: CoupoleError, *, as_json: bool, figures: dict[str, Any] | None = None) -> None:
+def fail(error: CoupoleError | SignalReceived, *, as_json: bool, figures: dict[str, Any] | None = None) -> None:
     """Print an error as JSON if `as_json`; the caller raises it afterwards."""
+    if isinstance(error, SignalReceived):
+        error = Interrupted("stopped", error.number)
     if as_json:
         document = {
             **(figures or {}),

@@ -24,7 +24,7 @@ from coupole.commands.common import (
     served_cell,
 )
 from coupole.commands.completion import runs
-from coupole.errors import CoupoleError, Interrupted
+from coupole.errors import CoupoleError
 from coupole.plan.shipped_files import SIMULATED_CELL, file_of
 
 if TYPE_CHECKING:
@@ -105,11 +105,8 @@ def acquire(
                 job = read_job(plan or plan_of(resume), rig)
                 wanted_session = SessionRequest(output, resume, confirm=not yes, with_mesh=with_mesh)
                 _acquire_here(job, console, wanted_session, (result, reflectance), summary, starting)
-    except CoupoleError as error:
+    except (CoupoleError, SignalReceived) as error:
         fail(error, as_json=as_json, figures=summary)
-        raise
-    except SignalReceived as received:
-        fail(Interrupted("stopped", received.number), as_json=as_json, figures=summary)
         raise
     if as_json:
         print(json.dumps(summary))

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from coupole.reflectance.suggestion.drawn_triangles import DrawnTriangles, MeshParts
-from coupole.reflectance.suggestion.rehearsal import rehearse
+from coupole.reflectance.suggestion.rehearsal import PlannedFrames, rehearse
 from coupole.reflectance.suggestion.supposed_materials import SUPPOSED
 from coupole.reflectance.suggestion.supposed_signal import CameraNoise, SeenParts, Surface
 
@@ -73,7 +73,9 @@ def test_a_wrong_pose_moves_pixels_to_the_neighbour(shift_mm: float) -> None:
     pixels = np.full(len(triangles.numbers), 4)
     shares = []
     for shift in shift_mm * np.eye(2):  # along the two axes of the picture
-        seen = triangles.seen_normals(view(0.5), pixels, shift, np.random.default_rng(1))
+        seen = triangles.seen_normals(
+            view(0.5), pixels, np.tile(shift, (len(pixels), 1)), np.random.default_rng(1)
+        )
         shares.append(np.mean(np.sum(seen * triangles.normals[:, None], axis=2) < 0.999))
     assert math.hypot(*shares) == pytest.approx(shift_mm, abs=0.03)
 
@@ -82,7 +84,7 @@ def test_one_pixel_sees_one_place() -> None:
     triangles = of_middle(one_part(roof()))
     count = len(triangles.numbers)
     seen = triangles.seen_normals(
-        view(0.5), np.ones(count, np.int64), np.array([0.3, 0.3]), np.random.default_rng(1)
+        view(0.5), np.ones(count, np.int64), np.full((count, 2), 0.3), np.random.default_rng(1)
     )
     assert np.ptp(seen, axis=1).max() == 0.0
 
@@ -103,7 +105,7 @@ def test_the_share_that_is_known_is_that_of_triangles_with_pixels() -> None:
     cameras_mm = [CAMERA_MM, CAMERA_MM + np.array((150.0, 0.0, 0.0))]
     views = [view(mean_mm2, camera_mm) for camera_mm in cameras_mm]
     rows = np.arange(len(lamps()))
-    rehearsal = rehearse(surface(mean_mm2), mesh, views, SUPPOSED["glossy"], (1000,), rows, 30.0)
+    rehearsal = rehearse(surface(mean_mm2), mesh, PlannedFrames(views, (1000,), rows), SUPPOSED["glossy"], 30.0)
     seen_once = 1.0 - (1.0 - 0.005 * PIXELS_PER_MM2) ** 2
     assert rehearsal.known_share == pytest.approx((100 + 200 * seen_once) / 300, abs=0.05)
 
@@ -115,6 +117,6 @@ def test_a_pose_with_noise_makes_materials_of_a_rough_mesh_less_certain() -> Non
     rows, medians = np.arange(len(lamps())), []
     for u_pose_mm in (0.0, 0.3):
         of_rough = surface(0.5, u_pose_mm)
-        rehearsal = rehearse(of_rough, mesh, views, SUPPOSED["metal"], (1000,), rows, 30.0)
+        rehearsal = rehearse(of_rough, mesh, PlannedFrames(views, (1000,), rows), SUPPOSED["metal"], 30.0)
         medians.append(float(np.nanmedian(rehearsal.uncertainty["alpha_percent"])))
     assert medians[1] > 1.5 * medians[0]

@@ -19,7 +19,7 @@ from coupole.reflectance.next_views.next_views import NextViews
 from coupole.reflectance.next_views.supposed_surface import supposed_surface
 from coupole.reflectance.next_views.view_trials import Trials, trials_of
 from coupole.reflectance.suggestion.drawn_triangles import MeshParts
-from coupole.reflectance.suggestion.rehearsal import drawn_samples
+from coupole.reflectance.suggestion.rehearsal import PlannedFrames, drawn_samples
 from coupole.reflectance.suggestion.supposed_materials import SUPPOSED
 from coupole.reflectance.suggestion.supposed_signal import seen_by
 from coupole.reflectance.triangle_fit import fit_triangles
@@ -99,7 +99,7 @@ def test_fits_to_chosen_views_are_at_most_a_little_worse_than_to_spread_ones(job
         random = np.random.default_rng(1)
         drawn = np.stack([surface.noise.drawn_pixels(pixels[name], random) for name in names])
         views = [seen[name] for name in names]
-        samples = drawn_samples(surface, triangles, drawn, views, truth, (8000,), rows, random)
+        samples = drawn_samples(surface, triangles, drawn, PlannedFrames(views, (8000,), rows), truth, random)
         fitted = fit_triangles(samples, np.ones(len(samples.led_mm), np.bool_), 30.0)
         wrong = [fitted.kd[:, 0] / truth.kd, fitted.ks[:, 0] / truth.ks, fitted.alpha / truth.alpha]
         errors = np.abs(np.array(wrong) - 1.0)

@@ -124,8 +124,8 @@ class DrawnTriangles:
         self, view: SeenParts, pixels: NDArray[np.int64], shift_mm: Floats, random: np.random.Generator
     ) -> Floats:
         """[n, PLACES, 3] unit normals at the places that a triangle's pixels really see. The pose of the view is
-        wrong: everything lies `shift_mm` [2] beside its supposed place, across the line of sight. So some pixels
-        see a neighbouring triangle. `pixels` [n] is the number of pixels; one pixel has one place."""
+        wrong: a triangle lies `shift_mm` [n, 2] beside its supposed place, across the line of sight. So some
+        pixels see a neighbouring triangle. `pixels` [n] is the number of pixels; one pixel has one place."""
         count = len(self.numbers)
         shares = random.dirichlet(np.ones(3), (count, PLACES))
         place_of = np.arange(PLACES)[None] % np.clip(pixels, 1, PLACES)[:, None]
@@ -134,10 +134,10 @@ class DrawnTriangles:
         places_mm = np.einsum("npc,nck->npk", shares, corners_mm)
         ways = self._to(view.camera_mm)
         across, along = _axes_across(ways.mean(axis=0))
-        shift = shift_mm[0] * across + shift_mm[1] * along
+        shift = shift_mm @ np.stack([across, along])
         steep = np.sum(ways * self.normals, axis=1)
         steep = np.where(np.abs(steep) > LEAST_COSINE, steep, LEAST_COSINE)
-        places_mm += (shift - ways * ((self.normals @ shift) / steep)[:, None])[:, None]
+        places_mm += (shift - ways * (np.sum(self.normals * shift, axis=1) / steep)[:, None])[:, None]
         numbers = np.repeat(self.numbers[:, None], PLACES, axis=1)
         is_outside = ~_are_inside(places_mm, corners_mm[:, None])
         if is_outside.any():

@@ -29,7 +29,7 @@ from coupole.preflight.preflight import Report, StorageFacts
 from coupole.reflectance.suggestion.candidate_views import Candidate, candidates_of
 from coupole.reflectance.suggestion.drawn_triangles import MeshParts
 from coupole.reflectance.suggestion.plan_text import PlanText
-from coupole.reflectance.suggestion.rehearsal import Rehearsal, rehearse
+from coupole.reflectance.suggestion.rehearsal import PlannedFrames, Rehearsal, rehearse
 from coupole.reflectance.suggestion.supposed_materials import SupposedMaterial, supposed_materials
 from coupole.reflectance.suggestion.supposed_signal import SupposedCell, signal_quantile
 from coupole.reflectance.suggestion.view_choice import ViewChoice, choose_views
@@ -327,17 +327,10 @@ class _Trial:
         led_rows = self._order[: self._fitted_numbers[settings.leds]]
         corners_mm = job.shape.corners_mm
         mesh = MeshParts(corners_mm, job.motion.occlusions.patches.of_triangles(len(corners_mm)))
+        frames = PlannedFrames(parts_of_views, settings.exposures_us, led_rows)
         rehearsals = {}
         for number, (name, material) in enumerate(self._materials.items(), start=1):
-            rehearsals[name] = rehearse(
-                self._surface,
-                mesh,
-                parts_of_views,
-                material,
-                settings.exposures_us,
-                led_rows,
-                self._request.scan_noise_um,
-            )
+            rehearsals[name] = rehearse(self._surface, mesh, frames, material, self._request.scan_noise_um)
             self._say("samples that are drawn, and their fits", number, len(self._materials))
         views = [self._candidates[view].view for view in choice.views]
         suggestion = Suggestion(

@@ -37,6 +37,16 @@ triangle with too few samples for a material."""
 
 
 @dataclass(frozen=True)
+class PlannedFrames:
+    """Frames of views, each under the same LEDs and with the same exposures."""
+
+    views: Sequence[SeenParts]
+    exposures_us: Sequence[int]
+    led_rows: NDArray[np.int64]
+    """[leds] rows of the dome's table."""
+
+
+@dataclass(frozen=True)
 class Rehearsal:
     """The expected uncertainty for a supposed material."""
 
@@ -57,15 +67,14 @@ class Rehearsal:
 def rehearse(
     surface: Surface,
     mesh: MeshParts,
-    views: Sequence[SeenParts],
+    frames: PlannedFrames,
     material: SupposedMaterial,
-    exposures_us: Sequence[int],
-    led_rows: NDArray[np.int64],
     noise_um: float,
     *,
     seed: int = 1,
 ) -> Rehearsal:
-    """Return the uncertainty of a mesh after these views under these LEDs (rows of the dome's table)."""
+    """Return the uncertainty of a mesh, with vertices of this uncertainty, from the frames that are frames."""
+    views, led_rows = frames.views, frames.led_rows
     random, channels = np.random.default_rng(seed), surface.signal_upright.shape[2]
     triangles = mesh.drawn(_MOST_DRAWN, random)
     mean_pixels = np.stack([triangles.pixels(surface, view) for view in views])
@@ -77,7 +86,7 @@ def rehearse(
     if len(shown) > most:
         shown = np.sort(random.choice(shown, most, replace=False))
     triangles, pixels = triangles.only(shown), pixels[:, shown]
-    samples = drawn_samples(surface, triangles, pixels, views, material, exposures_us, led_rows, random)
+    samples = drawn_samples(surface, triangles, pixels, frames, material, random)
     mask = np.ones(len(samples.led_mm), np.bool_)
     materials = fit_triangles(samples, mask, noise_um)
     uncertainty = covariances(
@@ -98,27 +107,26 @@ def drawn_samples(
     surface: Surface,
     triangles: DrawnTriangles,
     pixels: NDArray[np.int64],
-    views: Sequence[SeenParts],
+    frames: PlannedFrames,
     material: SupposedMaterial,
-    exposures_us: Sequence[int],
-    led_rows: NDArray[np.int64],
     random: np.random.Generator,
 ) -> TriangleSamples:
     """Return samples of the triangles. The places and the power of the LEDs, and the poses of the views, have
     errors against the records. `pixels` [views, n, channels] are the pixels of each triangle; without a pixel of a
     channel, there is no sample of it."""
+    views, led_rows = frames.views, frames.led_rows
     leds_mm, channels = surface.leds_mm[led_rows], surface.signal_upright.shape[2]
     true_leds_mm = leds_mm + surface.u_led_mm * random.standard_normal(leds_mm.shape)
     own_power = 1.0 + surface.u_own[led_rows] * random.standard_normal(len(led_rows))
     upright, count = surface.signal_upright[triangles.parts][:, led_rows], len(triangles.parts)
     values = np.full((count, len(views), len(led_rows), channels), np.nan, np.float32)
     for number, (view, channel_pixels) in enumerate(zip(views, pixels, strict=True)):
-        shift_mm = surface.u_pose_mm * random.standard_normal(2)
+        shift_mm = surface.u_pose_mm * random.standard_normal((count, 2))
         normals = triangles.seen_normals(view, channel_pixels.sum(axis=1), shift_mm, random)
         is_lit = view.is_lit[triangles.parts][:, led_rows] & _faces(triangles, leds_mm)
         samples = seen_samples(triangles.points_mm, normals, view.camera_mm, true_leds_mm, is_lit, material)
         variances = surface.noise.relative_variances(
-            upright * samples[:, :, None], channel_pixels[:, None].astype(np.float64), exposures_us
+            upright * samples[:, :, None], channel_pixels[:, None].astype(np.float64), frames.exposures_us
         )
         variances[~np.isfinite(variances)] = np.nan
         noisy = 1.0 + np.sqrt(variances) * random.standard_normal(variances.shape)

@@ -51,7 +51,7 @@ def checked_target(
 def checked_speed(speed: float) -> float:
     """Return a share of the driver's speeds. Raises DeviceRefused for any other number."""
     if not 0.0 < speed <= 1.0:
-        raise refusal("a speed above 0, at most 1, as a share of the arm's", f"got {speed!r}")
+        raise refusal("a speed above 0 and at most 1, as a share of the arm's greatest speed", f"got {speed!r}")
     return float(speed)
 
 

@@ -79,7 +79,9 @@ def size(room: str) -> int:
     """Lines of Python."""
     names = CONTRACTS if room == "contracts" else (room,)
     places = [ROOT / name if name in BESIDE else ROOT / "coupole" / name for name in names]
-    files = [file for place in places for file in (*place.rglob("*.py"), place.with_suffix(".py")) if file.exists()]
+    files = [
+        file for place in places for file in (*place.rglob("*.py"), place.with_suffix(".py")) if file.exists()
+    ]
     return sum(path.read_text(encoding="utf-8").count("\n") for path in files)
 
 

@@ -240,8 +240,10 @@ class BurstRunner:
                 raise DeviceTimeout(
                     "led box",
                     expected=f"a step of the burst every {1e3 * step_s:.0f} ms",
-                    happened=f"none came for {next_step.seconds:.1f} s; "
-                    f"{len(running.log)} of {len(burst.table)} are in its log",
+                    happened=(
+                        f"none came for {next_step.seconds:.1f} s; {len(running.log)} of {len(burst.table)} "
+                        "steps are in its log"
+                    ),
                     remedy="Check the box, then resume the run.",
                 )
             clock.sleep(_pause_s((ends_ns - clock.now_ns()) / 1e9))

@@ -111,7 +111,7 @@ def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, 
             raise InputError(
                 f"{path}: holds for a focus of {holds.focus_distance_mm:g} mm, within "
                 f"{holds.focus_tolerance_mm:g} mm; the images were taken at {about.focus_distance_mm:g} mm. "
-                "Name the record of this focus"
+                "Name a record that was made at this focus"
             )
     for label, valid, figure in (
         ("focal length", holds.focal_length_mm, about.focal_length_mm),

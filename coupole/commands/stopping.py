@@ -201,7 +201,10 @@ class _Stopping:
         for pid, name in starting.items():
             if waited_s > _SAID_AFTER_S and pid not in self._told_pids:
                 self._told_pids.add(pid)
-                _alarm(f"{name} is just starting: waiting until it can be stopped, or is known not to be meant")
+                _alarm(
+                    f"{name} is just starting: waiting until it can be stopped, or until it is known that "
+                    "another session was meant"
+                )
         if starting:
             time.sleep(_STARTING_EVERY_S)
 

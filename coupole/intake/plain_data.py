@@ -109,7 +109,7 @@ def yaml_of(text: str, name: str, *, line: int = 1) -> Any:
         raise InputError([Problem(name, line, 1, "", f"nested deeper than {MAX_DEPTH} levels")]) from error
     except (YAMLError, ValueError, OverflowError, TypeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise NotDataError([Problem(name, line, 1, "", f"is no YAML of plain data: {reason}")]) from error
+        raise NotDataError([Problem(name, line, 1, "", f"is not YAML of plain data: {reason}")]) from error
 
 
 def _values(node: Any, known_counts: dict[int, int]) -> int:

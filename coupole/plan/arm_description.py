@@ -186,7 +186,7 @@ def _body_problems(document: Document, description: ArmDescription, at: KeyPath)
     problems, links = [], {TOOL: 7}
     for k, link in enumerate(description.links):
         if link.name in links:
-            message = f"expected a name of its own, `{link.name}` is taken"
+            message = f"expected a different name for each link; `{link.name}` is taken"
             problems.append(document.problem((*at, "links", k, "name"), message))
         links[link.name] = link.link
     for number in sorted(set(range(1, 7)) - set(links.values())):

@@ -240,8 +240,9 @@ def refuse_beyond(bound: Sequence[Burst], bursts: Sequence[Burst]) -> None:
     allowed_frames = sum(label is not None for burst in bound for label in burst.labels)
     if too_long or frames > allowed_frames or len(bursts) > len(bound):
         raise RuntimeError(
-            f"{bound[0].view}: {len(bursts)} bursts with {frames} frames were chosen, where preflight has checked "
-            f"{len(bound)} with {allowed_frames}; LEDs that would be lit for longer: {sorted(too_long)[:5]}"
+            f"{bound[0].view}: {len(bursts)} bursts with {frames} frames were chosen, where preflight has "
+            f"checked {len(bound)} with {allowed_frames}; LEDs that would be lit for longer: "
+            f"{sorted(too_long)[:5]}"
         )
 
 

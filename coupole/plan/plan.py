@@ -282,7 +282,10 @@ class Plan(Model):
         if not isinstance(self.exposure, FixedExposure) or self.repeats > 1:
             raise ValueError("`exposure: {kind: fixed}` and `repeats: 1` with `lights: {kind: adaptive}`")
         if any(isinstance(view.lights or self.lights, NoLights | Panels) for view in self.view_entries):
-            raise ValueError("LEDs in each view with `lights: {kind: adaptive}` in one; no panels, no darks alone")
+            raise ValueError(
+                "LEDs in each view, if one view has `lights: {kind: adaptive}`; panels or dark frames alone are "
+                "not allowed"
+            )
         return self
 
     @model_validator(mode="after")

@@ -223,11 +223,13 @@ def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -
     shortest_times_us = [a.shortest_us for a in advices if a.object_share]
     shortest_us = max(shortest_times_us, default=brightest_us)
     if brightest_us < low_us:
-        remarks.append(f"even {low_us} us saturate more than allowed: close the aperture or dim the lights")
+        remarks.append(
+            f"even with {low_us} us, more pixels are saturated than allowed: close the aperture or dim the lights"
+        )
     if shortest_us > high_us:
         remarks.append(
-            f"even {high_us} us are too short for the required signal-to-noise ratio: "
-            "open the aperture or raise the gain"
+            f"even {high_us} us is too short for the required signal-to-noise ratio: open the aperture or raise "
+            "the gain"
         )
     first = _rounded_us(min(max(min(shortest_us, brightest_us), low_us), high_us), up=shortest_us <= brightest_us)
     if shortest_us <= brightest_us:

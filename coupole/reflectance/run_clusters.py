@@ -70,7 +70,9 @@ def cluster_result(
     most = int(np.count_nonzero(is_fitted))
     count = count or int(np.clip(most // USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS))
     if most < count:
-        raise InputError(f"--clusters: expected at most {most}, the triangles with a material; got {count}")
+        raise InputError(
+            f"--clusters: expected at most {most}, the number of triangles with a material; got {count}"
+        )
     cluster = np.full(len(is_fitted), -1, np.int64)
     cluster[is_fitted] = clusters_of(looks(materials.at(np.flatnonzero(is_fitted))), count)
     members = np.bincount(cluster[is_fitted])

@@ -65,7 +65,7 @@ def reason_to_keep(run: Run, view: str) -> str:
         return "the plan does not say `discard: after_fit`"
     events = list(journal.read_events(run.journal_path))
     if any(isinstance(event, FindingNoted) and event.view == view for event in events):
-        return "something was found in it while it was taken, and its frames are marked"
+        return "a disturbance was found while it was taken, and its frames are marked"
     if incomplete := incomplete_until(run, view):
         return f"the view {incomplete} is not complete"
     if not _is_finished(events, view):
@@ -151,7 +151,7 @@ def append_to_journal(run: Run) -> Callable[[FramesDiscarded], None]:
 def _layout(path: Path) -> Layout:
     layout = frame_file.read_layout(path)
     if layout.is_archived:
-        raise StorageError(f"{path}: is archived; its frames stay")
+        raise StorageError(f"{path}: is archived, so its frames are not discarded")
     return layout
 
 

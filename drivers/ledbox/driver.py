@@ -286,7 +286,7 @@ class LedBox:
 
     def _start(self, payload: bytes, table: NDArray[np.void]) -> None:
         if payload not in self._banks:
-            self._refuse("a loaded table", "neither bank holds this one", "Call load() first.")
+            self._refuse("a loaded table", "neither bank holds this table", "Call load() first.")
         bank = self._banks.index(payload)
         if self._crc(bank) != zlib.crc32(payload):
             self._upload(bank, payload)

@@ -60,7 +60,7 @@ def emergency_stop(bench: Bench) -> None:
     except DeviceError as error:
         is_accepted = False
         findings.remarks.append(f"a motion was refused: {error}")
-    findings.at_most("motions that are accepted after the emergency stop", int(is_accepted), 0, "")
+    findings.at_most("motions that were accepted after the emergency stop", int(is_accepted), 0, "")
     bench.opened.clock.sleep(_WATCHED_S)
     further_deg = float(np.abs(_last_known_deg(bench, rested_deg) - rested_deg).max())
     findings.at_most("turn of the axes at rest", further_deg, _STILL_DEG, "deg")

@@ -65,7 +65,7 @@ def triggered_by_box(bench: Bench, step: Step) -> tuple[NDArray[np.float64], Ste
         bench.control.go_on()
         raise DeviceError(
             "led box",
-            expected="a record of the step that has ended",
+            expected="a log record of the step that has ended",
             happened=f"{len(records)} came",
             remedy="Find out what else commands the box, then repeat the step.",
         )

@@ -47,8 +47,8 @@ def trigger(bench: Bench) -> None:
     """
     findings = bench.findings
     findings.remedy = (
-        "Check the cable, the polarity and the input filter of the camera's trigger, and its trigger delay; the "
-        f"LEDs outlast the nominal exposure by {EXPOSURE_MARGIN_US} us only."
+        "Check the cable, the polarity and the input filter of the camera's trigger, and its trigger delay; "
+        f"the LEDs are lit only {EXPOSURE_MARGIN_US} us longer than the nominal exposure."
     )
     if not bench.opened.ledbox.runs_tables:
         findings.remarks.append("the box has no trigger output: the host triggers the camera, nothing was timed")

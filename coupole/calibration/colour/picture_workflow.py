@@ -170,8 +170,8 @@ def _refuse_curved(view: _ChartView, known_chart: KnownChart) -> None:
     if len(grey) < _LEAST_GREYS or luminance.max() < _LEAST_RANGE * luminance.min():
         if view.picture.levels == 256:
             raise InputError(
-                f"{view.picture.name}: 8 bits, and too few greys to see whether its values are linear; give RAW, "
-                "16 bit or OpenEXR"
+                f"{view.picture.name}: 8 bits, and the chart has too few greys to test whether the values are "
+                "linear; give RAW, 16 bit or OpenEXR"
             )
         return
     slope = float(np.polyfit(np.log(luminance), np.log(view.reading.mean[grey, 1]), 1)[0])
@@ -298,7 +298,8 @@ def _offsets(signals: Signals, known_chart: KnownChart) -> list[str]:
     words = ", ".join(f"{value:+.1%}" for value in share)
     return [
         f"the greys show an offset of {words} of white in red, green and blue: a black level that was not taken "
-        "off, or stray light. Dark colours are wrong by it, and the uncertainty does not include this error"
+        "off, or stray light. The offset makes dark colours wrong, and the uncertainty does not include this "
+        "error"
     ]
 
 

@@ -222,7 +222,10 @@ def _places(
         here[row] = place if distance_mm < near_mm else -1
         if here[row] < 0:
             led = int(ids[row])
-            text = f"LED {led}: found {off_mm[row]:.1f} mm from its place and at no other LED's. Look at its mount"
+            text = (
+                f"LED {led}: found {off_mm[row]:.1f} mm from its place, and not at the place of another LED. "
+                "Look at its mount"
+            )
             faults.append(LedFault("astray", (led,), text))
     twice = [p for p in np.unique(here[here >= 0]) if np.sum(here == p) > 1]
     for place in twice:
@@ -289,4 +292,4 @@ def fault_lines(faults: Sequence[LedFault]) -> tuple[str, ...]:
     if len(dead) < 4:
         return tuple(fault.text for fault in faults)
     other_lines = tuple(fault.text for fault in faults if fault.kind != "dead")
-    return (f"{len(dead)} LEDs are dead, no spot in any frame: {', '.join(map(str, dead))}", *other_lines)
+    return (f"{len(dead)} LEDs are dead: no frame shows their spot: {', '.join(map(str, dead))}", *other_lines)

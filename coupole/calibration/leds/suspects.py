@@ -97,10 +97,10 @@ class SuspectedShift:
                     "about as much. Check records and views, and measure heights with a probe"
                 )
             return (
-                f"lenses on the dies shift their images towards the camera by {self.coefficients[0]:.3f} mm "
-                f"(u {u:.3f} mm) times the sine of the angle to the normal; places and uncertainties account for "
-                "it. Heights rest on this law: a flat window over the dies gives nearly the same spots, but its "
-                "heights are off the other way. Check one height with a probe"
+                f"lenses on the dies shift their images towards the camera by {self.coefficients[0]:.3f} mm (u "
+                f"{u:.3f} mm) times the sine of the angle to the normal; places and uncertainties account for "
+                "it. Heights rest on this law: a flat window over the dies gives nearly the same spots, but "
+                "then the heights have the opposite error. Check one height with a probe"
             )
         if self.name == OVAL:
             return (
@@ -110,9 +110,10 @@ class SuspectedShift:
             )
         growth, near = self.coefficients
         return (
-            f"spots lie farther out than the camera's record says, by {growth:.1f} (u {self.u[0]:.1f}) in 10,000, "
-            f"and {near:.1f} (u {self.u[1]:.1f}) more at 1 m: it does not hold for LEDs so far out of focus. "
-            "Places and uncertainties account for it; stop the lens down, or calibrate camera and hand-eye anew"
+            f"spots lie farther out than the camera's record says, by {growth:.1f} (u {self.u[0]:.1f}) in "
+            f"10,000, and {near:.1f} (u {self.u[1]:.1f}) more at 1 m: this record is not valid for LEDs so far "
+            "out of focus. Places and uncertainties account for it; stop the lens down, or calibrate camera "
+            "and hand-eye anew"
         )
 
 

@@ -268,7 +268,12 @@ def _h5(
             "[leds] share of the centre's variance from poses, lens and hand-eye, common to its neighbours"
         )
         write_dataset("shared_part", geometry.shared_part[where], "", shared_text)
-        write_dataset("offset_mm", geometry.state.offsets_mm[where], "mm", "[leds, 3] from its place on the board")
+        write_dataset(
+            "offset_mm",
+            geometry.state.offsets_mm[where],
+            "mm",
+            "[leds, 3] offset of each LED from its nominal place on the board",
+        )
         write_dataset("views", views[where], "", "[leds] number of views in which the LED was found")
         write_dataset("residual_rms", np.sqrt(square / np.maximum(views, 1))[where], "px", "[leds]")
         write_dataset("found", matching.place_of >= 0, "", "[leds] False: only its board determines its place")
@@ -293,8 +298,8 @@ def _moved_boards(boards: Boards, geometry: LedGeometry, place: NDArray[np.intp]
         LedFault(
             "moved",
             (),
-            f"board {boards.numbers[b]} stands {shift_mm[b]:.1f} mm and {turn_deg[b]:.2f} deg from its table. "
-            "Its new place is in this record",
+            f"board {boards.numbers[b]} stands {shift_mm[b]:.1f} mm and {turn_deg[b]:.2f} deg from its place in "
+            "the table. Its new place is in this record",
         )
         for b in np.flatnonzero(is_seen & ((shift_mm > MOVED_MM) | (turn_deg > MOVED_DEG)))
     ]

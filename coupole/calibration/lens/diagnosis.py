@@ -74,8 +74,8 @@ class Diagnosis:
         lines = []
         if self.contradicts:
             lines.append(
-                "robot and camera contradict each other: by the poses, the board's place scatters by "
-                f"{self.scatter_mm:.3g} mm and {self.scatter_deg:.3g} deg, where noise explains "
+                "robot and camera contradict each other: the board's place as computed from the poses scatters "
+                f"by {self.scatter_mm:.3g} mm and {self.scatter_deg:.3g} deg, where noise explains "
                 f"{self.noise_scatter.position_mm:.2g} mm and {self.noise_scatter.orientation_deg:.2g} deg"
             )
             lines += [

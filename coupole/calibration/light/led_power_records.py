@@ -107,7 +107,7 @@ def _of_views(power: LedPower, limits: Sequence[Limit]) -> list[str]:
     """Return what views left out in turn say, and what to do if they contradict each other."""
     figures = {limit.name: limit for limit in limits}
     if not power.left_out.worst:
-        return ["each LED is in one view only: nothing tells a drift, or a lobe of the tile"]
+        return ["each LED is in one view only, so a drift, or a lobe of the tile, cannot be detected"]
     line = (
         f"views left out in turn move the powers by {figures['left_out'].found:.2f} of the stated uncertainty; "
         f"{power.left_out.worst} moves them most"

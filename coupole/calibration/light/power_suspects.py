@@ -50,7 +50,10 @@ _REMEDIES = {
     STAIN: "Clean the tile or turn another part of it up",
     GLOSS: "Grind the tile flat with wet abrasive paper, or describe its lobe by a goniometer's certificate",
     DRIFT: "Let lamps and camera warm up for half an hour, then acquire again",
-    DIES: f"They hold up to {REACH_MM:.0f} mm from the tile's middle: lay the tile where the object will be",
+    DIES: (
+        f"The powers are valid up to {REACH_MM:.0f} mm from the tile's middle: lay the tile where the object "
+        "will be"
+    ),
     UNSTEADY: "Look at the supply of the LEDs and at room light, then acquire again",
     RESTLESS: "Look at the supply of the LEDs and at room light, then acquire again",
 }

@@ -64,7 +64,9 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
             return sign_in_page()
         return RedirectResponse("/run", 303)
 
-    @app.post("/api/v1/sign-in", responses={401: {"description": "Wrong, or tried too often."}})
+    @app.post(
+        "/api/v1/sign-in", responses={401: {"description": "Name or password is wrong, or was tried too often."}}
+    )
     def sign_in(credentials: SignIn, request: Request, response: Response) -> dict[str, str]:
         """Begin a session. Browsers get a cookie; scripts get `session`, to be sent as `Authorization: Bearer`."""
         here = is_of_this_machine(request)
@@ -73,7 +75,7 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
         else:
             account = service.accounts.sign_in_first(credentials.token) if here else None
         if account is None:
-            raise NotAllowed(401, "name or password are wrong, or were wrong too often: try again in a minute")
+            raise NotAllowed(401, "name or password is wrong, or was wrong too often: try again in a minute")
         secret = service.sessions.begin(account, script=credentials.script)
         answer = {"name": account.name, "role": account.role.word}
         if credentials.script:

@@ -130,7 +130,10 @@ class _Hold:
         if word != self._next_word:
             raise InputError("renew: expected the word of the newest answer; a renewal sent before it is void")
         if any(request[key] != self._asked[key] for key in ("axis", "direction")):
-            raise InputError("a renewal is for the axis and the direction of the press")
+            raise InputError(
+                "expected the axis and the direction with which the button was pressed; a renewal cannot change "
+                "them"
+            )
 
     def _let_go(self) -> str:
         """End the motion at once: a command in the opposite direction ends it."""

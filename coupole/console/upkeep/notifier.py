@@ -151,7 +151,9 @@ class Notifier:
 
 def send_test(settings: Settings, cell: str) -> dict[str, str]:
     """Send a message by each way, once; return the error of each, empty if it was sent."""
-    message = Message.now(cell, "test", "a test of its notifications", "If you read this, they reach you.")
+    message = Message.now(
+        cell, "test", "a test of its notifications", "If you read this, notifications reach you."
+    )
     error_of_way = {}
     for way, send in ways(settings).items():
         begun_s = time.monotonic()

@@ -169,8 +169,8 @@ def _check(films: Sequence[Film]) -> None:
     kinds = {(film.ground_name, film.ground is None, film.thickness_mm) for film in films}
     if len(kinds) < 2:
         raise InputError(
-            "expected films over two grounds, of two thicknesses, or an opaque one; found films that are alike: "
-            "these cannot separate K from S"
+            "expected films over two grounds, of two thicknesses, or an opaque film; found films that are "
+            "alike, which cannot separate K from S"
         )
 
 

@@ -200,7 +200,7 @@ class _Job:
         self._refuse_other_quantities(pixels)
         pairs_left, pairs_right = np.concatenate(left_pixels), np.concatenate(right)
         if not len(pairs_left):
-            raise InputError("expected neighbouring pixels, from which noise is known; found none")
+            raise InputError("expected neighbouring pixels, from which the noise is estimated; found none")
         result = find_regions(pixels @ self._matrix, noise_of_neighbours(pairs_left, pairs_right), most)
         self.state.save(
             "found", mean=result.mean, noise=result.noise, basis=result.basis, centres=result.centres,

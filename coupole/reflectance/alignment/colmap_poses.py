@@ -169,7 +169,7 @@ def _refuse_a_line(path: Path, centres_mm: Floats, u_mm: Floats) -> None:
     if spread_mm[1] < MOST_APART * u_mm.max():
         raise InputError(
             f"{path}: the run's cameras stand on a line (within {spread_mm[1]:.2g} mm), about which COLMAP's "
-            "model may be turned; take more views, or `coupole reflectance refine`"
+            "model may be turned; take more views, or use `coupole reflectance refine`"
         )
 
 
@@ -185,7 +185,8 @@ def _refuse_far(poses: ColmapPoses, measured_run: MeasuredRun) -> None:
         else "in the support's frame, in mm; with one or two views the model must be in this frame"
     )
     raise InputError(
-        f"{poses.path}: the camera of {measured_run.views[view].name} is {how_far} from its place in the records, "
-        f"{conditions}: {poses.over_u[view, kind]:.1f} times their standard uncertainty; expected {MOST_APART:g} "
-        "at most. Is it another run's model, or a reconstruction that failed? Else calibrate hand-eye anew"
+        f"{poses.path}: the camera of {measured_run.views[view].name} is {how_far} from its place in the "
+        f"records, {conditions}: {poses.over_u[view, kind]:.1f} times their standard uncertainty; expected "
+        f"{MOST_APART:g} at most. Is it another run's model, or a reconstruction that failed? Else calibrate "
+        "hand-eye anew"
     )

@@ -34,8 +34,8 @@ def common_leds(views: Sequence[MeasuredView]) -> list[int]:
     common = sorted(set.intersection(*(set(view.by_led) for view in views)))
     if len(common) < FEWEST_LEDS:
         raise InputError(
-            f"views are compared under the same LEDs: expected {FEWEST_LEDS} or more that all views have, found "
-            f"{len(common)}; name runs that share more"
+            f"views are compared under the same LEDs: expected {FEWEST_LEDS} or more LEDs that all views have, "
+            f"found {len(common)}; name runs that share more LEDs"
         )
     places = np.linspace(0, len(common) - 1, min(len(common), MOST_LEDS)).round().astype(int)
     return [common[place] for place in places]

@@ -252,7 +252,7 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface, digest: A
     file["seen"].attrs["told"] = "[h, w] place in `triangles` of what a pixel sees, -1 where it is not used"
     _dataset(file, "triangles", surface.triangles, "numbers of the mesh's triangles, from 0", digest)
     _dataset(file, "pixels", work.reader.pixels, "pixels of each channel on each triangle", digest)
-    description = "relative standard uncertainty, shared by a triangle's samples, from pixels' own responses"
+    description = "relative standard uncertainty from the pixels' own responses, shared by a triangle's samples"
     _dataset(file, "u_response", work.reader.u_response, description, digest)
     _dataset(file, "centres_mm", work.facets.centres_mm, "of the triangles, mm, base frame", digest)
     _dataset(file, "normals", work.facets.normals, "of the triangles, unit, base frame", digest)
@@ -302,7 +302,7 @@ def _begin_samples(file: h5py.File, work: ViewPass) -> dict[str, h5py.Dataset]:
     (count, channels), leds = work.reader.pixels.shape, len(work.leds)
     codes = ", ".join(f"{code} {name}" for name, code in CODES.items())
     kinds: dict[str, tuple[Any, tuple[int, ...], str]] = {
-        "f": (np.float16, (count, leds, channels), "reflectance, 1/sr; NaN where there is none"),
+        "f": (np.float16, (count, leds, channels), "reflectance, 1/sr; NaN where there is no sample"),
         "u_own": (np.float16, (count, leds, channels), "relative standard uncertainty, of noise"),
         "codes": (np.uint8, (count, leds), f"of a triangle and an LED: {codes}"),
     }

@@ -371,7 +371,7 @@ def test_a_stopped_bench_is_named_by_who_asks_it_moves_nothing_later_and_says_wh
         stopped.send_signal(signal.SIGCONT)
     assert given_up.code == 130
     assert (
-        "the bench did not answer in time: it will not move the arm or light an LED for this request later"
+        "stopped waiting for an answer: the bench will not move the arm or light an LED for this request later"
         in given_up.err
     )
     ended = cells.finish(stopped)

@@ -17,8 +17,8 @@ _LONG_PATIENCE_S = 120.0
 """Longest wait for an answer: a path among many bodies, or a long exposure, takes time."""
 _AT_ONCE = {"state", "stop", "jog", "drive"}
 """Commands that are answered before the work that they begin or end is done."""
-_GIVEN_UP = "the bench did not answer in time: it will not move the arm or light an LED for this request later"
-_STOP_GIVEN_UP = "the bench did not answer in time: it obeys the stop as soon as it runs again"
+_GIVEN_UP = "stopped waiting for an answer: the bench will not move the arm or light an LED for this request later"
+_STOP_GIVEN_UP = "stopped waiting for an answer: the bench obeys the stop as soon as it runs again"
 
 
 def bench_socket(cell: Cell) -> Path:

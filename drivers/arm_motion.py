@@ -26,7 +26,7 @@ def refusal(expectation: str, observation: str) -> DeviceRefused:
 
 
 def overtaken() -> DeviceRefused:
-    """Return the error for a wait that another command has ended."""
+    """Return the error for the case that another command has ended a wait."""
     return refusal("the arm to continue to its target", "another command ended the motion")
 
 

@@ -220,7 +220,8 @@ def arm_named(
     settings: Mapping[str, Any],
     files: InputFiles,
 ) -> tuple[ArmDescription | None, list[Problem]]:
-    """Return the arm under `arm:` in a rig's document, or otherwise its driver's, and the problems found in it."""
+    """Return the arm under `arm:` in a rig's document, or otherwise the default arm of its driver, and the
+    problems found in it."""
     if isinstance(arm_reference, ArmDescription):
         if arm_reference.link_meshes is not None:
             arm_reference = arm_reference.model_copy(

@@ -172,9 +172,9 @@ class Chooser(Protocol):
 def next_choice(
     chooser: Chooser, view: OpenView, choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
 ) -> Choice:
-    """Return a view's next choice after these, all of which were fired; `samples` has their proven frames. It is
-    the same choice that `choose_ahead` gave, or would have given, while the last of these was fired. So it does
-    not depend on when a run was interrupted.
+    """Return a view's next choice after these, all of which were fired; `samples` has their proven frames. The
+    choice is the same as the one that `choose_ahead` gave, or would have given, while the last of these was fired.
+    So it does not depend on when a run was interrupted.
     """
     ahead = chooser.choose_ahead(view, choices, before_last(choices, samples)) if choices else None
     return ahead or chooser.choose(view, choices, samples)
@@ -189,9 +189,9 @@ def before_last(
 
 
 def bound_of(whole: Sequence[Burst], frames_of_light: int, again: Collection[int]) -> tuple[Burst, ...]:
-    """Return the bound of a view whose bursts are chosen from `whole` (shortest exposure first). The bound has
-    the `frames_of_light` longest bursts with all LEDs, and the two longest once more with the LEDs `again`. The
-    bound also has marks and dark frames for all further bursts that a view may have.
+    """Return the bound of a view whose bursts are chosen from `whole` (shortest exposure first). The bound has the
+    `frames_of_light` longest bursts with all LEDs. It has the two longest of these once more, with the LEDs
+    `again`. The bound also has marks and dark frames for all further bursts that a view may have.
     """
     in_first = [burst for burst in whole if burst.repeat == 0]
     longest = in_first[-1]

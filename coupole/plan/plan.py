@@ -180,7 +180,7 @@ class Plan(Model):
     trigger: Literal["hardware", "software"] = "hardware"
     """The LED box triggers the camera (`hardware`), or the host triggers it light by light (`software`)."""
     reshoot_limit: Annotated[int, Field(ge=0, le=20)] = 3
-    """Greatest number of times that unproven frames are taken again."""
+    """Greatest number of attempts to take unproven frames again."""
     discard: Literal["after_fit"] | None = None
     """`after_fit`: frames are discarded when their samples are safe, except the frames that the check needs."""
     watch: bool | Watch = DARKS_ONLY

@@ -1,8 +1,8 @@
 """The dose ledger of each object: all light that it has received, `<ledger folder>/<object id>.jsonl`.
 
 A caller that gives light enters the planned light first (`Ledger.plan`), and afterwards the light that was given
-(`Ledger.correct`); both are on disk when the call returns. So after the process was killed, or after a power cut,
-the figure can only be too high: the planned light then counts. Writers hold a lock on the object's file.
+(`Ledger.correct`); both are on disk when the call returns. So if the process is killed or the power fails, the
+planned light counts, and the figure can only be too high. Writers hold a lock on the object's file.
 
 The object's budget is in the same file. A plan is entered only if the budget allows it, with all entries of the
 file at that moment, under the same lock. So even if several processes give light at once, the sum of their light

@@ -102,7 +102,7 @@ class History:
     budgets: list[BudgetSet] = field(default_factory=list)
     """Budgets in the order in which they were set. The last one counts."""
     without_plan: int = 0
-    """Number of lines with given light whose plan is missing, since light was last entered by hand."""
+    """Number of lines since the last entry by hand that state given light but whose plan is missing."""
     unreadable: int = 0
     """Number of lines that are not entries: a crash cut them before their light was given, or they were damaged
     later."""
@@ -114,7 +114,7 @@ class History:
 
     @property
     def unreadable_words(self) -> str:
-        """How many lines of the ledger cannot be read, for a person."""
+        """Sentence for a person: how many lines of the ledger cannot be read."""
         return f"{self.unreadable} line{'s' if self.unreadable != 1 else ''} of the ledger cannot be read"
 
     @property

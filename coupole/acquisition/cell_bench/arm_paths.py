@@ -37,7 +37,7 @@ class ShownPath:
 
 
 class ArmPaths:
-    """Plans paths of a cell's arm. On the support lies a job's object, or nothing."""
+    """Plans paths of a cell's arm. The support carries a job's object, or nothing."""
 
     def __init__(self, cell: Cell, job: Job | None) -> None:
         self._cell, self._job = cell, job

@@ -1,4 +1,5 @@
-"""Steps that time the light: from the trigger's edge to the exposure, and from the host's silence to the dark."""
+"""Steps that time the light: from the trigger's edge to the exposure, and from the host's last command to
+darkness."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ _ABOUT_PX, _CLOSE_PX = 2e-3, 1e-4
 """Bounds of the last step of a fit: of the fit near the start, and of the fit near the found corner, which is a
 hundredth of the noise of a corner."""
 _WORST = 0.2
-"""Largest rms residual, as a share of the contrast. An image with a larger one is not that of a corner."""
+"""Largest rms residual, as a share of the contrast. If it is larger, the image does not show a corner."""
 _LEAST_SIGMA_PX = 0.05
 _THIN = 0.01
 """Least width of a box, for an edge along the pixels' rows."""

@@ -104,7 +104,7 @@ def power_limits(powers: Mapping[str, LedPower], operator_limits: Mapping[str, f
 
 
 def _of_views(power: LedPower, limits: Sequence[Limit]) -> list[str]:
-    """Return what views left out in turn say, and what to do if they contradict each other."""
+    """Return a sentence on the effect of leaving each view out, and advice if views contradict each other."""
     figures = {limit.name: limit for limit in limits}
     if not power.left_out.worst:
         return ["each LED is in one view only, so a drift, or a lobe of the tile, cannot be detected"]

@@ -111,8 +111,8 @@ class CausesFound:
 
 
 def names_of(causes: CausesFound, parts: PartsFound) -> Iterator[str]:
-    """Yield the suspects that are named. A lobe of the tile that Ward's lobes do not follow looks like a fall-off,
-    so beside a lobe no fall-off is named."""
+    """Yield the suspects that are named. If the tile has a lobe of another form than Ward's, its error looks like
+    a fall-off. Therefore no fall-off is named if a lobe is named."""
     yield from (suspect.name for suspect in (*causes.suspects, parts.stain) if suspect.evidence >= CLEAR)
     if parts.evidence >= CLEAR_FALL_OFF and not causes.names_lobe:
         yield DIES

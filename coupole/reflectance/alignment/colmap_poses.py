@@ -4,7 +4,8 @@ A bundle adjustment may move, turn and scale its model. With three views or more
 centres onto the centres of the records by least squares (Umeyama, PAMI 13(4), 1991). With one or two views the
 model is taken as it is, in the frame of `coupole export RUN --to colmap`: the support frame, in mm. Poses that are
 farther from the records than `MOST_APART` times the records' standard uncertainty are refused. A lens that is not
-the records' lens is refused too. COLMAP's files state no uncertainties, so the poses take those of the records.
+the records' lens is refused too. COLMAP's files state no uncertainties, so the uncertainties of the records are
+used for these poses.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from coupole.reflectance.extraction.measured_run import MeasuredRun
 from coupole.storage.durable import sha256
 
 LEAST_FITTED = 3
-"""Least number of views that fix a similarity."""
+"""Least number of views that determine a similarity."""
 _TO_CENTRE_PX = 0.5
 """Shift from our pixel coordinates to COLMAP's, px. In COLMAP the first pixel ends at 1."""
 _SAME = 1e-6

@@ -80,11 +80,11 @@ class Powers:
     power: Floats
     """[leds, channels] DN s^-1 m^2 sr; NaN or 0 for an LED without power."""
     board_c: Floats
-    """[leds] temperature of the board for which the power holds."""
+    """[leds] temperature of the board for which the power is valid."""
     u_own: Floats
-    """[leds, channels] relative standard uncertainty that an LED shares with no other."""
+    """[leds, channels] relative standard uncertainty that an LED shares with no other LED."""
     u_shared: Floats
-    """[leds, channels] relative standard uncertainty that all LEDs share: of the tile and its place."""
+    """[leds, channels] relative standard uncertainty that all LEDs share: it comes from the tile and its place."""
 
     @cached_property
     def _row(self) -> dict[int, int]:

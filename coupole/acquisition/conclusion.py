@@ -20,8 +20,8 @@ from coupole.viewing.terminal import alarm, bytes_text
 from coupole.viewing.text_outlet import unread
 
 MOST_HASHED_BYTES = 2_000_000_000
-"""Most bytes of complete views that a session hashes, so that it ends soon. `verify --manifest` or `archive` hashes
-more."""
+"""Most bytes of complete views that a session hashes, so that it ends soon. `verify --manifest` or `archive`
+hashes more."""
 _SLOWEST_BYTES_S, _REPORT_S = 10e6, 60.0
 
 

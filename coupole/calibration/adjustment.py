@@ -100,7 +100,7 @@ class Adjusted(Generic[S]):
     covariance: Floats
     components: tuple[Component, ...]
     contributions: Floats
-    """Share [groups, p] of each parameter's variance."""
+    """Share [groups, p] of each parameter's variance that comes from each group of observations."""
     degrees: Floats
     """Effective degrees of freedom [p]."""
     residuals: tuple[Floats, ...]

@@ -72,7 +72,7 @@ def acquire(
     own copies of plan and rig. Or name the plan again; only its comments and the object's budget of light may have
     changed. On a terminal the key p pauses between bursts and continues, q stops. From elsewhere use `coupole
     pause`, `go-on` and `stop`. If a console owns the cell (`coupole serve`), the command enters the plan in the
-    console's queue and follows the run; nothing may run or wait there.
+    console's queue and follows the run. This needs a console at which no other plan runs or waits.
     """
     from coupole.acquisition.sessions_without_run import ACQUIRE, SessionWithoutRun
 

@@ -193,7 +193,7 @@ class _ExitanceOfLeds:
         self._exitance = np.empty((0, 0, 0), np.float32)
 
     def exitance(self, view: ViewSamples) -> NDArray[np.float32]:
-        """[channels, patches, leds] of a view, by `radiosity`."""
+        """[channels, patches, leds] exitance of the patches under the LEDs of a view, by `radiosity`."""
         leds = (view.led_mm.tobytes(), view.led_normals.tobytes())
         if leds != self._leds:
             direct = self._paths.direct(view.led_mm, view.led_normals)

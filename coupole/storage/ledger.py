@@ -108,10 +108,10 @@ class Ledger:
     def _refuse_lacking(self, history: History) -> None:
         if history.lacks_lines:
             raise StorageError(
-                f"{self.path}: has light of a plan that is not in it, so earlier lines are missing: it was "
-                "moved or replaced while light was given, and nobody knows what the object may still receive. "
-                "Put the whole ledger back; if it is lost, give "
-                f"`coupole dose {self.object_id} --add LUX_H --note WHY` with what it had, or with 0"
+                f"{self.path}: counts light for a plan whose own line is not there, so earlier lines are "
+                "missing: the ledger was moved or replaced while light was given, and it is not known what the "
+                "object may still receive. Put the whole ledger back; if it is lost, give `coupole dose "
+                f"{self.object_id} --add LUX_H --note WHY` with what it had, or with 0"
             )
 
     def ask_again(self, budget_request: Asked, plan_id: str) -> None:

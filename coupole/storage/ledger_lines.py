@@ -245,7 +245,7 @@ class Reading:
     def _refuse_loss(self, path: Path, loss: str) -> None:
         if self._only_grows and self._read_bytes:
             raise StorageError(
-                f"{path}: the dose ledger {loss} while light was given, so nobody knows what the object may "
+                f"{path}: the dose ledger {loss} while light was given, so it is not known what the object may "
                 "still receive. Put it back, then continue."
             )
 
@@ -264,8 +264,8 @@ class Reading:
         rest, _, _ = (file.read()).rpartition(b"\n")
         if self._only_grows and b"\0" in rest:
             raise StorageError(
-                f"{path}: expected text in UTF-8, found bytes 0 (UTF-16, or a damaged file), so nobody "
-                "knows what the object may still receive. Restore the dose ledger, then continue."
+                f"{path}: expected text in UTF-8, found bytes 0 (UTF-16, or a damaged file), so it is not known "
+                "what the object may still receive. Restore the dose ledger, then continue."
             )
         if rest:
             for text in rest.split(b"\n"):

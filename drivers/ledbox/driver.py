@@ -314,7 +314,9 @@ class LedBox:
         try:
             return pack(table)
         except ValueError as error:
-            self._refuse("a table that the wire can carry", str(error), "Correct the figure that it names.")
+            self._refuse(
+                "a table whose figures fit into the records of the box", str(error), "Correct this figure."
+            )
 
     def _crc(self, bank: int) -> int:
         (crc,) = self._scpi.ask(f"SEQ:BANK {bank};CRC?", 1)

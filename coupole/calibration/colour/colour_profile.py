@@ -210,9 +210,9 @@ def covariance_of(patch_signals: Balanced, profile: Profile) -> tuple[Floats, Fl
     """Return covariances [3 terms, 3 terms] of the coefficients, row by row. The first is from the noise of
     signals, the second from the patches' own uncertainty, and the third from that of the light.
 
-    Let J and K be the derivatives of the misses by the coefficients and by the data. Then dm = -(J'J)^-1 J'K dd
-    (the implicit function theorem on the normal equations, with Gauss and Newton's approximation). Errors that the
-    form itself cannot follow (metamerism) are not noise; `leave_out` shows them.
+    Let J and K be the derivatives of the misses with respect to the coefficients and to the data. Then dm =
+    -(J'J)^-1 J'K dd (the implicit function theorem on the normal equations, with Gauss and Newton's
+    approximation). Errors that the form itself cannot follow (metamerism) are not noise; `leave_out` shows them.
     """
     lab = lab_of(patch_signals.xyz)
     signal = patch_signals.signal / profile.white_signal

@@ -52,7 +52,7 @@ class LedState:
     axis_zeros_deg: Floats
     """[k] deviation of the arm's axis zeros from their record."""
     coefficients: Floats
-    """[c] of the suspects' modes."""
+    """[c] coefficients of the suspects' modes."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Problem:
 
     boards: Boards
     place: Indices
-    """[k] of each spot."""
+    """[k] place of each spot on its board."""
     view: Indices
     observed: Floats
     whiten: Floats
@@ -87,7 +87,7 @@ class Problem:
     """[v, 6, k] step of each pose per degree of each axis of the arm."""
     stated_noise: Stated
     modes: tuple[Mode, ...]
-    """[c] of suspects."""
+    """[c] modes of the suspects."""
     spots_of: tuple[BoardSpots, ...]
     """[b]."""
 

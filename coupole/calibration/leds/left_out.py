@@ -51,7 +51,8 @@ class _InView:
     own_hat: Floats
     """[2 k, 2 k] part of the hat matrix that comes from the board's own parameters."""
     by_shared: Floats
-    """[2 k, shared] derivatives by the shared parameters, after the board's own parameters are eliminated."""
+    """[2 k, shared] derivatives with respect to the shared parameters, after the board's own parameters are
+    eliminated."""
     residuals: Floats
     """[2 k]."""
 

@@ -56,7 +56,7 @@ class LedsFound:
     u_mm: Floats
     """[n] standard uncertainty of each LED's centre, by row of the table; NaN for an LED that was not found."""
     u_deg: Floats
-    """[n] of its normal."""
+    """[n] standard uncertainty of each LED's normal."""
     view_errors: Floats
     """[v, 6] error of the arm at each view, mm and degrees."""
 

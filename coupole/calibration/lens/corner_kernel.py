@@ -239,8 +239,8 @@ def _products(rows, count, many, products):  # type: ignore[no-untyped-def]
 
 @kernel
 def _rows(image, mask_tile, middle_x, middle_y, radius, unknowns, many, rows):  # type: ignore[no-untyped-def]
-    """Return the number of pixels. `rows` [16, pixels] becomes the derivatives by the unknowns, the residuals, and
-    the values of the model."""
+    """Return the number of pixels. `rows` [16, pixels] is filled with the derivatives with respect to the
+    unknowns, the residuals, and the values of the model."""
     x, y, sigma, sigma_2 = unknowns[_X], unknowns[_Y], unknowns[_SIGMA], unknowns[_SIGMA_2]
     level, contrast, together = unknowns[_LEVEL], unknowns[_CONTRAST], unknowns[_CORRELATION]
     cos1, sin1 = math.cos(unknowns[_FIRST]), math.sin(unknowns[_FIRST])

@@ -191,7 +191,7 @@ def _parameters(powers: Mapping[str, LedPower], covariance: Floats) -> list[Para
 
 
 def _mean_and_slopes(power: LedPower) -> tuple[float, Floats]:
-    """Return the mean power of all LEDs, and its derivatives [c] by the shared figures."""
+    """Return the mean power of all LEDs, and its derivatives [c] with respect to the shared figures."""
     good = np.isfinite(power.power) & (power.power > 0)
     return float(power.power[good].mean()), np.asarray((power.power[good, None] * power.common[good]).mean(axis=0))
 

@@ -40,7 +40,7 @@ REACH_MM = 40.0
 
 _WORDS = {
     STAIN: "the tile has a stain, or is not equally white",
-    GLOSS: "the tile shines: it has a lobe beside Minnaert's law",
+    GLOSS: "the tile shines: it has a lobe in addition to Minnaert's law",
     DRIFT: "gain or light drifted over the session",
     UNSTEADY: "gain or light wavered during the session",
     RESTLESS: "gain or light wavered many times during the session",

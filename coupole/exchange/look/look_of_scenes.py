@@ -257,7 +257,7 @@ def _box(parts: Sequence[_Part]) -> list[list[float]]:
 
 
 def _material_codes(parts: Sequence[_Part]) -> NDArray[np.uint16]:
-    """[n, 2] for triangles: number of the material, and code of the first layer's share."""
+    """[n, 2] codes of triangles: number of the material, and code of the first layer's share."""
     blocks = []
     for part in parts:
         block = np.full((len(part.corners_mm), 2), _WHOLE, np.uint16)

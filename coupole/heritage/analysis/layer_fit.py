@@ -202,7 +202,7 @@ def _one_seen(k: Array, s: Array, film: Film, face: Face, h: float, ground: Arra
 
 
 def _jacobian(k: Array, s: Array, films: Sequence[Film], face: Face) -> Array:
-    """[n, films, 2] derivatives by K and S."""
+    """[n, films, 2] derivatives with respect to K and S."""
     step = 1e-5 * (np.abs(k) + s)
     return np.stack(
         [

@@ -40,7 +40,8 @@ exist side by side."""
 _FREE_BYTES = 2**30
 """Free space that must remain: more than a rig keeps free by default (`reserve_bytes`)."""
 _SHARE_OF_MEMORY = 8
-"""Factor by which the blocks of work are smaller for a result so far, so that it can be abandoned without delay."""
+"""Factor by which the blocks of work are smaller for a result so far, so that it can be abandoned without
+delay."""
 
 
 @dataclass(frozen=True)

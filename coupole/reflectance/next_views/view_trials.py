@@ -27,7 +27,7 @@ from coupole.reflectance.triangle_fit import FEWEST
 Floats = NDArray[np.float64]
 
 _MOST_LEDS = 240
-"""Number of LEDs that represent all LEDs of the plan; they are spread over them."""
+"""Greatest number of LEDs with which a view is tried. They are spread over all LEDs of the plan."""
 _MESH_NOISE_UM = 30.0
 """Usual standard uncertainty of the mesh's vertices."""
 

@@ -21,8 +21,8 @@ AGREEMENT_PITCHES = 3.0
 """Two motions agree if their positions of a scan's points differ by at most this number of cells of the coarse
 grid."""
 _MOST_CROSS_CHECKS, _FEW_CHECKS, _EVERY = 300, 30, 5
-"""Greatest number of pairs of scans of two groups that are checked; number of pairs above which only some points
-are checked; step between these points."""
+"""Limits for the check of two groups against each other. The first is the greatest number of pairs of scans that
+are checked. From the second number of pairs on, only some points are checked, in steps of the third number."""
 
 
 @dataclass

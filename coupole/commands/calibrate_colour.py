@@ -182,7 +182,7 @@ def _by_pictures(paths: list[Path], options: _GivenOptions, *, srgb: bool) -> Wo
 
 @dataclass(frozen=True)
 class _At:
-    """Tells at the terminal how far the work is."""
+    """Shows the progress of the work at the terminal."""
 
     console: Console
 

@@ -76,7 +76,7 @@ def _stamp(about: os.stat_result) -> tuple[int, ...]:
 
 
 def _change(path: Path, earlier_read: _Read) -> str:
-    """Return what is different now; empty if nothing is different, or only the file's times."""
+    """Return what is different now; empty if nothing is different, or if only the file's times are."""
     try:
         about = path.stat()
         if _stamp(about) == earlier_read.stamp:

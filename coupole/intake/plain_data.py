@@ -1,6 +1,6 @@
 """JSON, and YAML that is no plan or rig, as plain data: the one place where others' files and messages are parsed.
 
-Every text gives data or an InputError with file, line and column. This also holds for text that is not UTF-8,
+Every text gives data or an InputError with file, line and column. The same is true of text that is not UTF-8,
 deeply nested lists, numbers of thousands of digits, NaN, and aliases that multiply each other. Otherwise these
 would end in Python's own errors, or much later in a traceback elsewhere. Plans and rigs are read by
 `coupole.plan.yamlfile`, which knows the place of each key; pydantic's own reader of JSON has such limits already.

@@ -2,7 +2,7 @@
 
 The address contains a token that is new each time. A request is refused if it uses another host name (DNS
 rebinding), comes from a page of another site, or is not exactly as the page sends it. Each connection has one
-request, a bounded time and one of a few threads. So clients that are slow or hang delay nobody.
+request, a bounded time and one of a few threads. So a client that is slow or hangs does not delay others.
 """
 
 from __future__ import annotations

@@ -179,8 +179,8 @@ async def _events(service: Service, request: Request) -> AsyncIterator[str]:
 def _add_people(app: FastAPI, service: Service) -> None:
     @app.post("/api/v1/control/take", responses=REFUSALS)
     def take(person: Who) -> dict[str, str]:
-        """Take control, or ask for it. An engineer takes it; so does any operator if the person in control has
-        done nothing for five minutes."""
+        """Take control, or ask for it. An engineer gets control at once, and any operator does if the person in
+        control has done nothing for five minutes."""
         allow(service, person, Role.OPERATOR, "take control")
         return asdict(service.control.take(person))
 

@@ -67,8 +67,8 @@ def add_bench_routes(app: FastAPI, service: Service) -> None:
     async def hold(socket: WebSocket) -> None:
         """Move an axis while a button is held. The page sends `{axis, direction, share}`. A renewal also has the
         word of the newest answer (`renew`), so it cannot be sent before this answer has come. Renewals that wait
-        in the network, or are sent in advance, have no effect. When the button is let go, or the connection is
-        lost, the connection ends, and so does the motion.
+        in the network, or are sent in advance, have no effect. When the button is released or the connection is
+        lost, the motion ends.
         """
         await socket.accept()
         await _Hold(service, socket).serve()

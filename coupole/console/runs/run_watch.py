@@ -60,7 +60,7 @@ class _SignsOfLife:
 
     signs: tuple[float, ...] = ()
     since_s: float = 0.0
-    """Monotonic time at which they were seen first."""
+    """Monotonic time at which these values were seen first."""
 
     def missing_s(self, result: Path) -> float:
         """Return the seconds since the newest sign; 0 if no process is at work."""

@@ -101,7 +101,7 @@ class Notifier:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the threads; messages that are not sent yet are given up."""
+        """End the threads; messages that are not sent yet are dropped."""
         self._ending.set()
         with contextlib.suppress(queue.Full):
             self._messages.put_nowait(None)

@@ -6,8 +6,9 @@ h, sigma = S h, x^2 = alpha^2 - sigma^2 and beta = x coth x, a film over a groun
 
     R = (sigma - g (alpha - beta))/(alpha + beta - g sigma)
 
-inside the binder, and (sigma)/(alpha + x) if it is opaque. The formula also holds for K a little below 0, as noise
-can give for a white paint. Such estimates are not clipped, so that intervals hold.
+inside the binder, and (sigma)/(alpha + x) if it is opaque. The formula is also valid for K a little below 0, which
+noise can give for a white paint. Such estimates are not clipped, so that intervals contain the truth as often as
+stated.
 
 Uncertainties are propagated linearly (JCGM 100): noise of each spectrum, of each ground, and the thicknesses,
 which are common to all bands and to all films of the same thickness.

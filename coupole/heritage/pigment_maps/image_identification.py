@@ -57,12 +57,12 @@ class ImageRegion:
     """[bands of the cube] standard deviation of its pixels."""
     finding: PigmentFinding
     draws_alike: float
-    """Share of draws of the mean, by its standard error, with the same first class (or, of unknown, unknown
-    too)."""
+    """The mean spectrum is drawn many times with its standard error. This is the share of draws with the same
+    first class (or, if the finding is unknown, the share that is unknown too)."""
     agreement: float
-    """Share of its pixels whose own spectrum gives the region's answer."""
+    """Share of the region's pixels whose own spectra give the region's answer."""
     code: int
-    """Its code in the map."""
+    """The region's code in the map."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -141,7 +141,7 @@ def _contradict(
 
 
 def spheres_meet(first_scan: PreparedScan, second_scan: PreparedScan, one_from_other: Floats) -> bool:
-    """Tell whether the bounding spheres of two scans meet; only then the scans may overlap."""
+    """Tell whether the bounding spheres of two scans meet; only then can the scans overlap."""
     (middle_one, radius_one), (middle_other, radius_other) = first_scan.coarse.sphere, second_scan.coarse.sphere
     apart = np.linalg.norm(moved_points(one_from_other, middle_other[None])[0] - middle_one)
     return bool(apart < radius_one + radius_other)

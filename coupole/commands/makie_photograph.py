@@ -207,7 +207,10 @@ def _about(picture: NDArray[np.float64], place: list[str], option: str, form: st
     height, width = picture.shape[:2]
     numbers = [int(word) for word in place if word.strip().isascii() and word.strip().isdigit()]
     if len(place) != 2 or len(numbers) != 2 or numbers[0] >= width or numbers[1] >= height:
-        raise InputError(f"{option}: expected {form} of a pixel of a picture of {width} x {height}, from 0")
+        raise InputError(
+            f"{option}: expected {form}, with column and row (from 0) of a pixel in the picture of {width} x "
+            f"{height}"
+        )
     columns, rows = (slice(max(0, number - _AROUND_PX), number + _AROUND_PX + 1) for number in numbers)
     pixels = picture[rows, columns]
     if not np.isfinite(pixels).all():

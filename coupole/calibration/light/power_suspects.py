@@ -66,11 +66,11 @@ class CausesFound:
     error: ModelError
     """Its step are the shared figures [c]."""
     modes: Floats
-    """[n, modes] what coefficients of 1 do to each observation."""
+    """[n, modes] change of each observation if a coefficient is 1."""
     mean_modes: Floats
     """[leds, modes] weighted mean of the modes of each LED."""
     pattern: Floats
-    """[n] what lobe and drift do to each observation, against the mean of its LED."""
+    """[n] change of each observation by lobe and drift, less the mean change over its LED's views."""
     gloss: float
     """Reflectance of the lobe for light along the normal."""
     drift: float

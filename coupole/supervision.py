@@ -2,7 +2,7 @@
 
 A moving arm or a lit lamp never depends on a single process that may simply *stop*, such as a frozen process, a
 hung call or a cut cable. So each moving or shining part receives beats from its supervisor, and makes itself safe
-when the beats end. The supervising thread itself gives a beat, when it has looked at the arm. A helper thread
+when the beats end. The supervising thread itself gives a beat, each time it has checked the arm. A helper thread
 never gives the beat, because it would live on beside a hung thread. The chain, from the arm backwards:
 
 ======================  =====================================  ======================  ==========================
@@ -32,7 +32,7 @@ import threading
 import time
 
 ATTENTION_S = 0.1
-"""A motion that nobody has looked at for this long ends: the axes brake."""
+"""Longest time for which a motion may go unchecked. Then it ends: the axes brake."""
 LOOK_S = 0.02
 """The supervisor of a moving arm checks it again after at most this time, on the machine's clock."""
 ASKS_FROM_S = 1.0
@@ -69,8 +69,8 @@ class Attention:
     """The beats of the thread that watches a motion, on the watching side. `drivers` give each arm one such
     object.
 
-    The watching thread is the one that began the motion. Its gaps are measured here, where it looks. The part that
-    makes the motion decides whether a gap ends the motion.
+    The watching thread is the one that began the motion. The gaps between its beats are measured here, in the
+    watching process. The process that makes the motion decides whether a gap ends the motion.
     """
 
     def __init__(self) -> None:

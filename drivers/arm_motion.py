@@ -26,7 +26,7 @@ def refusal(expectation: str, observation: str) -> DeviceRefused:
 
 
 def overtaken() -> DeviceRefused:
-    """Return the error for a wait that another command has ended."""
+    """Return the error for the case that another command has ended a wait."""
     return refusal("the arm to continue to its target", "another command ended the motion")
 
 
@@ -51,7 +51,7 @@ def checked_target(
 def checked_speed(speed: float) -> float:
     """Return a share of the driver's speeds. Raises DeviceRefused for any other number."""
     if not 0.0 < speed <= 1.0:
-        raise refusal("a speed above 0, at most 1, as a share of the arm's", f"got {speed!r}")
+        raise refusal("a speed above 0 and at most 1, as a share of the arm's greatest speed", f"got {speed!r}")
     return float(speed)
 
 

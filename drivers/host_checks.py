@@ -96,7 +96,9 @@ def own_address(address: str, *, kind: socket.SocketKind) -> list[HostNeed]:
                 remedy = "End the other program (`ss -lptu`), or choose another port here and at the controller."
                 return [HostNeed(what, False, "another program has this port", remedy)]
             remedy = f"Give the interface to the controller the address {host}, or correct the rig."
-            return [HostNeed(what, False, f"no interface of this machine has it ({error.strerror})", remedy)]
+            return [
+                HostNeed(what, False, f"no interface of this machine has this address ({error.strerror})", remedy)
+            ]
     return [HostNeed(what, True, "is this machine's, and free", "")]
 
 

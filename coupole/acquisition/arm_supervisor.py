@@ -97,7 +97,7 @@ class ArmSupervisor:
         return Visit(visit.joints_deg, leg)
 
     def begin_here(self) -> Joints:
-        """Let the next leg begin where the arm is now; return its joint angles."""
+        """Let the next leg begin where the arm is now; return the arm's joint angles."""
         self._from_deg = np.array(self._robot.measured().joints_deg)
         return self._from_deg
 
@@ -106,7 +106,7 @@ class ArmSupervisor:
         self._checked_state()
 
     def go(self, visit: Visit, meanwhile: Callable[[], None] = lambda: None, speed: float = 1.0) -> SettledPose:
-        """Follow the leg of a visit; returns the measured pose. `meanwhile` is called every 10 ms. If it raises,
+        """Follow the leg of a visit; return the measured pose. `meanwhile` is called every 10 ms. If it raises,
         the error is raised at once, while the arm still moves: the caller stops it. `speed`: share of the arm's
         speeds.
 
@@ -167,8 +167,8 @@ class ArmSupervisor:
             self._stand()
 
     def was_held(self, error: BaseException) -> bool:
-        """Tell whether this error came because the session is being held (`Control.stands`). While this is not
-        known yet, the lights are switched off and the arm is stopped first."""
+        """Tell whether this error came because the session is being held (`Control.stands`). If this is not known
+        yet, first switch the lights off and stop the arm."""
         if not isinstance(error, DeviceError):
             return isinstance(error, Held)
         if self._control.awaits_word:
@@ -221,7 +221,7 @@ class ArmSupervisor:
         return self._robot.measured()
 
     def hurry(self, seconds: float) -> None:
-        """Say that the caller only waits for these seconds. The clock of a dry run may then run fast."""
+        """Announce that the caller only waits during these seconds. The clock of a dry run may then run fast."""
         self._clock.hurry(self._clock.now_ns() + int(max(0.0, seconds) * 1e9))
 
     def _off_deg(self, arm: ArmState) -> float:
@@ -264,8 +264,8 @@ class ArmSupervisor:
         )
 
     def _speeds_deg_s(self, arm: ArmState) -> NDArray[np.float64]:
-        """Return the speeds [6] between two readings; 0 before the second reading. The two are so far apart in
-        time that rounding and delays of the network do not matter."""
+        """Return the speeds [6] between two readings; 0 before the second reading. The readings are so far apart
+        in time that rounding and delays of the network do not matter."""
         before = self._before
         if before is None:
             self._before, self._latest_deg_s = arm, np.zeros(6)

@@ -31,9 +31,11 @@ from coupole.viewing.progress import Outcome
 
 _POLL_S = 0.05
 _LAST_POLL_S = 0.002
-"""Pause between looks at the log once the table should have run, as the next burst waits for it."""
+"""Pause between readings of the log after the table should have ended: short, because the next burst waits for the
+end."""
 _STALL_S = 5.0
-"""Time beyond the duration of a step. A box that logs no step for longer than this has stopped."""
+"""Additional time beyond the duration of a step. A box that logs no step for longer than both together has
+stopped."""
 _LAST_STRETCH_S = 0.3
 """The last part of a burst runs in real time, so that a host that fell behind in a dry run catches up."""
 _BOX_JITTER_US = 20.0
@@ -95,7 +97,8 @@ class BurstRunner:
         """Durations of the bursts, from the start to the last proof of each, on the rig's clock."""
 
     def end(self) -> None:
-        """End the thread that uploads tables, once it is done: no more bursts come. Does not wait for it."""
+        """Let the thread that uploads tables end when it has finished, because no more bursts come. Does not wait
+        for it."""
         self._uploader.end_soon()
 
     def exposure(self, burst: Burst) -> Exposure:
@@ -240,8 +243,10 @@ class BurstRunner:
                 raise DeviceTimeout(
                     "led box",
                     expected=f"a step of the burst every {1e3 * step_s:.0f} ms",
-                    happened=f"none came for {next_step.seconds:.1f} s; "
-                    f"{len(running.log)} of {len(burst.table)} are in its log",
+                    happened=(
+                        f"none came for {next_step.seconds:.1f} s; {len(running.log)} of {len(burst.table)} "
+                        "steps are in its log"
+                    ),
                     remedy="Check the box, then resume the run.",
                 )
             clock.sleep(_pause_s((ends_ns - clock.now_ns()) / 1e9))
@@ -325,7 +330,7 @@ class BurstRunner:
         panel_s: float,
         **figures: Any,
     ) -> None:
-        """Count the burst's light. Write it to the journal first, then to the ledger."""
+        """Count the burst's light. Write the light to the journal first, then to the ledger."""
         given_lux_h = self._dose.count(burst, log, table_ran_s=table_ran_s, panel_s=panel_s)
         self._recorder.note(
             BurstEnded(

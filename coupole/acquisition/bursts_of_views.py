@@ -193,8 +193,8 @@ class BurstsOfViews:
         return self._choices.setdefault(self._job.schedule.views[number].name, [])
 
     def _cool(self, bursts: list[Burst]) -> tuple[list[Burst], BoardHeat]:
-        """Return the same bursts, slowed down if boards would get too hot after the light of this session so far,
-        and the heat after them. Chosen LEDs may all be on one board."""
+        """Return the same bursts, and the heat of the boards after them. The bursts are slowed down if the boards,
+        which this session has already heated, would get too hot. Chosen LEDs may all be on one board."""
         for duty in (1.0, *LED_DUTIES):
             cool_bursts, boards = [_at_duty(burst, duty) for burst in bursts], deepcopy(self._boards)
             boards.light(cool_bursts)
@@ -217,7 +217,7 @@ def _at_duty(burst: Burst, duty: float) -> Burst:
 
 
 class _Seen(Mapping[ShotLabel, FrameSample]):
-    """Samples of the proven frames of a view's choices; read when they are asked for."""
+    """Samples of the proven frames of a view's choices; they are read when they are requested."""
 
     def __init__(self, view: str, choices: Sequence[Choice], recorder: Recorder) -> None:
         self._view, self._recorder = view, recorder

@@ -28,7 +28,7 @@ def _align(  # type: ignore[no-untyped-def]
     """Fill `steps_out` [frames] under one hypothesis; returns the number of surplus frames.
 
     It stops and returns `max_surplus + 1` as soon as there are too many. If several frames fall on one step, all
-    but one are counted as surplus. It does not matter here which one is not counted.
+    but one are counted as surplus. It does not matter here which of these frames is not counted.
     """
     surplus = pending = 0
     n_frames, n_steps = len(frame_ns), len(step_ns)

@@ -1,9 +1,9 @@
 """Python's collector of reference cycles, kept out of motions and bursts.
 
 A full collection looks at every object and stops all threads meanwhile. This takes 0.1 to 0.3 s with the 500,000
-objects of a session of 300,000 frames. In a motion it is a lapse of attention (`coupole.supervision`); in a burst
-the box is not asked meanwhile. So a session collects only when it asks for it, at rest and in the dark, and looks
-at each object once.
+objects of a session of 300,000 frames. In a motion, this time is a lapse of attention (`coupole.supervision`); in
+a burst, the box is not queried during this time. So a session collects only at rest and in the dark, when it
+requests a collection, and examines each object once.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Begin and end of a session for the run's folder: its manifest and its report. No device is open when it ends."""
+"""Begin and end of a session for the run's folder: its manifest and its report. No device is open when a session
+concludes."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from coupole.viewing.terminal import alarm, bytes_text
 from coupole.viewing.text_outlet import unread
 
 MOST_HASHED_BYTES = 2_000_000_000
-"""Views of more bytes together are left to `verify --manifest` and to `archive`, so that a session ends soon."""
+"""Most bytes of complete views that a session hashes, so that it ends soon. `verify --manifest` or `archive`
+hashes more."""
 _SLOWEST_BYTES_S, _REPORT_S = 10e6, 60.0
 
 

@@ -1,5 +1,5 @@
-"""Discards frames while a session goes on, when the processing beside it says that their samples are safe. It also
-tells whether there is room for the next view."""
+"""Discards frames while a session goes on, when the processing beside it says that their samples are safe. The
+discarder also tells whether there is room for the next view."""
 
 from __future__ import annotations
 

@@ -37,8 +37,8 @@ from coupole.storage.run import user_name
 LuxHours = NDArray[np.float64]
 """[points] light at each of the object's dose points."""
 _CLOCKS_PPM, _START_US = 1000, 1000
-"""Allowances for steps that the box's log lacks: for the error of the box's clock, and for the time that the box
-needs to start a table."""
+"""Allowances for steps that the box's log lacks: one for the error of the box's clock, one for the time that the
+box needs to start a table."""
 _DIGITS = 9
 T = TypeVar("T")
 
@@ -89,8 +89,8 @@ class LightOnObject:
 
     @property
     def lux_h_at_most(self) -> float:
-        """Dose of the run so far, or of the live view, with all planned light whose true amount is not entered
-        yet."""
+        """Dose of the run so far, or of the live view. Planned light counts in full until its true amount is
+        entered."""
         return self.lux_h if self._planned is None else float((self._given_lux_h + self._planned.at_most).max())
 
     @property
@@ -240,8 +240,8 @@ class FlashMeter:
         self._given_lux_h = self._given_lux_h + lux_h
 
     def settle(self) -> None:
-        """Enter the light that was given of the last plan. If it is not sure that the lights are off, all planned
-        light counts."""
+        """Enter how much of the last planned light was given. If it is not certain that the lights are off, all
+        planned light counts."""
         self._light.end(self._given_lux_h if self._cell.lights_confirmed else None)
         self._given_lux_h, self._left = np.zeros_like(self._given_lux_h), 0
 

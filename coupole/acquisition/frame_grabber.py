@@ -17,7 +17,7 @@ from coupole.storage.view_writer import WRITERS
 
 _TAKE_TIMEOUT_S = 0.05
 _STALL_S = 2.0
-"""A stall of disk or host that the camera's buffers must cover, if memory allows."""
+"""Duration of a stall of disk or host that the camera's buffers must cover, if memory allows."""
 _FEWEST_BUFFERS = 16
 _MEMORY_SHARE = 0.25
 """Share of the free memory that may be used for buffers."""
@@ -103,7 +103,7 @@ class FrameGrabber:
         return self._slots[frame].result()
 
     def end_soon(self) -> None:
-        """Ask for no frame after the one that is being waited for. Does not wait; `stop` does."""
+        """Request no more frames after the frame for which the thread is waiting. Does not wait; `stop` does."""
         self._stopping.set()
 
     def stop(self) -> None:

@@ -48,8 +48,8 @@ class FaultModel:
     drift_ppm: float = 100.0
     max_surplus: int = 3
     in_flight: int = 2
-    """Frames that may reach the host before their step is in the log. The log must have been read to its end after
-    the last frame was taken."""
+    """Number of frames that may reach the host before their step is in the log. The log must have been read to its
+    end after the last frame was taken."""
 
 
 @dataclass(frozen=True)
@@ -69,12 +69,12 @@ class Match:
     step_of_frame: NDArray[np.int64]
     """[frames] index into the log, or UNLABELLED."""
     surplus: NDArray[np.bool_]
-    """[frames] fired by no step; all candidates agree on it."""
+    """[frames] True for frames that no step has fired, as all candidates agree."""
     missing: NDArray[np.bool_]
     """[steps] an edge was sent, and all candidates agree that none of the frames belongs to it (while a burst
     runs, its frame may still be in transfer)."""
     lost_in_transfer: NDArray[np.bool_]
-    """[steps] missing, and the frame ids show that the camera did expose it."""
+    """[steps] True for missing frames that the camera did expose, as the frame ids show."""
     ambiguous: bool
     """True if at least one frame could be neither labelled nor declared surplus or pending."""
     reason: str

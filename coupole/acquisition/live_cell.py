@@ -60,6 +60,6 @@ class CellSource:
         if choice.led is None or studio.is_watched:
             studio.remark = self._meter.warning if self._meter else ""
             return False
-        studio.remark = "no page is open: the light is off until one is"
+        studio.remark = "no page is open: the light is off until a page is opened"
         studio.closing.wait(_POLL_S)
         return True

@@ -114,7 +114,9 @@ def watch_cell(
     request = Wanted(led=choice.led, exposure_us=choice.exposure_us)
     studio = Studio(choice_from(request, choice, tuple(leds.ids.tolist()), longest_us))
     if job is None or job.plan.object is None:
-        console.print("no object is known, so the light is not counted; to count it, give a plan")
+        console.print(
+            "without a plan no object is known, so the light is entered in no ledger; to enter it, give a plan"
+        )
     else:
         _ask_the_ledger(job, console)
     faults_of(rig_cell).refuse(rig_cell.document.path)

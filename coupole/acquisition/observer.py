@@ -147,8 +147,8 @@ class Control:
         return self.hold_pending.is_set()
 
     def await_word(self) -> None:
-        """Wait until the reason is known if this process did not run for a while. Call this before an arm that
-        stands is moved again."""
+        """Wait, if this process did not run for a while, until the reason for that is known. Call this before an
+        arm that stands is moved again."""
         if self.session is not None:
             self.session.await_word()
             return

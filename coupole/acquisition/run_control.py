@@ -145,11 +145,11 @@ class NoAnswer(InputError):
 
 # -- the side of whoever asks ---------------------------------------------------------------------------------
 
-_OBEYED_LATER = "given up without an answer: `coupole {}` is obeyed as soon as the process runs again"
+_OBEYED_LATER = "stopped waiting for an answer: the process obeys `coupole {}` as soon as it runs again"
 _WHEN_GIVEN_UP = {
     "pause": _OBEYED_LATER.format("pause"),
     "stop": _OBEYED_LATER.format("stop"),
-    "go-on": "given up without an answer: `coupole go-on` is not obeyed later",
+    "go-on": "stopped waiting for an answer: the process does not obey this `coupole go-on` later",
 }
 
 

@@ -28,7 +28,7 @@ S = TypeVar("S")
 
 HUBER = 2.0
 REJECT_SIGMA = 5.0
-"""Bound of the norm of an image point's residual: with normal noise, one point in 270,000 exceeds it."""
+"""Greatest norm of an image point's residual: with normal noise, one point in 270,000 exceeds it."""
 _MAX_STEPS = 60
 _MAX_ROUNDS = 30
 _SETTLED = 1e-3
@@ -37,7 +37,7 @@ _SINGULAR = 1e-6
 """Least diagonal element of the Cholesky factor of the scaled normal matrix. Its square is the share of a
 parameter's information that is left if the earlier parameters are unknown too."""
 _LEAST_REDUNDANCY = 3.0
-"""Least redundancy. With less redundancy the residuals do not determine the noise."""
+"""Least redundancy with which the residuals determine the noise."""
 _LEAST_FACTOR = 1e-4
 """Lower bound of a noise factor (estimated over stated noise). Without it, residuals of nearly zero would give a
 group unlimited weight."""
@@ -100,7 +100,7 @@ class Adjusted(Generic[S]):
     covariance: Floats
     components: tuple[Component, ...]
     contributions: Floats
-    """Share [groups, p] of each parameter's variance."""
+    """Share [groups, p] of each parameter's variance that comes from each group of observations."""
     degrees: Floats
     """Effective degrees of freedom [p]."""
     residuals: tuple[Floats, ...]

@@ -1,4 +1,4 @@
-"""Artefacts: things with a certificate that calibrations use, and the data of them that a record keeps.
+"""Artefacts: things with a certificate that calibrations use, and the data about them that a record keeps.
 
 A description of a board, tile, chart or target may have a block `artefact`. The block identifies the thing, and
 gives the certificate's figures and their temperature. Uncertainties are written as in certificates: expanded, with
@@ -72,7 +72,7 @@ class Certificate(Model):
     date: datetime.date
     """Date of the calibration."""
     due: datetime.date | None = Field(default=None, exclude_if=_not_said)
-    """Date on which its owner wants it to be calibrated again."""
+    """Date on which the owner of the thing wants it to be calibrated again."""
     file: FilePath | None = Field(default=None, exclude_if=_not_said)
     """The file of the certificate, beside the description. Its checksum goes into records."""
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = Field(default=None, exclude_if=_not_said)
@@ -218,7 +218,7 @@ class UsedArtefact(Model):
     measured_by: str = ""
     """Source of that temperature."""
     correction_ppm: float = 0.0
-    """Correction of all its lengths for thermal expansion."""
+    """Relative correction of all its lengths for thermal expansion."""
     u_scale_ppm: Annotated[float, Field(ge=0)] | None = None
     """Standard uncertainty of its lengths at that temperature."""
     figures: dict[str, float] = Field(default_factory=dict)
@@ -239,8 +239,8 @@ def used_as(
 
 
 def temperature_of(celsius: float | None, u_k: float, of_run_c: tuple[float, float] | None) -> Temperature:
-    """Return the temperature that was entered, or otherwise that of a run's coolest LED board (`of_run_c`, from
-    and to), which is nearest to the room's."""
+    """Return the temperature that was entered. Without it, return that of a run's coolest LED board (`of_run_c`,
+    from and to), which is nearest to the room temperature."""
     if celsius is not None:
         return Temperature(celsius, u_k, "entered by hand")
     if of_run_c is not None:
@@ -323,7 +323,7 @@ def facts_of(used_artefact: UsedArtefact) -> dict[str, str]:
 
 
 def sentence_of(used_artefact: UsedArtefact) -> str:
-    """Return one line with the thing and its certificate, or that there is no certificate."""
+    """Return one line that names the thing and its certificate, or says that there is no certificate."""
     certificate = used_artefact.artefact.certificate
     certificate_words = (
         NOT_TRACEABLE

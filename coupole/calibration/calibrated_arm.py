@@ -1,7 +1,7 @@
 """The arm as a hand-eye calibration describes it: zero errors of its axes, and the uncertainty of the hand-eye.
 
-A hand-eye record that was made with the arm's model (`coupole calibrate hand-eye --rig`) holds for poses that are
-corrected by its axis zeros. Without this correction, an error of 0.02 degrees in the zero of an axis shifts
+A hand-eye record that was made with the arm's model (`coupole calibrate hand-eye --rig`) is valid for poses that
+are corrected by its axis zeros. Without this correction, an error of 0.02 degrees in the zero of an axis shifts
 everything that the camera sees by a third of a millimetre. The shift is the same in every view, so no residual
 shows it.
 """

@@ -31,7 +31,7 @@ class LeftOut:
 
     @property
     def ratio(self) -> float:
-        """Root mean square of the ratios of all views."""
+        """Root mean square over all views of the prediction error divided by its standard uncertainty."""
         return float(np.sqrt(np.mean(self.ratios**2)))
 
 

@@ -49,8 +49,8 @@ def read_accepted(path: Path, kind: Kind) -> Record:
 
 def refuse_read_otherwise(path: Path, record: Record, given_kinds: Collection[str]) -> None:
     """Raise InputError if frames would be read differently from those that a record of LEDs' powers was made from.
-    This is so if it was made with a response, a flat field or a glare, and this kind is not among `given_kinds`,
-    or the reverse."""
+    This is so if the powers were made with a record of the response, the flat field or the glare and this kind is
+    not among `given_kinds`, or if they were made without it and the kind is among them."""
     for kind in (*SHAPE_SIGNAL, GLARE):
         read_with = record.fixed.get(READ_WITH + kind, 0.0 if kind == GLARE else None)
         beside = _made_with(path, record, kind)
@@ -68,7 +68,8 @@ def refuse_read_otherwise(path: Path, record: Record, given_kinds: Collection[st
 
 
 def _made_with(path: Path, record: Record, kind: str) -> Path | None:
-    """Return the record of a kind that another record was made with, if it lies beside that."""
+    """Return the record of this kind that was used to make another record, if it lies in the folder of that
+    record."""
     input_hashes = {line.sha256 for line in record.inputs if "/" not in line.name}
     for beside in sorted(path.parent.glob("*.yaml")):
         if hashlib.sha256(beside.read_bytes()).hexdigest() in input_hashes:
@@ -111,7 +112,7 @@ def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, 
             raise InputError(
                 f"{path}: holds for a focus of {holds.focus_distance_mm:g} mm, within "
                 f"{holds.focus_tolerance_mm:g} mm; the images were taken at {about.focus_distance_mm:g} mm. "
-                "Name the record of this focus"
+                "Name a record that was made at this focus"
             )
     for label, valid, figure in (
         ("focal length", holds.focal_length_mm, about.focal_length_mm),

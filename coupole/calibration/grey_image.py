@@ -12,7 +12,7 @@ from coupole.errors import InputError
 
 Channel = Literal["green", "red", "blue"]
 CHANNELS: tuple[Channel, ...] = ("green", "red", "blue")
-"""Green first: the others are compared with it."""
+"""Green comes first, because the other colours are compared with it."""
 MONO, COLOUR = "MONO", "COLOUR"
 _RESIZED = (np.uint8, np.uint16, np.float32, np.float64)
 """Types for which OpenCV can compute means."""
@@ -20,7 +20,7 @@ _RESIZED = (np.uint8, np.uint16, np.float32, np.float64)
 
 @dataclass(frozen=True)
 class Picture:
-    """The values of one camera image, black level subtracted."""
+    """The values of one camera image, without its black level."""
 
     values: NDArray[Any]
     """[H, W]; of pattern `COLOUR` [H, W, 3]: red, green, blue."""
@@ -44,8 +44,8 @@ class Picture:
         return self.values.shape[1], self.values.shape[0]
 
     def plane(self, channel: Channel = "green") -> NDArray[Any]:
-        """Return one colour at full size [H, W]; grey counts as green. Raises InputError for another colour of a
-        grey image."""
+        """Return one colour at full size [H, W]; grey counts as green. Raises InputError if another colour of a
+        grey image is requested."""
         if self.pattern == COLOUR:
             return np.asarray(self.values[..., ("red", "green", "blue").index(channel)])
         if self.pattern == MONO:
@@ -63,8 +63,8 @@ class Picture:
 
     def reduced(self, factor: int) -> NDArray[Any]:
         """Return green (or grey) at a fraction of the size [H // factor, W // factor], as means over squares of
-        pixels. In a RAW image only the green pixels count. Its pixel (x, y) has its middle at factor (x, y) +
-        (factor - 1) / 2."""
+        pixels. In a RAW image only the green pixels count. The middle of pixel (x, y) of the result is at factor
+        (x, y) + (factor - 1) / 2 of the image."""
         import cv2
 
         if factor == 1:
@@ -105,7 +105,8 @@ class Picture:
 
 
 def plane(frame: NDArray[Any], pattern: str, channel: Channel = "green") -> NDArray[np.float32]:
-    """Return one channel of a RAW frame [H, W] at full size [H, W], DN. Edges in it are edges in the frame.
+    """Return one channel of a RAW frame [H, W] at full size [H, W], DN. Edges in the result have the places of
+    edges in the frame.
 
     `pattern` has the names of the four pixels at the frame's top left, row by row; `MONO` has one channel. The
     value is a mean over the channel's pixels with the weights 1 2 1 in both directions. The weights of green

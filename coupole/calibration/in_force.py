@@ -21,7 +21,7 @@ _SAME = 1e-3
 
 @dataclass(frozen=True)
 class Situation:
-    """The cell that is to take the pictures. A value of None is not known, and is not checked."""
+    """State of the cell that will take the pictures. A value of None is not known, and is not checked."""
 
     now: datetime
     """Time now, with a time zone."""
@@ -32,7 +32,7 @@ class Situation:
     focus_distance_mm: float
     f_number: float
     camera: str | None = None
-    """Model and serial number, once the camera is open."""
+    """Model and serial number of the camera, once it is open."""
     temperature_c: float | None = None
     """Temperature of the coolest LED board, which is nearest to the room's temperature."""
 

@@ -82,7 +82,7 @@ class ModelError:
     """Noise of the group without the patterns, divided by the stated noise."""
     suspects: tuple[Suspected, ...]
     coefficients: Floats
-    """[modes] of all suspects together, in their order."""
+    """[modes] coefficients of all suspects together, in their order."""
     joint_covariance: Floats
     """[p + modes] squared, of the parameters and all coefficients."""
 

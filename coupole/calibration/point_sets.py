@@ -90,8 +90,8 @@ def match_points(found_mm: Floats, known_mm: Floats, tolerance_mm: float) -> Mat
     )
     if rivals > _AMBIGUOUS_SHARE * count:
         raise InputError(
-            f"targets: two motions fit: one brings {count} targets together, another {rivals}. The stickers are "
-            "placed too regularly, or too few were seen; add some, or take more views."
+            f"targets: two motions fit: one brings {count} targets together, the other {rivals}. The stickers "
+            "are placed too regularly, or too few were seen; add some, or take more views."
         )
     pairs = _pairs(tree, motion, known_mm, tolerance_mm)
     return Matched(*pairs, motion, rms_mm, rivals)

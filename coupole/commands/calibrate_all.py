@@ -37,9 +37,9 @@ def calibrate_all(
     """Acquire and calibrate each of: dark frames, response, flat field, lens and hand-eye, LEDs and their power,
     an object's place.
 
-    A step with a record in the folder is skipped, and an interrupted run is resumed, so call it again to finish.
-    For a real cell the command prints what must be on the support, and waits; a simulated cell has its own object
-    and scanner.
+    A step with a record in the folder is skipped, and an interrupted run is resumed: to finish, give the command
+    again. For a real cell the command prints what must be on the support, and waits; a simulated cell has its own
+    object and scanner.
     """
     from coupole.console.command_line.client import borrowed_cell
     from coupole.plan.cell import read_cell

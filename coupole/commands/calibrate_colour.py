@@ -58,9 +58,11 @@ WhiteOption = Annotated[
     Path | None,
     typer.Option(
         "--white",
-        help="For runs: a run of the same plan with a white sheet in the chart's place, in place of the LEDs' "
-        "known light. For pictures: a picture of a white card in the chart's place, in place of the light found "
-        "from the patches.",
+        help=(
+            "For runs: a run of the same plan with a white sheet where the chart lay; it replaces the LEDs' "
+            "known light. For pictures: a picture of a white card where the chart lay; it replaces the light "
+            "found from the patches."
+        ),
         show_default=False,
     ),
 ]
@@ -180,7 +182,7 @@ def _by_pictures(paths: list[Path], options: _GivenOptions, *, srgb: bool) -> Wo
 
 @dataclass(frozen=True)
 class _At:
-    """Tells at the terminal how far the work is."""
+    """Shows the progress of the work at the terminal."""
 
     console: Console
 

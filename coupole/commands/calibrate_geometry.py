@@ -82,7 +82,8 @@ def leds(
 ) -> Work:
     """Find positions and normals of all LEDs, from views of the lit LEDs. Each LED must be seen six times or more.
 
-    With a dead LED or swapped wires the record is not accepted and no table is written, unless --accept-faults.
+    If an LED is dead or wires are swapped, the record is not accepted and no table is written, unless you give
+    --accept-faults.
     """
     from coupole.calibration.leds.drawing import draw_leds
     from coupole.calibration.leds.equations import Stated

@@ -226,7 +226,7 @@ def look_for_board(
 
 
 def _earlier_lens(path: Path | None, sources: Sources, board_images: Found) -> EarlierLens | None:
-    """The lens of a camera record, with its covariance. Raises InputError if the record does not hold for these
+    """The lens of a camera record, with its covariance. Raises InputError if the record is not valid for these
     images."""
     from coupole.calibration.earlier import read_earlier, refuse_same_images
     from coupole.calibration.lens.equations import EarlierLens

@@ -101,7 +101,7 @@ class Campaign:
                             for excess in excesses
                         ),
                         f"Read {path.with_suffix('.html')}; remove the cause, or calibrate by hand with --limit "
-                        f"or --accept-faults; remove {path.stem}.*, and call this again",
+                        f"or --accept-faults; then remove {path.stem}.*, and call this again",
                     ]
                 )
 
@@ -119,7 +119,7 @@ class Campaign:
         if self._operator.is_asked:
             self._console.print(f"Place on the support: [bold]{step.stands}[/].")
             if not ask("Ready?", default=True):
-                raise Interrupted("stopped by the operator; call it again to continue")
+                raise Interrupted("stopped by the operator; give the command again to continue")
         summary: dict[str, Any] = {}
         job = read_job(plan)
         request = SessionRequest(self._out / "runs", resumed_run, confirm=self._operator.is_asked)

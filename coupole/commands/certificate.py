@@ -27,14 +27,16 @@ def certificate(
         Path,
         typer.Option(
             "--about",
-            help="Statements of the laboratory (YAML): item, place, climate, who authorises.",
+            help="Statements of the laboratory (YAML): item, place, climate, and the person who authorises.",
             show_default=False,
         ),
     ],
     earlier: Annotated[
         list[Path] | None,
         typer.Option(
-            "--earlier", help="Records of earlier calibrations: how fast figures drift.", show_default=False
+            "--earlier",
+            help="Records of earlier calibrations, which show how fast figures drift.",
+            show_default=False,
         ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", help="Write this page, and JSON beside it.")] = Path(

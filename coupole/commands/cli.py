@@ -197,7 +197,7 @@ def _options(
         print(json.dumps(_about_version()) if as_json else f"coupole {coupole.__version__}")
         raise typer.Exit
     if as_json or context.invoked_subcommand is None:
-        context.fail("--json goes with --version here, or behind a command's name")
+        context.fail("--json goes with --version here, or after a command's name")
     if context.invoked_subcommand in AT_A_CELL:
         text_outlet.install()
 

@@ -167,7 +167,8 @@ EXAMPLES: dict[str, tuple[str, str]] = {
 """Examples of a command, without the word `coupole`. The key is the command's name, or the names of its group and
 step.
 
-RUN, RESULT, WHITE (a run with a white sheet) and PICTURES stand for folders, SCAN for one of `coupole scan`.
+RUN, RESULT, WHITE (a run with a white sheet) and PICTURES stand for folders, and SCAN stands for a folder of
+`coupole scan`.
 """
 
 HEADING = "Examples:"

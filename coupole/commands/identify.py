@@ -93,8 +93,8 @@ def identify(
     """Which class of pigments each spectrum shows, or that the library has none for it.
 
     A verdict is match, mixture, ambiguous or unknown. The class and its probability are printed beside every
-    verdict. Below, the error rates of the library about its own spectra are printed. For an image cube, a map of
-    classes is made. If it was interrupted, the same command continues.
+    verdict. The last lines are the error rates with which the library identifies its own spectra. For an image
+    cube, a map of classes is made. If it was interrupted, the same command continues.
     """
     from coupole.commands.identify_spot import asked_spot, identify_spot
     from coupole.scripting.analyses import references_of

@@ -119,7 +119,7 @@ def verify(
         goes_on = f"go on with `{folder.go_on_command}`"
         if folder.in_use:
             at_work = f"process {folder.holder}" if folder.holder else "another process"
-            goes_on = f"{at_work} is at work on this run: verify it again when that has ended"
+            goes_on = f"{at_work} is at work on this run: verify it again when this process has ended"
         raise UnprovenError(f"{len(check.missing)} frames of the plan are missing; {goes_on}")
 
 
@@ -150,8 +150,8 @@ def _verify_report(folder: Path, *, as_json: bool) -> None:
         raise ChecksumMismatch(f"{folder}: the report ({words}) is not as it was written: {len(check.problems)} "
                                "differences (above)")  # fmt: skip
     console.print(
-        f"ok: record and {check.files} files are as they were written; {words}. The checksums tell of changes, "
-        "not who signed",
+        f"ok: record and {check.files} files are as they were written; {words}. The checksums show whether "
+        "anything was changed, not who signed",
         markup=False,
     )
 

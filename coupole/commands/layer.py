@@ -363,7 +363,7 @@ def _say(document: dict[str, Any], console: Console) -> None:
     if grains := document.get("grains"):
         console.print(
             f"its grains are {grains['ratio']:.2f} +- {2 * grains['u_ratio']:.2f} times as large as those of "
-            f"{grains['than']}, if they are larger than the wavelength (S as 1/size)",
+            f"{grains['than']}, if the grains are larger than the wavelength (S proportional to 1/size)",
             markup=False,
         )
     for path in document.get("files", ()):
@@ -377,7 +377,8 @@ def _say_films(document: dict[str, Any], console: Console) -> None:
         bands = [number for number, value in enumerate(film["reflectance"]) if value is not None]
         if not bands:
             console.print(
-                f"{name}: cannot be predicted, because the measured films hide their grounds", markup=False
+                f"{name}: cannot be predicted, because the measured films hide the grounds that they lie on",
+                markup=False,
             )
             continue
         at = bands[len(bands) // 2]

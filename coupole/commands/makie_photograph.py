@@ -73,7 +73,7 @@ def makie(
         typer.Option(
             "--known",
             metavar="X,Y,SHARE",
-            help="A place whose share of metal is known, to check the result; repeat.",
+            help="A place whose share of metal is known, to check the result; repeat for more.",
         ),
     ] = None,
     as_json: JsonOption = False,
@@ -137,7 +137,9 @@ def _say(console: Any, out: Path, result: _Result) -> None:
         difference = check["found"] - check["share"]
         console.print(f"at {check['x']},{check['y']}: {shares}, off by {difference:+.3f}", markup=False)
     if result.unknown_share:
-        console.print(f"{result.unknown_share:.2%} of the pixels are saturated or dark; they have no metal here")
+        console.print(
+            f"{result.unknown_share:.2%} of the pixels are saturated or dark; they count as without metal"
+        )
     if parts.clamped_share > _TOLD_FROM:
         console.print(
             f"in {parts.clamped_share:.1%} of the pixels the share of metal was beyond 0 or 1 and was cut off: "
@@ -205,7 +207,10 @@ def _about(picture: NDArray[np.float64], place: list[str], option: str, form: st
     height, width = picture.shape[:2]
     numbers = [int(word) for word in place if word.strip().isascii() and word.strip().isdigit()]
     if len(place) != 2 or len(numbers) != 2 or numbers[0] >= width or numbers[1] >= height:
-        raise InputError(f"{option}: expected {form} of a pixel of a picture of {width} x {height}, from 0")
+        raise InputError(
+            f"{option}: expected {form}, with column and row (from 0) of a pixel in the picture of {width} x "
+            f"{height}"
+        )
     columns, rows = (slice(max(0, number - _AROUND_PX), number + _AROUND_PX + 1) for number in numbers)
     pixels = picture[rows, columns]
     if not np.isfinite(pixels).all():

@@ -63,7 +63,7 @@ def refine(
 
     `coupole reflectance RUN... --refined OUT` uses the refined poses, lens and mesh.
 
-    The last options are standard uncertainties that no record states.
+    The options for flange, mesh and surface are standard uncertainties that no record states.
     """
     from coupole.calibration.record import records_named
     from coupole.reflectance.alignment.refine_job import RefineRequest, refine_runs

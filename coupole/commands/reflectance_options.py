@@ -199,7 +199,7 @@ def bytes_of(text: str) -> int:
     try:
         size = float(text[:-2]) * units[text[-2:].upper()]
     except (KeyError, ValueError) as error:
-        raise InputError(f"--memory: expected a size as 500MB or 4GB, got {text!r}") from error
+        raise InputError(f"--memory: expected a size such as 500MB or 4GB, got {text!r}") from error
     if not 50e6 <= size < 1e15:
         raise InputError(f"--memory: expected 50MB or more, got {text!r}")
     return int(size)

@@ -83,7 +83,10 @@ SizeOption = Annotated[str | None, _option("--size", "Size of its picture, WIDTH
 FieldOption = Annotated[
     float | None,
     _option(
-        "--field-of-view", "Width of its field, degrees; by default as the object needs.", min=0.01, max=170.0
+        "--field-of-view",
+        "Width of its field, degrees; by default just wide enough for the object.",
+        min=0.01,
+        max=170.0,
     ),
 ]
 FitOption = Annotated[
@@ -116,7 +119,8 @@ WhiteOption = Annotated[
     float | None,
     _option(
         "--white",
-        "Value that a video or a picture for the eye shows as white; by default its 99.9 % quantile.",
+        "Value that a video or a picture for the eye shows as white; by default the 99.9 % quantile of its "
+        "values.",
         min=1e-9,
     ),
 ]

@@ -72,8 +72,8 @@ def acquire(
     Ctrl-C stops safely (lights off, arm still). Resume the run with `acquire --resume RUN`, which uses the run's
     own copies of plan and rig. Or name the plan again; only its comments and the object's budget of light may have
     changed. On a terminal the key p pauses between bursts and continues, q stops. From elsewhere use `coupole
-    pause`, `go-on` and `stop`. If a console owns the cell (`coupole serve`), the command acquires in the console's
-    name, if nothing runs or waits there.
+    pause`, `go-on` and `stop`. If a console owns the cell (`coupole serve`), the command enters the plan in the
+    console's queue and follows the run. This needs a console at which no other plan runs or waits.
     """
     from coupole.acquisition.sessions_without_run import ACQUIRE, SessionWithoutRun
 

@@ -53,7 +53,8 @@ def _shortage(error: BaseException) -> ResourceShortage | StorageError | None:
     if number == errno.ENOMEM or isinstance(error, MemoryError):
         limit = _limit(resource.RLIMIT_AS)
         return ResourceShortage(
-            f"this process got no more memory ({limit}). Free memory, or raise the limit (`ulimit -v unlimited`)."
+            f"this process was given no more memory ({limit}). Free memory, or raise the limit (`ulimit -v "
+            "unlimited`)."
         )
     no_process = number == errno.EAGAIN and place_of(error).startswith(_STARTS_PROCESSES)
     if no_process or (isinstance(error, RuntimeError) and _NO_THREAD in str(error)):

@@ -27,7 +27,8 @@ and than a slow report."""
 _LEAVES_WITHIN_S = 2.0
 """Longest wait for the end of the process of a run that has ended, s. A Python program may go on after its run."""
 _LOOKS = len(SESSION_PATIENCE_S)
-"""Looks before it is said that there is nothing to stop. Later ones have the patience of the last."""
+"""How often sessions are looked for before the command says that there is nothing to stop. Later looks have the
+patience of the last of these."""
 
 
 def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
@@ -201,7 +202,10 @@ class _Stopping:
         for pid, name in starting.items():
             if waited_s > _SAID_AFTER_S and pid not in self._told_pids:
                 self._told_pids.add(pid)
-                _alarm(f"{name} is just starting: waiting until it can be stopped, or is known not to be meant")
+                _alarm(
+                    f"{name} is just starting: waiting until it can be stopped, or until it is known that "
+                    "another session was meant"
+                )
         if starting:
             time.sleep(_STARTING_EVERY_S)
 

@@ -44,8 +44,8 @@ def lines_of(forecast: TexelForecast, machine_bytes: int) -> Iterator[str]:
         )
     if size_mm is not None and size_mm > forecast.edge_mm:
         yield (
-            f"texels of {size_mm:g} mm are larger than the mesh's triangles, whose edge is {forecast.edge_mm:.2g} "
-            "mm (median): each triangle also has a material without --texels"
+            f"texels of {size_mm:g} mm are larger than the mesh's triangles, whose edge is "
+            f"{forecast.edge_mm:.2g} mm (median): without --texels, each triangle has a material too"
         )
 
 

@@ -77,7 +77,9 @@ def budget(
     ] = None,
     earlier: Annotated[
         list[Path] | None,
-        typer.Option("--earlier", help="Records of earlier calibrations: which figures have drifted since."),
+        typer.Option(
+            "--earlier", help="Records of earlier calibrations, which show the figures that have drifted since."
+        ),
     ] = None,
     *,
     spot: SpotOfObject,

@@ -99,7 +99,8 @@ def write_crate(
         raise InputError(f"{root}: has files already. Choose another --out, or give --overwrite")
     if not in_place and (root / DATA).exists() and not (root / METADATA).exists():
         raise InputError(
-            f"{root / DATA}: does not belong to a crate: {METADATA} is missing. Remove it, or choose another --out"
+            f"{root / DATA}: belongs to no crate, because {METADATA} is missing. Remove it, or choose another "
+            "--out"
         )
     inside = "" if in_place else f"{DATA}/"
     paths = sorted(_files(source, without=None if in_place else root))
@@ -272,8 +273,8 @@ def _person(text: str) -> tuple[Entity, Entity | None]:
     url = within.removesuffix(">")
     if not name or (within and not _ORCID.fullmatch(url)):
         raise InputError(
-            f"--author {text!r}: expected 'NAME', 'NAME <https://orcid.org/0000-0000-0000-0000>', and behind it "
-            "' at INSTITUTION' if it is to be named"
+            f"--author {text!r}: expected 'NAME', 'NAME <https://orcid.org/0000-0000-0000-0000>', followed by ' "
+            "at INSTITUTION' if you want to name the institution"
         )
     person = {"@id": url or f"#person-{_part_of_id(name)}", "@type": "Person", "name": name}
     if not house:

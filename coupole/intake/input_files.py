@@ -76,20 +76,20 @@ def _stamp(about: os.stat_result) -> tuple[int, ...]:
 
 
 def _change(path: Path, earlier_read: _Read) -> str:
-    """Return what is different now; empty if nothing is different, or only the file's times."""
+    """Return what is different now; empty if nothing is different, or if only the file's times are."""
     try:
         about = path.stat()
         if _stamp(about) == earlier_read.stamp:
             return ""
         if not stat.S_ISREG(about.st_mode):
-            return "is no file any more"
+            return "is not a file any more"
         if about.st_size == earlier_read.stamp[2]:
             with path.open("rb") as file:
                 same = hashlib.file_digest(file, "sha256").hexdigest() == earlier_read.sha256
         else:
             same = False
     except FileNotFoundError:
-        return "is not there any more"
+        return "does not exist any more"
     except OSError as error:
         return f"cannot be read any more ({reason(error)})"
     return "" if same else "was changed"

@@ -1,6 +1,6 @@
 """JSON, and YAML that is no plan or rig, as plain data: the one place where others' files and messages are parsed.
 
-Every text gives data or an InputError with file, line and column. This also holds for text that is not UTF-8,
+Every text gives data or an InputError with file, line and column. The same is true of text that is not UTF-8,
 deeply nested lists, numbers of thousands of digits, NaN, and aliases that multiply each other. Otherwise these
 would end in Python's own errors, or much later in a traceback elsewhere. Plans and rigs are read by
 `coupole.plan.yamlfile`, which knows the place of each key; pydantic's own reader of JSON has such limits already.
@@ -109,7 +109,7 @@ def yaml_of(text: str, name: str, *, line: int = 1) -> Any:
         raise InputError([Problem(name, line, 1, "", f"nested deeper than {MAX_DEPTH} levels")]) from error
     except (YAMLError, ValueError, OverflowError, TypeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise NotDataError([Problem(name, line, 1, "", f"is no YAML of plain data: {reason}")]) from error
+        raise NotDataError([Problem(name, line, 1, "", f"is not YAML of plain data: {reason}")]) from error
 
 
 def _values(node: Any, known_counts: dict[int, int]) -> int:

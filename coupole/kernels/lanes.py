@@ -214,8 +214,8 @@ def total(_context, numbers):  # type: ignore[no-untyped-def]
 
 @_compiled_function
 def gather_lanes(_context, arrays, rows, place):  # type: ignore[no-untyped-def]
-    """Return the numbers at one place in eight `rows` [8] of `arrays` [m, n], of unsigned integers or floats, in
-    single precision."""
+    """Return, in single precision, the numbers at one place of eight `rows` [8] of `arrays` [m, n]. The arrays
+    have unsigned integers or floats."""
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
         frames, row_number, place = values

@@ -33,8 +33,8 @@ from coupole.motion.sphere_tree import MESH_STEP_MM, Floats, Spheres, sphere_tre
 from coupole.plan.arm_description import TOOL, ArmDescription
 
 _NEIGHBOURLY_MM = 25.0
-"""Distance in the postures `near_by_design_deg`. Parts of a body that stay farther away than this are checked all
-the same."""
+"""Distance in the postures `near_by_design_deg`. Parts of a body that stay farther away than this are still
+checked."""
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ class Occlusion:
         """Return [leds], True where an LED reaches no patch that the camera sees; all False if the camera sees no
         patch.
 
-        Parts smaller than a patch may be lit all the same.
+        Parts smaller than a patch may still be lit.
         """
         reaches: NDArray[np.bool_] = (self.codes[self.is_seen] == REACHED).any(axis=0)
         return ~reaches & self.is_seen.any()

@@ -1,7 +1,7 @@
 """Keeps the last few results of computations on arrays, by the content of these arrays.
 
 A process may check a cell several times. A console checks plans, a session checks again before it begins, and the
-report needs the occlusion once more. The same arm and object give the same bodies and patches.
+report needs the occlusion again. The same arm and object give the same bodies and patches.
 """
 
 from __future__ import annotations

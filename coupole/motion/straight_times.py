@@ -9,8 +9,9 @@ from coupole.kernels import kernel
 
 @kernel
 def pairwise_s(places_deg, velocity_deg_s, acceleration_deg_s2, jerk_deg_s3):  # type: ignore[no-untyped-def]
-    """Return the durations [n, n], s, of the motions of `kinematics.move_durations_s` between postures [n, 6]. The
-    limits are [6] each. The memory is one number per pair, however many postures there are."""
+    """Return [n, n] durations, s, of the straight motions between all pairs of postures [n, 6], as
+    `kinematics.move_durations_s` computes them. The limits are [6] each. The memory is one number per pair,
+    however many postures there are."""
     n = len(places_deg)
     seconds = np.zeros((n, n))
     for a in range(n):

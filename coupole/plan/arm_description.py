@@ -186,7 +186,7 @@ def _body_problems(document: Document, description: ArmDescription, at: KeyPath)
     problems, links = [], {TOOL: 7}
     for k, link in enumerate(description.links):
         if link.name in links:
-            message = f"expected a name of its own, `{link.name}` is taken"
+            message = f"expected a different name for each link; `{link.name}` is taken"
             problems.append(document.problem((*at, "links", k, "name"), message))
         links[link.name] = link.link
     for number in sorted(set(range(1, 7)) - set(links.values())):
@@ -220,7 +220,8 @@ def arm_named(
     settings: Mapping[str, Any],
     files: InputFiles,
 ) -> tuple[ArmDescription | None, list[Problem]]:
-    """Return the arm under `arm:` in a rig's document, or otherwise its driver's, and the problems found in it."""
+    """Return the arm under `arm:` in a rig's document, or otherwise the default arm of its driver, and the
+    problems found in it."""
     if isinstance(arm_reference, ArmDescription):
         if arm_reference.link_meshes is not None:
             arm_reference = arm_reference.model_copy(

@@ -39,7 +39,7 @@ def possible_path(path: Path) -> Path:
         try:
             with_home(path)
         except InputError as error:
-            raise ValueError(f"a path in the home folder of a known user: {error}") from error
+            raise ValueError(f"a path in the home folder of a user of this machine: {error}") from error
     return path
 
 

@@ -72,7 +72,8 @@ class Burst:
     table: NDArray[np.void]
     """STEP_DTYPE [steps]."""
     labels: tuple[ShotLabel | None, ...]
-    """Label of the frame of each step; None for a mark whose frame is not needed (in a burst taken again)."""
+    """Label of the frame of each step; None for a mark whose frame is not needed, in a burst that is taken
+    again."""
 
     @cached_property
     def duration_s(self) -> float:

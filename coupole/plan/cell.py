@@ -34,7 +34,7 @@ class Cell:
     known."""
     panel_damage_w_per_lm: float | None = None
     files: InputFiles = field(default_factory=InputFiles, repr=False, compare=False)
-    """Files that were read. Code that needs one of them again gets the same bytes."""
+    """Files that were read. Code that needs one of these files again gets the same bytes."""
 
     @property
     def leds_path(self) -> Path:

@@ -172,9 +172,9 @@ class Chooser(Protocol):
 def next_choice(
     chooser: Chooser, view: OpenView, choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
 ) -> Choice:
-    """Return a view's next choice after these, all of which were fired; `samples` has their proven frames. It is
-    the same choice that `choose_ahead` gave, or would have given, while the last of these was fired. So it does
-    not depend on when a run was interrupted.
+    """Return a view's next choice after these, all of which were fired; `samples` has their proven frames. The
+    choice is the same as the one that `choose_ahead` gave, or would have given, while the last of these was fired.
+    So it does not depend on when a run was interrupted.
     """
     ahead = chooser.choose_ahead(view, choices, before_last(choices, samples)) if choices else None
     return ahead or chooser.choose(view, choices, samples)
@@ -189,9 +189,9 @@ def before_last(
 
 
 def bound_of(whole: Sequence[Burst], frames_of_light: int, again: Collection[int]) -> tuple[Burst, ...]:
-    """Return the bound of a view whose bursts are chosen from `whole` (shortest exposure first). The bound has
-    the `frames_of_light` longest bursts with all LEDs, and the two longest once more with the LEDs `again`. The
-    bound also has marks and dark frames for all further bursts that a view may have.
+    """Return the bound of a view whose bursts are chosen from `whole` (shortest exposure first). The bound has the
+    `frames_of_light` longest bursts with all LEDs. It has the two longest of these once more, with the LEDs
+    `again`. The bound also has marks and dark frames for all further bursts that a view may have.
     """
     in_first = [burst for burst in whole if burst.repeat == 0]
     longest = in_first[-1]
@@ -240,8 +240,9 @@ def refuse_beyond(bound: Sequence[Burst], bursts: Sequence[Burst]) -> None:
     allowed_frames = sum(label is not None for burst in bound for label in burst.labels)
     if too_long or frames > allowed_frames or len(bursts) > len(bound):
         raise RuntimeError(
-            f"{bound[0].view}: {len(bursts)} bursts with {frames} frames were chosen, where preflight has checked "
-            f"{len(bound)} with {allowed_frames}; LEDs that would be lit for longer: {sorted(too_long)[:5]}"
+            f"{bound[0].view}: {len(bursts)} bursts with {frames} frames were chosen, where preflight has "
+            f"checked {len(bound)} with {allowed_frames}; LEDs that would be lit for longer: "
+            f"{sorted(too_long)[:5]}"
         )
 
 

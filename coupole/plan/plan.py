@@ -180,7 +180,7 @@ class Plan(Model):
     trigger: Literal["hardware", "software"] = "hardware"
     """The LED box triggers the camera (`hardware`), or the host triggers it light by light (`software`)."""
     reshoot_limit: Annotated[int, Field(ge=0, le=20)] = 3
-    """Greatest number of times that unproven frames are taken again."""
+    """Greatest number of attempts to take unproven frames again."""
     discard: Literal["after_fit"] | None = None
     """`after_fit`: frames are discarded when their samples are safe, except the frames that the check needs."""
     watch: bool | Watch = DARKS_ONLY
@@ -282,7 +282,10 @@ class Plan(Model):
         if not isinstance(self.exposure, FixedExposure) or self.repeats > 1:
             raise ValueError("`exposure: {kind: fixed}` and `repeats: 1` with `lights: {kind: adaptive}`")
         if any(isinstance(view.lights or self.lights, NoLights | Panels) for view in self.view_entries):
-            raise ValueError("LEDs in each view with `lights: {kind: adaptive}` in one; no panels, no darks alone")
+            raise ValueError(
+                "LEDs in each view, if one view has `lights: {kind: adaptive}`; panels or dark frames alone are "
+                "not allowed"
+            )
         return self
 
     @model_validator(mode="after")

@@ -24,7 +24,7 @@ class LightIds(Model):
     @classmethod
     def _no_twice(cls, ids: tuple[int, ...]) -> tuple[int, ...]:
         if twice := sorted({i for i in ids if ids.count(i) > 1}):
-            raise ValueError(f"each LED once; given more than once: {twice}")
+            raise ValueError(f"each LED once; these are given more than once: {twice}")
         return ids
 
 

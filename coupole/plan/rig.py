@@ -39,7 +39,7 @@ class Device(Model):
     settings: dict[str, Any] = Field(default_factory=dict)
     """Settings that the driver needs: address, limits."""
     twin: Twin | None = None
-    """Driver that `--dry-run` opens in its place. Without it, a stand-in of the same kind is opened."""
+    """Driver that `--dry-run` opens in the device's place. Without it, a stand-in of the same kind is opened."""
 
 
 class Sensor(Model):
@@ -77,7 +77,7 @@ class Lens(Model):
     focal_length_mm: Annotated[float, Field(gt=0, le=5000)]
     """Focal length from the maker's data."""
     f_number: Annotated[float, Field(gt=0, le=1000)]
-    """F-number to which its aperture is set."""
+    """F-number to which the lens's aperture is set."""
     focus_distance_mm: Length
     """Distance from the projection centre to the plane of best focus."""
 

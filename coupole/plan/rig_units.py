@@ -1,8 +1,8 @@
 """Values of a rig that look as if they were in another unit than expected, such as m where mm are expected.
 
-What no cell can have is refused: with a clearance of 0.05 mm instead of 50 mm the arm may hit the object, and with
-a panel of 0.18 lux instead of 180 lux the light on the object is counted a thousand times too low. What a cell
-might have, but hardly has, is a warning of preflight. 0 stands for "none" where a rig may have it.
+Values that no cell can have are refused. With a clearance of 0.05 mm instead of 50 mm the arm may hit the object.
+With a panel of 0.18 lux instead of 180 lux the light on the object is counted a thousand times too low. For values
+that are unlikely but possible, preflight gives a warning. The value 0 means "none", where a rig may have it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from coupole.plan.validation_messages import KeyPath
 _LEAST_SPREAD_MM = 5.0
 """Least extent of a dome, if it has more than one LED."""
 _HOTTEST_BOARD_C = 150.0
-"""Solder and LEDs of a board do not bear more, so a higher limit is none: in K it is 273 too high."""
+"""Solder and LEDs of a board do not bear a higher temperature, so a higher limit has no effect. A limit in kelvin
+would be 273 too high."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ class Doubt:
 
 @dataclass(frozen=True)
 class _Least:
-    """A value that is 0, or as large as in all cells (`possible`) and in nearly all (`usual`)."""
+    """A value that should be 0, or at least as large as in all cells (`possible`) and in nearly all cells
+    (`usual`)."""
 
     at: KeyPath
     value: float
@@ -43,7 +45,7 @@ class _Least:
     possible: float
     usual: float
     hint: str = ""
-    """Unit of the file's value, if it is not `unit`."""
+    """Unit of the value in the file, if it differs from `unit`."""
     may_be_zero: bool = False
     of: str = ""
     """Quantity that is judged, in words, if the key has more than one value."""

@@ -19,7 +19,7 @@ from coupole.plan.shot_id import MAX_CHARACTERS, Led, Panel, PanelMark, Sentinel
 from coupole.plan.watch import SENTINELS
 
 MOST_VIEWS, MOST_FRAMES = 2000, 5_000_000
-"""Largest numbers of views and frames of one plan. So many frames fit into memory."""
+"""Largest numbers of views and frames of one plan. This number of frames fits into memory."""
 MOST_CANDIDATES = 400
 """Largest number of views among which a run chooses."""
 TAKEN_TWICE = 4
@@ -155,7 +155,7 @@ def chosen_bursts(view: OpenView, choices: Sequence[Choice]) -> tuple[Burst, ...
 
 
 def bursts_left(bursts: Sequence[Burst], proven: Collection[ShotId]) -> list[Burst]:
-    """Return the bursts with unproven frames. Each contains only these frames."""
+    """Return the bursts with unproven frames. Each burst contains only these frames."""
     remaining_bursts = []
     for burst in bursts:
         missing_labels = {shot.label for shot in burst.shots if shot and shot not in proven}
@@ -308,7 +308,7 @@ def too_large(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], s
 
 
 def names_too_long(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
-    """Return key path and message for each view whose shot ids do not fit the frame table."""
+    """Return key path and message for each view whose name makes shot ids too long for the frame table."""
     longest_light = max(int(leds.ids.max()), 9999)
     longest = ShotLabel(Led(longest_light), len(plan.exposure.exposures_us) - 1, plan.repeats - 1)
     mark = ShotLabel(PanelMark(4, MARKS - 1), longest.exposure, longest.repeat)

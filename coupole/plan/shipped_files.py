@@ -36,7 +36,7 @@ def file_of(path: Path, kind: Kind) -> Path:
 
 
 def place_to_write(folder: Path) -> Path:
-    """Return the folder itself. Nobody writes into an installed package, so for a folder there, return the one of
+    """Return the folder itself. For a folder in an installed package, where nobody writes, return the folder of
     the same name in the working folder."""
     if not _INSTALLED.is_dir() or not folder.is_relative_to(_PACKAGE):
         return folder

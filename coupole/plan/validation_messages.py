@@ -141,7 +141,8 @@ class _Explainer:
         return f"; did you mean `{near}`?" if near else ""
 
     def _union(self, path: KeyPath, value: Any, by_member: list[Errors]) -> Iterator[Mistake]:
-        """Yield mistakes when all members of a plain union failed: those of the member with the value's shape."""
+        """Yield mistakes when all members of a plain union failed: the mistakes of the member that has the value's
+        shape."""
         members = [self._inner(choice) for choice in self._choices()]
         if len(members) == len(by_member):
             for member, errors in zip(members, by_member, strict=True):

@@ -107,7 +107,7 @@ class AdaptiveLightsChooser(Chooser):
         if reason := _enough(lights, figures, len(affordable_ids)):
             return Choice(bursts=(), reason=reason, figures=figures)
         errors = f"{100.0 * figures['relit_rms']:.2f} %, {100.0 * figures['relit_rms_after']:.2f} % after them"
-        reason = f"{len(affordable_ids)} LEDs that add most information: expected error {errors}"
+        reason = f"the {len(affordable_ids)} LEDs that add the most information: expected error {errors}"
         return self._choice(view, affordable_ids, reason, figures)
 
     def _affordable(

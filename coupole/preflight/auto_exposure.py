@@ -72,7 +72,7 @@ class AutoExposureChooser(Chooser):
         if not evidence.first_leds:
             return Choice(bursts=(), reason="no frame of the first pass is proven, so no exposure can be chosen")
         if len(choices) == 1 and (probes := self._probes(view, evidence)):
-            reason = _in_words("the first pass clips or is dark", probes)
+            reason = _in_words("the frames of the first pass are clipped or dark", probes)
             return Choice(bursts=tuple(probes), reason=reason, figures={_PROBE: True})
         rounds = len([choice for choice in choices[1:] if _PROBE not in choice.figures])
         if rounds == 0:

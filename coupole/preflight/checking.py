@@ -50,7 +50,7 @@ def preflight_of(
 
     Without `paths`, collisions are not checked. The views of a resumed run occupy `occupied_space` of the disk,
     and its `proven` frames are not taken again. The disk's speed is known only with `measure`. `say` is called
-    with each step in words.
+    with a description of each step.
     """
     if measure:
         say("measuring the disk's speed")
@@ -209,7 +209,8 @@ def _object_check(job: Job, itinerary: Itinerary, proven: Collection[ShotId]) ->
 
 
 def _badly_exposed(white: Sequence[ExposedWhite]) -> list[str]:
-    """Warnings if even the shortest exposure saturates white, or even the longest leaves it dark."""
+    """Return warnings if even the shortest exposure saturates white, or if even the longest exposure leaves it
+    dark."""
     ends = [(white[0], "over-exposed"), (white[-1], "under-exposed")] if white else []
     return [
         f"{end.exposure_us} us: {verdict}: white reaches {end.brightest:.0%} of full scale under the brightest "

@@ -98,7 +98,7 @@ class CommissioningRecord(Model):
         return all((step_result := self.result(step)) is not None and step_result.has_passed for step in STEPS)
 
     def with_result(self, result: StepResult) -> CommissioningRecord:
-        """The same record with a new result in place of an older one of that step."""
+        """Return the same record with a new result in place of the older result of that step."""
         results = {step_result.step: step_result for step_result in self.steps} | {result.step: result}
         return _sealed_record(
             self.rig, tuple(results[step] for step in STEPS if step in results), is_simulated=self.simulated
@@ -140,7 +140,7 @@ def read_commissioning(cell: Cell) -> CommissioningRecord | None:
 
 
 def _is_there(path: Path) -> bool:
-    """Tell whether a record exists. Raises StorageError if this cannot be seen."""
+    """Tell whether a record exists. Raises StorageError if this cannot be determined."""
     try:
         return path.exists()
     except OSError as error:

@@ -47,7 +47,7 @@ HARMLESS: Mapping[str, str] = {
     "ledbox.twin": "opened in dry runs only",
     "camera.twin": "opened in dry runs only",
     "robot.twin": "opened in dry runs only",
-    "world": "stand-ins: nothing real is opened in their place",
+    "world": "stand-ins are opened, and no real device",
 }
 """Keys, with all keys below them, that no collision and no lamp depends on, and the reason. The addresses of
 `NOWHERE` are harmless too, because the device at an address is identified by its serial number when it is

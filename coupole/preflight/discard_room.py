@@ -30,12 +30,13 @@ _TRIANGLE_BYTES = 200
 _PICTURES = 12
 """Greatest number of pictures of a view for the check."""
 _FIT_BYTES, _MATERIAL_BYTES = 1250, 360
-"""Bytes of the fits: first of a view's triangle for each channel, then of a triangle of the mesh."""
+"""Bytes of the fits: the first number is for a triangle of a view and each channel, the second for a triangle of
+the mesh."""
 _SMALL_BYTES = 4_000_000
 """Bytes of reports and of other data that belong to no triangle. The reports of a view need less."""
 _LEAST_COSINE = -0.05
-"""Least cosine of a triangle's direction to the camera. A triangle below it cannot be seen, even if the pose is a
-little off."""
+"""Least cosine between a triangle's normal and the direction to the camera. A triangle below this value cannot be
+seen, even if the pose has a small error."""
 
 
 @dataclass(frozen=True)

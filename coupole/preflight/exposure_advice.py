@@ -70,7 +70,7 @@ class Noise:
     """DN per electron."""
 
     def signal_for(self, snr: float) -> float:
-        """Signal in DN at which s / sqrt(variance) is `snr`."""
+        """Return the signal s, DN above black, at which s / sqrt(variance) is `snr`."""
         shot = snr**2 * self.gain_dn
         return (shot + math.sqrt(shot**2 + 4.0 * (snr * self.read_dn) ** 2)) / 2.0
 
@@ -158,9 +158,9 @@ def noise_of(views: Iterable[Metered]) -> Noise:
 
 def noise_of_pairs(pairs: Iterable[tuple[NDArray[np.int32], NDArray[np.int32], int]]) -> Noise:
     """Fit the photon transfer line to pairs of frames: signals [n] of both above black, and the top of their
-    range, DN. The line is half of the mean squared difference against the mean signal, in levels with equally many
-    pixels. Levels are weighted by the uncertainty of their variance. If everything is saturated, the result is
-    rounding noise only."""
+    range, DN. The line is half of the mean squared difference as a function of the mean signal, in levels with
+    equally many pixels. Levels are weighted by the uncertainty of their variance. If everything is saturated, the
+    result is rounding noise only."""
     signal, half_squares = [np.zeros(0)], [np.zeros(0)]
     for a, b, white in pairs:
         below_white = np.maximum(a, b) < white
@@ -223,11 +223,13 @@ def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -
     shortest_times_us = [a.shortest_us for a in advices if a.object_share]
     shortest_us = max(shortest_times_us, default=brightest_us)
     if brightest_us < low_us:
-        remarks.append(f"even {low_us} us saturate more than allowed: close the aperture or dim the lights")
+        remarks.append(
+            f"even with {low_us} us, more pixels are saturated than allowed: close the aperture or dim the lights"
+        )
     if shortest_us > high_us:
         remarks.append(
-            f"even {high_us} us are too short for the required signal-to-noise ratio: "
-            "open the aperture or raise the gain"
+            f"even {high_us} us is too short for the required signal-to-noise ratio: open the aperture or raise "
+            "the gain"
         )
     first = _rounded_us(min(max(min(shortest_us, brightest_us), low_us), high_us), up=shortest_us <= brightest_us)
     if shortest_us <= brightest_us:

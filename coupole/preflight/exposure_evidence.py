@@ -39,7 +39,7 @@ _CLIPPED_FACTOR = 4.0
 
 @dataclass(frozen=True)
 class Merged:
-    """The frames of one LED together, pixel by pixel of the samples. Clipped pixels do not count."""
+    """The frames of one LED, combined for each pixel of the samples. Clipped pixels do not count."""
 
     rate: Floats
     """[n] signal, DN per us, weighted by the inverse of its variance; it is infinite where all frames clip."""
@@ -120,8 +120,8 @@ class Evidence:
 
     @cached_property
     def reference(self) -> tuple[Floats, Booleans]:
-        """Upper quartile [n] of a pixel's rate over illuminance under the first LEDs, and where the object is
-        seen."""
+        """Return the upper quartile [n] of a pixel's rate divided by the illuminance, under the first LEDs, and
+        the mask [n] of pixels that show the object."""
         rates = np.stack([self.merge(led).rate / np.float32(self._lux_of_led[led]) for led in self.first_leds])
         place = math.floor(_REFERENCE_QUANTILE * (len(rates) - 1))
         reference = np.partition(rates, place, axis=0)[place]

@@ -171,8 +171,8 @@ def framing_of(
 
 
 def seen_depths_mm(sight: Sight, mesh: Any) -> NDArray[np.float64]:
-    """Return [rows, columns], the depth along the axis of the first surface behind each middle of a coarse raster
-    of the picture; infinite where there is no surface."""
+    """Return [rows, columns] depths along the optical axis, for the middles of a coarse raster of the picture: the
+    depth of the first surface that each of them shows. A depth is infinite where there is no surface."""
     columns = min(_COLUMNS, sight.width_px)
     rows = max(1, round(columns * sight.height_px / sight.width_px))
     x = ((np.arange(columns) + 0.5) / columns - 0.5) * sight.width_px / sight.focal_px

@@ -53,7 +53,7 @@ def memory_behind(error: BaseException) -> str:
     link: BaseException | None = error
     while link is not None:
         if isinstance(link, MemoryError) or (isinstance(link, OSError) and link.errno == errno.ENOMEM):
-            return little_address_space(os.getpid()) or "this process got no more memory"
+            return little_address_space(os.getpid()) or "this process was given no more memory"
         link = link.__cause__ or link.__context__
     why = little_address_space(os.getpid())
     limit_bytes, _ = resource.getrlimit(resource.RLIMIT_AS)

@@ -350,8 +350,8 @@ class CostOfViews:
 
 
 def _most_dose(view: OpenView, lux: NDArray[np.float64], row_of_id: Mapping[int, int]) -> NDArray[np.float64]:
-    """Return [points] the most light of a view whose LEDs are chosen. At each point the brightest of the LEDs get
-    the longest on-times."""
+    """Return the greatest light [points] that a view can give whose LEDs are chosen in the run. At each point the
+    brightest of the LEDs get the longest on-times."""
     if not view.bound:
         return np.zeros(len(lux))
     on_us = np.concatenate([burst.table["on_us"][burst.is_light()] for burst in view.bound])

@@ -89,8 +89,8 @@ def world_config(
 
 @contextmanager
 def frozen(config: dict[str, Any], files: InputFiles) -> Iterator[dict[str, Any]]:
-    """Give the same world with copies of the bytes that were read, while it starts. The world reads its files
-    itself, in another process, and must read the bytes that were checked.
+    """Give the settings of the same world, with copies of the files as they were read. Use them while the world
+    starts. The world reads its files itself, in another process, and must read the bytes that were checked.
     """
     scene = config["scene"]
     with tempfile.TemporaryDirectory(prefix="coupole-inputs-") as folder:

@@ -132,8 +132,8 @@ def fit_pool(pool: Pool, starts: TriangleMaterials) -> TriangleMaterials:
 def nearest_cluster(
     samples: TriangleSamples, sample_mask: NDArray[np.bool_], materials: TriangleMaterials, fewest: int
 ) -> NDArray[np.int64]:
-    """[b] cluster whose material fits a triangle's samples best, with the mesh's normal; -1 for fewer than
-    `fewest` samples."""
+    """Return [b], for each triangle the cluster whose material fits its samples best, with the mesh's normal; -1
+    for fewer than `fewest` samples."""
     nearest = np.full(len(samples.values), -1, np.int64)
     _nearest(
         samples.values, samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, samples.normals,

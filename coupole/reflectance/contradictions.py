@@ -1,5 +1,5 @@
-"""Samples that are shaded by a thing which nobody described, for example a cable. Such samples contradict the
-samples of neighbouring LEDs.
+"""Samples that are shaded by a thing that no description contains, for example a cable. Such samples contradict
+the samples of neighbouring LEDs.
 
 A cable's full shadow is too dark to give samples. At the shadow's edge a triangle is partly lit, and its sample
 can be too low by any amount. A contradicted sample is darker than the triangle's material in all channels, by more
@@ -34,7 +34,7 @@ BESIDE = 6
 _FEWEST_BESIDE = 4
 """Least number of these LEDs that must have a sample."""
 _MOST_LEFT = 0.8
-"""A contradicted sample has kept less than this share of its light."""
+"""A sample counts as contradicted only if less than this share of its light is left."""
 _AGREE = (0.9, 1.15)
 """Range in which the median ratio of neighbouring LEDs to the material counts as agreement."""
 _LEAST_DIFFUSE = 0.5
@@ -109,8 +109,8 @@ def _mark(values, whole, u_noise, led_mm, centres_mm, normals, kd, places_beside
 
 @kernel(error_model="numpy")
 def _compare(values, whole, u_noise, kd, cosine):  # type: ignore[no-untyped-def]
-    """Tell whether a sample is darker than the material in all its channels, by more than its noise. Return also
-    the ratio of the sample's mean over the channels to the material's; NaN if there is none."""
+    """Tell whether a sample is darker than the material in all its channels, by more than its noise. Also return
+    the sample's mean over the channels, divided by the material's mean; NaN if there is no such ratio."""
     count, low_count, total = 0, 0, 0.0
     for channel in range(len(values)):
         ratio = values[channel] / whole[channel]

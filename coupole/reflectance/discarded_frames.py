@@ -28,7 +28,7 @@ from coupole.storage.sample_proofs import has_proofs, note, problem_of, proofs_o
 
 _LOCK_NAP_S = 0.2
 _MOST_HASHED_BYTES = 2_000_000_000
-"""Files of views that are larger than this are left to `verify --manifest`."""
+"""Files of views that are larger than this are hashed only by `verify --manifest`."""
 
 
 # -- the result that stands for the frames --------------------------------------------------------------------
@@ -113,8 +113,8 @@ def rewrite(path: Path, write: Callable[[Path], Any]) -> None:
 
 def discard_complete(run: Run, out: Path, say: Callable[[str, int, int], object]) -> None:
     """Discard the frames that a run's plan names, after its last session, for all views whose samples in its
-    result are safe. Finish also a discard that a crash interrupted. Waits while a session holds the run. Raises
-    StorageError."""
+    result are safe. Also finish a discard that a crash has interrupted. Waits while a session holds the run.
+    Raises StorageError."""
     if not is_complete(run.folder):
         return
     with _hold_when_free(run):

@@ -35,8 +35,8 @@ class Fit:
 class MaterialFit(Fit):
     """A material for each triangle, fitted to the samples of all views; it is valid from all directions.
 
-    Pictures under new light, exports and pages take its `kd`, `ks` and `alpha` as GGX's: a material without a lobe
-    has a `ks` of 0."""
+    Pictures under new light, exports and pages use its `kd`, `ks` and `alpha` as those of GGX: a material without
+    a lobe has a `ks` of 0."""
 
     fits_normals: bool
 

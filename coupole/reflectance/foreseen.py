@@ -57,7 +57,7 @@ class Foreseen:
     near_spread: Floats
     """Range of the near pictures."""
     near_miss: Floats
-    """Rms error of the kernel for the near pictures, each left out in turn."""
+    """Rms error of the kernel for the near pictures, each of which is left out in turn."""
     worst_miss: Floats
     correction: Floats
     """Size of the learnt correction."""

@@ -52,8 +52,8 @@ def tangents(x, y, z):  # type: ignore[no-untyped-def]
 
 @kernel
 def root_by_unknowns(normal, t1, t2, light, half, nv, v1, v2, kd, ks, alpha, row):  # type: ignore[no-untyped-def]
-    """Return the square root of the radiance, and write its derivatives by the unknowns to `row`; n l must be
-    positive. The view is given by its components nv, v1, v2 along the normal and the tangents t1, t2."""
+    """Return the square root of the radiance, and write its derivatives with respect to the unknowns to `row`; n l
+    must be positive. The view is given by its components nv, v1, v2 along the normal and the tangents t1, t2."""
     nl = normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2]
     nh = normal[0] * half[0] + normal[1] * half[1] + normal[2] * half[2]
     value, by_nl, by_nv, by_nh, by_alpha = lobe(nl, nv, nh, alpha)

@@ -1,8 +1,8 @@
 """The fit of `coupole.reflectance.normal_fit.fit_from` for eight samples at once, with the same costs, steps and
 stopping rule.
 
-A trial's derivatives are computed with its cost, because most trials are accepted. Cauchy's cost takes one
-logarithm of a product over some samples instead of many logarithms.
+The derivatives of a trial step are computed together with its cost, because most trials are accepted. Cauchy's
+cost takes one logarithm of a product over some samples instead of many logarithms.
 """
 
 from __future__ import annotations

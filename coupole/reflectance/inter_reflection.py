@@ -1,4 +1,5 @@
-"""Light from one part of the object to another, estimated from its mesh and samples, and subtracted from them.
+"""Light from one part of the object to another: it is estimated from the mesh and the samples, and subtracted from
+the samples.
 
 A sample of reflectance counts all light of its triangle as direct light of the LED. In a fold, other triangles
 reflect a part of this light. The object is cut into patches. Their radiosity under each LED follows from the light
@@ -41,8 +42,8 @@ _MOST_REFLECTED = 0.95
 MOST_SHARE = 0.5
 """Largest share of a sample that may be inter-reflection; samples with a larger share are left out."""
 _ROWS, _MEDIAN_ROWS, _PART = 4096, 8192, 256
-"""Number of triangles that are read together, for the subtraction and for medians; number of triangles that a
-thread works on at a time."""
+"""The first two are numbers of triangles that are read together: for the subtraction, and for medians. The third
+is the number of triangles that a thread works on at a time."""
 
 
 def radiosity(
@@ -192,7 +193,7 @@ class _ExitanceOfLeds:
         self._exitance = np.empty((0, 0, 0), np.float32)
 
     def exitance(self, view: ViewSamples) -> NDArray[np.float32]:
-        """[channels, patches, leds] of a view, by `radiosity`."""
+        """[channels, patches, leds] exitance of the patches under the LEDs of a view, by `radiosity`."""
         leds = (view.led_mm.tobytes(), view.led_normals.tobytes())
         if leds != self._leds:
             direct = self._paths.direct(view.led_mm, view.led_normals)

@@ -218,7 +218,7 @@ def lessons(
 
 
 def join_lessons(parts: Sequence[Lesson]) -> Lesson:
-    """Return the lessons of one light in several strips as one."""
+    """Join the lessons of one light in several strips into one lesson."""
     return Lesson(
         np.concatenate([part.features for part in parts]),
         np.concatenate([part.targets for part in parts]),

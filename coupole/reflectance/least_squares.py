@@ -134,8 +134,8 @@ def left_out(rows, values, coefficients, factor, step, off):  # type: ignore[no-
     `rows` [n, samples], `coefficients` [m, n] and `factor` belong to a solution. With fewer samples than rows,
     `values` [m, samples] are those that `solve_by_samples` left, else the samples. The amount is the residual of
     the fit to all samples, divided by 1 - h, where h is the diagonal of the matrix from samples to fitted values
-    (Golub, Heath, Wahba, Technometrics 21, 1979). In the form with a matrix of the samples, the diagonal of its
-    inverse is a factor of both and cancels.
+    (Golub, Heath, Wahba, Technometrics 21, 1979). In the form with a matrix of the size of the samples, both the
+    residual and 1 - h contain the diagonal of its inverse as a factor, which cancels.
     """
     (count, samples), size = rows.shape, len(factor)
     columns = np.zeros((off.shape[1], size))

@@ -16,7 +16,7 @@ from coupole.reflectance.light_interpolation import nearest
 from coupole.reflectance.normal_fit import PointMaterials
 
 SUSPECT = 0.05
-"""A gain that differs from 1 by more than this is reported."""
+"""Least difference of a gain from 1 that is reported."""
 _LIT = 0.2
 """Least cosine of incidence at pixels that are used."""
 GAIN_NEIGHBOURS = 3

@@ -30,7 +30,7 @@ _RAYS_OF_A_TRIANGLE = 128
 _POINTS = 4
 """Number of triangles that represent a patch."""
 _BYTES_OF_A_TRIANGLE, _MOST_REMEMBERED_BYTES = 12 * _RAYS_OF_A_TRIANGLE, 10**9
-"""Largest memory, in bytes, for one triangle of a view, and for all views."""
+"""Largest memory, in bytes: for one triangle of a view, and for all views together."""
 _SUPPORT_CELLS = 24
 _RAYS = 1_000_000
 
@@ -105,8 +105,8 @@ def _support(corners_mm: Floats, point_mm: Floats, normal: Floats) -> Floats:
 
 
 def _patches(centres_mm: Floats, normals: Floats, of_support: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return a patch number for each triangle, from its cell in a grid and from the one of six directions that its
-    normal is nearest to. The grid is as fine as the allowed number of patches permits."""
+    """Return a patch number for each triangle. It follows from the triangle's cell in a grid, and from the nearest
+    of six directions to its normal. The grid is as fine as the allowed number of patches permits."""
     low, size = centres_mm.min(axis=0), float(np.ptp(centres_mm, axis=0).max())
     axis = np.argmax(np.abs(normals), axis=1)
     facing = 2 * axis + (np.take_along_axis(normals, axis[:, None], axis=1)[:, 0] > 0)

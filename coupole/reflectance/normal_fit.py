@@ -30,7 +30,8 @@ SHADOW_SHARE, SHADOW_QUANTILE = 0.05, 0.9
 CAUCHY = 0.05
 """Scale of the Cauchy weights, as a share of sqrt(kd)."""
 USUAL_KS, SPREAD_KS, USUAL_ALPHA = math.log(0.04), 2.0, math.log(0.3)
-"""Logarithms for materials in 1/sr: a dielectric's ks within a factor of 7, and alpha within a factor of 3."""
+"""Prior of the logarithms of ks and alpha, for materials in 1/sr: the ks of a dielectric within a factor of 7, and
+alpha within a factor of 3."""
 _MOST_STEPS = 40
 _SETTLED = 1e-5
 LEAST_ALPHA, _MOST_ALPHA = 0.02, 1.0

@@ -92,7 +92,8 @@ def _orders(degrees: int) -> list[tuple[int, int, int]]:
 
 @kernel
 def _legendre(z, degrees, a, b, first, polynomials):  # type: ignore[no-untyped-def]
-    """Fill `polynomials` [degrees, degrees] with P(l, m) of z, without the power of the distance from the axis."""
+    """Fill `polynomials` [degrees, degrees] with P(l, m) of z. The factor of P(l, m) that is a power of the
+    distance from the z axis is left out."""
     p_mm = math.sqrt(0.25 / math.pi)
     for m in range(degrees):
         p_mm *= first[m]

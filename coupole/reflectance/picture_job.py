@@ -1,6 +1,6 @@
 """Job from pictures under known lights to a result folder with normals, materials and the data for relighting.
 
-Each step leaves one complete file or none; a job that was killed continues with the first missing file.
+Each step leaves either one complete file or no file; a job that was killed continues with the first missing file.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ def _fit(result: PictureResult, lights: NDArray[np.int64], path: Path, step: str
 
 
 def _can_go_on(begun: Path) -> bool:
-    """Tell whether the file of a killed fit can be read: perhaps not even its first block is on the disk."""
+    """Tell whether the file of a killed fit can be read. It cannot if not even its first block is on the disk."""
     try:
         with h5py.File(begun, "r") as file:
             return "fitted" in file.attrs

@@ -81,7 +81,7 @@ def read_pictures(
     Raises InputError with file and line.
     """
     if not folder.is_dir():
-        refuse(folder, "is no folder of pictures")
+        refuse(folder, "is not a folder of pictures")
     light_file = read_lights(lights)
     directions = light_file.directions
     names = light_file.names or _names_in(folder, {path.resolve() for path in (mask,) if path is not None})

@@ -4,7 +4,8 @@ The lights are divided into three folds. Each light's picture is predicted from 
 that was learnt without its fold, and compared with the measured picture. The scale of the error is predicted
 log-linearly from quantities known beforehand (`foreseen`; locally weighted conformal prediction: Lei et al. 2018).
 Quantiles of error over scale are fitted by strata (`strata`). Last, intervals are fitted without each fold in
-turn, and all intervals are widened until those hold in the left-out folds (cross-conformal prediction: Vovk 2015).
+turn, and all intervals are widened until they contain the stated share of the left-out folds (cross-conformal
+prediction: Vovk 2015).
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ _SAMPLES = 400_000
 _LEAST_SIZE = 5e-5
 """Share of the peak that is added to errors before their logarithm is taken."""
 _FARTHEST = 2.0
-"""Largest distance of a new light from the measured lights, as a multiple of their spacing. Beyond it nothing is
-known."""
+"""Largest distance of a new light from the measured lights, as a multiple of their spacing. Beyond this distance
+the error is not known."""
 
 
 @dataclass(frozen=True)

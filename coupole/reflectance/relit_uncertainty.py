@@ -102,7 +102,7 @@ def _uncertain(scene: RelitScene) -> Uncertain:
 
 
 def _uncertain_texels(scene: RelitScene) -> Uncertain:
-    """Return the same values as `_uncertain` for the picture's texels. Each channel of a texel is taken as
+    """Return the same values as `_uncertain` for the picture's texels. Each channel of a texel is assumed to be as
     uncertain as the channels' mean."""
     assert isinstance(scene.reflecting, Texels)
     texels, (u_pixel, u_shared) = (

@@ -35,8 +35,9 @@ ABOUT_CLUSTERS = "clusters.json"
 FEWEST_TO_BORROW = 4
 """Least number of samples that determine the cluster of a triangle."""
 USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS = 400, 16, 1000
-"""Number of members of a cluster, and bounds on the number of clusters, if that number is not given. The numbers
-are those of the paper, but small objects have at least `FEWEST_CLUSTERS` clusters.
+"""Usual number of members of a cluster, and bounds on the number of clusters. They are used if the number of
+clusters is not given. The numbers are those of the paper, but small objects have at least `FEWEST_CLUSTERS`
+clusters.
 """
 _FROM = GGX_NORMAL.name
 _WAYS = ("own", "clustered", "harmonics", "borrowed")
@@ -70,7 +71,9 @@ def cluster_result(
     most = int(np.count_nonzero(is_fitted))
     count = count or int(np.clip(most // USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS))
     if most < count:
-        raise InputError(f"--clusters: expected at most {most}, the triangles with a material; got {count}")
+        raise InputError(
+            f"--clusters: expected at most {most}, the number of triangles with a material; got {count}"
+        )
     cluster = np.full(len(is_fitted), -1, np.int64)
     cluster[is_fitted] = clusters_of(looks(materials.at(np.flatnonzero(is_fitted))), count)
     members = np.bincount(cluster[is_fitted])
@@ -199,8 +202,8 @@ def _mae(
 
 
 def _alike(*values: NDArray[np.floating]) -> dict[str, NDArray[np.floating]]:
-    """Return the values of all ways but the last, where all of them have a value. Below the horizon of the fitted
-    normal, harmonics have no value but GGX has one."""
+    """Return the predicted values of all ways but the last, where each of these ways has a value. Below the
+    horizon of the fitted normal, harmonics have no value but GGX has one."""
     all_do = np.logical_and.reduce([np.isfinite(way_values) for way_values in values])
     return {
         name: np.where(all_do, way_values, np.nan) for name, way_values in zip(_WAYS[:-1], values, strict=True)

@@ -171,8 +171,8 @@ def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> 
     records. Existing files stay if they agree with the view's frames. A result that was begun with all frames of
     its runs stays too. Raises as `reflectance_of`.
 
-    Returns the digest of the samples if the view's frames may be discarded for them, which means that they were
-    just read back and are as written. Otherwise returns an empty text.
+    Returns the digest of the samples if the view's frames may be discarded for them: the samples were just read
+    back and are as written. Otherwise returns an empty text.
     """
     if (out / SETTINGS).exists():
         return ""
@@ -221,7 +221,7 @@ def _write_object(measured_run: MeasuredRun, path: Path) -> None:
 
 
 def expected_leds(run: Run) -> set[int]:
-    """LEDs of all views. If LEDs are chosen in the run, those chosen so far."""
+    """Return the LEDs of all views. If LEDs are chosen in the run, these are the LEDs chosen so far."""
     return {shot.light.id for shot in run.expected_shots() if isinstance(shot.light, Led)}
 
 

@@ -1,4 +1,5 @@
-"""Pictures of LEDs that were kept for the check, in blocks of 2 x 2 pixels, beside the predictions of the fits."""
+"""Pictures of LEDs that were kept for the check, in blocks of 2 x 2 pixels, and the predictions of the fits for
+the same blocks."""
 
 from __future__ import annotations
 

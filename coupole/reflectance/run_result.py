@@ -275,8 +275,8 @@ class RunResult:
         return float(np.nanmean([np.nanmean(file["led_u_shared"][()]) for file in files]))
 
     def along_samples(self, block: slice, name: str) -> NDArray[Any]:
-        """[samples, ...] values for each sample of `samples(block)`: `leds`, `led_normals` or `full_scales` of its
-        LED, or `names` of its view."""
+        """[samples, ...] one value for each sample of `samples(block)`. It is taken from `leds`, `led_normals`,
+        `full_scales` (of the sample's LED) or `names` (of its view), as `name` says."""
         triangles = self.triangles[block]
         return np.concatenate([getattr(view, name) for view in self.views if _rows(view, triangles)])
 

@@ -46,10 +46,10 @@ def write_materials(
                 values = values[:, *LOWER]
             file.create_dataset(field, data=values, track_times=False).attrs["told"] = description
         file.create_dataset("u_triangle", data=u_triangle, track_times=False).attrs["told"] = (
-            "relative standard uncertainty of kd and ks, that of the responses of the triangle's pixels"
+            "relative standard uncertainty of kd and ks from the responses of the triangle's pixels"
         )
         file.create_dataset("u_shared", data=u_shared, track_times=False).attrs["told"] = (
-            "relative standard uncertainty of kd and ks, that of the power of all LEDs"
+            "relative standard uncertainty of kd and ks from the power of all LEDs"
         )
 
 

@@ -156,9 +156,9 @@ def _centres(path: Path, stamp: tuple[int, int]) -> tuple[Floats, Floats, cKDTre
 
 
 def triangles_beside(result: RunResult, view: ViewSamples, rows: Integers) -> Beside:
-    """Return triangles on all sides of `rows`, in the plane across the line of sight. They are at the distance of
-    the likely shift of a picture, or are the nearest triangles. Raises InputError for a file that an earlier
-    version made.
+    """Return triangles on all sides of `rows`, in the plane across the line of sight. They are as far away as a
+    picture is likely to be shifted, but at least as far as the neighbouring triangles. Raises InputError for a
+    file that an earlier version made.
     """
     with h5py.File(view.path, "r") as file:
         if "lateral_u_mm" not in file.attrs:

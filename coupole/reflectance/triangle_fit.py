@@ -41,7 +41,8 @@ _TO_CHOOSE = 256
 LEAST_KD = 1e-6
 """kd that a black surface is given, 1/sr, where a share of kd is needed."""
 _CHOSEN, _SETTLED = 1e-4, 1e-5
-"""A fit ends when a step lowers the cost by less than this share: for each start, and for the best one."""
+"""A fit ends when a step lowers the cost by less than this share. The first number is for each start, the second
+for the best start."""
 HELD = 1e9
 """Stiffness of a normal that is not fitted."""
 _PART = 256

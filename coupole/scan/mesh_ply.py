@@ -180,12 +180,14 @@ def _read_ascii_ply(source: MeshFile, elements: list[_Element], at: int, line: i
             vertices = np.empty((element.count, 3), np.float32)
             columns = np.array([names.index(axis) for axis in "xyz"])
             state, at, line = _fill_vertices(data, at, line, columns, vertices)
-            expect_text(path, state, line, "x, y and z in numbers")
+            expect_text(path, state, line, "numbers for x, y and z")
             expect_finite(path, vertices, f"vertex {{}} (lines from {line - len(vertices)})")
         elif element.name == "face":
             triangles = np.empty((element.count, 3), np.uint32)
             state, at, line = _fill_faces(data, at, line, triangles, len(vertices))
-            expect_text(path, state, line, f"3 and three vertices of 0 to {len(vertices) - 1}")
+            expect_text(
+                path, state, line, f"the number 3, then three vertex numbers from 0 to {len(vertices) - 1}"
+            )
         else:
             at, line = _after_lines(path, data, at, element), line + element.count
     return Mesh(vertices, triangles)

@@ -48,7 +48,7 @@ class Acquisition(Iterator[Event]):
     run: Path | None
     """The run's folder, absolute; None until it exists."""
     figures: Mapping[str, Any]
-    """Figures of the run when it is over, as in `coupole acquire --json`; empty before."""
+    """Figures of the run, as in `coupole acquire --json`; empty until the run is over."""
 
     def __init__(self, arguments: list[str], plan: Plan | None, run: Path | None) -> None:
         self.run, self.figures = None, {}
@@ -111,7 +111,7 @@ class Acquisition(Iterator[Event]):
             raise unsafe_end("; ".join(trouble))
 
     def _tell_if_it_stands_still(self) -> None:
-        """Log once that the run's process is stopped (SIGSTOP); no events come until it runs again."""
+        """Log once that the run's process is stopped (SIGSTOP): no events come until it runs again."""
         stands_still = is_stopped(self._process.pid)
         if stands_still and not self._stands_still:
             _LOG.warning(

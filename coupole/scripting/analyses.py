@@ -85,9 +85,9 @@ def calibrate_camera(
     """Find lens and distortion from 8 to 60 pictures of a board, like `coupole calibrate camera`.
 
     `images` is a folder of pictures, or runs. `board` is a description (YAML; by default `board.yaml` of the
-    folder), or the numbers of inner corners of a plain chessboard, columns and rows, with the side of its squares
-    `square_mm`. The record has parameters with standard uncertainties, their covariance and remarks. Check
-    `is_accepted` before you use it.
+    folder), or, for a plain chessboard, its numbers of inner corners (columns and rows), together with the side of
+    its squares, `square_mm`. The record has parameters with standard uncertainties, their covariance and remarks.
+    Check `is_accepted` before you use it.
 
     Raises InputError if there is no board or too few pictures of it; CalibrationRefused.
     """
@@ -120,7 +120,8 @@ def identify(
     """Find the class of pigments of each reflectance spectrum, like `coupole identify`.
 
     `spectra` are files of an instrument or tables, or folders of them; `library` has the spectra of known
-    pigments, `classes` the class of each (by default the table that comes with Coupole). Raises InputError.
+    pigments, and `classes` names the class of each spectrum (by default the table that comes with Coupole). Raises
+    InputError.
     """
     from coupole.appearance.spectra.spectra_library import read_library
 
@@ -206,7 +207,8 @@ def compare(
 
 
 def references_of(library: Path, classes: Path | None) -> References:
-    """Return the library's spectra with their classes. Raises InputError, also if there is no table of classes."""
+    """Return the library's spectra with their classes. Raises InputError if a file is wrong, or if there is no
+    table of classes."""
     from coupole.appearance.spectra.spectra_library import read_library
     from coupole.heritage.analysis.pigment_classes import read_classes, shipped_classes
     from coupole.heritage.analysis.references import make_references
@@ -257,11 +259,11 @@ def sight_board(
     progress: Callable[[int, int], None],
     warmth: tuple[float | None, float] = (None, 0.5),
 ) -> tuple[Sources, Board, Found]:
-    """Open the images, and find the board in them: a plain one, that of a file, or that of `board.yaml` beside the
-    images.
+    """Open the images, and find the board in them: a plain board, or the board that a file or `board.yaml` beside
+    the images describes.
 
     `warmth` is the board's temperature when it was photographed (C, None if not measured) and its standard
-    uncertainty (K). It gives the lengths of a board with a certificate.
+    uncertainty (K). The lengths of a board with a certificate are corrected for this temperature.
     """
     from coupole.calibration.artefact import temperature_of
     from coupole.calibration.lens.board import read_board

@@ -24,7 +24,7 @@ def open_cell(rig: str | os.PathLike[str] = "sim", *, support_is_empty: bool = F
     `cell.ledbox`, `cell.camera` and `cell.robot` are as described in `coupole.devices`; `cell.clock` is the rig's
     clock, and `cell.identities` has the identity of each device. At the end, also after an exception or Ctrl-C,
     the lights are switched off, the arm is stopped, the camera is disarmed, and the devices are closed. No path is
-    checked, and no ledger counts the light: this is done only for plans. Therefore a real cell opens only if you
+    checked, and no ledger counts the light: both are done only for plans. Therefore a real cell opens only if you
     state that its `support_is_empty`.
 
     Raises InputError if the rig is wrong, if `support_is_empty` is missing for a real cell, or if another process

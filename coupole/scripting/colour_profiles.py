@@ -39,10 +39,11 @@ def calibrate_colour(
     picture of a white card in the chart's place. `corners_px` [4, 2] are the centres of the corner patches, column
     and row, one after the other round the chart; by default the chart is searched for. Patches `without` are left
     out. With `srgb`, the pictures have sRGB's transfer curve and no other. The record, its ICC profile, its table
-    and its page are written to the folder `out`, which must not have them.
+    and its page are written to the folder `out`, which must not contain such files yet.
 
     Check `is_accepted` of the record before you use it. `record.value("xyz_d50_from_balanced.Xr")` and so on are
-    the matrix. Raises InputError if the chart is not found, or values are not linear; StorageError.
+    the matrix. Raises InputError if the chart is not found, or if values are not linear; StorageError if a file
+    cannot be written.
     """
     from coupole.calibration.report import write_outcome
     from coupole.calibration.request import Request
@@ -78,7 +79,7 @@ def _corners(corners_px: ArrayLike) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class ChartInputs:
-    """Pictures of a chart, and what is known of them."""
+    """Pictures of a chart, and the facts that are known about them."""
 
     pictures: Sequence[Path]
     """Files, or one folder."""
@@ -91,13 +92,13 @@ class ChartInputs:
 
 
 class Told(Protocol):
-    """Who is told how far the work is."""
+    """Receiver of the progress of the work."""
 
     def status(self, words: str) -> AbstractContextManager[object]:
-        """Tell of work whose end is not known."""
+        """Report work whose end is not known."""
 
     def bar(self, words: str) -> AbstractContextManager[Progress]:
-        """Tell of work that is counted."""
+        """Report work whose parts are counted."""
 
 
 class Silence:

@@ -100,7 +100,8 @@ class Result:
         return mask
 
     def materials(self, fit: str | None = None) -> Materials:
-        """Materials of all faces by a fit (one of `fits`; by default that with the smallest error in the check).
+        """Materials of all faces by a fit: one of `fits`, or by default the fit with the smallest error in the
+        check.
 
         Raises InputError if the result has no such fit.
         """
@@ -152,7 +153,8 @@ class Result:
         samples: int = SAMPLES,
     ) -> NDArray[np.float32]:
         """[height, width, 3] standard uncertainty (68 %) of the picture that `relight` makes with the same
-        arguments and a fit of materials. Raises InputError, also for a fit that states no uncertainty."""
+        arguments and a fit of materials. Raises InputError like `relight`, and for a fit that states no
+        uncertainty."""
         scene = relit_result.open_result(self.folder, view, fit, camera, samples, uncertain=True)
         assert scene.uncertainty is not None
         return scene.uncertainty(_lights(lights, direction, led), _say_nothing)
@@ -180,8 +182,7 @@ class Result:
         return name or run_relighting.best_fit(self._result, self.fits)
 
     def _on_faces(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return [faces, ...]: the values, which are given for the faces that a view sees, and NaN for the
-        others."""
+        """Return [faces, ...] values. They are given for the faces that a view sees; the other faces get NaN."""
         all_values = np.full((len(self._result.corners_mm), *values.shape[1:]), np.nan)
         all_values[self._result.triangles] = values
         return all_values

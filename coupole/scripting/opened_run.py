@@ -227,8 +227,8 @@ class Run(Mapping[str, RunView]):
 def open_run(path: str | os.PathLike[str]) -> Run:
     """Open a run folder for reading, also while it is being acquired.
 
-    `path` is the folder that `coupole acquire` made. Raises InputError if it is not a run, StorageError if its
-    journal or a view's file is damaged.
+    `path` is the folder that `coupole acquire` made. Raises InputError if the folder is not a run, StorageError if
+    its journal or a view's file is damaged.
     """
     return Run(path)
 

@@ -1,8 +1,8 @@
 """Plans and rigs in Python: read, built, checked, written.
 
-They are the models of the YAML files; every key is an argument. Paths are absolute: a relative path is relative to
-its file, or to the working folder if the model is built in Python. The name of a shipped rig, such as `sim`, stays
-a name.
+The classes are the models of the YAML files; every key is an argument. Paths are absolute: a relative path is
+relative to its file, or to the working folder if the model is built in Python. The name of a shipped rig, such as
+`sim`, stays a name.
 """
 
 from __future__ import annotations

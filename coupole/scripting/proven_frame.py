@@ -38,7 +38,7 @@ class Frame:
     board_temperature_c: float | None
     """Temperature of the LED's board, C; None if the box did not measure it."""
     taken_utc: str
-    """Time when it was proven, UTC, ISO 8601."""
+    """Time when the frame was proven, UTC, ISO 8601."""
     proof: str
     """How the frame's identity was proven, in the words of run.json."""
     xxh3: str

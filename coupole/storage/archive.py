@@ -66,8 +66,8 @@ def archive_run(
     run are archived; incomplete views never are, so that the run can be resumed.
 
     Raises InputError if another process has locked the run or makes its result, and UnprovenError if frames are
-    missing (without `partial`). Raises ChecksumMismatch if a frame differs from the proven one, before or after,
-    and DiskFull. After an error the current view is unchanged.
+    missing (without `partial`). Raises ChecksumMismatch if a frame, before or after compression, differs from the
+    proven frame, and DiskFull. After an error the current view is unchanged.
     """
     with run.hold_lock():
         if run.asked_result:

@@ -4,8 +4,8 @@ that arm.
 A fault belongs to the arm, not to the run in which it happened, nor to the rig. A named person must confirm that
 the cause is found and the cell is clear; until then no session of any run may move that arm. So the fault is noted
 under the address and the serial number of the arm's controller, and in the rig's state folder
-(`coupole.plan.controller_places`). It holds as long as it is in one of these places. A confirmation names the
-faults that it confirms; it confirms them in all places.
+(`coupole.plan.controller_places`). The fault stands as long as it is in one of these places. A confirmation names
+the faults that it confirms, and is valid in all places.
 """
 
 from __future__ import annotations

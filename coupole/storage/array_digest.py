@@ -1,4 +1,5 @@
-"""Digest of the arrays of an HDF5 file: taken as they are written, and again from the disk.
+"""Digest of the arrays of an HDF5 file: computed when they are written, and again when they are read from the
+disk.
 
 The digest depends on each array's type, shape and bytes, and on the attributes of the file. An array that is
 written in chunks counts chunk by chunk. The places of the arrays in the file do not matter.

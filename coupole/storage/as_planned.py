@@ -34,8 +34,8 @@ from coupole.storage.run import Run
 from coupole.storage.step_fields import STORED_NO_LED
 
 _SETTLED_DEG = 0.1
-"""Allowed angle of each axis from its goal, deg, in addition to the motion that is allowed in a burst (the rig's
-`still_deg`)."""
+"""Allowed deviation of each axis from its goal, deg, in addition to the motion that is allowed in a burst (the
+rig's `still_deg`)."""
 _REACH_MM = 2000.0
 """Reach of an arm. An error of an axis moves the camera by at most the error's angle times this radius."""
 

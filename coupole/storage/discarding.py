@@ -59,13 +59,13 @@ def place_of_result(run: Run, event: FramesDiscarded) -> Path:
 
 
 def reason_to_keep(run: Run, view: str) -> str:
-    """Return why the frames of a view must not be discarded, or not yet, even if its samples are safe; empty if
-    they may be discarded."""
+    """Return the reason why the frames of a view must not be discarded, or must not be discarded yet, even if its
+    samples are safe. It is empty if they may be discarded."""
     if not run.discards:
         return "the plan does not say `discard: after_fit`"
     events = list(journal.read_events(run.journal_path))
     if any(isinstance(event, FindingNoted) and event.view == view for event in events):
-        return "something was found in it while it was taken, and its frames are marked"
+        return "a disturbance was found while it was taken, and its frames are marked"
     if incomplete := incomplete_until(run, view):
         return f"the view {incomplete} is not complete"
     if not _is_finished(events, view):
@@ -131,8 +131,8 @@ def discard(run: Run, event: FramesDiscarded, note: Callable[[FramesDiscarded], 
 
 
 def finish(run: Run) -> None:
-    """Give back the space of frames that the journal lists as discarded, if a crash has left it. A file that
-    changes by this is taken out of the manifest first. Only the process that holds the run's lock may call this.
+    """Give back the space of frames that the journal lists as discarded, if a crash has left it. If a file changes
+    by this, it is taken out of the manifest first. Only the process that holds the run's lock may call this.
     Raises StorageError."""
     for event in discarded_views(run).values():
         path = run.view_path(event.view)
@@ -151,7 +151,7 @@ def append_to_journal(run: Run) -> Callable[[FramesDiscarded], None]:
 def _layout(path: Path) -> Layout:
     layout = frame_file.read_layout(path)
     if layout.is_archived:
-        raise StorageError(f"{path}: is archived; its frames stay")
+        raise StorageError(f"{path}: is archived, so its frames are not discarded")
     return layout
 
 
@@ -184,8 +184,8 @@ def _is_given_back(path: Path, layout: Layout, slots: NDArray[np.int64]) -> bool
 
 
 def _give_back(path: Path, layout: Layout, slots: NDArray[np.int64]) -> None:
-    """Mark the slots, then give back their space. The marks come first, so that a reader never takes a hole for a
-    frame. Slots without a frame are given back too."""
+    """Mark the slots, then give back their space. The marks come first, so that a reader never mistakes a hole for
+    a frame. Slots without a frame are given back too."""
     table = frame_file.read_frames(path)
     table["state"][slots] = DISCARDED
     try:

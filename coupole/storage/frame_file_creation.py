@@ -47,7 +47,7 @@ _FRAMES_ATTRIBUTES = {
     "led_none": 65535,
     "exposure_us_units": "us",
     "t_trigger_ns_units": "ns",
-    "t_trigger_ns_clock": "the LED box's; the host's where the box has none",
+    "t_trigger_ns_clock": "time by the LED box's clock; by the host's clock where the box has none",
     "camera_ns_units": "ns",
     "camera_ns_clock": "the camera's",
     "board_temperature_dc_units": "0.1 degC",

@@ -90,7 +90,7 @@ class SessionResumed(SessionBegun):
 
 
 class ProcessingAsked(JournalEvent):
-    """The session shall end with a result. Views are processed beside the acquisition, in another process."""
+    """The session is to end with a result: views are processed beside the acquisition, in another process."""
 
     event: Literal["processing"] = "processing"
     result: str
@@ -337,7 +337,7 @@ class SessionStopped(JournalEvent):
     robot: dict[str, Any] = Field(default_factory=dict)
     """Figures of the robot's link."""
     took_s: float | None = None
-    """Duration of the session by a clock that nobody sets, s. Journals of earlier versions have none."""
+    """Duration of the session by a monotonic clock, s. Journals of earlier versions have none."""
 
 
 Event: TypeAlias = (

@@ -1,8 +1,8 @@
 """The dose ledger of each object: all light that it has received, `<ledger folder>/<object id>.jsonl`.
 
 A caller that gives light enters the planned light first (`Ledger.plan`), and afterwards the light that was given
-(`Ledger.correct`); both are on disk when the call returns. So after the process was killed, or after a power cut,
-the figure can only be too high: the planned light then counts. Writers hold a lock on the object's file.
+(`Ledger.correct`); both are on disk when the call returns. So if the process is killed or the power fails, the
+planned light counts, and the figure can only be too high. Writers hold a lock on the object's file.
 
 The object's budget is in the same file. A plan is entered only if the budget allows it, with all entries of the
 file at that moment, under the same lock. So even if several processes give light at once, the sum of their light
@@ -108,10 +108,10 @@ class Ledger:
     def _refuse_lacking(self, history: History) -> None:
         if history.lacks_lines:
             raise StorageError(
-                f"{self.path}: has light of a plan that is not in it, so earlier lines are missing: it was "
-                "moved or replaced while light was given, and nobody knows what the object may still receive. "
-                "Put the whole ledger back; if it is lost, give "
-                f"`coupole dose {self.object_id} --add LUX_H --note WHY` with what it had, or with 0"
+                f"{self.path}: counts light for a plan whose own line is not there, so earlier lines are "
+                "missing: the ledger was moved or replaced while light was given, and it is not known what the "
+                "object may still receive. Put the whole ledger back; if it is lost, give `coupole dose "
+                f"{self.object_id} --add LUX_H --note WHY` with what it had, or with 0"
             )
 
     def ask_again(self, budget_request: Asked, plan_id: str) -> None:

@@ -102,7 +102,7 @@ class History:
     budgets: list[BudgetSet] = field(default_factory=list)
     """Budgets in the order in which they were set. The last one counts."""
     without_plan: int = 0
-    """Number of lines with given light whose plan is missing, since light was last entered by hand."""
+    """Number of lines since the last entry by hand that state given light but whose plan is missing."""
     unreadable: int = 0
     """Number of lines that are not entries: a crash cut them before their light was given, or they were damaged
     later."""
@@ -114,7 +114,7 @@ class History:
 
     @property
     def unreadable_words(self) -> str:
-        """How many lines of the ledger cannot be read, for a person."""
+        """Sentence for a person: how many lines of the ledger cannot be read."""
         return f"{self.unreadable} line{'s' if self.unreadable != 1 else ''} of the ledger cannot be read"
 
     @property
@@ -245,7 +245,7 @@ class Reading:
     def _refuse_loss(self, path: Path, loss: str) -> None:
         if self._only_grows and self._read_bytes:
             raise StorageError(
-                f"{path}: the dose ledger {loss} while light was given, so nobody knows what the object may "
+                f"{path}: the dose ledger {loss} while light was given, so it is not known what the object may "
                 "still receive. Put it back, then continue."
             )
 
@@ -264,8 +264,8 @@ class Reading:
         rest, _, _ = (file.read()).rpartition(b"\n")
         if self._only_grows and b"\0" in rest:
             raise StorageError(
-                f"{path}: expected text in UTF-8, found bytes 0 (UTF-16, or a damaged file), so nobody "
-                "knows what the object may still receive. Restore the dose ledger, then continue."
+                f"{path}: expected text in UTF-8, found bytes 0 (UTF-16, or a damaged file), so it is not known "
+                "what the object may still receive. Restore the dose ledger, then continue."
             )
         if rest:
             for text in rest.split(b"\n"):

@@ -287,7 +287,8 @@ def _changes_of(
 
 
 def _with_budget_of(now: Plan, then: Plan) -> Plan:
-    """Return the plan `then` with the budget of light of the plan `now`: a run may be resumed with another one."""
+    """Return the plan `then` with the budget of light of the plan `now`: a run may be resumed with another
+    budget."""
     if then.object is None or now.object is None:
         return then
     budget = {"dose_budget_lux_h": now.object.dose_budget_lux_h}

@@ -98,14 +98,14 @@ def refuse_lost(folder: Path, frames: Iterable[FrameProven]) -> None:
             layout = frame_file.read_layout(path)
         except StorageError as error:
             raise StorageError(
-                f"{error}. Restore it, then resume the run; if that cannot be, its frames are lost: begin a new "
-                "run."
+                f"{error}. Restore it, then resume the run; if that is impossible, its frames are lost: begin a "
+                "new run."
             ) from error
         end_bytes = layout.data_offset + (last_slot + 1) * layout.frame_bytes
         if not layout.is_archived and path.stat().st_size < end_bytes:
             raise StorageError(
-                f"{path}: ends within slot {last_slot}, of which the journal has a proven frame. Restore it, then "
-                "resume the run; if that cannot be, its frames are lost: begin a new run."
+                f"{path}: ends within slot {last_slot}, although the journal has a proven frame of this slot. "
+                "Restore it, then resume the run; if that is impossible, its frames are lost: begin a new run."
             )
 
 

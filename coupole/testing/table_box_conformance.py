@@ -29,14 +29,14 @@ class TableLedBoxConformance:
     """
 
     limits: ClassVar[Sequence[tuple[str, int, str]]] = (("led", 65_534, ""), ("trigger_delay_us", 8001, ""))
-    """Name of a field of a step, a value of it outside the box's limits (in a step of `table()`), and a pattern of
-    the refusal. Each refusal also names the step's number."""
+    """Name of a field of a step, a value of this field outside the box's limits (in a step of `table()`), and a
+    pattern that the text of the refusal matches. Each refusal also names the step's number."""
     words_of_rest: ClassVar[str] = "7"
     """Pattern of the refusal of step 7, which lights the LED of step 6 again; empty if the box allows this."""
     words_of_no_table: ClassVar[str] = "expected"
     """Pattern of the refusal to start a table that was not loaded."""
     words_of_lost_state: ClassVar[str] = "expected"
-    """Pattern of the message when the box does not tell whether it runs."""
+    """Pattern that the message matches if the box does not say whether it runs."""
     words_of_a_lost_link: ClassVar[str] = "expected"
     """Pattern of the message when the cable was pulled."""
 

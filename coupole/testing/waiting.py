@@ -32,8 +32,8 @@ class Call:
         return self.error
 
     def waits_its_turn(self) -> bool:
-        """True if the thread of the call is about to take a lock, by the line of code at which it is. If a driver
-        keeps the order by other means, the result is True after a fixed time."""
+        """True if the thread of the call is about to take a lock. The line of code at which the thread is shows
+        this. If a driver keeps the order by other means, the result is True after a fixed time."""
         if time.monotonic() > self._reached_s:
             return True
         gc.disable()  # a garbage collection in there may wait for ever (CPython issue gh-106883)

@@ -100,7 +100,7 @@ def remarks(comparison: Comparison) -> Iterator[str]:
     if comparison.shape_regions:
         yield _largest(comparison, comparison.shape_regions[0])
     if comparison.de00 is None or comparison.recoloured_points is None:
-        yield "colour: not compared, as not both states have colours"
+        yield "colour: not compared, because one of the states has no colours"
     else:
         yield (
             f"colour: {int(comparison.recoloured_points.sum()):,} points changed significantly, "

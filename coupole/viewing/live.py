@@ -222,7 +222,7 @@ class Wanted(BaseModel):
 
 
 def read_wanted(body: bytes) -> Wanted:
-    """Raises InputError for anything else than JSON like {"led": 417, "exposure_us": 8000}."""
+    """Raises InputError for anything other than JSON like {"led": 417, "exposure_us": 8000}."""
     try:
         return Wanted.model_validate_json(body)
     except ValidationError as error:

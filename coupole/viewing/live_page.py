@@ -2,7 +2,7 @@
 
 The address contains a token that is new each time. A request is refused if it uses another host name (DNS
 rebinding), comes from a page of another site, or is not exactly as the page sends it. Each connection has one
-request, a bounded time and one of a few threads. So clients that are slow or hang delay nobody.
+request, a bounded time and one of a few threads. So a client that is slow or hangs does not delay others.
 """
 
 from __future__ import annotations
@@ -196,9 +196,9 @@ class _Viewer(BaseHTTPRequestHandler):
         if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]):
             raise Refused(HTTPStatus.FORBIDDEN, "ask 127.0.0.1")
         if any(not _ORIGIN.fullmatch(origin) for origin in origins):
-            raise Refused(HTTPStatus.FORBIDDEN, "another site's page may not ask")
+            raise Refused(HTTPStatus.FORBIDDEN, "the page of another site may not ask")
         if self.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
-            raise Refused(HTTPStatus.FORBIDDEN, "another site's page may not ask")
+            raise Refused(HTTPStatus.FORBIDDEN, "the page of another site may not ask")
 
     def _read_body(self) -> bytes:
         if self.headers.get(_OURS) != "1":

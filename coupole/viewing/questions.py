@@ -1,4 +1,4 @@
-"""Questions to the person at the terminal. They are given up when the session that asks is to end."""
+"""Questions to the person at the terminal. A question is withdrawn when the session that asks it has to end."""
 
 from __future__ import annotations
 
@@ -27,8 +27,9 @@ def _forget_typing() -> None:
 
 def ask(question: str, is_over: Callable[[], bool] = lambda: False, *, default: bool = False) -> bool:
     """Ask a yes-or-no question on standard error, even with `--json`; any answer but yes counts as no, an empty
-    one as `default`. What was typed before the question does not count. No answer is no: neither an input that has
-    ended, nor a question that is given up because `is_over()`. Raises Interrupted if the terminal is gone."""
+    one as `default`. What was typed before the question does not count. A missing answer counts as no: the input
+    has ended, or the question is withdrawn because `is_over()` is true. Raises Interrupted if the terminal is
+    gone."""
     _forget_typing()
     print(f"{question} {'[Y/n]' if default else '[y/N]'} ", end="", file=sys.stderr, flush=True)
     line = _line_typed(is_over)
@@ -37,7 +38,8 @@ def ask(question: str, is_over: Callable[[], bool] = lambda: False, *, default: 
 
 def ask_number(question: str, is_over: Callable[[], bool] = lambda: False) -> float | None:
     """Ask for a number on standard error, and ask again if the answer is not a number. Return None for an empty
-    answer, or if the question is given up because `is_over()` is true. Raises Interrupted if the terminal is gone.
+    answer, or if the question is withdrawn because `is_over()` is true. Raises Interrupted if the terminal is
+    gone.
     """
     while True:
         _forget_typing()
@@ -58,9 +60,9 @@ def is_asked_at_a_terminal() -> bool:
 def _line_typed(is_over: Callable[[], bool]) -> str:
     """Return the next line of standard input with its end; empty if there is none, or as soon as `is_over()`.
 
-    Raises Interrupted (exit code 129) if the terminal is gone: that is no answer, and a read may tell it before
-    SIGHUP comes. A signal does not end a read in Python, so this waits in short steps. It takes byte after byte,
-    so that the lines that follow are left to whoever asks next.
+    Raises Interrupted (exit code 129) if the terminal is gone: this is not an answer, and a read may show it
+    before SIGHUP comes. A signal does not end a read in Python, so this waits in short steps. It takes byte after
+    byte, so that the lines that follow are left to whoever asks next.
     """
     try:
         input_fd = sys.stdin.fileno()
@@ -86,8 +88,8 @@ def _line_typed(is_over: Callable[[], bool]) -> str:
 
 
 def _is_hung_up(input_fd: int) -> bool:
-    """Tell whether a file is a terminal that was closed at its other end. Nobody is told of this who ignores
-    SIGHUP (`nohup`)."""
+    """Tell whether a file is a terminal that was closed at its other end. For a process that ignores SIGHUP
+    (`nohup`), the answer is False."""
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         return False
     try:

@@ -49,8 +49,8 @@ class Coverage:
     views: tuple[Framing, ...]
     """Framings of the views that have proven shots."""
     shares: tuple[float, ...]
-    """[n] share of the reachable part that at least n + 1 views show. It ends at `MOST` views or at the number of
-    views."""
+    """[n] share of the reachable part that at least n + 1 views show. The tuple ends at `MOST` views, or at the
+    number of views if that is smaller."""
     reachable: float
     """Reachable part, as a share of the whole surface."""
     drawings: dict[str, bytes]

@@ -176,7 +176,7 @@ def seen_faces(lookout: Lookout, solid: Solid) -> tuple[NDArray[np.int32], NDArr
 
 
 def _edges(body: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return [height, width], True beside a pixel of another body."""
+    """Return a mask [height, width]: True for pixels next to a pixel of another body."""
     edge = np.zeros(body.shape, np.bool_)
     across, down = body[:, 1:] != body[:, :-1], body[1:] != body[:-1]
     edge[:, 1:] |= across

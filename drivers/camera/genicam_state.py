@@ -78,7 +78,7 @@ FRAME_TRIGGER = (
     _line("TriggerDivider", 1),
     _line("TriggerMultiplier", 1),
 )
-"""Features of the trigger that starts frames. They are set after it is on, because some cameras lock them
+"""Features of the trigger that starts frames. They are set after the trigger is on, because some cameras lock them
 before."""
 TRIGGER_LINE = (
     Line(("LineMode",), ("Input",)),

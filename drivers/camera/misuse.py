@@ -1,4 +1,4 @@
-"""The error for methods of a camera that are called in a wrong order."""
+"""The error for methods of a camera that are called in the wrong order."""
 
 from __future__ import annotations
 

@@ -286,7 +286,7 @@ class LedBox:
 
     def _start(self, payload: bytes, table: NDArray[np.void]) -> None:
         if payload not in self._banks:
-            self._refuse("a loaded table", "neither bank holds this one", "Call load() first.")
+            self._refuse("a loaded table", "neither bank holds this table", "Call load() first.")
         bank = self._banks.index(payload)
         if self._crc(bank) != zlib.crc32(payload):
             self._upload(bank, payload)
@@ -314,7 +314,9 @@ class LedBox:
         try:
             return pack(table)
         except ValueError as error:
-            self._refuse("a table that the wire can carry", str(error), "Correct the figure that it names.")
+            self._refuse(
+                "a table whose figures fit into the records of the box", str(error), "Correct this figure."
+            )
 
     def _crc(self, bank: int) -> int:
         (crc,) = self._scpi.ask(f"SEQ:BANK {bank};CRC?", 1)

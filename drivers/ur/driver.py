@@ -259,7 +259,8 @@ class UrRobot:
     def _command(
         self, verb: Literal["move", "stop"], target_deg: Six | None = None, stops: int = 0, speed: float = 1.0
     ) -> State:
-        """Send a command and return the state. `stops` is the number of stops when the call of a motion began."""
+        """Send a command and return the state. `stops` is the number of stop commands that had been given when the
+        call of a motion began."""
         with self._asking:
             if verb == "stop":
                 self._stops += 1

@@ -31,7 +31,7 @@ class Exposed:
     """Light, pose and timing of one exposure, for the renderer."""
 
     seconds_of_led: dict[int, float]
-    """Seconds at the tabulated flux by LED number. An LED with 10 % more flux counts 10 % longer."""
+    """Seconds of light at the tabulated flux, by LED number. An LED with 10 % more flux counts 10 % longer."""
     panels: list[int]
     exposure_s: float
     gain: float
@@ -109,7 +109,8 @@ class Wire(Protocol):
         ...
 
     def send(self, shot: Shot) -> bool:
-        """Send a frame. False if this is not possible yet; `CameraBody.deliver` must then be called later."""
+        """Send a frame. Return False if this is not possible yet; `CameraBody.deliver` must then be called
+        later."""
         ...
 
 

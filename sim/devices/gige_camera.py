@@ -2,9 +2,9 @@
 another process.
 
 That process (`gige_server`) speaks GVCP and GVSP with any client, and holds the registers, which both processes
-can read. It may die, as a camera may, without harm to the world. Exposure, trigger and picture are simulated here
-(`camera_body`, `camera_picture`). Written registers are polled at every edge, and every few milliseconds of world
-time. While the link is busy, the world pauses.
+can read. That process may die, as a camera may, without harm to the world. Exposure, trigger and picture are
+simulated here (`camera_body`, `camera_picture`). Written registers are polled at every edge, and every few
+milliseconds of world time. While the link is busy, the world pauses.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """The network end of the simulated GigE Vision camera, in a process of its own: control (GVCP) and stream (GVSP).
 
 `python -S -m sim.devices.gige_server` with one argument, the JSON form of `Start`. Registers and images are in
-memory shared with the world, which tells over a socket what to send. This process answers clients at any time,
-even while the world pauses. It refuses values out of the camera's limits with the protocol's status codes (GigE
-Vision 1.2: chapters 16 and 18, GVCP; 22 to 24, GVSP). It needs only the standard library, so that it starts
-quickly.
+memory shared with the world. Over a socket, the world names the images to send. This process answers clients at
+any time, even while the world pauses. It refuses values out of the camera's limits with the protocol's status
+codes (GigE Vision 1.2: chapters 16 and 18, GVCP; 22 to 24, GVSP). It needs only the standard library, so that it
+starts quickly.
 
 If this process ends, the world loses only its camera.
 """
@@ -218,7 +218,7 @@ class GigeServer:
         return status
 
     def _act_on(self, address: int, client: tuple[str, int]) -> None:
-        """Start what a written register asks for."""
+        """Start the action that a written register requests."""
         registers = self._registers
         if address == reg.CONTROL_PRIVILEGE:
             if registers.integer(address):

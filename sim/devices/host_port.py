@@ -36,7 +36,8 @@ class HostPort:
         self._socket.close()
 
     def _claim(self, port: int, *, probe: bool) -> tuple[socket.socket, int] | None:
-        """Claim the port. None if another world has it, or, with `probe`, if any other program has it."""
+        """Claim the port. Return None if another world has the port, or, with `probe`, if any other program has
+        it."""
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
             claim.bind(f"\0coupole-arm-sends-to-{port}")

@@ -21,7 +21,7 @@ _NOWHERE: tuple[float, ...] = (0.0,) * 6
 _TOLERANCE_DEG = 2e-6
 """Tolerance, because corrections have six decimals."""
 _STILL_DEG = 1e-5
-"""Vibration below this counts as none, because packets have four decimals."""
+"""Vibration below this amplitude is ignored, because packets have four decimals."""
 
 Axes6 = tuple[float, ...]
 
@@ -43,7 +43,7 @@ class Axes:
         """Step of the axes in the last cycle; below, the change of that step."""
         self._change_deg: Axes6 = _NOWHERE
         self._stood_ns: int | None = now_ns
-        """World time at which the commanded axes came to rest or were last pushed; None while they move."""
+        """World time at which the commanded axes came to rest, or were last pushed; None while they move."""
         self._swing_deg: Axes6 = _NOWHERE
         """Amplitudes of the vibration at `_stood_ns`."""
         swings = settings.vibration_deg > _STILL_DEG

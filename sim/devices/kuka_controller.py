@@ -3,8 +3,8 @@
 In every cycle of world time it applies the client's last answer and sends the axes. It stops as the real one does
 on: limits of axes and corrections, corrections that are too fast, poses without solution, workspaces, late
 answers, a silent client, an emergency stop. Then the brakes close, and the arm stays where it is until the RSI
-program is restarted. An answer with the stop element ends the program without a fault. `tell` gets each refusal
-with its reason, because the client itself sees only that packets stop.
+program is restarted. An answer with the stop element ends the program without a fault. `tell` receives each
+refusal with its reason, because the client only sees that packets stop.
 
 In lock-step the world waits for each answer, so a client on a busy machine is never late. Then only the fault
 script (`late`) causes late answers.

@@ -30,7 +30,7 @@ Six = tuple[float, float, float, float, float, float]
 _NO_FAULT, _EMERGENCY_STOP, _TARGET_REFUSED = 0, 1, 5
 _TRY_AGAIN_S = 0.1
 _UNSENT_BYTES = 4096
-"""Send buffer. When it is full, the world pauses, so that it does not run ahead of its client."""
+"""Size of the send buffer. When it is full, the world pauses, so that it does not run ahead of its client."""
 _HARD = 100.0
 """Factor on the jerk in an emergency stop, which is practically not jerk-limited."""
 

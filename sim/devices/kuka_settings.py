@@ -64,11 +64,11 @@ class Settings(_Model):
     """SENTYPE: answers of another type are ignored."""
     measured_tag: str = Field(default="AIPos", pattern=_TAG)
     delay_tag: str = Field(default="Delay", pattern=_TAG + "|^$")
-    """Name of the counter of late answers. Empty means that it is not sent."""
+    """Name of the counter of late answers. If the name is empty, the counter is not sent."""
     correction_tag: str = Field(default="", pattern=_TAG + "|^$")
     """Element of the corrections. Empty means AKorr for axes, RKorr for the pose."""
     stop_tag: str = Field(default="Stop", pattern=_TAG + "|^$")
-    """The element that ends the RSI program. Empty means that there is none."""
+    """The element that ends the RSI program. If the name is empty, there is no such element."""
     sends_pose: bool = False
     """Packets also carry RIst, the flange's pose."""
 
@@ -88,7 +88,7 @@ class Settings(_Model):
     delay_limit: int = Field(default=100, ge=1)
     """Number of late answers at which RSI stops with KSS29002."""
     delay_counts: Literal["cumulative", "consecutive"] = "cumulative"
-    """Way of counting late answers. It is not known which of the two real controllers use."""
+    """Way of counting late answers. It is not known which of the two ways real controllers use."""
     packets_after_estop_s: float = Field(default=0.5, ge=0)
     restart_s: float = Field(default=1.0, gt=0)
     """World time from a lost link until the RSI program runs and sends again."""

@@ -74,7 +74,8 @@ class Settings(BaseModel):
 
 @dataclass(frozen=True)
 class BoxCables:
-    """The box's cables into the world; times are the world's. By default nothing is connected."""
+    """The cables between the box and the simulated world. Times are on the world's clock. By default nothing is
+    connected."""
 
     on_edge: Callable[[int], None] = lambda t_ns: None
     """Called for each pulse on the trigger cable."""

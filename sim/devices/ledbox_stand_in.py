@@ -57,7 +57,10 @@ def impossible(fault: faults.Fault, settings: LedBoxSettings) -> str:
             if isinstance(fault, faults.OverTemperature) and fault.board >= boards:
                 return f"`{fault.kind}`: the LED box has boards 0 to {boards - 1}, not {fault.board}"
             if isinstance(fault, faults.EnablingSwitch) and settings.enabling_switch == "none":
-                return f"`{fault.kind}`: the LED box has no input for one; give it `enabling_switch: released`"
+                return (
+                    f"`{fault.kind}`: the LED box has no input for an enabling switch; give it "
+                    "`enabling_switch: released`"
+                )
             if isinstance(fault, faults.StuckLed):
                 return f"`{fault.kind}` cannot happen to an LED box of kind `scpi`: it switches all current off"
         case text_box.Settings():

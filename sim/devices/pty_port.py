@@ -17,7 +17,7 @@ from collections.abc import Callable
 from sim.world.reactor import Reactor, Timer
 
 _PIECE_BYTES, _PIECE_S = 64, 0.006
-"""Bytes are transferred in pieces of at most this size and duration, at least one byte."""
+"""Largest size and duration of the pieces in which bytes are transferred; a piece has at least one byte."""
 _UNPACED_BYTES = 4096
 """Largest piece if the rate is not limited."""
 _MOST_UNREAD_BYTES = 2**20

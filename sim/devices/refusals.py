@@ -1,7 +1,8 @@
 """Refusals of a stand-in. Refusals are shown to a person, because an outside client would otherwise see only
 silence.
 
-A mistake of a client occurs in every cycle. So the same reason is told again only after a while, with its count.
+A mistake of a client occurs in every cycle. So the same reason is printed again only after a while, with its
+count.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ def untold(message: str) -> None:
 
 
 class Refusals:
-    """Counts refusals by reason, and tells them."""
+    """Counts refusals by reason, and prints them."""
 
     def __init__(self, device: str, tell: Callable[[str], None]) -> None:
         self._device, self._tell = device, tell

@@ -292,9 +292,9 @@ class _Splitter:
         text, blocks, overrun = self._text.decode("latin-1"), tuple(self._blocks), self._overrun
         self._start_message()
         if overrun:
-            return ScpiError(-363, "the message was thrown away")
+            return ScpiError(-363, "the message was discarded")
         if strange := _FORBIDDEN.search(text):
-            return ScpiError(-101, f"byte {ord(strange[0]):#04x}; the message was thrown away")
+            return ScpiError(-101, f"byte {ord(strange[0]):#04x}; the message was discarded")
         return _Text(text, blocks)
 
     def _take_text(self, count: int) -> None:

@@ -48,7 +48,8 @@ class TcpPort:
         reactor.add_reader(self._listener, self._accept)
 
     def mute(self) -> None:
-        """Answer no client from now on. Present connections never recover, and are not told."""
+        """Answer no client from now on. Connections that exist at that time never recover, and get no message that
+        they are lost."""
         if self._listens:
             self._reactor.remove_reader(self._listener)
             self._listens = False

@@ -1,7 +1,7 @@
 """Materials of virtual objects: spectra of `appearance.matter`, as the camera sees them under the dome's LEDs.
 
 Each material is reduced to a diffuse reflectance, a reflectance at normal incidence and a roughness per channel
-(`sim.scene.surface.Material`). White is a perfect diffuser: Spectralon itself has 0.99.
+(`sim.scene.surface.Material`). The value 1 is a perfect diffuser: Spectralon itself has 0.99.
 """
 
 from __future__ import annotations

@@ -30,8 +30,8 @@ _LOCKS = (
 
 
 def head_height(x: Array, y: Array) -> Array:
-    """Return the height [...] of the turned head above places [...] of its plane, in its unit; `DEEPEST` beside
-    it."""
+    """Return the height [...] of the turned head above places [...] of its plane, in the head's unit; `DEEPEST`
+    where there is no head."""
     turn = Rotation.from_euler("xyz", [-TURN_DEG[0], TURN_DEG[1], -TURN_DEG[2]], degrees=True).as_matrix()
     return height_above_plane([*_face(), *_eyes(), *_mouth(), *_hair()], x, y, turn, _HIGHEST, DEEPEST)
 
@@ -113,6 +113,6 @@ def _curl(x: float, y: float, z: float, radius: float) -> Form:
 
 
 def _on_skull(x: float, y: float) -> float:
-    """Height z of the skull's front at a place, and of its rim beside it."""
+    """Height z of the skull's front at a place; outside the skull, that of its rim."""
     across = ((x - _SKULL[0]) / _SKULL_RADII[0]) ** 2 + ((y - _SKULL[1]) / _SKULL_RADII[1]) ** 2
     return float(_SKULL[2] + _SKULL_RADII[2] * np.sqrt(max(0.0, 1.0 - across)))

@@ -9,7 +9,7 @@ from sim.objects.surfaces import of_material
 from sim.scene.surface import Material, Surface
 
 LINEN = Material("linen", (0.55, 0.47, 0.34), (0.04, 0.04, 0.04), 0.5)
-"""Undyed; all figures are assumed."""
+"""Material of undyed cloth; all figures are assumed."""
 _BULGE_DEG = 50.0
 """Slope at the edge of a thread."""
 _DIP_DEG = 25.0

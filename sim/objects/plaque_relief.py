@@ -180,7 +180,7 @@ def _roundel(x: Array, y: Array) -> Array:
 
 
 def _rope(x: Array, y: Array) -> Array:
-    """A twisted rope around the roundel; 0 beside it."""
+    """Height of a twisted rope around the roundel; 0 outside it."""
     radius, angle = np.hypot(x - ROUNDEL[0], y - ROUNDEL[1]), np.arctan2(y - ROUNDEL[1], x - ROUNDEL[0])
     offset = (radius - ROUNDEL[2] - ROPE_MM) / ROPE_MM
     strand = np.abs(np.sin(30.0 * angle + 1.4 * offset)) ** 0.6
@@ -189,7 +189,7 @@ def _rope(x: Array, y: Array) -> Array:
 
 
 def _flowers(x: Array, y: Array) -> Array:
-    """A flower in each corner around the roundel; 0 beside them."""
+    """Height of a flower in each corner around the roundel; 0 outside the flowers."""
     r, phi = _flower_place(x, y)
     petal = 3.9 * (0.62 + 0.38 * np.abs(np.cos(2.5 * phi)))
     leaf = 1.5 * np.sqrt(np.maximum(0.0, 1.0 - (r / petal) ** 2)) * (0.75 + 0.25 * np.cos(10.0 * phi))

@@ -8,7 +8,7 @@ from coupole.appearance.matter import makie_drawing
 from sim.objects.carving import Array, Place, curve, distance_to_line
 
 _EDGE_MM = 0.12
-"""Width over which the powder thins out beside a line."""
+"""Width beside a line over which the powder gets thinner."""
 _BRANCHES: tuple[tuple[tuple[Place, ...], float], ...] = (
     (((-7.5, -31.0), (-4.0, -22.0), (-5.5, -12.0), (-0.5, -3.0), (-2.5, 7.0), (2.5, 17.0), (1.0, 27.0)), 1.25),
     (((-5.2, -14.0), (0.5, -10.5), (4.5, -12.5), (7.4, -8.0)), 0.55),

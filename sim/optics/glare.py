@@ -39,7 +39,7 @@ class Glare(BaseModel):
     core: Annotated[float, Field(gt=0, le=1)] = 0.05
     """Radius of the lobe's middle, as a share of the picture's width."""
     falls_by: Annotated[float, Field(ge=2, le=5)] = 3.0
-    """Power of the distance by which the lobe falls."""
+    """Exponent of the distance with which the lobe falls."""
     ghost_blur: Annotated[float, Field(gt=0, le=0.5)] = 0.12
     """Standard deviation of the ghost's blur, as a share of the picture's width."""
 

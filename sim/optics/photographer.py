@@ -82,7 +82,7 @@ class Look:
 
 
 class Photographer:
-    """Holds the scene, its shadows and the last look at it. Only one worker thread calls `render`."""
+    """Contains the scene, its shadows, and the last view of it. Only one worker thread calls `render`."""
 
     def __init__(self, scene: SceneConfig, camera: CameraConfig, settings: Settings) -> None:
         base_from_support = np.array(scene.base_from_support)

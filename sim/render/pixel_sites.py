@@ -30,8 +30,8 @@ def pixel_sites(
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Return points [sites, 3] in the base frame, mm, and the row of the triangle of each point [sites].
 
-    `triangle` [h k, w k], the row seen by each ray or -1, is replaced by the rows of the sites. `centroids_mm` and
-    `normals` [seen, 3] give the triangles' planes.
+    `triangle` [h k, w k] has the row of the triangle that each ray sees, or -1. It is overwritten with the rows of
+    the sites. `centroids_mm` and `normals` [seen, 3] give the triangles' planes.
     """
     lens = sight.lens
     k = lens.samples

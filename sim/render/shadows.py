@@ -1,7 +1,7 @@
 """Table of the LEDs that reach each triangle, kept from view to view.
 
-LEDs, support and object are fixed in the base frame. So the answer whether an LED reaches a side of a triangle
-holds for every view. One ray is traced from the triangle's centroid, raised by `embree.OFFSET_MM`, to the
+LEDs, support and object are fixed in the base frame. So whether an LED reaches a side of a triangle has the same
+answer in every view. One ray is traced from the triangle's centroid, raised by `embree.OFFSET_MM`, to the
 emitter's centre. So shadows are hard and follow triangles' edges. For moving bodies see `sim.render.arm_shadow`.
 """
 

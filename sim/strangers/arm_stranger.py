@@ -25,7 +25,7 @@ class ArmStranger(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     backlash_deg: Six = _NONE
-    """Play of each axis. The axis stops short by half of it, on the side from which it came."""
+    """Play of each axis. The axis stops short by half of the backlash, on the side from which it came."""
     sag_deg_per_nm: Six = _NONE
     """Compliance of each axis under the weight of the parts that it carries."""
     down: tuple[float, float, float] = (0.0, 0.0, 1.0)

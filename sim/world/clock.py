@@ -100,8 +100,8 @@ class ClockWriter:
 class SharedClock:
     """A reader's side: `coupole.clock.Clock` on the block at `path`.
 
-    When the world has ended, or its process was killed, time goes on at the world's speed. So nobody who waits by
-    this clock waits for ever.
+    When the world has ended, or its process was killed, time goes on at the world's speed. So no wait by this
+    clock lasts for ever.
     """
 
     _process: int | None = None

@@ -198,7 +198,7 @@ class Settings(_Model):
     stickers: Stickers | None = None
     """Stickers on the plan's object."""
     leds: LedModel = STEADY
-    """`{}`: realistic LEDs, each with its own flux and colour, temperature dependence and flicker."""
+    """`{}`: realistic LEDs. Each has its own flux and colour, and depends on temperature and flickers."""
     dome: DomeErrors = DomeErrors()
     """Deviations of the dome from its table."""
     glare: Glare | None = None

@@ -159,7 +159,7 @@ class LedBoxAlone:
         """Wait until nothing shines. Fails if something does not stop shining."""
         end_s = time.monotonic() + _PATIENCE_S
         while self.shining():
-            assert time.monotonic() < end_s, "waited in vain for darkness"
+            assert time.monotonic() < end_s, "the LEDs did not become dark in time"
             time.sleep(0.005)
 
     def lit_us(self, number: int) -> float:

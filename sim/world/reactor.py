@@ -22,7 +22,7 @@ from typing import Protocol
 from sim.world.clock import FOREVER_NS, ClockWriter
 
 _MAX_LAG_S = 0.02
-"""A world that is farther behind its pace than this (machine time) gives up catching up."""
+"""A world that is farther behind its pace than this (machine time) no longer tries to catch up."""
 _TIMERS_PER_POLL = 16
 _IDLE_TICK_NS = 10_000_000
 

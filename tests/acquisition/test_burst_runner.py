@@ -249,7 +249,7 @@ def test_the_last_records_are_asked_for_as_soon_as_the_table_is_over() -> None:
 def test_a_box_that_logs_nothing_more_is_a_time_out_and_the_cell_is_made_safe_first() -> None:
     what = take(BURST)
     cell = Cell(BURST, replace(what, edges_us=np.where(np.arange(len(what.edges_us)) < 20, what.edges_us, np.inf)))
-    with pytest.raises(DeviceTimeout, match=f"20 of {len(BURST.table)} are in its log"):
+    with pytest.raises(DeviceTimeout, match=f"20 of {len(BURST.table)} steps are in its log"):
         cell.fire()
     assert cell.done[cell.done.index("started") + 1] == "made safe"
 

@@ -128,7 +128,7 @@ def test_an_arm_that_stops_and_tells_and_refuses_to_go_on_passes() -> None:
 def test_an_arm_that_can_be_driven_on_does_not_pass() -> None:
     bench = bench_of(ScriptedArm(Clock(), obeys_after=True))
     emergency_stop(bench)
-    assert missed(bench) == ["motions that are accepted after the emergency stop"]
+    assert missed(bench) == ["motions that were accepted after the emergency stop"]
 
 
 def test_an_arm_that_turns_farther_than_promised_does_not_pass() -> None:

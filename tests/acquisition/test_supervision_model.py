@@ -50,9 +50,8 @@ PROMISES: dict[str, Callable[[State], bool]] = {
     "After a freeze that needs a confirmation, or Ctrl-Z, nothing moves or is lit before a person confirms": (
         lambda now: not (now.owed and now.since >= AT_ONCE and acts(now))
     ),
-    "A confirmation ends no pause while the cell is still being made safe, or before the session has paused": (
-        lambda now: now.pause or not (now.held or now.halting)
-    ),
+    "A confirmation does not end a pause while the cell is still being made safe, or before the session has "
+    "paused": (lambda now: now.pause or not (now.held or now.halting)),
     "After a stop nothing moves and no lamp is lit": (
         lambda now: not (now.stop and now.since >= AT_ONCE and acts(now))
     ),

@@ -79,7 +79,7 @@ def test_columns_are_read_in_nm_and_in_micrometres(tmp_path: Path) -> None:
         ("a.txt", "350 1.5 0\n350 1.5 0\n", "a.txt:2:1: expected rising wavelengths"),
         ("a.txt", "350 1,5 0,1\n", "a.txt:1:1: expected 3 numbers, found 5"),
         ("a.txt", "350 1.5 0\n800 1.5 0\n", "no value between 350 and 800 nm"),
-        ("a.txt", TABLE_UM.replace("4.4", "-1"), "k not negative"),
+        ("a.txt", TABLE_UM.replace("4.4", "-1"), "n and k of at least 0"),
         ("a.yml", "DATA:\n  - type: tabulated k\n    data: |\n        0.38 1\n        0.4 1\n", "a.yml"),
         ("a.yml", "DATA:\n  - type: formula 9\n", "found 'formula 9'"),
         ("a.yml", "REFERENCES: none\n", "expected a list `DATA`"),

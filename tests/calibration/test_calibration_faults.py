@@ -114,7 +114,7 @@ def test_clipped_images_are_left_out_by_name_and_too_many_are_not_accepted(tmp_p
     ended = of_board("camera", write_run(tmp_path / "run", light=light).folder, tmp_path)
     assert ended.code == 3
     assert "v6: clipped" in said(ended)
-    assert "images too clipped for corners is 0.333" in ended.err
+    assert "images that are too clipped to find corners is 0.333" in ended.err
 
 
 def test_a_lens_of_another_focus_is_not_taken_for_an_observation(sound: Path, tmp_path: Path) -> None:

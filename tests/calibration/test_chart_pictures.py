@@ -329,7 +329,7 @@ def test_pictures_for_displays_are_refused_unless_their_curve_is_stated(even: Pa
     assert cv2.imwrite(str(jpeg), cv2.imread(str(encoded)))
     assert "a JPEG is encoded for displays" in refusal(jpeg, *chart)
     few_greys = ("--without", "D2,D3,D4,D5,D6")
-    assert "8 bits, and too few greys" in refusal(encoded, *chart, *few_greys)
+    assert "8 bits, and the chart has too few greys" in refusal(encoded, *chart, *few_greys)
 
 
 def test_another_chart_or_place_is_refused(even: Path, tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ def test_many_dead_leds_are_one_line() -> None:
     made = dome(1, **WELL_SEEN)
     found = matched(made, made.seen.only(np.flatnonzero(made.seen.led >= 6)))
     assert len(found.faults) == 6
-    assert fault_lines(found.faults) == ("6 LEDs are dead, no spot in any frame: 0, 1, 2, 3, 4, 5",)
+    assert fault_lines(found.faults) == ("6 LEDs are dead: no frame shows their spot: 0, 1, 2, 3, 4, 5",)
 
 
 def test_an_led_that_no_frame_shows_is_not_called_dead() -> None:

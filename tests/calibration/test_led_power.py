@@ -141,7 +141,7 @@ def test_a_dead_led_is_named() -> None:
     views = [replace(v, u_signal=np.full(v.signal.shape, 1.0)) for v in views_of(positions, power, random)]
     found = found_with(views, positions)
     assert found.power[7] == 0
-    assert "dead LEDs, or hidden in every view: LED 7" in found.remarks
+    assert "LEDs that are dead, or hidden in every view: LED 7" in found.remarks
 
 
 def test_a_shadow_on_the_tile_is_named_and_not_used() -> None:

@@ -62,7 +62,7 @@ def test_a_mirrored_layout_is_not_matched() -> None:
 def test_a_regular_layout_is_refused_as_ambiguous() -> None:
     angle = np.arange(8) * np.pi / 4
     ring = np.stack([50 * np.cos(angle), 50 * np.sin(angle), 0 * angle], axis=1)
-    with pytest.raises(InputError, match="two motions fit: one brings 8 targets together, another 8"):
+    with pytest.raises(InputError, match="two motions fit: one brings 8 targets together, the other 8"):
         match_points(ring, ring, TOLERANCE_MM)
 
 

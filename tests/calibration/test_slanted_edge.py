@@ -49,7 +49,7 @@ def test_a_shift_is_found_in_a_noisy_picture() -> None:
 
 
 def test_edges_that_tell_nothing_are_refused() -> None:
-    with pytest.raises(InputError, match="turn the chart by 5"):
+    with pytest.raises(InputError, match="turn the chart by about 5 degrees"):
         slanted_edge(*drawn_edge(0.7, slant_deg=0.3))
     x, y, _ = drawn_edge(0.7)
     with pytest.raises(InputError, match="between light and dark"):

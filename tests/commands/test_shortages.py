@@ -63,7 +63,7 @@ def test_too_little_memory_is_told_though_another_error_hides_it() -> None:
         frame_without_memory()
     shortage = shortage_behind(caught.value)
     assert isinstance(shortage, ResourceShortage)
-    assert "this process got no more memory (no limit is set)" in str(shortage)
+    assert "this process was given no more memory (no limit is set)" in str(shortage)
 
 
 _NO_MORE_THREADS = """

@@ -261,7 +261,7 @@ def test_one_is_in_control_another_looks_until_it_is_handed_over(staffed: Staffe
         ({"plan": "other.yaml"}, "its rig is"),
         ({"plan": "budget.yaml"}, "its budget is 0.01 lux.h"),
         ({"resume": "../../etc"}, "expected a place below"),
-        ({"plan": "plan.yaml", "output": "/tmp"}, "for the command line"),
+        ({"plan": "plan.yaml", "output": "/tmp"}, "only for the command line"),
         ({}, "either `plan` or `hold`"),
         ({"plan": "plan.yaml", "hold": "both"}, "either `plan` or `hold`"),
     ],

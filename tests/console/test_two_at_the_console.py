@@ -196,7 +196,7 @@ def test_a_run_that_does_not_answer_is_said_to_be_silent_and_stopped(two: Two) -
         two.max.sees("[data-name=state]", "the run does not answer")
         cells.wait_until(lambda: _is_dark(two.world), "the devices' own watchdogs")
         two.max.clicks("[data-name=stop]")
-        two.max.is_told("not sure: the run does not answer")
+        two.max.is_told("perhaps not stopped yet: the run does not answer")
     finally:
         os.kill(running["pid"], signal.SIGCONT)
     cells.wait_until(lambda: two.state()["state"] == "halted", "the end of its process")

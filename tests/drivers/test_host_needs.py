@@ -90,7 +90,7 @@ def test_an_address_that_no_interface_has() -> None:
     for settings in (rsi, eki):
         (need,) = [need for need in settings.host_needs() if "address" in need.name]
         assert not need.is_met
-        assert "no interface of this machine has it" in need.state
+        assert "no interface of this machine has this address" in need.state
 
 
 def test_a_port_that_another_program_has() -> None:

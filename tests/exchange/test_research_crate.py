@@ -118,7 +118,7 @@ def test_a_crate_that_is_written_over_keeps_no_file_of_the_old_one(made: MadeRun
     options = ("--to", "rocrate", "--licence", CC_BY, "--author", AUTHOR, "--out", out, "--overwrite")
     ended = cells.here("export", other, *options)
     assert ended.code == 2
-    assert "data: does not belong to a crate" in " ".join(ended.err.split())
+    assert "data: belongs to no crate" in " ".join(ended.err.split())
     assert (out / "data/run.json").exists()
 
 

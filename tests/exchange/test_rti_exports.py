@@ -284,7 +284,7 @@ def test_a_manifest_leads_to_pictures_of_the_sizes_that_it_says(result: Path, tm
     [
         ({"simulated": True, "uncalibrated_run": "vase"}, "simulated: vase"),
         ({"simulated": False, "uncalibrated_run": "vase"}, "measured: vase"),
-        ({"simulated": None}, "not known whether measured or simulated: egg"),
+        ({"simulated": None}, "not known whether it was measured or simulated: egg"),
     ],
 )
 def test_files_say_whether_their_pictures_were_simulated(

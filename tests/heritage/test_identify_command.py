@@ -123,7 +123,7 @@ def test_a_dark_spectrum_in_percent_is_not_taken_for_a_light_one(library: Path, 
     rows = np.column_stack([WAVELENGTHS_NM, np.full(81, 1.8)])
     np.savetxt(tmp_path / "black.txt", rows, fmt="%.2f")
 
-    with pytest.raises(InputError, match=r"1.8 may be percent or a fraction; say which with `unit`"):
+    with pytest.raises(InputError, match=r"1.8, may be percent or a fraction; say which with `unit`"):
         identify([tmp_path / "black.txt"], library=library, classes=library.parent / "classes.tsv")
 
 

@@ -124,7 +124,7 @@ def test_a_series_in_a_yaml_file_is_solved_and_says_how_well_it_agrees(
     ("changed", "words"),
     [
         ({"over_black": "over-white", "over_white": "over-black"}, "is darker over the lighter ground"),
-        ({"over_white": "percent"}, "percent.csv: is 1 at 400 nm"),
+        ({"over_white": "percent"}, "percent.csv: the reflectance is 1 at 400 nm"),
         ({"over_white": "gap"}, "gap.csv: has a gap of more than 20 nm"),
         ({"over_white": "micrometres"}, "micrometres.csv:2:1: expected a wavelength in nm"),
         ({"over_white": "nowhere"}, "nowhere.csv: no such file"),

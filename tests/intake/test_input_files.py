@@ -43,8 +43,8 @@ def made_a_folder(path: Path) -> None:
         (edited, "was changed"),
         (replaced, "was changed"),
         (emptied, "was changed"),
-        (Path.unlink, "is not there any more"),
-        (made_a_folder, "is no file any more"),
+        (Path.unlink, "does not exist any more"),
+        (made_a_folder, "is not a file any more"),
     ],
 )
 def test_a_file_that_changes_is_told_once_and_its_bytes_stay(

@@ -78,7 +78,7 @@ def test_a_urs_lengths_and_speeds_are_those_that_universal_robots_publishes(
         (lambda d: d["joints"].pop(), "joints: "),
         (
             lambda d: d["links"][2].update(name="base"),
-            "links[2].name: expected a name of its own, `base` is taken",
+            "links[2].name: expected a different name for each link; `base` is taken",
         ),
         (lambda d: d["links"].pop(5), "links: expected a body for each link, there is none of link 5"),
         (lambda d: d["links"][1]["capsules"][0].update(radius_mm=0), "links[1].capsules[0].radius_mm: "),

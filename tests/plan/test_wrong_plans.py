@@ -85,7 +85,7 @@ WRONG_PLANS = [
     ("{kind: all}", "{kind: all, §ids: [1]}", "lights.ids", "unknown key `ids`; valid keys: kind"),
     ("{kind: all}", "§{kind: every}", "lights.every", "missing key `every`: a whole number from 1 to 65535"),
     ("{kind: all}", "{kind: every, every: §0}", "lights.every", "a whole number from 1 to 65535, found 0"),
-    ("{kind: all}", "{kind: ids, ids: §[1, 2, 1]}", "lights.ids", "given more than once: [1]"),
+    ("{kind: all}", "{kind: ids, ids: §[1, 2, 1]}", "lights.ids", "these are given more than once: [1]"),
     ("{kind: all}", "{kind: ids, ids: [1, §2.5]}", "lights.ids[1]", "a whole number from 0 to 65534, found 2.5"),
     ("{kind: all}", "{kind: panels, panels: [§5]}", "lights.panels[0]", "from 1 to 4, found 5"),
     ("repeats: 1", "repeats: §0", "repeats", "a whole number from 1 to 1000, found 0"),

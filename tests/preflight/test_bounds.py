@@ -58,7 +58,7 @@ def refused(cell: CellFolder, key: str, expected: str, file: str = "rig.yaml") -
             "a black level below the highest value of 12 bits, 4095",
         ),
         ("led_limits", {"on_us": [2000, 1000]}, "led_limits", "the shortest on-time first"),
-        ("link_meshes", "~nobody-at-all/x", "link_meshes", "home folder of a known user"),
+        ("link_meshes", "~nobody-at-all/x", "link_meshes", "home folder of a user of this machine"),
         ("arm", "a\0b", "arm", "text with a NUL character"),
         ("link_meshes", "x" * 300, "link_meshes", "each of its names of at most 255 bytes"),
     ],

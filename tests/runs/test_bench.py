@@ -407,7 +407,10 @@ def test_a_stopped_bench_is_named_by_who_asks_it_moves_nothing_later_and_says_wh
     finally:
         stopped.send_signal(signal.SIGCONT)
     assert given_up.code == 130
-    assert "given up without an answer: it will not move the arm or light an LED later" in given_up.err
+    assert (
+        "stopped waiting for an answer: the bench will not move the arm or light an LED for this request later"
+        in given_up.err
+    )
     ended = cells.finish(stopped)
     assert ended.code == 130
     assert "the program did not run for" in ended.err

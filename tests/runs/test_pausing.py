@@ -60,7 +60,10 @@ def test_a_paused_run_can_be_stopped(standing: tuple[CellFolder, World]) -> None
     assert cells.safe(world)
     verified = cells.here("verify", run)
     assert verified.code == 5
-    assert f"process {process.pid} is at work on this run: verify it again when that has ended" in verified.err
+    assert (
+        f"process {process.pid} is at work on this run: verify it again when this process has ended"
+        in verified.err
+    )
     assert "--resume" not in verified.err
     stopped = cells.here("stop", run, "--json")
     assert (stopped.code, stopped.document["state"]) == (0, "interrupted"), stopped.err
@@ -153,7 +156,7 @@ def test_a_word_that_was_given_up_while_the_run_was_stopped_is_not_obeyed_later(
     assert f"kill -CONT {process.pid}" in " ".join(shown.err.split())
     asked.send_signal(signal.SIGINT)
     ended = cells.finish(asked)
-    assert (ended.code, "is not obeyed later" in ended.err) == (130, True)
+    assert (ended.code, "does not obey this `coupole go-on` later" in ended.err) == (130, True)
     process.send_signal(signal.SIGCONT)
     end_s = time.monotonic() + 2.0
     while time.monotonic() < end_s:

@@ -114,7 +114,7 @@ def test_leds_that_are_old_and_warm_are_corrected_by_the_runs_own_drift(aged: Ce
     np.testing.assert_allclose(ratio["without"], 0.7 ** (6000 / 50_000), atol=0.012)
     np.testing.assert_allclose(ratio["with"], 1.0, atol=0.012)
     told = next(
-        line for line in (aged.folder / "drift.yaml").read_text().splitlines() if "of the factor, worst" in line
+        line for line in (aged.folder / "drift.yaml").read_text().splitlines() if "the drift factor" in line
     )
     u_drift = float(told.split('"found": ')[1].split(",")[0])
     np.testing.assert_allclose(u_shared["with"] ** 2 - u_shared["without"] ** 2, u_drift**2, rtol=1e-6)

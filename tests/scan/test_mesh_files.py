@@ -163,9 +163,9 @@ PLY = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float
     [
         ("ply\n", "plx\n", ":1: expected `ply`"),
         ("property float y", "property floot y", ":5: expected a line of a PLY header, found `property floot y`"),
-        ("1 0 0\n", "1 O 0\n", ":11: expected x, y and z in numbers"),
-        ("3 0 1 2", "4 0 1 2", ":13: expected 3 and three vertices of 0 to 2"),
-        ("3 0 1 2", "3 0 1 3", ":13: expected 3 and three vertices of 0 to 2"),
+        ("1 0 0\n", "1 O 0\n", ":11: expected numbers for x, y and z"),
+        ("3 0 1 2", "4 0 1 2", ":13: expected the number 3, then three vertex numbers from 0 to 2"),
+        ("3 0 1 2", "3 0 1 3", ":13: expected the number 3, then three vertex numbers from 0 to 2"),
         ("element face 1", "element face 0", "expected triangles; the file holds 3 vertices"),
         ("property float x\n", "", "expected vertices with x, y and z, found y, z"),
         ("end_header\n", "", "expected a line of a PLY header, found `0 0 0`"),

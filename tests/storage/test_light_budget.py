@@ -249,7 +249,7 @@ def test_whoever_gives_light_does_not_forget_a_budget_with_the_file_that_had_it(
         "ask_again": lambda: ours.ask_again(asked(0.7), plan),
     }
     for _ in range(2):  # nor when it is asked again
-        with pytest.raises(StorageError, match="nobody knows what the object may still"):
+        with pytest.raises(StorageError, match="it is not known what the object may still"):
             asks[reads]()
 
 

@@ -37,7 +37,7 @@ class ShownPath:
 
 
 class ArmPaths:
-    """Plans paths of a cell's arm. On the support lies a job's object, or nothing."""
+    """Plans paths of a cell's arm. The support carries a job's object, or nothing."""
 
     def __init__(self, cell: Cell, job: Job | None) -> None:
         self._cell, self._job = cell, job
@@ -127,8 +127,8 @@ class ArmPaths:
         job = self._jobs[key]
         if self._job is not None and not np.array_equal(job.shape.corners_mm, self._job.shape.corners_mm):
             raise InputError(
-                f"{plan}: its object, or the object's place, differs from the object with which the bench was "
-                "begun"
+                f"{plan}: its object, or the object's place, differs from that of the plan with which the bench "
+                "was begun"
             )
         return job
 

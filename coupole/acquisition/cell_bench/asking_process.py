@@ -18,8 +18,8 @@ _LOOK_EVERY_S = 0.02
 @contextmanager
 def watched_process(pid: int, lose: Callable[[str], None]) -> Iterator[None]:
     """Call `lose` with the reason, from another thread, if a process of this machine ends or is stopped while the
-    context lasts, or if it cannot be watched. `pid` 0 is a process that this one cannot see, as one outside a
-    container: it is not watched. Raises RuntimeError if no thread can be begun."""
+    context lasts, or if it cannot be watched. `pid` 0 is a process that this one cannot see, for example outside a
+    container. It is not watched. Raises RuntimeError if no thread can be begun."""
     over = threading.Event()
     if pid:
         threading.Thread(target=_watch, args=(pid, lose, over), name="asking process", daemon=True).start()

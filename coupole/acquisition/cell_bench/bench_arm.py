@@ -35,7 +35,7 @@ _SAME_PLACE_DEG = 0.05
 
 
 class HoldLostError(Exception):
-    """Raised when a button was let go, or when its renewals have ended."""
+    """Raised when a button was released, or when its renewals have ended."""
 
 
 class BenchArm:
@@ -92,8 +92,8 @@ class BenchArm:
 
     def drive(self, number: str, stops: int, asking_pid: int) -> dict[str, Any]:
         """Begin to follow a path that was shown. `stops` is the number of stops when this was requested. The
-        motion ends when the process `asking_pid` no longer runs. Raises InputError if the arm is not at the path's
-        begin."""
+        motion ends when the process `asking_pid` no longer runs. Raises InputError if the arm is not at the
+        beginning of the path."""
         path = self._shown.get(number)
         if path is None:
             raise InputError(f"path: expected one that `plan_path` has shown, found {number!r}")
@@ -218,18 +218,18 @@ class _Hold:
         self._renewed_s = self._now_s()
 
     def renew(self) -> None:
-        """Hold on, unless the hold has lapsed: a request that reaches the bench late, after a freeze, must not
+        """Renew the hold, unless it has lapsed: a request that reaches the bench late, after a freeze, must not
         begin a motion again.
         """
         self._note_lapse()
         self._renewed_s = self._now_s()
 
     def let_go(self, why: str) -> None:
-        """End the hold for this reason, unless it has ended for another."""
+        """End the hold for this reason, unless it has already ended for another reason."""
         self._ended = self._ended or why
 
     def check(self) -> None:
-        """Raise HoldLostError unless it is still held."""
+        """Raise HoldLostError unless the button is still held."""
         self._note_lapse()
         if self._ended:
             raise HoldLostError(self._ended)

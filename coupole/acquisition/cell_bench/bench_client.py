@@ -17,8 +17,8 @@ _LONG_PATIENCE_S = 120.0
 """Longest wait for an answer: a path among many bodies, or a long exposure, takes time."""
 _AT_ONCE = {"state", "stop", "jog", "drive"}
 """Commands that are answered before the work that they begin or end is done."""
-_GIVEN_UP = "given up without an answer: it will not move the arm or light an LED later"
-_STOP_GIVEN_UP = "given up without an answer: the bench obeys the stop as soon as it runs again"
+_GIVEN_UP = "stopped waiting for an answer: the bench will not move the arm or light an LED for this request later"
+_STOP_GIVEN_UP = "stopped waiting for an answer: the bench obeys the stop as soon as it runs again"
 
 
 def bench_socket(cell: Cell) -> Path:
@@ -29,9 +29,9 @@ def bench_socket(cell: Cell) -> Path:
 def ask_bench(
     cell: Cell, command: str, *, say: Callable[[str], object] = lambda _: None, **fields: Any
 ) -> dict[str, Any]:
-    """Return the bench's answer. It has an `error` if the command was not obeyed. `say` gets a message within 2 s
-    if the bench does not answer, and another if this gives up: it says what becomes of the command. Raises
-    InputError if there is no bench, or if it is silent."""
+    """Return the bench's answer. The answer has an `error` if the command was not obeyed. `say` gets a message
+    within 2 s if the bench does not answer. It gets another message if the caller stops waiting, about what
+    happens to the command. Raises InputError if there is no bench, or if it is silent."""
     patience_s = PATIENCE_S if command in _AT_ONCE else _LONG_PATIENCE_S
     rig, request = cell.document.path, {"version": VERSION, "command": command, **fields}
     try:

@@ -38,7 +38,7 @@ class BenchDevices:
 
     def state(self, robot_heard_s_ago: float | None) -> dict[str, Any]:
         """Return by kind of device: identity, link, temperature, last error, last self-test. The box is asked for
-        its temperature now and then, unless it is busy."""
+        its temperature at intervals, unless it is busy."""
         self._ask_the_box()
         now_s = time.monotonic()
         heard_s_ago = {kind: round(now_s - heard_s, 3) for kind, heard_s in self._heard_s.items()}

@@ -19,8 +19,8 @@ class Work:
     def __init__(
         self, session: Control, kind: str, about: dict[str, Any], act: Callable[[Control], dict[str, Any]]
     ) -> None:
-        """`act` does the work and returns its results. It raises Interrupted after the `stop` of its Control or of
-        the session's."""
+        """`act` does the work and returns its results. It raises Interrupted when its own Control or the session's
+        Control is stopped."""
         self.kind, self._about, self._act = kind, about, act
         self.control = Control(session=session)
         self._state, self._found, self._why = "running", {}, ""  # type: tuple[str, dict[str, Any], str]

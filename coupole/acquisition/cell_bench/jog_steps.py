@@ -83,7 +83,7 @@ def _step_target_deg(arm: Arm, here_deg: Joints, axis: int, direction: int) -> J
 
 
 def _along(arm: Arm, flange_from_camera: Transform, here_deg: Joints, axis: str, direction: int) -> Joints:
-    """Return joint angles farther along the camera's line or turn. The step is as long as a straight motion in
+    """Return joint angles farther along the camera's line or turn. The step is so short that a straight motion in
     joint space stays close to the line."""
     start = forward(arm, here_deg) @ flange_from_camera
     part = 1.0

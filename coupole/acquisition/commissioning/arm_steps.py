@@ -18,8 +18,8 @@ CYCLES = {"cycle_ms": "packets", "status_ms": "statuses", "frequency_hz": "sampl
 `Robot.statistics` that counts these reports."""
 _CYCLE_S = 3.0
 _CYCLE_DEVIATION = 0.05
-"""Greatest deviation of the period of the controller's reports, as a share. A larger deviation shows another
-cycle, not another quartz."""
+"""Greatest deviation of the period of the controller's reports, as a share. A larger deviation shows a different
+cycle, not an inaccurate quartz."""
 _LENS_MM, _LEAST_DEG, _MOST_DEG = 15.0, 3.0, 10.0
 _TURNED_DEG, _OTHERS_DEG = 0.05, 0.05
 _SHARES = (1.0, 0.5, 0.25)
@@ -64,7 +64,8 @@ def axes(bench: Bench) -> None:
     """Turn each axis by a few degrees: the measured change, and the motion that the person sees, must agree with
     the rig's arm.
 
-    The angles that a controller reports are its own, so only the person can tell an axis that turns the wrong way.
+    The angles that a controller reports are its own, so only the person can detect an axis that turns the wrong
+    way.
     """
     findings = bench.findings
     bench.ask_before(
@@ -102,8 +103,8 @@ def stopping(bench: Bench) -> None:
     """Stop motions of all axes at several speeds; no axis may turn farther than the driver promises.
 
     In one motion the axes have different shares of their greatest speeds (`_SHARES`, in turn). So three motions
-    measure each axis at each share. All axes stop together along their path, so the limit for a share is that
-    share of `stopping_deg`.
+    together measure each axis at each share. All axes stop together along their path, so the limit for a share is
+    that share of `stopping_deg`.
     """
     findings = bench.findings
     findings.remedy = (
@@ -133,7 +134,7 @@ def stopping(bench: Bench) -> None:
             return
         bench.go_to(home_deg)
     findings.remarks.append(
-        "at the greatest speeds of this session, the angle to a stop was at most that of "
+        "at the greatest speeds of this session, the arm turned until it stopped by at most the angle of "
         f"{1e3 * max(delays_s):.0f} ms at full speed; stops from the speeds of plans are not measured, because "
         "these exceed 250 mm/s"
     )

@@ -49,7 +49,7 @@ class Person(Protocol):
 
 
 Say = Callable[[str, int, int], None]
-"""Called with a job's name, the number that is done, and the number in all."""
+"""Called with a job's name, the number of finished parts, and the number of all parts."""
 
 
 class StepFailedError(Exception):
@@ -67,7 +67,8 @@ class Findings:
     """Action for the case that a limit is exceeded, or that the person answers no."""
 
     def at_most(self, quantity: str, figure: float, limit: float, unit: str) -> bool:
-        """Note a figure and its limit; returns whether it is met. A figure that is not finite misses it."""
+        """Note a figure and its limit; returns whether it is met. A figure that is not finite does not meet the
+        limit."""
         finite_figure = float(figure) if np.isfinite(figure) else 1e9
         self.limits.append(
             Limit(what=quantity, found=round(finite_figure, 6), limit=round(float(limit), 6), unit=unit)
@@ -118,8 +119,8 @@ class Bench:
             raise Interrupted("the commissioning was not continued; the steps that were done are kept")
 
     def ask_whether(self, question: str) -> bool:
-        """Ask the person what was seen; the answer is noted. Raises Interrupted after the operator's stop, which
-        is no answer."""
+        """Ask the person what was seen; the answer is noted. Raises Interrupted after the operator's stop, because
+        a stop is not an answer."""
         self.control.go_on()
         yes = self.person.confirms(question)
         self.control.go_on()

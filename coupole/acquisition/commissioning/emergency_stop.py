@@ -1,5 +1,5 @@
-"""The emergency stop is pressed during a motion. The arm must stop, its fault must be seen here, and nothing may
-move it on."""
+"""The emergency stop is pressed during a motion. The arm must stop, the driver must report the fault, and nothing
+may move the arm afterwards."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _WATCHED_S = 2.0
 _STILL_DEG = 0.02
 _ARRIVED_DEG = 0.1
 _TOLD_WITHIN_S = 3.0
-"""Time within which an arm that stopped on its way tells its fault."""
+"""Time within which the fault of an arm that stopped on its way is reported."""
 _SPEED_OVER_S, _MOMENT_S = 0.3, 0.08
 """Times over which speeds are measured: that of the motion, and one in which the arm has begun to brake. Reports
 come unevenly, so speeds over shorter times are noise."""
 _FAST_SHARE = 0.5
-"""Share of the axis's greatest speed in this session that it must have had."""
+"""Share of an axis's greatest speed in this session; the axis must have been this fast."""
 _STEADY_SHARE = 0.8
 """Share of the speed of the motion; the arm brakes when it is slower."""
 _PRESSED_AT_REST = (
@@ -60,7 +60,7 @@ def emergency_stop(bench: Bench) -> None:
     except DeviceError as error:
         is_accepted = False
         findings.remarks.append(f"a motion was refused: {error}")
-    findings.at_most("motions that are accepted after the emergency stop", int(is_accepted), 0, "")
+    findings.at_most("motions that were accepted after the emergency stop", int(is_accepted), 0, "")
     bench.opened.clock.sleep(_WATCHED_S)
     further_deg = float(np.abs(_last_known_deg(bench, rested_deg) - rested_deg).max())
     findings.at_most("turn of the axes at rest", further_deg, _STILL_DEG, "deg")
@@ -98,8 +98,8 @@ def _moved_until_pressed(bench: Bench) -> _Press:
 
 
 def _follow(bench: Bench, way: _Way, fast_deg_s: float, ask: Callable[[], None]) -> str:
-    """Follow a motion until the arm has arrived; return its fault if there is one. `ask` is called while an axis
-    is as fast as this. An arm that stopped on its way may tell the reason later."""
+    """Follow a motion until the arm has arrived; return its fault if there is one. `ask` is called when an axis
+    has reached the required speed. The reason why an arm stopped on its way may be reported later."""
     robot, clock = bench.opened.robot, bench.opened.clock
     fault_deadline = Deadline(clock, _TOLD_WITHIN_S)
     while True:

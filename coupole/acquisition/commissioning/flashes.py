@@ -52,7 +52,7 @@ def photograph(bench: Bench, led: int, exposure_us: int) -> tuple[NDArray[np.flo
 
 
 def triggered_by_box(bench: Bench, step: Step) -> tuple[NDArray[np.float64], StepRecord]:
-    """Take the picture by a table with this one step; return the same."""
+    """Take the picture by a table with this one step; return picture and record as `photograph` does."""
     bench.control.go_on()
     box = table_box(bench.opened.ledbox)
     table = np.array([astuple(step)], STEP_DTYPE)
@@ -65,7 +65,7 @@ def triggered_by_box(bench: Bench, step: Step) -> tuple[NDArray[np.float64], Ste
         bench.control.go_on()
         raise DeviceError(
             "led box",
-            expected="a record of the step that has ended",
+            expected="a log record of the step that has ended",
             happened=f"{len(records)} came",
             remedy="Find out what else commands the box, then repeat the step.",
         )

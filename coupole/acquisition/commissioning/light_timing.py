@@ -1,4 +1,5 @@
-"""Steps that time the light: from the trigger's edge to the exposure, and from the host's silence to the dark."""
+"""Steps that time the light: from the trigger's edge to the exposure, and from the host's last command to
+darkness."""
 
 from __future__ import annotations
 
@@ -47,8 +48,8 @@ def trigger(bench: Bench) -> None:
     """
     findings = bench.findings
     findings.remedy = (
-        "Check the cable, the polarity and the input filter of the camera's trigger, and its trigger delay; the "
-        f"LEDs outlast the nominal exposure by {EXPOSURE_MARGIN_US} us only."
+        "Check the cable, the polarity and the input filter of the camera's trigger, and its trigger delay; "
+        f"the LEDs are lit only {EXPOSURE_MARGIN_US} us longer than the nominal exposure."
     )
     if not bench.opened.ledbox.runs_tables:
         findings.remarks.append("the box has no trigger output: the host triggers the camera, nothing was timed")
@@ -146,7 +147,7 @@ def watchdog(bench: Bench) -> None:
         f"{lit_s:.2f} s after the last command the LEDs were still lit; after {dark_s:.2f} s they were dark"
     )
     findings.at_most("last light after the host's last command", lit_s, seconds + _DARK_LATE_S, "s")
-    findings.at_most("light until the end of the test", int(not np.isfinite(dark_s)), 0, "")
+    findings.at_most("lights that stayed on until the end of the test", int(not np.isfinite(dark_s)), 0, "")
     report = ""
     try:
         opened_cell.ledbox.self_test()

@@ -14,7 +14,7 @@ from coupole.viewing.terminal import alarm
 
 
 class PersonAtTerminal:
-    """A `Person` who reads and types here. A question is given up when the session is to end."""
+    """A `Person` who reads and types here. A question is withdrawn when the session must end."""
 
     def __init__(self, control: Control) -> None:
         self._is_over = control.stop.is_set

@@ -241,13 +241,13 @@ class BurstJudge:
         if len(changed_leds) == 1:
             led = int(changed_leds[0])
             labels = tuple(f.label for f in series.lit if f.label.is_shot and _led_of(f.label) == led)
-            words = f"{Led(led)} changed by {share} from flash to flash, the other sentinels did not"
+            words = f"{Led(led)} changed by {share} from flash to flash; the other sentinels did not change"
             finding = series.finding("LED", largest, None, abs(figure), limit, OF_THE_LIGHT, words)
             return replace(finding, labels=labels)
         if since == 0 and series.is_since_earlier:
             words = (
-                f"all light differs by {share} from that of the session before: check LEDs, camera and its "
-                "settings"
+                f"all LEDs together differ by {share} from their light in the session before: check LEDs, "
+                "camera and its settings"
             )
             return series.finding("drift", since, None, abs(figure), limit, OF_THE_LIGHT, words)
         if _is_step(np.array(series.places, float), gains):

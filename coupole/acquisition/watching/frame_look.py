@@ -12,8 +12,8 @@ from coupole.devices import FrameFormat
 from coupole.kernels import kernel
 
 _COLUMNS = 128
-"""Greatest number of bins across a frame. With 32 pixels in a bin of the full camera, 0.2 mm are an eighth of a
-bin."""
+"""Greatest number of bins across a frame. A bin of the full-size camera is 32 pixels wide, so a displacement of
+0.2 mm is an eighth of a bin."""
 _ROWS_READ = 4
 """Greatest number of rows that are read of each bin, in pairs spread over it. The speed of the memory is the
 limit."""

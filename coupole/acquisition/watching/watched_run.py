@@ -181,8 +181,8 @@ class WatchedRecorder:
     # -- watching -----------------------------------------------------------------------------------------
 
     def judge(self, burst: Burst, *, may_retake: bool) -> str:
-        """Judge a burst that was fired, and prove its frames. Findings are noted and told. Returns why shots are
-        left unproven, to be taken again; the text is empty if there are none."""
+        """Judge a burst that was fired, and prove its frames. Findings are written to the journal and reported.
+        Returns why shots are left unproven, to be taken again; the text is empty if there are none."""
         try:
             findings = self._findings_in(burst)
         except Exception as error:  # noqa: BLE001  a defect of what only looks must not end a run

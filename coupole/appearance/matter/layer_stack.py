@@ -5,9 +5,9 @@ directed to its mirror image. A layer over a ground is again a ground, so layers
 Layers have two fluxes (Kubelka and Munk) or four fluxes (seed 000, section 3.4, with a path of directed light that
 is 1/cos longer), are clear (Beer and Lambert), or are metal leaves (thin films). A face closes the stack.
 
-Along one direction this is the exact solution of the four fluxes' equations with the faces' reflections. Over
-directions, the emerging light is distributed as the entering light is accepted: f = A(i) A(o)/(pi <A>). This keeps
-the reflectance A of each direction, and is reciprocal.
+For light along one direction, this computation is the exact solution of the four-flux equations with the
+reflections at the faces. Over directions, the emerging light is distributed as the entering light is accepted: f =
+A(i) A(o)/(pi <A>). This keeps the reflectance A of each direction, and is reciprocal.
 """
 
 from __future__ import annotations

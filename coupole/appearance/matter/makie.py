@@ -90,7 +90,7 @@ def _three_lacquers(t: Array, m: Array, c: Array, region: str) -> Array:
     positive = m_in > _SINGULAR
     if not positive.any():
         raise InputError(
-            "makie: expected a metal that has some of a lacquer's colour, found weights "
+            "makie: expected a metal that contains some of a lacquer's colour, found weights "
             f"{m_in.round(3).tolist()}; check the sample colours"
         )
     return np.asarray((t_in[..., positive] / m_in[positive]).min(axis=-1))

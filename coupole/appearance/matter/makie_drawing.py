@@ -63,7 +63,9 @@ def _shares(path: Path) -> Array:
                 return np.asarray(image, dtype=float) / 65535.0
             return np.asarray(image.convert("L"), dtype=float) / 255.0
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected a picture (PNG, TIFF), white where metal is; {error}") from error
+        raise InputError(
+            f"{path}: expected a picture (PNG, TIFF) that is white where there is metal; {error}"
+        ) from error
 
 
 def _waves(place: Array) -> Array:

@@ -161,7 +161,7 @@ def _table(lines: list[str], columns: int, path: Path, first: int) -> Array:
         except ValueError as error:
             raise _wrong(path, number, f"expected numbers: {error}") from error
         if not np.isfinite(rows[-1]).all():
-            raise _wrong(path, number, "expected numbers, found one that is none; leave the band out")
+            raise _wrong(path, number, "expected numbers, found a field that is not a number; leave the band out")
     if len(rows) < 3:
         raise _wrong(path, first, f"expected 3 or more bands, found {len(rows)}")
     return np.array(rows)

@@ -192,7 +192,7 @@ def read_bsdf(path: Path) -> RglTable:
             raise InputError(f"{path}: field `{name}`: expected rising values; fetch or export it anew")
     for name, table in (*density.items(), ("spectra" if spectral else "rgb", values)):
         if min(table.shape[-2:]) < 2 or (name != "ndf" and name in density and table.min() < 0.0):
-            raise InputError(f"{path}: field `{name}`: expected planes of 2 x 2 or more, of no value below 0")
+            raise InputError(f"{path}: field `{name}`: expected planes of 2 x 2 or more, without values below 0")
     if (density["vndf"].mean(axis=(2, 3)) <= 0.0).any() or density["sigma"].min() <= 0.0:
         raise InputError(f"{path}: `vndf` or `sigma` is 0 where it must not be; fetch or export it anew")
     flag, description = fields.get("jacobian"), fields.get("description", np.zeros(0, np.uint8))

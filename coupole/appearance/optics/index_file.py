@@ -108,7 +108,9 @@ def _of_columns(text: str, path: Path, first_line: int) -> Complex:
             count = len(rows[0]) if len(rows[0]) in (2, 3) else 3
             raise _wrong(path, number, f"expected {count} numbers, found {len(rows[-1])}")
         if min(rows[-1]) < 0.0 or rows[-1][0] == 0.0:
-            raise _wrong(path, number, f"expected wavelength, n and k not negative, found {min(rows[-1]):g}")
+            raise _wrong(
+                path, number, f"expected a wavelength above 0, and n and k of at least 0; found {min(rows[-1]):g}"
+            )
         if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
             raise _wrong(path, number, f"expected rising wavelengths, found {rows[-1][0]:g} after {rows[-2][0]:g}")
     if len(rows) < 2:

@@ -62,7 +62,7 @@ def around_nodes(power: Array, step_nm: StepNm) -> Array:
 
 def weights(functions: Array, power: Array, step_nm: StepNm) -> Array:
     """[n, bands] weights in nm. The sum of weights times radiance in the rendered bands is the integral of
-    radiance times `functions` [n, 81], under the light `power` [81]. This holds for reflectances that are cubic
+    radiance times `functions` [n, 81], under the light `power` [81]. This is exact for reflectances that are cubic
     splines over the bands."""
     from scipy.interpolate import CubicSpline
 

@@ -83,7 +83,9 @@ def read_map(path: Path, mi: Any) -> Array:
             "stitch or unwrap it to all directions"
         )
     if not np.isfinite(pixels).all():
-        raise InputError(f"{path}: expected finite pixels, found {np.sum(~np.isfinite(pixels))} others; mend them")
+        raise InputError(
+            f"{path}: expected finite pixels, found {np.sum(~np.isfinite(pixels))} that are not finite; mend them"
+        )
     negative = float((pixels < 0.0).any(axis=2).mean())
     if negative > _MOST_NEGATIVE:
         raise InputError(
@@ -117,7 +119,7 @@ def factor(source: EnvironmentMap, folder: Path, step_nm: StepNm) -> Array:
     if not np.all(white > 0.0):
         raise InputError(
             f"{source.path}: expected a light for the map with some power in all bands, found "
-            f"{np.count_nonzero(white <= 0.0)} bands without; choose another `spectrum`"
+            f"{np.count_nonzero(white <= 0.0)} bands without power; choose another `spectrum`"
         )
     fine_nm = WAVELENGTHS_NM[:, None] + step_nm * ((np.arange(_PARTS) + 0.5) / _PARTS - 0.5)
     d65 = np.interp(fine_nm, WAVELENGTHS_NM, light.illuminant("D65")).mean(axis=1)

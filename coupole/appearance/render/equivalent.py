@@ -40,7 +40,7 @@ def equivalent_index(reflectance: Callable[[Array], Array]) -> Complex:
     if off > MOST_OFF:
         raise InputError(
             f"films: expected a stack that reflects like a bulk material within {MOST_OFF} at all angles; the "
-            f"nearest material differs by {off:.2f}. Take thinner films, or fewer"
+            f"nearest material differs by {off:.2f}. Take thinner films, or fewer films"
         )
     index: Complex = n[best, np.arange(BANDS)] + 1j * k[best, np.arange(BANDS)]
     return index

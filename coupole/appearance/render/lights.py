@@ -146,8 +146,8 @@ def plain(lights: Iterable[Light], folder: Path) -> tuple[PlainLight, ...]:
     around = [light.kind for light in plain_lights if isinstance(light, Environment | EnvironmentMap)]
     if len(around) > 1:
         raise InputError(
-            f"lights: expected one light from all directions, found {len(around)} ({', '.join(around)}); "
-            "leave one, or write `sky: false` in `daylight`"
+            f"lights: expected one light from all directions, found {len(around)} ({', '.join(around)}); keep "
+            "one of them, or write `sky: false` in `daylight`"
         )
     return plain_lights
 

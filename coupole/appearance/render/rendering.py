@@ -122,8 +122,9 @@ class Renderer:
         image = np.array(self._mi.render(mitsuba_scene, spp=count, seed=self.scene.seed + part), np.float32)
         if not np.isfinite(image).all():
             raise CoupoleError(
-                f"{self.scene.name}, camera {camera.name}: expected finite radiances from Mitsuba {self.version} "
-                f"({self.variant_name}), found {np.count_nonzero(~np.isfinite(image))} others; report the scene"
+                f"{self.scene.name}, camera {camera.name}: expected finite radiances from Mitsuba "
+                f"{self.version} ({self.variant_name}), found {np.count_nonzero(~np.isfinite(image))} that are "
+                "not finite; please report the scene"
             )
         return image / np.float32(self.scene.bands.step_nm)
 

@@ -51,7 +51,7 @@ class Camera(Model):
     def _looks(self) -> Camera:
         way = np.subtract(self.target_mm, self.position_mm)
         if np.linalg.norm(np.cross(way, self.up)) < 1e-6 * np.linalg.norm(way) * np.linalg.norm(self.up):
-            raise ValueError("the camera looks along `up`, or nowhere: choose another `up`, or move it")
+            raise ValueError("the camera looks along `up`, or nowhere: choose another `up`, or move the camera")
         return self
 
     def field_deg(self) -> float:

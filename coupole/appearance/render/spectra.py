@@ -168,7 +168,7 @@ def coefficients(paint: MeasuredPaint, folder: Path, *, needs_mm: bool) -> Pigme
     if needs_mm and paint_file.unit != "per mm":
         raise InputError(
             f"{folder / paint.path}: is {paint_file.unit}; a layer of a thickness needs K and S per mm: measure "
-            "it with its thickness, or leave out thickness_mm for an opaque one"
+            "the film with its thickness, or leave out thickness_mm for an opaque layer"
         )
     return paint_file.on_grid()
 

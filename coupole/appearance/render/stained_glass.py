@@ -32,7 +32,7 @@ class Glazing(Model):
         if len({len(row) for row in self.layout}) > 1:
             raise ValueError("the rows of `layout` differ in length: give each the same number of letters")
         if missing := sorted({*"".join(self.layout)} - {*self.panes, OPEN}):
-            raise ValueError(f"`layout` has {', '.join(missing)}, which `panes` does not name: add them")
+            raise ValueError(f"`layout` has {', '.join(missing)}, which `panes` does not name: add these panes")
         return self
 
 

@@ -91,8 +91,8 @@ def _sun(light: Distant, thing: Arcature, folder: Path, scene_name: str) -> caus
     direction = thing.scene_from_thing()[:3, :3].T @ np.array(unit(light.direction))
     if direction[1] <= 0.0:
         raise InputError(
-            f"{scene_name}: expected a sun that shines into the arcature, found it behind the wall; "
-            "turn one of them"
+            f"{scene_name}: expected a sun that shines into the arcature, found the sun behind the wall; turn "
+            "the arcature, or move the sun"
         )
     return caustic.Sun(
         direction, light.width_deg, scaled_power(power(light.spectrum, folder), light.illuminance_lux)

@@ -38,7 +38,9 @@ def turned_body(profile_mm: Sequence[tuple[float, float]], *, around: int = 256,
     steps = max(2 * len(outline), int(way[-1] / step_mm))
     line = np.asarray(Akima1DInterpolator(way, outline)(np.linspace(0.0, way[-1], steps + 1)))
     if np.any(line[1:-1, 0] <= 0.0):
-        raise InputError("profile: its curve crosses the axis between two points; add points there")
+        raise InputError(
+            "profile: the curve through its points crosses the axis between two of them; add points there"
+        )
     line[[0, -1], 0] = 0.0
     r, z = line.T
     if np.sum((r[1:] + r[:-1]) * (r[1:] * z[:-1] - r[:-1] * z[1:])) <= 0.0:

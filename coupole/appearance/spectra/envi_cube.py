@@ -121,7 +121,9 @@ class Cube:
         file.seek(self._offset + at)
         values = np.fromfile(file, self._dtype, count)
         if len(values) != count:
-            raise InputError(f"{self.data}: ends at byte {self._offset + at + values.nbytes}; it became shorter")
+            raise InputError(
+                f"{self.data}: ends at byte {self._offset + at + values.nbytes}; the file became shorter"
+            )
         return values
 
 

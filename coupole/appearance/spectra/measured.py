@@ -186,8 +186,8 @@ def _check_wavelengths(nm: Array, rows: list[_Row], file: str) -> None:
             raise _wrong(
                 file,
                 row.line,
-                f"expected wavelengths that all rise or all fall, found {after:g} after {before:g}; "
-                "one spectrum in a file",
+                f"expected wavelengths that all rise or all fall, found {after:g} after {before:g}; give one "
+                "spectrum in a file",
             )
 
 
@@ -201,7 +201,11 @@ def _scale(values: Array, table: _Table, unit: Unit, file: str) -> float:
     # A percent sign in another comment may refer to humidity.
     if peak <= _FRACTION_AT_MOST and not any(_speaks_of_percent(remark) for remark in table.remarks):
         return 1.0
-    raise _wrong(file, table.rows[highest].line, f"{peak:g} may be percent or a fraction; say which with `unit`")
+    raise _wrong(
+        file,
+        table.rows[highest].line,
+        f"the largest value, {peak:g}, may be percent or a fraction; say which with `unit`",
+    )
 
 
 def _speaks_of_percent(remark: str) -> bool:

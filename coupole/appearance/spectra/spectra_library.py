@@ -208,7 +208,11 @@ def _scale(path: Path, nm: Array, numbers: list[Array], rows: list[Row], unit: U
     highest, (line, name, _) = max(spectra, key=lambda item: float(item[0].max()))
     peak = float(highest.max())
     if unit == "auto" and _FRACTION_AT_MOST < peak < _PERCENT_AT_LEAST:
-        raise _wrong(str(path), line, f"{name}: {peak:g} may be percent or a fraction; say which with `unit`")
+        raise _wrong(
+            str(path),
+            line,
+            f"{name}: the largest value, {peak:g}, may be percent or a fraction; say which with `unit`",
+        )
     scale = 0.01 if unit == "percent" or (unit == "auto" and peak >= _PERCENT_AT_LEAST) else 1.0
     low, high = _REFLECTANCE
     for values, (at, label, _) in spectra:
@@ -217,8 +221,8 @@ def _scale(path: Path, nm: Array, numbers: list[Array], rows: list[Row], unit: U
             raise _wrong(
                 str(path),
                 at,
-                f"{label}: expected a reflectance of {low:g} to {high:g}, found {values[outside[0]] * scale:g} at "
-                f"{nm[outside[0]]:g} nm; see whether it is percent or a fraction",
+                f"{label}: expected a reflectance of {low:g} to {high:g}, found {values[outside[0]] * scale:g} "
+                f"at {nm[outside[0]]:g} nm; check whether it is percent or a fraction",
             )
     return scale
 

@@ -1,7 +1,7 @@
 """The accuracies of seed 003 beside those from calibration records, for one cell or several.
 
 Our figures are computed from records: standard uncertainties, all directions together. The paper does not state
-the coverage of its own.
+the coverage of its figures.
 """
 
 from __future__ import annotations

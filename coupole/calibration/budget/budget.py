@@ -89,8 +89,8 @@ class Known:
     response: float = 0.002
     glare: float = 0.005
     """Uncertainty of the veil over the sample, as a share of a white target's signal. With a record it is the
-    uncertainty of the remaining veil. Without a record it is that of all veil that a good lens makes of a scene
-    half as bright as white."""
+    uncertainty of the remaining veil. Without a record it is the uncertainty of the whole veil that a good lens
+    makes from a scene half as bright as white."""
     power_own: float = 0.003
     power_common: float = 0.01
     drift: float = 0.002
@@ -145,7 +145,7 @@ class Share:
 
     source: str
     figure: str
-    """Figures that are used for it, as text."""
+    """Figures that are used for the source, as text."""
     said_by: str
     linear: float
     """Share of the linear variance."""

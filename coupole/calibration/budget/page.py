@@ -69,7 +69,7 @@ def _next_step(budget: Budget, doubts: Sequence[str]) -> Inline:
     if largest is None:
         return "Nothing: no source is stated."
     narrower = f"{largest.width_decrease:.0%} narrower"
-    return f"To narrow it, begin with {largest.source}: without it the interval is {narrower}."
+    return f"To narrow it, begin with {largest.source}: without this source the interval is {narrower}."
 
 
 def verdict(validation: Validation) -> str:

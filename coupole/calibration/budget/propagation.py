@@ -301,8 +301,8 @@ def _sorted_values(values: Floats, *, infinite: float = 0.0) -> Floats:
     if np.isnan(values).any() or float(np.mean(np.isinf(values))) > infinite:
         raise InputError(
             f"budget: {np.mean(~np.isfinite(values)):.2%} of the trials give no finite value: an input's "
-            "distribution reaches where the measurement equation has no meaning, for example with a light below "
-            "the horizon"
+            "distribution includes values for which the measurement equation has no meaning, for example a "
+            "light below the horizon"
         )
     return np.sort(values)
 

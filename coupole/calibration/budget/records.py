@@ -164,7 +164,7 @@ def _of_leds(record: Record, path: Path) -> Said:
 
 
 def _of_mesh(record: Record, path: Path) -> Said:
-    """Use the uncertainty of the worst sticker for all points of the object."""
+    """Use the uncertainty of the least certain sticker for all points of the object."""
     turn = step_names("base_from_mesh")[3:]
     u = {parameter.name: parameter.u for parameter in record.parameters}
     figures = {
@@ -234,10 +234,11 @@ def camera_reach_mm(record: Record) -> float:
 
 
 def ray_mm(record: Record, distance_mm: float) -> float:
-    """Return the standard uncertainty of the point where a ray meets an object at this distance. It is across the
-    ray, both directions together, as root mean square over the field. It follows from the common covariance of
-    lens and hand-eye. The zeros of the arm's axes are left out, because a record has no posture. With them the
-    uncertainty falls by up to half (the zero of the last axis is correlated with a rotation of the camera).
+    """Return the standard uncertainty of the point where a ray meets an object at this distance. It is the
+    uncertainty across the ray, both directions together, as root mean square over the field. It follows from the
+    common covariance of lens and hand-eye. The zeros of the arm's axes are left out, because a record has no
+    posture. With them the uncertainty falls by up to half (the zero of the last axis is correlated with a rotation
+    of the camera).
 
     A step of flange_from_camera by t (flange's axes) and r (camera's axes) moves a point p of the camera frame by
     -(R^T t + r x p).

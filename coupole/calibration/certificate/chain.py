@@ -14,7 +14,7 @@ from coupole.calibration.traceability import is_traceable, trace_of
 from coupole.storage.durable import sha256
 
 NEEDS: dict[Kind, tuple[Kind, ...]] = {"leds": ("hand-eye",), "mesh": ("hand-eye",), "drift": ("led-power",)}
-"""Kinds of records that hold only together with a record of another kind."""
+"""Kinds of records that are valid only together with a record of another kind."""
 
 
 @dataclass(frozen=True)

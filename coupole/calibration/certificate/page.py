@@ -176,7 +176,9 @@ def _conditions(certificate: CellCertificate) -> dict[str, Inline]:
     for record in certificate.records:
         if record.validity.temperature_c is not None:
             low, high = record.validity.temperature_c
-            facts[f"{record.kind} {record.name} holds for"] = f"{low:g} to {high:g} C of the coolest LED board"
+            facts[f"{record.kind} {record.name} holds for"] = (
+                f"a temperature of the coolest LED board from {low:g} to {high:g} C"
+            )
     return facts
 
 

@@ -1,7 +1,7 @@
 """Lengths on a board as a calibrated cell measures them, with their uncertainties.
 
 The board's corners are points in the base frame. They are found only from their images at many poses; the board's
-known form is used only for a start. Lens and hand-eye are held at their record's values. The arm's error at each
+known form gives only initial values. Lens and hand-eye are held at their record's values. The arm's error at each
 pose is unknown within its stated noise. Least squares then give the points. Their covariance has two parts. The
 first is noise of corners and poses, which is independent between positions of the board. The second is the errors
 of lens, hand-eye and axis zeros, from the record's covariance; all positions share them. Lengths are compared as
@@ -76,9 +76,10 @@ class Lengths:
     """[n, parameters] changes of the lengths by the figures of the record, mm, in the order of
     `CameraPrior.covariance`."""
     u_certified_mm: Floats
-    """[n] uncertainty from places of corners and flatness. The scale, which all lengths share, is not included."""
+    """[n] standard uncertainty of the certified lengths from the places of corners and from flatness. The scale,
+    which all lengths share, is not included."""
     residual_ratio: float
-    """Residuals over those that the record's noise explains, root mean square."""
+    """Root mean square of the residuals, divided by the value that the record's noise explains."""
 
 
 def lengths_of(position: Position, board: Board, noise: Noise) -> Lengths:

@@ -6,8 +6,8 @@ The model is logarithmic. For the LED k in the channel c, in a view of the tile 
 
 Here value is the power that the LED would have if the tile were as described (`tile_views.Row`). delta is the
 logarithm of measured over certified reflectance. theta is the tile's tilt and height, kappa its departure from
-Minnaert's law. phi are the figures that the powers share; they represent the first tile. All but delta have
-priors: from the description of this tile, and from the covariance in the record of the powers.
+Minnaert's law. phi are the figures that the powers share; they represent the first tile. All of these except delta
+have priors, from the description of this tile and from the covariance in the record of the powers.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class MeasuredTile:
     reflectance: Floats
     """[places, channels]."""
     covariance: Floats
-    """[places channels] squared: covariance of the logarithms of reflectance, so it is relative."""
+    """[places channels, places channels] covariance of the logarithms of reflectance, so it is relative."""
     certified_reflectance: Floats
     """[places, channels]."""
     u_certified: Floats

@@ -53,7 +53,7 @@ class Chart(Described):
     rows: Annotated[int, Field(ge=1, le=100)]
     columns: Annotated[int, Field(ge=1, le=100)]
     pitch_mm: tuple[_Length, _Length]
-    """Distance from the middle of a patch to that of the next, along rows and along columns."""
+    """Distance from the middle of a patch to the middle of the next patch, along rows and along columns."""
     patch_mm: tuple[_Length, _Length]
     """Width and height of a patch."""
     used: Annotated[float, Field(gt=0, le=0.95)] = 0.7

@@ -23,10 +23,11 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 _LARGEST_MISS = 15.0
-"""Largest mean CIEDE2000 of patches at the chart's place, by the best matrix without any correction."""
+"""Largest mean CIEDE2000 of the patches, after conversion by the best matrix alone, with which the chart counts as
+found."""
 _BETTER = 1.25
-"""Least ratio of the miss of the second best order of corners to that of the best one. Above it the best order is
-certain."""
+"""Least error of the second best order of corners, divided by the error of the best order. Above this ratio the
+best order is certain."""
 _LEAST_PIXELS = 36
 _SIDE_TILES = 6
 """Greatest number of tiles along a patch's side. The tiles show the noise and evenness of the patch."""

@@ -21,8 +21,8 @@ COLOUR, MONO = "COLOUR", "MONO"
 _LEAST_PIXELS = 12
 """Least number of pixels of each colour on a patch."""
 _ODD, _ODD_SIGMA = 0.03, 6.0
-"""Relative departure of a patch under one light, and its size in units of noise, above which it counts as shadow
-or gloss."""
+"""Departure of a patch under one light above which it counts as shadow or gloss: relative, and in units of
+noise."""
 _LEAST_LIGHTS = 3
 """Least number of lights that is needed to find shadows."""
 _ROUNDS = 5
@@ -36,7 +36,7 @@ class ChartPicture:
     signal: Floats
     """[H, W] signal above dark, linear, over the flat field; for the pattern `COLOUR` it is [H, W, 3]."""
     full: NDArray[np.bool_]
-    """True where saturated; it has the shape of `signal`."""
+    """True where a pixel is saturated; it has the shape of `signal`."""
     pattern: str
     """Names of the four pixels at the top left, row by row; or `COLOUR`."""
     patches_px: Floats

@@ -106,7 +106,7 @@ def _words(path: Path, number: int, line: str) -> list[str]:
     try:
         return shlex.split(line)
     except ValueError as error:
-        raise _wrong(path, number, f"expected a quotation mark that ends too: {error}") from error
+        raise _wrong(path, number, f"expected a second quotation mark after the first: {error}") from error
 
 
 def _csv(path: Path, text: str) -> tuple[list[str], Rows]:
@@ -146,14 +146,15 @@ def reflectance_fractions(path: Path, table: Floats, unit: Unit) -> Floats:
     peak = float(table.max())
     if unit == "auto" and _FRACTION_AT_MOST < peak < _PERCENT_AT_LEAST:
         raise InputError(
-            f"{path}: {peak:g} may be percent or a fraction; say which with `unit` in the description"
+            f"{path}: the largest value, {peak:g}, may be percent or a fraction; say which with `unit` in the "
+            "description"
         )
     scale = 0.01 if unit == "percent" or (unit == "auto" and peak >= _PERCENT_AT_LEAST) else 1.0
     values = table * scale
     if values.min() < _POSSIBLE[0] or values.max() > _POSSIBLE[1]:
         raise InputError(
             f"{path}: expected reflectances of {_POSSIBLE[0]:g} to {_POSSIBLE[1]:g}, found {values.min():g} to "
-            f"{values.max():g}; see to `unit` in the description"
+            f"{values.max():g}; correct `unit` in the description"
         )
     return values
 

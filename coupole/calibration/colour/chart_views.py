@@ -20,8 +20,8 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 _LEAST_COSINE = 0.3
-"""Least cosine of incidence on the chart. Light that is nearer to its plane than 17 degrees shows its surface, not
-its colour."""
+"""Least cosine of incidence on the chart. Light at less than 17 degrees to the chart's plane shows the surface of
+the patches, not their colour."""
 _GLOSS_DEG = 25.0
 """Angle about the mirrored direction to the camera. Light from within this angle is not used (45/0 geometry also
 avoids it)."""

@@ -4,8 +4,8 @@ under D50.
 There are two forms: a matrix [3, 3], and a root-polynomial of degree 2 (Finlayson, Mackiewicz and Hurlbert, Color
 correction using root-polynomial regression, IEEE Trans. Image Processing 24, 2015). Its terms r, g, b, sqrt(rg),
 sqrt(rb), sqrt(gb) scale with the exposure, like those of a matrix. Both forms keep white exactly. First they are
-found by least squares in XYZ, weighted by the slope of L*. Then the sum of squares of CIEDE2000 is minimised, held
-weakly to the first solution.
+found by least squares in XYZ, weighted by the slope of L*. Then the sum of squares of CIEDE2000 is minimised, with
+a weak prior at the first solution.
 """
 
 from __future__ import annotations
@@ -166,10 +166,10 @@ class LeftOut:
         return float(self.de.max())
 
     def bound(self, share: float) -> tuple[float, float]:
-        """Return a bound of CIEDE2000 for a share of further colours like the patches', and the share that it
-        holds for. The bound is the smallest order statistic k for which k / (n + 1) is at least the share. If
-        there is none, it is the largest of the n patches (split conformal prediction: Vovk, Gammerman and Shafer,
-        Algorithmic Learning in a Random World, 2005)."""
+        """Return a bound of CIEDE2000 for a share of further colours like the patches', and the share for which
+        the bound is valid. The bound is the smallest order statistic k for which k / (n + 1) is at least the
+        share. If there is none, it is the largest of the n patches (split conformal prediction: Vovk, Gammerman
+        and Shafer, Algorithmic Learning in a Random World, 2005)."""
         count = len(self.de)
         place = min(int(np.ceil(share * (count + 1))), count)
         return float(np.sort(self.de)[place - 1]), min(share, place / (count + 1))
@@ -210,9 +210,9 @@ def covariance_of(patch_signals: Balanced, profile: Profile) -> tuple[Floats, Fl
     """Return covariances [3 terms, 3 terms] of the coefficients, row by row. The first is from the noise of
     signals, the second from the patches' own uncertainty, and the third from that of the light.
 
-    Let J and K be the derivatives of the misses by the coefficients and by the data. Then dm = -(J'J)^-1 J'K dd
-    (the implicit function theorem on the normal equations, with Gauss and Newton's approximation). Errors that the
-    form itself cannot follow (metamerism) are not noise; `leave_out` shows them.
+    Let J and K be the derivatives of the misses with respect to the coefficients and to the data. Then dm =
+    -(J'J)^-1 J'K dd (the implicit function theorem on the normal equations, with Gauss and Newton's
+    approximation). Errors that the form itself cannot follow (metamerism) are not noise; `leave_out` shows them.
     """
     lab = lab_of(patch_signals.xyz)
     signal = patch_signals.signal / profile.white_signal
@@ -270,7 +270,7 @@ def _by_noise(
 def _by_chart(
     patch_signals: Balanced, balanced_channels: Floats, parts: Parts, free: Floats, lab: Floats
 ) -> Sequence[Floats]:
-    """Return the same for the patches' L*, a*, b*. The L* of a grey patch changes the balance too."""
+    """Return the same changes for the patches' L*, a*, b*. The L* of a grey patch changes the balance too."""
     columns = []
     grey = list(patch_signals.neutral)
     for patch in range(len(lab)):
@@ -293,7 +293,7 @@ def _by_chart(
 def _by_light(
     patch_signals: Balanced, balanced_channels: Floats, parts: Parts, free: Floats, lab: Floats
 ) -> Sequence[Floats]:
-    """Return the same for each error of the light, including the change of the balance."""
+    """Return the same changes for each error of the light, including the change of the balance."""
     columns = []
     grey = list(patch_signals.neutral)
     luminance = patch_signals.xyz[grey, 1]

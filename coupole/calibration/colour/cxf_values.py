@@ -6,7 +6,7 @@ and column: such patches are named A1, A2, ... by their place. The reflectance s
 Its wavelengths follow from the first one (of the spectrum, or of its colour specification) and from the increment
 of the specification. Without spectra, L*a*b* or XYZ is taken, under D50 for the 1931 observer alone. A file may
 hold each patch several times, once for each condition of measurement (ISO 13655: M0, M1, M2). The type of the
-objects tells which are meant.
+objects says which of them are used.
 """
 
 from __future__ import annotations

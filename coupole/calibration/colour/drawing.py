@@ -47,7 +47,7 @@ def draw_colour(
     axes[0, 0].bar(range(len(de)), de, color=BLUE)
     axes[0, 0].set_xticks(range(len(de)), names, rotation=90, fontsize=8)
     axes[0, 0].axhline(float(np.mean(de)), color=GREY)
-    axes[0, 0].set(title="CIEDE2000 of each patch, left out of the profile", ylabel="dE00")
+    axes[0, 0].set(title="CIEDE2000 of each patch by a profile without it", ylabel="dE00")
     for seen_lab, true_lab in zip(lab, known_chart.lab, strict=True):
         axes[0, 1].plot([true_lab[1], seen_lab[1]], [true_lab[2], seen_lab[2]], color=GREY)
     axes[0, 1].plot(known_chart.lab[:, 1], known_chart.lab[:, 2], "o", color=DARK, mfc="none", label="chart")

@@ -1,8 +1,8 @@
 """Figures of image quality that heritage imaging asks for (as ISO 19264-1), with published levels.
 
-Levels are those of a public comparison of the two guidelines (skandalski.pl/tabela-fadgi-iso-metamorfoze):
-ISO 19264-1:2021 levels A, B, C, and FADGI 2023 stars for bound general collections. The standards' own texts were
-not at hand; where the comparison has no tolerance, a figure has no level.
+Levels are those of a public comparison of the two guidelines (skandalski.pl/tabela-fadgi-iso-metamorfoze): ISO
+19264-1:2021 levels A, B, C, and FADGI 2023 stars for bound general collections. The texts of the standards were
+not available. If the comparison has no tolerance for a figure, the figure has no level.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@ matrix.
 
 Light and the lens's fall-off are taken as one smooth factor, exp(sum of t_k f_k(x, y)), of all three channels. Its
 t_k and the matrix's coefficients together minimise the sum of squares of CIEDE2000 (after Finlayson, Gong and
-Fisher, Color homography: theory and applications, IEEE Trans. PAMI 41, 2019, who have a factor for each patch).
+Fisher, Color homography: theory and applications, IEEE Trans. PAMI 41, 2019, where each patch has its own factor).
 Errors of the patches' colours that the matrix cannot follow count as noise of this adjustment. The noise differs
 between patches, and between lightness, chroma and hue.
 """

@@ -164,14 +164,15 @@ def _kept_patches(plain: PlainReading, bad: NDArray[np.bool_], keep: NDArray[np.
 
 
 def _refuse_curved(view: _ChartView, known_chart: KnownChart) -> None:
-    """Raise InputError if the greys show a transfer curve, or if nothing shows that 8 bits are linear."""
+    """Raise InputError if the greys show a transfer curve, or if it cannot be shown that a picture of 8 bits is
+    linear."""
     grey = [n for n in known_chart.neutral if not view.reading.full[n]]
     luminance = known_chart.xyz[grey, 1]
     if len(grey) < _LEAST_GREYS or luminance.max() < _LEAST_RANGE * luminance.min():
         if view.picture.levels == 256:
             raise InputError(
-                f"{view.picture.name}: 8 bits, and too few greys to see whether its values are linear; give RAW, "
-                "16 bit or OpenEXR"
+                f"{view.picture.name}: 8 bits, and the chart has too few greys to test whether the values are "
+                "linear; give RAW, 16 bit or OpenEXR"
             )
         return
     slope = float(np.polyfit(np.log(luminance), np.log(view.reading.mean[grey, 1]), 1)[0])
@@ -284,7 +285,8 @@ def _light_of(reading: Reading, known_chart: KnownChart, basis: Floats, without:
 
 
 def _offsets(signals: Signals, known_chart: KnownChart) -> list[str]:
-    """Return a sentence if straight lines through the greys do not end at 0. Neither profile can follow this."""
+    """Return a sentence if straight lines through the greys do not end at 0. Neither form of the profile can
+    describe such an offset."""
     grey = list(known_chart.neutral)
     luminance = known_chart.xyz[grey, 1]
     if len(grey) < _LEAST_GREYS or luminance.max() < _LEAST_RANGE * luminance.min():
@@ -298,7 +300,8 @@ def _offsets(signals: Signals, known_chart: KnownChart) -> list[str]:
     words = ", ".join(f"{value:+.1%}" for value in share)
     return [
         f"the greys show an offset of {words} of white in red, green and blue: a black level that was not taken "
-        "off, or stray light. Dark colours are wrong by it, and the uncertainty does not include this error"
+        "off, or stray light. The offset makes dark colours wrong, and the uncertainty does not include this "
+        "error"
     ]
 
 

@@ -80,7 +80,8 @@ def slanted_edge(x_px: Floats, y_px: Floats, values: Floats, where: str = "edge"
     slant_deg = np.degrees(abs((angle + np.pi / 4.0) % (np.pi / 2.0) - np.pi / 4.0))
     if slant_deg < _LEAST_SLANT_DEG:
         raise InputError(
-            f"{where}: the edge is {slant_deg:.2g} degrees from the pixels' rows or columns; turn the chart by 5"
+            f"{where}: the edge is {slant_deg:.2g} degrees from the pixels' rows or columns; turn the chart by "
+            "about 5 degrees"
         )
     away = _distance(angle, offset, bend, x, y)
     if min(-away.min(), away.max()) < _REACH_PX:

@@ -4,8 +4,9 @@
 
 with q_j a place on the board by the table, d_j the LED's offset from it, E_i the arm's error at view i. Camera,
 hand-eye and the zeros of the arm's axes are observed by their record, with its covariance. (Seed 003, section 4
-triangulates each LED by itself.) The arm's error at one view shifts all LEDs seen from it alike, so it can be
-estimated from the LEDs. Suspects (`suspects`) shift spots; their coefficients are shared unknowns with a prior.
+triangulates each LED by itself.) The arm's error at one view shifts all LEDs that this view sees in the same way,
+so it can be estimated from the LEDs. Suspects (`suspects`) shift spots; their coefficients are shared unknowns
+with a prior.
 
 A board's equations have only its own six parameters, its LEDs' offsets and the parameters that views share. So
 boards are eliminated one by one (Schur complement; Triggs et al., Bundle adjustment - a modern synthesis, 2000,
@@ -56,11 +57,11 @@ class LedGeometry:
 
     state: LedState
     centres_mm: Floats
-    """[n, 3] by place, base frame."""
+    """[n, 3] centres of the LEDs, by place on the boards; base frame."""
     centre_covariance: Floats
     """[n, 3, 3], mm^2."""
     normal_covariance: Floats
-    """[b, 2, 2], deg^2: of a board's turns about its own x and y."""
+    """[b, 2, 2] covariance of a board's turns about its own x and y, deg^2."""
     shared_part: Floats
     """[n] share of the centre's variance that comes from poses, hand-eye and lens."""
     degrees: Floats
@@ -72,7 +73,7 @@ class LedGeometry:
     residuals_px: Floats
     """[k, 2] observed minus computed."""
     accepted_mask: NDArray[np.bool_]
-    """[k] False for spots left out as gross errors."""
+    """[k] False for spots that were left out as gross errors."""
     prior_step: Floats
     """[free + 6 + k] changes of lens, hand-eye and axes, divided by the standard uncertainties of their record. If
     the growth of the picture is a named suspect, its change is included."""
@@ -82,11 +83,12 @@ class LedGeometry:
 
     @property
     def normals(self) -> Floats:
-        """[b, 3] of boards, base frame."""
+        """[b, 3] normals of the boards, base frame."""
         return self.state.base_from_board[:, :3, 2]
 
     def left_out_ratio(self, places: Indices) -> float:
-        """Uncertainty of the centres by views left out over the stated one, median over these places."""
+        """Uncertainty of the centres that follows from leaving views out, divided by the stated uncertainty:
+        median over these places."""
         by_views, stated_variance = (
             np.trace(covariance[places], axis1=1, axis2=2)
             for covariance in (self.views.centre_covariance, self.centre_covariance)
@@ -128,7 +130,7 @@ def adjust_leds(problem: Problem, start: Floats) -> LedGeometry:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Values, noises and accepted spots at some stage."""
+    """Values, noises and accepted spots at one stage of the adjustment."""
 
     state: LedState
     factors: Floats
@@ -200,27 +202,28 @@ def _descend(
 
 @dataclass(frozen=True)
 class _Solved:
-    """Covariances at the solution, and the noise by the residuals."""
+    """Covariances at the solution, and the noise as estimated from the residuals."""
 
     own_covariances: list[Floats]
-    """[b] of each board's own parameters."""
+    """[b] covariances of each board's own parameters."""
     alone: list[Floats]
-    """[b] the same if the shared parameters were known."""
+    """[b] the same covariances, if the shared parameters were known exactly."""
     noise_factors: Floats
     redundancy: Floats
     coefficient_covariance: Floats
-    """[c, c] of the suspects' modes."""
+    """[c, c] covariance of the suspects' modes."""
 
 
 def _reduced_at(problem: Problem, fit: _Fit) -> Reduced:
-    """The normal equations at a fit, its spots with equal weights."""
+    """Return the normal equations at the solution of a fit, with equal weights for its spots."""
     return reduced_normal(problem, fit.state, fit.factors, fit.accepted_mask.astype(np.float64))
 
 
 def _solution(
     problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], equations: Reduced
 ) -> _Solved:
-    """Covariances by `equations`, noise by the residuals of the accepted spots [k] at `state`.
+    """Return the covariances from `equations`, and the noise from the residuals of the accepted spots [k] at
+    `state`.
 
     The freedom that the spots use is not summed over them: all parameters together are as many as the traces of
     the spots' and the priors' parts, and those of the priors need the diagonal blocks alone.
@@ -268,7 +271,7 @@ def _solution(
 
 
 def _of_pose_errors(problem: Problem, shared_covariance: Floats) -> Floats:
-    """[v, 6] variance of `pose_errors` by the covariance of the shared parameters."""
+    """Return [v, 6], the variance of `pose_errors` that follows from the covariance of the shared parameters."""
     views, axes = 6 * len(problem.reported_poses), slice(6 * len(problem.reported_poses) + problem.of_camera, None)
     with_axes = shared_covariance[:views, axes].reshape(*problem.by_axes.shape)
     by = problem.by_axes
@@ -319,8 +322,8 @@ def _summary(problem: Problem, fit: _Fit, suspects: tuple[SuspectedShift, ...]) 
 
 
 def _degrees(shared_part: Floats, redundancy: Floats) -> Floats:
-    """[n] effective degrees of freedom of each centre's uncertainty (Welch-Satterthwaite). Half of its shared part
-    is taken to come from the poses' positions, half from their orientations."""
+    """[n] effective degrees of freedom of each centre's uncertainty (Welch-Satterthwaite). Half of the part that
+    centres share is assumed to come from the poses' positions, half from their orientations."""
     position, orientation, spots = np.maximum(redundancy[[POSITION, ORIENTATION, SPOTS]], 1.0)
     of_poses = shared_part**2 / 4 * (1 / position + 1 / orientation)
     return np.asarray(1.0 / (of_poses + (1.0 - shared_part) ** 2 / spots))

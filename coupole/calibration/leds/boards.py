@@ -1,4 +1,4 @@
-"""The dome's boards as rigid bodies, by its table: the LEDs on each, and its nominal pose."""
+"""The dome's boards as rigid bodies: from the table, the LEDs on each board and its nominal pose."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ class Boards:
     """
 
     numbers: NDArray[np.int64]
-    """[b] as the table numbers them."""
+    """[b] numbers of the boards in the table."""
     board_of: Indices
     """[n] rows of `numbers`."""
     base_from_board: Floats
     """[b, 4, 4] by the table."""
     places_mm: Floats
-    """[n, 3] in the frame of the board that each belongs to."""
+    """[n, 3] places of the LEDs in the frame of their board."""
 
     def rows_of(self, board: int) -> Indices:
-        """Places on a board (row of `numbers`)."""
+        """Return the places on a board, which is given by its row of `numbers`."""
         return self._rows_of[board]
 
     @cached_property
@@ -44,15 +44,16 @@ class Boards:
         return tuple(np.flatnonzero(self.board_of == board) for board in range(len(self.numbers)))
 
     def in_base(self, base_from_board: Floats, offsets_mm: Floats | float = 0.0) -> Floats:
-        """Centres [n, 3] of LEDs for these poses of the boards and offsets of the LEDs on them."""
+        """Return the centres [n, 3] of the LEDs, for these poses of the boards and offsets of the LEDs on the
+        boards."""
         pose = base_from_board[self.board_of]
         turned_mm: Floats = np.einsum("nij,nj->ni", pose[:, :3, :3], self.places_mm + offsets_mm)
         return turned_mm + pose[:, :3, 3]
 
 
 def board_poses(boards: Boards, found_mm: Floats) -> Floats:
-    """`base_from_board` [b, 4, 4] by the LEDs found at places [n, 3] (NaN where none was found); by the table for
-    a board with fewer than three."""
+    """Return `base_from_board` [b, 4, 4]. A pose follows from the LEDs that were found at `found_mm` [n, 3] (NaN
+    where none was found). A board with fewer than three such LEDs has its pose in the table."""
     poses = boards.base_from_board.copy()
     for board in range(len(poses)):
         rows = boards.rows_of(board)
@@ -63,7 +64,7 @@ def board_poses(boards: Boards, found_mm: Floats) -> Floats:
 
 
 def boards_of(table: LedTable) -> Boards:
-    """The boards of a dome's table. Raises InputError if the LEDs of one have different normals."""
+    """The boards of a dome's table. Raises InputError if the LEDs of one board have different normals."""
     numbers, board_of = np.unique(table.boards, return_inverse=True)
     poses = np.broadcast_to(np.eye(4), (len(numbers), 4, 4)).copy()
     places_mm = np.empty_like(table.positions_mm)

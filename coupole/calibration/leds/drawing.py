@@ -1,4 +1,4 @@
-"""The picture of a dome's geometry: uncertainty of each LED, and its distance from the place by the table."""
+"""The picture of a dome's geometry: uncertainty of each LED, and its distance from its place in the table."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def draw_leds(result: LedsFound, figure: Figure) -> None:
 
 
 def _draw_dome(ax: Axes, result: LedsFound, across: int, up: int, title: str) -> None:
-    """LEDs by uncertainty; arrows from the table's place of a board to the one found, enlarged; red rings for LEDs
-    not found."""
+    """Draw the LEDs coloured by their uncertainty. Enlarged arrows lead from a board's place in the table to the
+    place that was found. Red rings mark LEDs that were not found."""
     place = result.new_table.positions_mm
     is_known = np.isfinite(result.u_mm)
     order = np.argsort(np.nan_to_num(result.u_mm))
@@ -74,7 +74,8 @@ def _draw_uncertainty(ax: Axes, result: LedsFound) -> None:
 
 
 def _draw_residuals(ax: Axes, result: LedsFound) -> None:
-    """Residuals of all spots; those left out in red, at the rim if they are larger."""
+    """Draw the residuals of all spots. Spots that were left out are red; residuals that are too large for the
+    figure are at its rim."""
     residuals, keep = result.geometry.residuals_px, result.geometry.accepted_mask
     reach = 6.0 * float(np.sqrt(np.mean(residuals[keep] ** 2)))
     x, y = np.clip(residuals, -reach, reach).T
@@ -90,7 +91,7 @@ def _draw_residuals(ax: Axes, result: LedsFound) -> None:
 
 
 def _draw_robot(ax: Axes, result: LedsFound) -> None:
-    """Errors of the arm at each view."""
+    """Draw the errors of the arm at each view."""
     views = np.arange(len(result.view_errors))
     ax.plot(
         views,
@@ -107,6 +108,6 @@ def _draw_robot(ax: Axes, result: LedsFound) -> None:
 
 
 def _round(value: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten that does not exceed the value."""
+    """Return the largest number of the form 1, 2 or 5 times a power of ten that does not exceed the value."""
     ten = 10.0 ** np.floor(np.log10(value))
     return float(ten * max(step for step in (1, 2, 5) if step * ten <= value * (1 + 1e-9)))

@@ -20,7 +20,7 @@ from coupole.calibration.rotations import Floats, between, inverses, moved_trans
 
 SPOTS, TOLERANCE, POSITION, ORIENTATION = range(4)
 GROUPS = ("spots", "LEDs on their boards", "robot position", "robot orientation")
-"""Observations whose noise is estimated; that of table, lens and hand-eye is taken as stated."""
+"""Observations whose noise is estimated. The noise of table, lens and hand-eye is taken as stated."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,8 @@ class Stated:
     robot_mm: float = 0.03
     robot_deg: float = 0.003
     table_mm: float = 10.0
-    """Deviation of boards from their table: so wide that it matters only for a board that was not seen."""
+    """Prior deviation of boards from their table. It is so wide that it matters only for a board that was not
+    seen."""
     table_deg: float = 2.0
     side_mm: float = 7.0
     """Side of an LED."""
@@ -44,19 +45,19 @@ class LedState:
 
     base_from_board: Floats
     offsets_mm: Floats
-    """[n, 3] of LEDs on their boards."""
+    """[n, 3] offsets of LEDs on their boards."""
     base_from_flange: Floats
     flange_from_camera: Floats
     lens: Floats
     axis_zeros_deg: Floats
     """[k] deviation of the arm's axis zeros from their record."""
     coefficients: Floats
-    """[c] of the suspects' modes."""
+    """[c] coefficients of the suspects' modes."""
 
 
 @dataclass(frozen=True)
 class BoardSpots:
-    """The spots [k] on one board, and what their equations depend on."""
+    """The spots [k] on one board, and the data on which their equations depend."""
 
     rows: Indices
     """[k] rows of all spots."""
@@ -74,7 +75,7 @@ class Problem:
 
     boards: Boards
     place: Indices
-    """[k] of each spot."""
+    """[k] place of each spot on its board."""
     view: Indices
     observed: Floats
     whiten: Floats
@@ -86,7 +87,7 @@ class Problem:
     """[v, 6, k] step of each pose per degree of each axis of the arm."""
     stated_noise: Stated
     modes: tuple[Mode, ...]
-    """[c] of suspects."""
+    """[c] modes of the suspects."""
     spots_of: tuple[BoardSpots, ...]
     """[b]."""
 
@@ -108,7 +109,8 @@ class Problem:
 
     @property
     def of_camera(self) -> int:
-        """Number of these that belong to lens, hand-eye and suspects, on which all spots depend."""
+        """Number of the shared parameters that belong to lens, hand-eye and suspects, on which all spots
+        depend."""
         return len(self.prior.free) + 6 + len(self.modes)
 
 
@@ -121,8 +123,8 @@ def problem_of(
     stated_noise: Stated,
     modes: Sequence[Mode] = MODES,
 ) -> Problem:
-    """Return the problem of adjusting LEDs from their spots. `place` [k] is that of each spot, `reported_poses`
-    [v, 4, 4] are those of the flange, `modes` are those of the suspects."""
+    """Return the problem of adjusting LEDs from their spots. `place` [k] is the place of each spot,
+    `reported_poses` [v, 4, 4] are the poses of the flange, and `modes` are the modes of the suspects."""
     whiten = np.linalg.inv(np.linalg.cholesky(sightings.covariance))
     of_camera = 6 * len(reported_poses) + np.arange(6 + len(prior.free) + len(modes))
     return Problem(
@@ -142,7 +144,7 @@ def problem_of(
 
 
 def _spots_of(board: int, view: Indices, place: Indices, boards: Boards, of_camera: Indices) -> BoardSpots:
-    """The spots on a board; `view` and `place` [k] are those of all spots."""
+    """Return the spots on a board; `view` and `place` [k] are given for all spots."""
     rows = np.flatnonzero(boards.board_of[place] == board)
     views, number = np.unique(view[rows], return_inverse=True)
     columns = np.concatenate([(6 * views[:, None] + np.arange(6)).ravel(), of_camera])
@@ -150,7 +152,7 @@ def _spots_of(board: int, view: Indices, place: Indices, boards: Boards, of_came
 
 
 def _prior_whiten(prior: CameraPrior, modes: Sequence[Mode]) -> Floats:
-    """Factor that brings `camera_step` to unit variance."""
+    """Return the factor that brings `camera_step` to unit variance."""
     first = 6 + len(prior.free)
     of_modes = first + np.arange(len(modes))
     whiten = np.zeros((len(prior.covariance) + len(modes),) * 2)
@@ -161,12 +163,13 @@ def _prior_whiten(prior: CameraPrior, modes: Sequence[Mode]) -> Floats:
 
 
 def with_modes(problem: Problem, modes: Sequence[Mode]) -> Problem:
-    """The same with other prior standard deviations of the modes."""
+    """Return the same problem with other prior standard deviations of the modes."""
     return replace(problem, modes=tuple(modes), prior_whiten=_prior_whiten(problem.prior, modes))
 
 
 def at_centres(problem: Problem, state: LedState) -> Problem:
-    """The same with spots corrected from the centroid of the LED's outline to the image of its centre."""
+    """Return the same problem with corrected spots: moved from the centroid of the LED's outline to the image of
+    its centre."""
     board_pose = state.base_from_board[problem.boards.board_of[problem.place]]
     centres = problem.boards.in_base(state.base_from_board, state.offsets_mm)[problem.place]
     camera_from_base = inverses(state.base_from_flange @ state.flange_from_camera)[problem.view]
@@ -178,7 +181,7 @@ def at_centres(problem: Problem, state: LedState) -> Problem:
 
 
 def points_seen(problem: Problem, state: LedState) -> tuple[Floats, Floats, Floats]:
-    """Points [k, 3] in the frames of their boards, of the flange and of the camera."""
+    """Return the points [k, 3] in three frames: of their boards, of the flange and of the camera."""
     on_board = (problem.boards.places_mm + state.offsets_mm)[problem.place]
     pose = state.base_from_board[problem.boards.board_of[problem.place]]
     in_base = np.einsum("kij,kj->ki", pose[:, :3, :3], on_board) + pose[:, :3, 3]
@@ -189,7 +192,7 @@ def points_seen(problem: Problem, state: LedState) -> tuple[Floats, Floats, Floa
 
 
 def whitened_residuals(problem: Problem, state: LedState) -> Floats:
-    """Residuals [k, 2] divided by the stated noise."""
+    """Return the residuals [k, 2] divided by the stated noise."""
     in_camera = points_seen(problem, state)[2]
     projection = optics.project(in_camera, state.lens)
     computed_px = projection.pixels + _by_modes(problem, state, in_camera, projection) @ state.coefficients
@@ -198,7 +201,7 @@ def whitened_residuals(problem: Problem, state: LedState) -> Floats:
 
 
 def _by_modes(problem: Problem, state: LedState, in_camera: Floats, projection: optics.Projected) -> Floats:
-    """Shift [k, 2, c] px of each spot by one unit of each mode."""
+    """Return the shift [k, 2, c], px, of each spot per unit of each mode."""
     board = problem.boards.board_of[problem.place]
     flange = state.base_from_flange[problem.view, :3, :3]
     camera_from_board = (
@@ -253,13 +256,14 @@ def linearisation(problem: Problem, state: LedState) -> Linear:
 
 
 def pose_errors(problem: Problem, state: LedState) -> Floats:
-    """[v, 6] error of the arm at each view, without that of its axis zeros."""
+    """[v, 6] error of the arm at each view, without the effect of its axis zeros."""
     off: Floats = between(problem.reported_poses, state.base_from_flange) - problem.by_axes @ state.axis_zeros_deg
     return off
 
 
 def camera_step(problem: Problem, state: LedState) -> Floats:
-    """[free + 6 + c + k] step from the records' values to those of the state, and the suspects' coefficients."""
+    """Return [free + 6 + c + k]: the step from the records' values to the values of the state, with the suspects'
+    coefficients."""
     free = [optics.NAMES.index(name) for name in problem.prior.free]
     hand_eye = between(problem.prior.flange_from_camera, state.flange_from_camera)
     return np.concatenate(

@@ -30,7 +30,7 @@ _MOST_CANDIDATES = 2_000
 _LEAST_BOARDS = 2
 _ROUNDS = 6
 _WRIST_DEG, _TURN_DEG = 120.0, 90.0
-"""Axes 4 and 6 are not turned farther, because of cables."""
+"""Largest angle of axes 4 and 6, because of cables."""
 _MARGIN = 0.025
 """Margin as a share of the frame's width: a spot nearer to the edge may be cut off."""
 
@@ -60,7 +60,8 @@ def led_plan(
     enough: int = ENOUGH,
     tell: Callable[[str], None] = lambda what: None,
 ) -> str:
-    """The plan's text. Raises InputError if boards cannot be seen often enough, with their numbers."""
+    """The plan's text. Raises InputError, with the numbers of the boards, if boards cannot be seen often
+    enough."""
     boards = boards_of(cell.leds)
     bodies = bodies_of(cell.rig, cell.leds, np.zeros((0, 3, 3)))
     tell("drawing postures of the arm")
@@ -121,7 +122,7 @@ def _cameras(rig: Rig, joints_deg: Floats) -> Floats:
 
 
 def _camera(rig: Rig) -> tuple[Intrinsics, tuple[int, int], float]:
-    """Lens as the rig describes it, frame size, and least distance of a spot from the edge."""
+    """Return the lens as the rig describes it, the frame size, and the least distance of a spot from the edge."""
     lens, sensor = rig.lens, rig.sensor
     focal_px = 1e3 / sensor.pixel_pitch_um / (1.0 / lens.focal_length_mm - 1.0 / lens.focus_distance_mm)
     size = (sensor.width_px, sensor.height_px)

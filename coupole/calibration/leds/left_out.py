@@ -1,11 +1,11 @@
-"""Views of LEDs left out in turn, without a new adjustment: how each view moves the LEDs, and how well the others
-predict it.
+"""Views of LEDs that are left out in turn, without a new adjustment: how far each view moves the LEDs, and how
+well the other views predict it.
 
 With H the part of the hat matrix that belongs to a view, its residuals would be (I - H)^-1 r if it had been left
 out (as in `cross_validation`), and the LEDs would move by -C J^T (I - H)^-1 r. The sum of the squares of these
-moves is a covariance of the LEDs that takes only the views for independent, and nothing of noise as stated or of
-the model's form (the jackknife by clusters, CR3: Bell and McCaffrey, Survey Methodology 28(2), 2002). A view's six
-pose parameters are determined by the view alone; their directions do not count.
+moves is a covariance of the LEDs. It assumes only that the views are independent; it uses neither the stated noise
+nor the model's form (the jackknife by clusters, CR3: Bell and McCaffrey, Survey Methodology 28(2), 2002). A view's
+six pose parameters are determined by the view alone; their directions do not count.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class LeftOutViews:
     ratios: Floats
     """[v] root mean square of the prediction error of each view divided by its standard uncertainty; about 1."""
     centre_covariance: Floats
-    """[n, 3, 3] of the LEDs' centres by the jackknife over views, mm^2."""
+    """[n, 3, 3] covariance of the LEDs' centres, by the jackknife over views, mm^2."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,10 @@ class _InView:
     own_gain: Floats
     """[m, 2 k] own^-1 J^T."""
     own_hat: Floats
-    """[2 k, 2 k] their part of the hat matrix by the board's own parameters."""
+    """[2 k, 2 k] part of the hat matrix that comes from the board's own parameters."""
     by_shared: Floats
-    """[2 k, shared] derivatives by the shared parameters, the board's own eliminated."""
+    """[2 k, shared] derivatives with respect to the shared parameters, after the board's own parameters are
+    eliminated."""
     residuals: Floats
     """[2 k]."""
 
@@ -59,8 +60,8 @@ class _InView:
 def views_left_out(
     problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], equations: Reduced
 ) -> LeftOutViews:
-    """Leave out each view at the solution with these noises [groups] and normal equations; `accepted_mask` [k]
-    are the spots used."""
+    """Leave out the views, one after the other, at the solution with these noises [groups] and normal equations.
+    `accepted_mask` [k] is True for the spots that are used."""
     count = len(problem.reported_poses)
     by_own = [
         centres_by_own(problem, state, board).reshape(-1, len(part.gain))
@@ -96,7 +97,7 @@ def views_left_out(
 def _boards_in_views(
     problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], equations: Reduced
 ) -> list[list[_InView]]:
-    """[v] the boards with spots in each view."""
+    """Return [v], the boards with spots in each view."""
     residuals = whitened_residuals(problem, state) / factors[SPOTS]
     boards_in_views: list[list[_InView]] = [[] for _ in problem.reported_poses]
     for board, (part, spots) in enumerate(zip(equations.parts, problem.spots_of, strict=True)):
@@ -119,7 +120,7 @@ def _boards_in_views(
 
 
 def _pose_rows(problem: Problem, state: LedState, factors: Floats, view: int) -> tuple[Floats, Floats]:
-    """Derivatives [6, shared] and residuals [6] of the view's reported pose."""
+    """Return the derivatives [6, shared] and the residuals [6] of the view's reported pose."""
     sigmas = problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)
     derivatives = np.zeros((6, problem.shared_count))
     derivatives[:, 6 * view : 6 * view + 6] = np.diag(1.0 / sigmas)
@@ -130,7 +131,8 @@ def _pose_rows(problem: Problem, state: LedState, factors: Floats, view: int) ->
 
 
 def _left_residuals(hat: Floats, residuals: Floats) -> tuple[float, Floats]:
-    """Ratio of the prediction error to its uncertainty, and the residuals if the view had been left out."""
+    """Return the ratio of the prediction error to its uncertainty, and the residuals that the view would have if
+    it had been left out."""
     values, vectors = np.linalg.eigh(np.eye(len(hat)) - 0.5 * (hat + hat.T))
     usable = values > _OWN
     along = vectors[:, usable].T @ residuals

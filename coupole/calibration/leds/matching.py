@@ -26,7 +26,8 @@ LEAST_VIEWS = 3
 _NEAREST_MM, _FARTHEST_MM = 150.0, 4000.0
 _LEAST_SINE = 0.02
 _RIGID_MM = 5.0
-"""Points that fit a board's layout within this are that board, its LEDs in the right order."""
+"""Points that fit a board's layout within this distance are taken for this board, with its LEDs in the right
+order."""
 _MOST_TURN_DEG = 60.0
 """A board of 2 x 3 LEDs rotated by 180 degrees looks like one that is wired backwards, which is more likely."""
 
@@ -42,7 +43,7 @@ class LedSightings:
     covariance: Floats
     """[k, 2, 2], px^2."""
     frames: NDArray[np.intp]
-    """[m, 2] view and LED of every frame, with or without spots."""
+    """[m, 2] view and LED of every frame, also of frames without spots."""
 
     def only(self, keep: Indices) -> LedSightings:
         return LedSightings(self.view[keep], self.led[keep], self.pixels[keep], self.covariance[keep], self.frames)
@@ -53,11 +54,11 @@ class Matching:
     """The place of each LED."""
 
     found_mm: Floats
-    """[n, 3] in the base, by the order of the table; NaN where not found."""
+    """[n, 3] centres in the base frame, in the order of the table; NaN for an LED that was not found."""
     place_of: Indices
     """[n] place at which each LED lights, -1 if none."""
     sightings: LedSightings
-    """Spots that agree, their `led` still the one that was lit."""
+    """Spots that agree; their `led` is still the LED that was lit."""
     faults: tuple[LedFault, ...]
 
     @property
@@ -108,7 +109,8 @@ def match_leds(
 def _agreeing(
     rays: Floats, eyes_mm: Floats, views: Indices, tolerance_rad: float, near: cKDTree, reach_mm: float
 ) -> Indices:
-    """Spots of one LED, at most one of each view, that agree with one point; empty if there is no such point."""
+    """Return the spots of one LED, at most one of each view, that agree with one point; empty if there is no such
+    point."""
     a, b = np.triu_indices(len(rays), 1)
     apart = views[a] != views[b]
     a, b = a[apart], b[apart]
@@ -131,8 +133,8 @@ def _agreeing(
 
 
 def _crossings(rays_a: Floats, eyes_a: Floats, rays_b: Floats, eyes_b: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Midpoints [n, 3] of the shortest connections of pairs of rays, and which lie in front of both cameras at a
-    sufficient angle of intersection."""
+    """Return the midpoints [n, 3] of the shortest connections of pairs of rays, and a mask [n] of those that lie
+    in front of both cameras and at a sufficient angle of intersection."""
     apart = eyes_b - eyes_a
     cosine = np.einsum("ni,ni->n", rays_a, rays_b)
     along_a, along_b = np.einsum("ni,ni->n", rays_a, apart), np.einsum("ni,ni->n", rays_b, apart)
@@ -144,7 +146,7 @@ def _crossings(rays_a: Floats, eyes_a: Floats, rays_b: Floats, eyes_b: Floats) -
 
 
 def _off(points: Floats, rays: Floats, eyes_mm: Floats) -> Floats:
-    """Tangents [points, rays] of the angles between points and rays, seen from the camera."""
+    """Return the tangents [points, rays] of the angles between points and rays, as seen from the camera."""
     to_point = points[:, None] - eyes_mm[None]
     along = np.einsum("pki,ki->pk", to_point, rays)
     across = np.linalg.norm(to_point - along[..., None] * rays, axis=2)
@@ -160,7 +162,7 @@ def _nearest_of_each_view(off: Floats, views: Indices) -> Indices:
 
 
 def _meeting(rays: Floats, eyes_mm: Floats) -> Floats:
-    """The point [3] nearest to rays (least squares of angles, weights from one iteration)."""
+    """Return the point [3] that is nearest to the rays (least squares of angles, weights from one iteration)."""
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     weight = np.ones(len(rays))
     for _ in range(2):
@@ -203,7 +205,7 @@ def _unseen(sightings: LedSightings, found_mm: Floats, ids: NDArray[np.int64]) -
 def _places(
     found_mm: Floats, table_mm: Floats, ids: NDArray[np.int64], boards: Boards
 ) -> tuple[Indices, list[LedFault]]:
-    """The place at which each LED lights, and the faults of boards and wires that follow."""
+    """Return the place at which each LED lights, and the faults of boards and wires that follow from this."""
     here = np.where(np.isfinite(found_mm[:, 0]), np.arange(len(ids)), -1)
     tree = cKDTree(table_mm)
     spacing_mm = float(np.median(tree.query(table_mm, 2)[0][:, 1])) if len(table_mm) > 1 else np.inf
@@ -222,7 +224,10 @@ def _places(
         here[row] = place if distance_mm < near_mm else -1
         if here[row] < 0:
             led = int(ids[row])
-            text = f"LED {led}: found {off_mm[row]:.1f} mm from its place and at no other LED's. Look at its mount"
+            text = (
+                f"LED {led}: found {off_mm[row]:.1f} mm from its place, and not at the place of another LED. "
+                "Look at its mount"
+            )
             faults.append(LedFault("astray", (led,), text))
     twice = [p for p in np.unique(here[here >= 0]) if np.sum(here == p) > 1]
     for place in twice:
@@ -258,7 +263,8 @@ def _on_another(board: int, found_mm: Floats, tree: cKDTree, near_mm: float, boa
 
 
 def _wiring(here: Indices, ids: NDArray[np.int64], boards: Boards) -> Iterator[LedFault]:
-    """Cycles of LEDs that light at each other's places: two are swapped; more are a mis-wired board."""
+    """Yield cycles of LEDs that light at each other's places. Two LEDs are swapped; more LEDs mean a mis-wired
+    board."""
     for ring in _rings(here):
         leds = tuple(int(ids[row]) for row in ring)
         on = sorted({int(boards.numbers[boards.board_of[row]]) for row in (*ring, int(here[ring[-1]]))})
@@ -273,7 +279,7 @@ def _wiring(here: Indices, ids: NDArray[np.int64], boards: Boards) -> Iterator[L
 
 
 def _rings(here: Indices) -> Iterator[list[int]]:
-    """Cycles of rows that light at each other's places; an open chain where one LED was not found."""
+    """Yield cycles of rows that light at each other's places, and an open chain if one LED was not found."""
     todo = {int(row) for row in np.flatnonzero((here >= 0) & (here != np.arange(len(here))))}
     while todo:
         ring = [min(todo - {int(here[row]) for row in todo}, default=min(todo))]
@@ -284,9 +290,9 @@ def _rings(here: Indices) -> Iterator[list[int]]:
 
 
 def fault_lines(faults: Sequence[LedFault]) -> tuple[str, ...]:
-    """The faults as text; all dead LEDs share one line."""
+    """Return the faults as text; all dead LEDs share one line."""
     dead = [fault.leds[0] for fault in faults if fault.kind == "dead"]
     if len(dead) < 4:
         return tuple(fault.text for fault in faults)
     other_lines = tuple(fault.text for fault in faults if fault.kind != "dead")
-    return (f"{len(dead)} LEDs are dead, no spot in any frame: {', '.join(map(str, dead))}", *other_lines)
+    return (f"{len(dead)} LEDs are dead: no frame shows their spot: {', '.join(map(str, dead))}", *other_lines)

@@ -1,4 +1,4 @@
-"""Normal equations of the LEDs' adjustment, its boards eliminated one by one (see `adjustment`)."""
+"""Normal equations of the LEDs' adjustment, from which the boards are eliminated one by one (see `adjustment`)."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from coupole.errors import InputError
 
 @dataclass(frozen=True)
 class BoardPart:
-    """One board's part of the normal equations: its own parameters (pose, then its LEDs' offsets) and their
-    coupling with the shared ones in `columns`."""
+    """One board's part of the normal equations: its own parameters (pose, then its LEDs' offsets), and their
+    coupling with the shared parameters, which are given by `columns`."""
 
     own_normal: Floats
     """[m, m]."""
@@ -41,29 +41,30 @@ class BoardPart:
     side: Floats
     """[m]."""
     jacobian: Floats
-    """[2 k, m + columns] of its spots, weighted."""
+    """[2 k, m + columns] weighted derivatives of its spots."""
     columns: Indices
     solution: Floats
     """[m, columns + 1] own_normal^-1 [cross, side]."""
 
     @property
     def gain(self) -> Floats:
-        """[m, columns] step of the own parameters for a step of the shared ones, with the sign changed."""
+        """[m, columns] step of the board's own parameters for a step of the shared parameters, with the sign
+        changed."""
         return self.solution[:, :-1]
 
     def own_step(self, shared_step: Floats) -> Floats:
-        """Step [m] of the own parameters that belongs to a step of all shared ones."""
+        """Return the step [m] of the board's own parameters that belongs to a step of all shared parameters."""
         return np.asarray(self.solution[:, -1] - self.gain @ shared_step[self.columns])
 
 
 @dataclass(frozen=True)
 class Reduced:
-    """Normal equations whose boards are eliminated."""
+    """Normal equations from which the boards are eliminated."""
 
     parts: list[BoardPart]
     """[b]."""
     matrix: Floats
-    """[s, s] of the shared parameters."""
+    """[s, s] normal matrix of the shared parameters."""
     side: Floats
     """[s]."""
 
@@ -83,18 +84,19 @@ class Reduced:
         return np.asarray(np.tril(inverse) + np.tril(inverse, -1).T)
 
     def half_solve(self, side: Floats) -> Floats:
-        """L^-1 side, with L the lower triangle for which matrix = L L^T; `side` is [s, m]."""
+        """Return L^-1 side, where L is the lower triangle for which matrix = L L^T; `side` is [s, m]."""
         return np.asarray(solve_triangular(self._factor[0], side, lower=True))
 
     def other_half_solve(self, side: Floats) -> Floats:
-        """L^-T side [s]; of the result of `half_solve` this gives matrix^-1 side."""
+        """Return L^-T side [s]. If `side` is the result of `half_solve`, this completes the solution: matrix^-1
+        side."""
         return np.asarray(solve_triangular(self._factor[0], side, lower=True, trans=1))
 
 
 def _board_parts(
     problem: Problem, state: LedState, linear: Linear, factors: Floats, weights: Floats
 ) -> Iterator[tuple[BoardPart, Floats]]:
-    """The part of each board, and the residuals [2 k] of its spots."""
+    """Yield the part of each board, and the residuals [2 k] of its spots."""
     off_table = between(state.base_from_board, problem.boards.base_from_board)
     tolerance = problem.stated_noise.tolerance_mm * factors[TOLERANCE]
     of_table = table_sigmas(problem)

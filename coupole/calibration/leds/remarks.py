@@ -46,7 +46,7 @@ def _of_views(names: Sequence[str], geometry: LedGeometry, limits: Sequence[Limi
     limit = next(limit for limit in limits if limit.name == "left_out")
     line = (
         f"views left out in turn move the LEDs by {limit.found:.2f} of the stated uncertainty; "
-        f"the others predict {names[_worst(geometry)]} worst"
+        f"{names[_worst(geometry)]} is predicted worst by the other views"
     )
     if limit.is_met:
         return [line]

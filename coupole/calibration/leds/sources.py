@@ -30,7 +30,7 @@ class LedImages:
 
     seen: LedSightings
     base_from_flange: Floats
-    """[v, 4, 4] as the robot reported them."""
+    """[v, 4, 4] poses as the robot reported them."""
     views: tuple[str, ...]
     """[v] names."""
     size_px: tuple[int, int]
@@ -40,12 +40,12 @@ class LedImages:
     inputs: tuple[tuple[str, str], ...]
     """Name and SHA-256 of every file that was read."""
     joints_deg: Floats | None = None
-    """[v, axes] as the robot reported them; None if it did not."""
+    """[v, axes] angles as the robot reported them; None if it reported none."""
 
 
 @dataclass(frozen=True)
 class _LedFrame:
-    """One frame under one LED, that of the shortest exposure if there are several."""
+    """One frame under one LED: the frame of the shortest exposure, if there are several."""
 
     shot: ShotId
     led: int
@@ -67,7 +67,7 @@ class _Collected:
     joints_deg: list[Floats] = field(default_factory=list)
     lit_records: list[np.void] = field(default_factory=list)
     frames: list[tuple[int, int]] = field(default_factory=list)
-    """Number of the view and row of the LED."""
+    """Number of the view and row of the LED, for each frame."""
     spots: list[tuple[int, int, Floats, Floats]] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
 
@@ -75,8 +75,8 @@ class _Collected:
 def find_leds(
     paths: Sequence[Path], table: LedTable, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> LedImages:
-    """Find spots in all frames under single LEDs. Raises InputError: no such frames, LEDs that the dome does not
-    have, runs of different cameras."""
+    """Find spots in all frames under single LEDs. Raises InputError if there are no such frames, if the dome does
+    not have one of the LEDs, or if runs have different cameras."""
     row_of = {int(led): row for row, led in enumerate(table.ids)}
     runs = [Run(path) for path in paths]
     work = [(run, view, frames) for run in runs for view, frames in _by_view(run).items()]
@@ -175,7 +175,8 @@ def _by_view(run: Run) -> dict[str, list[FrameProven]]:
 
 
 def _single_leds(proven: Sequence[FrameProven], records: Any, view: str) -> list[_LedFrame]:
-    """Frames under LEDs: of one LED at one pose that of the shortest exposure, as spots are saturated in all."""
+    """Return the frames under LEDs: for one LED at one pose only the frame of the shortest exposure, because spots
+    are saturated in all exposures."""
     shortest: dict[tuple[int, int], _LedFrame] = {}
     for frame in proven:
         if not isinstance(frame.shot.light, Led):
@@ -195,7 +196,7 @@ def _dark_frames(proven: Sequence[FrameProven]) -> list[FrameProven]:
 
 
 def _darks(file: View, proven: Sequence[FrameProven]) -> dict[int, Floats]:
-    """Mean dark frame [H, W] for each exposure that has some, DN."""
+    """Return the mean dark frame [H, W], DN, for each exposure that has dark frames."""
     sums: dict[int, tuple[Floats, int]] = {}
     for frame in _dark_frames(proven):
         exposure_us = int(file.records[frame.index]["exposure_us"])

@@ -23,16 +23,17 @@ from coupole.calibration import optics
 from coupole.calibration.rotations import Floats
 
 LOW, HIGH = 0.25, 0.75
-"""Levels as shares of white: a pixel below the first has weight 0, one above the second weight 1."""
+"""Levels as shares of white: a pixel below the first has weight 0, and a pixel above the second has weight 1."""
 LEAST_AREA_PX = 9.0
-"""Smaller regions are hot pixels or sparks."""
+"""Least area of a spot: smaller regions are hot pixels or sparks."""
 LEAST_FILL, MOST_FILL, MOST_STRETCH = 0.935, 1.04, 4.0
 """Limits of a spot's fill and of the ratio of its axes. The fill of a disk is 1, that of a square 3/pi = 0.955;
 two spots that touch have less. An LED seen at 75 degrees is four times as wide as high."""
 MOST_SPOTS = 12
-"""A frame with more has another source of light."""
+"""Largest number of bright regions: a frame with more has another source of light."""
 _COARSE = 0.4
-"""Error of the fill of a small spot, which consists of whole pixels; times its width."""
+"""Error of the fill of a small spot times its width. The error arises because the spot consists of whole
+pixels."""
 _MARGIN_PX = 8
 _CROSSING = 0.25
 """Variance of the covered share of a rim pixel: half a pixel either way, as errors along a straight side are
@@ -44,7 +45,7 @@ class Spot:
     """One bright spot."""
 
     pixel: Floats
-    """[2], centre of the first pixel (0, 0)."""
+    """[2] px; the centre of the first pixel is (0, 0)."""
     covariance: Floats
     """[2, 2], px^2."""
     area_px: float
@@ -61,7 +62,7 @@ class Spots:
     rejection_reasons: tuple[str, ...]
     """Reasons why other bright regions are not spots."""
     brightest: float
-    """Largest green signal over white."""
+    """Largest green signal divided by white."""
 
 
 def find_spots(frame: NDArray[np.uint16], dark: Floats | float, pattern: str, white_dn: float) -> Spots:
@@ -94,10 +95,10 @@ def find_spots(frame: NDArray[np.uint16], dark: Floats | float, pattern: str, wh
 def outline_offsets(
     base_from_board: Floats, centres_mm: Floats, camera_from_base: Floats, lens: Floats, side_mm: float
 ) -> Floats:
-    """Offset of the centroid of each LED's outline from the image of its centre [n, 2], px.
+    """Return the offset [n, 2], px, of the centroid of each LED's outline from the image of its centre.
 
     LEDs are squares of `side_mm` about `centres_mm` [n, 3] (base frame) in the plane of their boards [n, 4, 4].
-    The centroid of a quadrangle is that of its two triangles, weighted by area.
+    The centroid of a quadrangle is the mean of the centroids of its two triangles, weighted by area.
     """
     half = side_mm / 2 * np.array([(0, 0, 0), (-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], dtype=np.float64)
     in_base = centres_mm[:, None] + half @ np.swapaxes(base_from_board[:, :3, :3], 1, 2)
@@ -112,7 +113,7 @@ def outline_offsets(
 
 
 def _spot(signal: Floats) -> Spot | str:
-    """The largest spot in a part of a frame, signal over white; or the reason why it is not a spot.
+    """Return the largest spot in a part of a frame (signal divided by white), or the reason why it is not a spot.
 
     A rim pixel is white if any part of it is covered, so the covered share is not known. The covariance of the
     centroid is propagated from this over the whole rim.
@@ -150,7 +151,7 @@ def _spot(signal: Floats) -> Spot | str:
 
 
 def _green_place(pattern: str) -> tuple[int, int]:
-    """Row and column of a green pixel in the 2 x 2 pattern; of `MONO` the first."""
+    """Return row and column of a green pixel in the 2 x 2 pattern; for `MONO` those of the first pixel."""
     place = max(pattern.find("G"), 0) if pattern != "MONO" else 0
     return place // 2, place % 2
 

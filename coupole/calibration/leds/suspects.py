@@ -29,12 +29,13 @@ from coupole.calibration.rotations import Floats
 
 PRIMARY, OVAL, FIELD = "primary lens", "lens not round", "field out of focus"
 GROWTH, NEAR_MM = 1e-4, 1000.0
-"""Unit of the growth of the picture, and the distance at which that of near LEDs has its value."""
+"""Unit of the growth of the picture, and the distance at which the growth for near LEDs has its stated value."""
 _WIDE_MM, _WIDE_GROWTHS = 2.0, 50.0
 """Prior standard deviations of freely estimated coefficients: much more than any lens on a die, or focus."""
 _LEAST, _CANDIDATES = 1e-6, 400
 _BY_CHANCE, _DOUBTFUL = 1e-4, 0.1
-"""Probabilities by noise alone below which a suspect is named, and below which it may have an amplitude."""
+"""Two probabilities that noise alone explains a suspect: below the first it is named, below the second it may have
+an amplitude."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +44,13 @@ class Mode:
 
     suspect: str
     sigma: float
-    """Prior standard deviation of its coefficient."""
+    """Prior standard deviation of the mode's coefficient."""
     across: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
     """Shift along the board's x and y, mm, by the x and y of the unit vector to the camera."""
     growth: float = 0.0
     """Growth of the picture about its principal point, in `GROWTH`."""
     near_growth: float = 0.0
-    """The same at `NEAR_MM`, in proportion to the nearness of the LED."""
+    """Growth of the picture at `NEAR_MM`, in proportion to the nearness of the LED."""
 
 
 MODES = (
@@ -63,11 +64,11 @@ MODES = (
 
 @dataclass(frozen=True)
 class SuspectedShift:
-    """One suspect by the evidence of the spots, with all other suspects present."""
+    """One suspect as the spots show it, with all other suspects in the model."""
 
     name: str
     coefficients: Floats
-    """[modes], estimated freely: mm, or in `GROWTH`."""
+    """[modes] coefficients that were estimated freely: mm, or in `GROWTH`."""
     u: Floats
     """[modes] standard uncertainties."""
     amplitude: float
@@ -83,11 +84,11 @@ class SuspectedShift:
 
     @property
     def is_named(self) -> bool:
-        """True if leaving the suspect out would hurt the fit, though all others are present."""
+        """True if the fit would be significantly worse without this suspect, with all other suspects present."""
         return self.by_chance < _BY_CHANCE
 
     def sentence(self) -> str:
-        """Cause and remedy, for the record's page."""
+        """Return cause and remedy, for the record's page."""
         size, u = float(np.linalg.norm(self.coefficients)), float(self.u.max())
         if self.name == PRIMARY:
             if self.coefficients[0] < 0.0:
@@ -97,10 +98,10 @@ class SuspectedShift:
                     "about as much. Check records and views, and measure heights with a probe"
                 )
             return (
-                f"lenses on the dies shift their images towards the camera by {self.coefficients[0]:.3f} mm "
-                f"(u {u:.3f} mm) times the sine of the angle to the normal; places and uncertainties account for "
-                "it. Heights rest on this law: a flat window over the dies gives nearly the same spots, but its "
-                "heights are off the other way. Check one height with a probe"
+                f"lenses on the dies shift their images towards the camera by {self.coefficients[0]:.3f} mm (u "
+                f"{u:.3f} mm) times the sine of the angle to the normal; places and uncertainties account for "
+                "it. Heights rest on this law: a flat window over the dies gives nearly the same spots, but "
+                "then the heights have the opposite error. Check one height with a probe"
             )
         if self.name == OVAL:
             return (
@@ -110,9 +111,10 @@ class SuspectedShift:
             )
         growth, near = self.coefficients
         return (
-            f"spots lie farther out than the camera's record says, by {growth:.1f} (u {self.u[0]:.1f}) in 10,000, "
-            f"and {near:.1f} (u {self.u[1]:.1f}) more at 1 m: it does not hold for LEDs so far out of focus. "
-            "Places and uncertainties account for it; stop the lens down, or calibrate camera and hand-eye anew"
+            f"spots lie farther out than the camera's record says, by {growth:.1f} (u {self.u[0]:.1f}) in "
+            f"10,000, and {near:.1f} (u {self.u[1]:.1f}) more at 1 m: this record is not valid for LEDs so far "
+            "out of focus. Places and uncertainties account for it; stop the lens down, or calibrate camera "
+            "and hand-eye anew"
         )
 
 
@@ -162,7 +164,7 @@ def judge(
 
 
 def _most_likely_variance(estimate: Floats, covariance: Floats) -> float:
-    """Prior variance, the same for all coefficients, under which estimates [m] are most likely."""
+    """Return the prior variance, the same for all coefficients, under which the estimates [m] are most likely."""
     variances, vectors = np.linalg.eigh(covariance)
     squares = (vectors.T @ estimate) ** 2
 
@@ -174,7 +176,7 @@ def _most_likely_variance(estimate: Floats, covariance: Floats) -> float:
 
 
 def as_found(modes: Sequence[Mode], suspects: Sequence[SuspectedShift]) -> tuple[Mode, ...]:
-    """The modes with the amplitudes found."""
+    """The modes, with the amplitudes that were found."""
     amplitude_of = {suspect.name: suspect.amplitude for suspect in suspects}
     return tuple(replace(mode, sigma=amplitude_of[mode.suspect]) for mode in modes)
 
@@ -182,8 +184,9 @@ def as_found(modes: Sequence[Mode], suspects: Sequence[SuspectedShift]) -> tuple
 def step_of_records(
     modes: Sequence[Mode], coefficients: Floats, lens: Floats, free: Sequence[str], turn: Floats
 ) -> Floats:
-    """[free + 6] step of lens and hand-eye that does what the growths do: the focal length, and a camera that is
-    shifted along its axis. `turn` [3, 3] is the rotation of `flange_from_camera`."""
+    """Return [free + 6], the step of lens and hand-eye that has the same effect as the growths: a change of the
+    focal length, and a shift of the camera along its axis. `turn` [3, 3] is the rotation of
+    `flange_from_camera`."""
     growths = np.array([(mode.growth, mode.near_growth) for mode in modes]).reshape(-1, 2)
     growth, near = GROWTH * coefficients @ growths
     focal_steps = [growth * lens[optics.NAMES.index(name)] if name in ("fx", "fy") else 0.0 for name in free]

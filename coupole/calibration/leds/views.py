@@ -21,13 +21,13 @@ from coupole.calibration.rotations import Floats, inverses
 ENOUGH = 6
 """Sightings of each LED (seed 003)."""
 MOST_ANGLE_DEG = 65.0
-"""Largest angle between an LED's normal and the direction to the camera; at larger angles edges of boards hide
-it."""
+"""Largest angle between an LED's normal and the direction to the camera; at larger angles the edges of boards hide
+the LED."""
 NEAREST_MM, FARTHEST_MM = 400.0, 2600.0
 _START_MM = 50.0
-"""Standard uncertainty of a board's position by the table."""
+"""Standard uncertainty of a board's position in the table."""
 _ANGLE_SIGMA = np.radians(0.004)
-"""Angular noise of one sighting, mostly by the arm."""
+"""Angular noise of one sighting, which comes mostly from the arm."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class LedViews:
 
     views: tuple[LedView, ...]
     images: int
-    """Sum over the views of the LEDs on their boards."""
+    """Sum over the views of the number of LEDs on the lit boards."""
     few: tuple[int, ...]
     """Boards that too few candidates see."""
     u_mm: Floats
@@ -92,12 +92,12 @@ def led_views(
 def boards_seen(
     boards: Boards, base_from_camera: Floats, lens: Intrinsics, size_px: tuple[int, int], margin_px: float
 ) -> NDArray[np.bool_]:
-    """[c, b] boards that are seen completely from each of the poses [c, 4, 4]."""
+    """Return [c, b], True for boards that are seen completely from each of the poses [c, 4, 4]."""
     return _sightings(boards, base_from_camera, lens, size_px, margin_px)[0]
 
 
 def _gain(known_information: Floats, information: Floats) -> Floats:
-    """Gain of each board [b] by each view [c]: growth of log det."""
+    """Return the gain of information [c, b] of each board by each view: the growth of log det."""
     return np.asarray(
         np.linalg.slogdet(known_information[None] + information)[1] - np.linalg.slogdet(known_information)[1]
     )
@@ -106,8 +106,8 @@ def _gain(known_information: Floats, information: Floats) -> Floats:
 def _sightings(
     boards: Boards, base_from_camera: Floats, lens: Intrinsics, size_px: tuple[int, int], margin_px: float
 ) -> tuple[NDArray[np.bool_], Floats]:
-    """Boards [c, b] that each candidate sees completely, and the information on their positions [c, b, 3, 3],
-    1/mm^2."""
+    """Return the boards [c, b] that each candidate sees completely, and the information on their positions [c, b,
+    3, 3], 1/mm^2."""
     leds_mm = boards.in_base(boards.base_from_board)
     normals = boards.base_from_board[boards.board_of, :3, 2]
     camera_from_base = inverses(base_from_camera)

@@ -38,13 +38,13 @@ from coupole.errors import InputError
 from coupole.plan.led_table import COLUMNS, LedTable
 
 MOVED_MM, MOVED_DEG = 5.0, 1.0
-"""A board farther from its place by the table is reported: it was remounted, or pushed."""
+"""A board that is farther than this from its place in the table is reported: it was remounted, or pushed."""
 _COVARIANCE_OF_SINGLE = 1e-12
 
 
 @dataclass(frozen=True)
 class LedsFound:
-    """The result and what the report draws."""
+    """The result, and the data that the report draws."""
 
     record: Record
     files: dict[str, bytes]
@@ -54,9 +54,9 @@ class LedsFound:
     geometry: LedGeometry
     matching: Matching
     u_mm: Floats
-    """[n] standard uncertainty of each LED's centre by row of the table; NaN where it was not found."""
+    """[n] standard uncertainty of each LED's centre, by row of the table; NaN for an LED that was not found."""
     u_deg: Floats
-    """[n] of its normal."""
+    """[n] standard uncertainty of each LED's normal."""
     view_errors: Floats
     """[v, 6] error of the arm at each view, mm and degrees."""
 
@@ -125,15 +125,16 @@ def leds_from(
 
 @dataclass(frozen=True)
 class _InTableOrder:
-    """The dome's LEDs by row of the table [n]."""
+    """The dome's LEDs [n], by row of the table."""
 
     found_mask: NDArray[np.bool_]
     place: NDArray[np.intp]
-    """Place on the boards at which the LED was found; that of its row where it was not found."""
+    """Place on the boards at which the LED was found. For an LED that was not found, it is the place of its row in
+    the table."""
     u_mm: Floats
     """Standard uncertainty of the centre at that place."""
     u_deg: Floats
-    """And of the normal."""
+    """Standard uncertainty of the normal at that place."""
 
 
 def _in_table_order(geometry: LedGeometry, matching: Matching, boards: Boards) -> _InTableOrder:
@@ -165,7 +166,7 @@ def _match_spots(
 
 @dataclass(frozen=True)
 class _Assessment:
-    """The record's words and figures of the adjustment and of the dome."""
+    """The record's remarks and figures about the adjustment and the dome."""
 
     views: tuple[ImageResidual, ...]
     limits: Sequence[Limit]
@@ -218,7 +219,7 @@ def tolerance_px(prior: CameraPrior, stated_noise: Stated, table: LedTable, base
 
 
 def led_csv(table: LedTable, name: str) -> str:
-    """A dome's table in the format of `configs/domes`."""
+    """Return a dome's table in the format of `configs/domes`."""
     lines = [
         f"# LEDs of a dome, in the frame of the robot's base. By the calibration {name}.",
         "# Positions in mm, normals of unit length into the dome, flux in lumen.",
@@ -239,7 +240,8 @@ def _h5(
     place: NDArray[np.intp],
     count: int,
 ) -> bytes:
-    """Uncertainties by LED, in the table's order; equal numbers give equal bytes."""
+    """Return the uncertainties by LED, in the table's order, as the bytes of an HDF5 file; equal numbers give
+    equal bytes."""
     keep = geometry.accepted_mask
     views = np.bincount(place[keep], minlength=count)
     square = np.bincount(place[keep], np.sum(geometry.residuals_px[keep] ** 2, axis=1), minlength=count)
@@ -268,7 +270,12 @@ def _h5(
             "[leds] share of the centre's variance from poses, lens and hand-eye, common to its neighbours"
         )
         write_dataset("shared_part", geometry.shared_part[where], "", shared_text)
-        write_dataset("offset_mm", geometry.state.offsets_mm[where], "mm", "[leds, 3] from its place on the board")
+        write_dataset(
+            "offset_mm",
+            geometry.state.offsets_mm[where],
+            "mm",
+            "[leds, 3] offset of each LED from its nominal place on the board",
+        )
         write_dataset("views", views[where], "", "[leds] number of views in which the LED was found")
         write_dataset("residual_rms", np.sqrt(square / np.maximum(views, 1))[where], "px", "[leds]")
         write_dataset("found", matching.place_of >= 0, "", "[leds] False: only its board determines its place")
@@ -293,8 +300,8 @@ def _moved_boards(boards: Boards, geometry: LedGeometry, place: NDArray[np.intp]
         LedFault(
             "moved",
             (),
-            f"board {boards.numbers[b]} stands {shift_mm[b]:.1f} mm and {turn_deg[b]:.2f} deg from its table. "
-            "Its new place is in this record",
+            f"board {boards.numbers[b]} stands {shift_mm[b]:.1f} mm and {turn_deg[b]:.2f} deg from its place in "
+            "the table. Its new place is in this record",
         )
         for b in np.flatnonzero(is_seen & ((shift_mm > MOVED_MM) | (turn_deg > MOVED_DEG)))
     ]
@@ -303,7 +310,8 @@ def _moved_boards(boards: Boards, geometry: LedGeometry, place: NDArray[np.intp]
 def _parameters(
     geometry: LedGeometry, stated_noise: Stated, centre_mm: float, normal_deg: float
 ) -> dict[str, object]:
-    """Figures of the whole dome. Their own uncertainty is that of a standard deviation, s / sqrt(2 nu)."""
+    """Return figures of the whole dome. Their own uncertainty is the uncertainty of a standard deviation, s /
+    sqrt(2 nu)."""
     robot_mm, robot_deg = (
         stated_noise.robot_mm * geometry.noise[POSITION],
         stated_noise.robot_deg * geometry.noise[ORIENTATION],
@@ -353,7 +361,7 @@ def _noise(geometry: LedGeometry, stated_noise: Stated) -> tuple[Noise, ...]:
 
 
 def _views(names: Sequence[str], view: NDArray[np.intp], geometry: LedGeometry) -> tuple[ImageResidual, ...]:
-    """One line for each view; its spots take the place of the corners of a board's image."""
+    """Return one line for each view; in it, spots take the place of the corners of a board's image."""
     lines = []
     for number, name in enumerate(names):
         rows = np.flatnonzero(view == number)
@@ -365,7 +373,7 @@ def _views(names: Sequence[str], view: NDArray[np.intp], geometry: LedGeometry) 
 
 
 def _figures(geometry: LedGeometry, leds: _InTableOrder) -> dict[str, float]:
-    """The figures that `acceptance.LEDS` limits."""
+    """Return the figures that `acceptance.LEDS` limits."""
     return {
         "missing": float(1 - leds.found_mask.mean()),
         "centre_mm": float(np.median(leds.u_mm[leds.found_mask])),

@@ -8,7 +8,7 @@ IMAGES = (
     Allowed("pixel_px", "noise of corners", 0.3, "px"),
     Allowed("bare_field", "field without corners", 0.4),
     Allowed("rejected", "corners left out", 0.05),
-    Allowed("clipped", "images too clipped for corners", 0.2),
+    Allowed("clipped", "images that are too clipped to find corners", 0.2),
 )
 """`bare_field` is the share of the field's 8 x 6 cells without corners. `rejected` is the share of the corners
 left out as gross errors."""

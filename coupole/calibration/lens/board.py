@@ -31,8 +31,8 @@ _REDUCTIONS = (4, 2)
 _SAME_SIDE = 0.01
 """Largest relative difference between the certified side of squares and that of the description."""
 CLIPPED_SHARE = 0.02
-"""Largest share of white pixels about the corners. An image with more is left out, because clipping shifts
-edges."""
+"""Largest share of white pixels about the corners. An image with a larger share is left out, because clipping
+shifts edges."""
 
 
 class Board(Described):
@@ -128,7 +128,7 @@ class Sighting:
     board_mm: Floats
     """[n, 3]."""
     pixels: Floats
-    """[n, 2], centre of the first pixel (0, 0)."""
+    """[n, 2] px; the centre of the first pixel is (0, 0)."""
     u_px: Floats | None = None
     """[n] standard uncertainty of a corner's coordinates, root mean square of both, from its pixels alone; None if
     the corners were not fitted."""
@@ -170,7 +170,7 @@ def detect(board: Board, picture: Picture) -> Sighting | str:
 def _searches(board: Board, picture: Picture) -> Iterator[tuple[NDArray[np.intp], Floats]]:
     """Yield numbers and approximate places of corners, to about a pixel. A large image is first searched at a
     quarter and at half of its size; these results count only if all corners are found. Then it is searched at its
-    own size. Corners of a reduced image are as good for the begin of the fit."""
+    own size. Corners of a reduced image are equally good as initial values of the fit."""
     search = _chess if board.kind == "chessboard" else _charuco
     most: tuple[NDArray[np.intp], Floats] = np.zeros(0, dtype=np.intp), np.zeros((0, 2))
     for factor in (*(n for n in _REDUCTIONS if min(picture.size_px) >= n * _SEARCHED_PX), 1):

@@ -86,7 +86,7 @@ class HandEyeCalibration:
     pose_errors: Floats
     """[n, 6] errors of each pose in the flange's frame, mm and degrees."""
     residuals_px: tuple[Floats, ...]
-    """[k, 2] of each image, observed minus computed."""
+    """[k, 2] residuals of each image, observed minus computed."""
     start: Solution
     """Park's solution, from which the adjustment started."""
     noise: RobotFound

@@ -1,7 +1,7 @@
 """Intrinsics and distortion from images of a board, with covariance.
 
-OpenCV's calibration (Zhang) gives the start. One adjustment of all images follows, in which corners with gross
-errors are left out and the noise of the others is estimated from their residuals.
+OpenCV's calibration (Zhang) gives the initial values. One adjustment of all images follows, in which corners with
+gross errors are left out and the noise of the others is estimated from their residuals.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ class CameraCalibration:
     degrees: Floats
     """[free] effective degrees of freedom."""
     sigma_px: float
-    """Noise of a corner, per coordinate, estimated."""
+    """Estimated noise of a corner, per coordinate."""
     camera_from_board: Floats
     """[views, 4, 4]."""
     residuals_px: tuple[Floats, ...]
-    """[n, 2] of each image, observed minus computed."""
+    """[n, 2] residuals of each image, observed minus computed."""
     accepted_masks: tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], ...]
-    """[n] of each image: False for corners left out as gross errors."""
+    """[n] mask of each image: False for corners that were left out as gross errors."""
     sightings: tuple[Sighting, ...]
     size_px: tuple[int, int]
     """Width and height."""

@@ -50,7 +50,7 @@ _ABOUT_PX, _CLOSE_PX = 2e-3, 1e-4
 """Bounds of the last step of a fit: of the fit near the start, and of the fit near the found corner, which is a
 hundredth of the noise of a corner."""
 _WORST = 0.2
-"""Largest rms residual, as a share of the contrast. An image with a larger one is not that of a corner."""
+"""Largest rms residual, as a share of the contrast. If it is larger, the image does not show a corner."""
 _LEAST_SIGMA_PX = 0.05
 _THIN = 0.01
 """Least width of a box, for an edge along the pixels' rows."""
@@ -239,8 +239,8 @@ def _products(rows, count, many, products):  # type: ignore[no-untyped-def]
 
 @kernel
 def _rows(image, mask_tile, middle_x, middle_y, radius, unknowns, many, rows):  # type: ignore[no-untyped-def]
-    """Return the number of pixels. `rows` [16, pixels] becomes the derivatives by the unknowns, the residuals, and
-    the values of the model."""
+    """Return the number of pixels. `rows` [16, pixels] is filled with the derivatives with respect to the
+    unknowns, the residuals, and the values of the model."""
     x, y, sigma, sigma_2 = unknowns[_X], unknowns[_Y], unknowns[_SIGMA], unknowns[_SIGMA_2]
     level, contrast, together = unknowns[_LEVEL], unknowns[_CONTRAST], unknowns[_CORRELATION]
     cos1, sin1 = math.cos(unknowns[_FIRST]), math.sin(unknowns[_FIRST])

@@ -21,13 +21,13 @@ from coupole.calibration.rotations import Floats, between, inverses, moved_trans
 from coupole.errors import InputError
 
 CONTRADICTION = 3.0
-"""Scatter over the scatter expected from noise. Above this ratio it has another cause."""
+"""Scatter divided by the scatter expected from noise. Above this ratio, the scatter has another cause."""
 CURE = 3.0
 """A hypothesis that divides the scatter by this factor is a likely cause."""
 _NO_WORSE = 0.7
 _WORTH_A_LOOK = 0.3
-"""Scatter over the expected one. Above this ratio single faults are searched for, because the stated noise of a
-poor robot may hide a moved board."""
+"""Scatter divided by the expected scatter. Above this ratio single faults are searched for, because the stated
+noise of a poor robot may hide a moved board."""
 _AS_GOOD = 1.5
 """Hypotheses whose scatter is within this factor of the best are ranked: the smallest change comes first."""
 _DEPTH_WORSE = 5.0
@@ -74,8 +74,8 @@ class Diagnosis:
         lines = []
         if self.contradicts:
             lines.append(
-                "robot and camera contradict each other: by the poses, the board's place scatters by "
-                f"{self.scatter_mm:.3g} mm and {self.scatter_deg:.3g} deg, where noise explains "
+                "robot and camera contradict each other: the board's place as computed from the poses scatters "
+                f"by {self.scatter_mm:.3g} mm and {self.scatter_deg:.3g} deg, where noise explains "
                 f"{self.noise_scatter.position_mm:.2g} mm and {self.noise_scatter.orientation_deg:.2g} deg"
             )
             lines += [
@@ -185,7 +185,8 @@ def _by_method(base_from_flange: Floats, camera_from_board: Floats) -> dict[str,
 def _likely(
     hypotheses: list[Hypothesis], noise_scatter: Expected, measured_scatter: tuple[float, float]
 ) -> tuple[Hypothesis, ...]:
-    """Return hypotheses that remove the contradiction. Of equally good ones, the smallest change comes first.
+    """Return hypotheses that remove the contradiction. Among equally good hypotheses, the smallest change comes
+    first.
 
     Such a hypothesis divides the scatter of positions or of orientations by the factor `CURE` and does not
     increase the other. Or it explains a deviation that noise cannot explain.

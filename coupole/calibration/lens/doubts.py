@@ -67,8 +67,8 @@ class Doubts:
             if suspect.evidence >= CLEAR:
                 pattern_px = PIXEL_SIGMA_PX * suspect.pattern
                 yield (
-                    f"{_words_of(suspect)}: its pattern in the residuals is {pattern_px:.2g} px "
-                    f"(log-likelihood ratio {suspect.evidence:.0f}); values and uncertainties account for it"
+                    f"{_words_of(suspect)}: the pattern that this leaves in the residuals is {pattern_px:.2g} "
+                    f"px (log-likelihood ratio {suspect.evidence:.0f}); values and uncertainties account for it"
                 )
         yield (
             f"views left out in turn are predicted with an error of {self.predicted_px:.2g} px, "

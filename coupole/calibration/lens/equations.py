@@ -51,7 +51,7 @@ class EarlierLens:
     intrinsics: Intrinsics
     free: tuple[str, ...] = ()
     covariance: Floats | None = None
-    """[free, free]; None if the lens is taken to be exact."""
+    """[free, free] covariance of the lens; None if the lens is taken to be exact."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class Bundle:
         return [*self._corner_blocks(state), *self._robot_blocks(state), *self._held_blocks(state, names)]
 
     def camera_from_board(self, state: State) -> Floats:
-        """Return [n, 4, 4] at each pose."""
+        """Return [n, 4, 4], the board's pose in the camera frame at each pose of the arm."""
         base_from_camera = (
             self.poses.base_from_flange @ self._zero_steps(state) @ state.pose_errors @ state.flange_from_camera
         )

@@ -40,7 +40,7 @@ class Motions:
 
 @dataclass(frozen=True)
 class Solution:
-    """Both unknown transforms, and the deviation of each pose from them."""
+    """Both unknown transforms, and the deviation of each pose from this solution."""
 
     flange_from_camera: Floats
     base_from_board: Floats

@@ -44,7 +44,8 @@ class Expected:
     orientation_deg: float
 
     def score(self, scatter_mm: float, scatter_deg: float) -> float:
-        """Return the scatter over the expected one, for position or orientation, whichever is worse."""
+        """Return the larger of two ratios, for position and for orientation: scatter divided by the expected
+        scatter."""
         return max(scatter_mm / self.position_mm, scatter_deg / self.orientation_deg)
 
 

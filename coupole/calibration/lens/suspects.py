@@ -71,7 +71,8 @@ class Field:
         return float(np.sqrt(2.0 * np.mean(squares)))
 
     def _own_derivatives(self, pixels: Floats) -> Floats:
-        """Return [2 n, free + 3], derivatives by the free lens parameters and by a turn of the camera."""
+        """Return derivatives [2 n, free + 3] with respect to the free lens parameters and to a turn of the
+        camera."""
         rays = np.column_stack([(pixels - self.lens[2:4]) / self.lens[:2], np.ones(len(pixels))])
         projection = optics.project(rays, self.lens)
         by_lens = projection.by_intrinsics[:, :, [optics.NAMES.index(name) for name in self.free]]

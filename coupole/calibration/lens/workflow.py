@@ -54,7 +54,7 @@ class Shown:
     names: tuple[str, ...]
     """Names of the images."""
     pixels: tuple[Floats, ...]
-    """[k, 2] of each image."""
+    """[k, 2] pixels of the corners in each image."""
     residuals_px: tuple[Floats, ...]
     """[k, 2], observed minus computed."""
     pixel_px: float

@@ -20,7 +20,7 @@ LED_POWER = (
     Allowed("unsteady", "unsteady change of gain or light within the session", 0.002),
 )
 DRIFT = (
-    Allowed("factor", "uncertainty of the factor, worst frame", 0.01),
+    Allowed("factor", "uncertainty of the drift factor of a frame, greatest value", 0.01),
     Allowed("left_out", "share of readings left out", 0.2),
 )
 GLARE = (

@@ -19,13 +19,14 @@ from coupole.errors import InputError
 
 Maps = NDArray[np.float32]
 HOT_SIGMA = 8.0
-"""Robust standard deviations above the median. A pixel with a larger dark current is hot."""
+"""Limit of the dark current, in robust standard deviations above the median. A pixel above it is hot."""
 _ROUNDING = 1.0 / 12.0
 """Variance of rounding to whole DN (EMVA 1288 release 4.0, section 2.4)."""
 _MAD = 1.4826
 _LEAST_FRAMES = 4
 _LIT = 10.0
-"""A frame was not dark if its mean lies above the line by more than this, over the scatter of the other frames."""
+"""Largest height of a dark frame's mean above the line, divided by the scatter of the other frames. Above this
+limit the frame was not dark."""
 _LIT_DN = 0.5
 
 

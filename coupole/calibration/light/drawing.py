@@ -81,7 +81,11 @@ def draw_response(
     axes[0, 0].set(title="Photon transfer", xlabel="signal above dark (DN)", ylabel="variance (DN$^2$)")
     axes[0, 0].legend(frameon=False)
     axes[0, 1].axhline(0, color=DARK, lw=1)
-    axes[0, 1].set(title="Variance off its line, one sigma", xlabel="signal above dark (DN)", ylabel="%")
+    axes[0, 1].set(
+        title="Deviation of the variance from its line; bars: one sigma",
+        xlabel="signal above dark (DN)",
+        ylabel="%",
+    )
     for channel, straight in lines.items():
         colour = CHANNEL_COLOURS[channel]
         t, signal = straight.exposures_us * 1e-3, straight.signals_dn
@@ -170,9 +174,9 @@ def draw_led_power(powers: Mapping[str, LedPower], positions: Positions, record:
         axes[1, 0].plot(power.ids[good], 100 * power.u_own[good], ".", color=colour, ms=3)
         axes[1, 0].plot(power.ids[good], 100 * power.u_against_mean()[good], ".", color=colour, ms=3, alpha=0.3)
     axes[0, 1].legend(frameon=False, title="spread")
-    axes[0, 1].set(title="Power over the mean", ylabel="LEDs")
+    axes[0, 1].set(title="Power divided by the mean", ylabel="LEDs")
     axes[1, 0].set(
-        title="Relative standard uncertainty: own noise (dark), against the mean (pale)",
+        title="Relative standard uncertainty of each LED: from its own noise (dark), relative to the mean (pale)",
         xlabel="LED", ylabel="%", yscale="log",
     )  # fmt: skip
     view_residuals = [residuals[np.isfinite(residuals)] for residuals in green.residuals]

@@ -1,11 +1,11 @@
 """Drift of the LEDs between their calibration and a run, measured on a tile in the run's views.
 
-A reading is the tile's signal over the signal expected from the calibrated power. It is 1 if nothing has changed.
-Its logarithm is common level + rate * hours + coefficient * (T - T0) + noise, where T0 is the board's temperature
-when the LED's power was calibrated. The coefficient has a prior (white power LEDs: about -0.3 % per kelvin),
-because temperature and time are correlated within a run. So each frame gets its own factor from its board's
-temperature and its time, with an uncertainty. Errors that all readings share (the tile's tilt, in the run and in
-the calibration of the powers) are estimated too, with their priors.
+A reading is the tile's signal divided by the signal expected from the calibrated power. It is 1 if nothing has
+changed. Its logarithm is common level + rate * hours + coefficient * (T - T0) + noise, where T0 is the board's
+temperature when the LED's power was calibrated. The coefficient has a prior (white power LEDs: about -0.3 % per
+kelvin), because temperature and time are correlated within a run. So each frame gets its own factor from its
+board's temperature and its time, with an uncertainty. Errors that all readings share (the tile's tilt, in the run
+and in the calibration of the powers) are estimated too, with their priors.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ _SUDDEN = 0.003
 _UNKNOWN = 10.0
 _NEIGHBOURS = 11
 _ODD_SIGMA, _ODD = 6.0, 0.01
-"""Largest distance of a reading from its neighbours' median. A larger one shows a fault of its LED, not drift."""
+"""Largest distance of a reading from its neighbours' median. A larger distance shows a fault of the LED, not
+drift."""
 _NO_FIGURES: Floats = np.zeros((0, 0))
 
 
@@ -145,7 +146,7 @@ class _Solved:
     noise: Floats
     """[readings] stated noise, relative."""
     scale: float
-    """Estimated over stated noise, at least 1."""
+    """Estimated noise divided by stated noise, at least 1."""
     freedom: float
 
 

@@ -240,7 +240,10 @@ def _parameters(drift: Drift) -> list[Parameter]:
 def _table(drift: Drift) -> str:
     """Return the readings as CSV."""
     text = io.StringIO()
-    text.write("# the reference tile: signal over that expected from the calibrated power; residual of the fit\n")
+    text.write(
+        "# the reference tile: signal divided by the signal expected from the calibrated power; residual of the "
+        "fit\n"
+    )
     text.write("shot,t_s,warmer_k,ratio,u_ratio,residual\n")
     for reading, residual in zip(drift.used_readings, drift.residuals, strict=True):
         text.write(

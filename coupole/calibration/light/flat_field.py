@@ -1,4 +1,4 @@
-"""Flat field: the light at each pixel over the light at the field's brightest point, per channel.
+"""Flat field: the light at each pixel divided by the light at the field's brightest point, per channel.
 
 The source is seed 003, section 4.2 (g in its Eq. 1). A luminous panel is photographed, shifted and turned. Its
 signal is a_v * g(p) * s(q). Here a_v is the view's brightness. g is the lens's fall-off, which depends on the
@@ -59,7 +59,7 @@ class FlatField:
     covariance: Floats
     """[5, 5]."""
     focal_px: float
-    """Focal length f, held. The polynomial absorbs its error."""
+    """Focal length f, held. The polynomial absorbs an error of this focal length."""
     size_px: tuple[int, int]
     """Width and height."""
     panel: Floats
@@ -76,7 +76,7 @@ class FlatField:
     form: Floats
     """[modes] coefficients of a fall-off that is not round (`form_modes`); none without a search."""
     field_covariance: Floats
-    """[5 + modes] squared, of the parameters and these coefficients."""
+    """[5 + modes, 5 + modes] covariance of the parameters and these coefficients."""
     causes: FlatCauses
 
     def at(self, pixels: Floats) -> Floats:
@@ -284,8 +284,8 @@ class Spot:
 
 
 def dust_spots(ratio: NDArray[np.float32], *, smooth_px: int = 5, least_depth: float = 0.01) -> list[Spot]:
-    """Find spots in the ratio [H, W], the mean over views of signal over fitted signal (NaN where unknown). The
-    deepest spot is first.
+    """Find spots in the ratio [H, W]: the mean over the views of signal divided by fitted signal (NaN where it is
+    unknown). The deepest spot is first.
 
     The ratio is smoothed over `smooth_px`, so that single pixels with a low response do not count as dust.
     """

@@ -2,9 +2,9 @@
 
 The panel's unevenness beyond a quadratic is a set of polynomials over the panel, which shifted and turned views
 show at other pixels. A fall-off that is not round about one centre is a set of polynomials over the field, the
-same in all views. A block of pixels has an own response, the same in all views: means over the views are noisier
-than differences between them. So both are separate observations, each with its noise, which differences of
-neighbouring blocks give.
+same in all views. A block of pixels has a response of its own, the same in all views. Therefore means over the
+views are noisier than differences between views. So both are separate observations, each with its noise, which
+differences of neighbouring blocks give.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PANEL, FORM = "panel", "form of the fall-off"
 CLEAR = 15.0
 """Evidence from which a suspect is named. Noise alone exceeds it once in 20,000 fits."""
 _DOUBTFUL = 1.64
-"""Evidence below which a suspect counts for nothing: noise alone gives as much in a tenth of all fits."""
+"""Evidence below which a suspect is ignored: noise alone exceeds it in a tenth of all fits."""
 _PANEL_DEGREES, _FORM_DEGREES = (3, 6), (1, 4)
 _MAD = 1.4826
 _LEAST_NOISE = 1e-9
@@ -37,17 +37,17 @@ _WORDS = {
 
 @dataclass(frozen=True)
 class FlatCauses:
-    """Panel and form of the fall-off, as the residuals tell them."""
+    """Panel and form of the fall-off, as the residuals show them."""
 
     step: Floats
     """[p] change of the parameters of the fit."""
     form: Floats
     """[modes] coefficients of `form_modes`."""
     joint_covariance: Floats
-    """[p + modes] squared, of the parameters and these coefficients."""
+    """[p + modes, p + modes] covariance of the parameters and these coefficients."""
     suspects: tuple[Suspected, ...]
     panel: float
-    """Relative root mean square of the panel's pattern, without what a lens's fall-off has too."""
+    """Relative root mean square of the panel's pattern, without the part that a lens's fall-off could have too."""
     off_round: float
     """Relative standard deviation over the field of the part of the fall-off that is not round."""
 

@@ -71,7 +71,7 @@ class LightFrames:
     white_dn: int
     about: About
     focal_px: float
-    """Image distance over pixel pitch, f (1 + m): the length on the sensor, px, for a tangent of 1."""
+    """Image distance f (1 + m) divided by the pixel pitch: the length on the sensor, px, for a tangent of 1."""
     inputs: tuple[tuple[str, str], ...]
     """Name and SHA-256 of every file that was or will be read."""
     gain_db: float = 0.0

@@ -11,7 +11,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
 _DARK = 0.2
-"""Share of the picture's white. A darker pixel may be a trap's."""
+"""Share of the picture's white. A pixel below it may belong to a trap."""
 _WHITE = 0.3
 """Least share of the picture's white that everything around a trap must have."""
 _LEAST_CELLS = 12

@@ -53,7 +53,8 @@ def lambert_vector(points_mm: ArrayLike, corners_mm: ArrayLike) -> Floats:
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    """Return the cross product [..., 3]. This is several times faster than numpy's own for many short vectors."""
+    """Return the cross product [..., 3]. This is several times faster than numpy's function for many
+    short vectors."""
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)

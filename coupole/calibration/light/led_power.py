@@ -64,7 +64,7 @@ class LedPower:
     u_own: Floats
     """[n] relative standard uncertainty from errors that are independent between LEDs."""
     common: Floats
-    """[n, c] relative change of each power by one unit of each common figure."""
+    """[n, c] relative change of each power per unit of each common figure."""
     common_names: tuple[str, ...]
     common_covariance: Floats
     """[c, c]."""

@@ -104,10 +104,10 @@ def power_limits(powers: Mapping[str, LedPower], operator_limits: Mapping[str, f
 
 
 def _of_views(power: LedPower, limits: Sequence[Limit]) -> list[str]:
-    """Return what views left out in turn say, and what to do if they contradict each other."""
+    """Return a sentence on the effect of leaving each view out, and advice if views contradict each other."""
     figures = {limit.name: limit for limit in limits}
     if not power.left_out.worst:
-        return ["each LED is in one view only: nothing tells a drift, or a lobe of the tile"]
+        return ["each LED is in one view only, so a drift, or a lobe of the tile, cannot be detected"]
     line = (
         f"views left out in turn move the powers by {figures['left_out'].found:.2f} of the stated uncertainty; "
         f"{power.left_out.worst} moves them most"
@@ -191,7 +191,7 @@ def _parameters(powers: Mapping[str, LedPower], covariance: Floats) -> list[Para
 
 
 def _mean_and_slopes(power: LedPower) -> tuple[float, Floats]:
-    """Return the mean power of all LEDs, and its derivatives [c] by the shared figures."""
+    """Return the mean power of all LEDs, and its derivatives [c] with respect to the shared figures."""
     good = np.isfinite(power.power) & (power.power > 0)
     return float(power.power[good].mean()), np.asarray((power.power[good, None] * power.common[good]).mean(axis=0))
 

@@ -110,7 +110,7 @@ class _Fit:
     """c2, c3."""
     time_offset_us: float
     covariance: Floats
-    """[3, 3] of c2, c3 and the time offset in ms."""
+    """[3, 3] covariance of c2, c3 and the time offset in ms."""
     residuals: Floats
     """Residuals of the unsaturated signals, divided by their uncertainties."""
     deviations: Floats

@@ -41,8 +41,7 @@ def refuse_all_clipped(pairs: Sequence[Pair]) -> None:
     if len(bright) > len(pairs) - 4:
         raise InputError(
             f"response: more than half of the pixels are saturated in {pair_names(bright)}; expected four "
-            f"exposures "
-            "or more without. Add shorter ones"
+            "exposures or more without saturation. Add shorter ones"
         )
 
 

@@ -42,7 +42,7 @@ class PhotonTransfer:
     prnu: Estimate | None
     """Relative PRNU; None if the scene was not uniform enough."""
     covariance: Floats
-    """[2, 2] of intercept (DN^2) and gain (DN)."""
+    """[2, 2] covariance of intercept (DN^2) and gain (DN)."""
     chi2_per_degree: float
     signal_dn: Floats
     """[levels] mean signal of each level; the next two fields are for the same levels."""

@@ -17,7 +17,7 @@ class Between:
     residuals: Floats
     """[n] against the mean of the LED's views."""
     design: Floats
-    """[n, c] derivatives by the shared figures, against their mean."""
+    """[n, c] derivatives with respect to the shared figures, less their mean over the LED's views."""
     weights: Floats
     """[n] inverse squares of the stated noise."""
     led: NDArray[np.intp]

@@ -36,9 +36,9 @@ class ViewsLeftOut:
 
 
 def views_left_out(y: Floats, observations: Between, names: Sequence[str]) -> ViewsLeftOut:
-    """Leave out each of the views. `y` [n] are the logarithms; the design of the observations are the derivatives
-    by the shared figures and by the modes of causes, its prior their standard uncertainties. `names` [n] are the
-    views."""
+    """Leave out the views, one after the other. `y` [n] are the logarithms; the design of the observations are the
+    derivatives by the shared figures and by the modes of causes, its prior their standard uncertainties. `names`
+    [n] are the views."""
     led, leds = observations.led, observations.leds
     whole = _log_powers(y, observations)
     squares, views_of_led, largest = np.zeros(leds), np.zeros(leds, np.int64), (0.0, "")

@@ -40,7 +40,7 @@ REACH_MM = 40.0
 
 _WORDS = {
     STAIN: "the tile has a stain, or is not equally white",
-    GLOSS: "the tile shines: it has a lobe beside Minnaert's law",
+    GLOSS: "the tile shines: it has a lobe in addition to Minnaert's law",
     DRIFT: "gain or light drifted over the session",
     UNSTEADY: "gain or light wavered during the session",
     RESTLESS: "gain or light wavered many times during the session",
@@ -50,7 +50,10 @@ _REMEDIES = {
     STAIN: "Clean the tile or turn another part of it up",
     GLOSS: "Grind the tile flat with wet abrasive paper, or describe its lobe by a goniometer's certificate",
     DRIFT: "Let lamps and camera warm up for half an hour, then acquire again",
-    DIES: f"They hold up to {REACH_MM:.0f} mm from the tile's middle: lay the tile where the object will be",
+    DIES: (
+        f"The powers are valid up to {REACH_MM:.0f} mm from the tile's middle: lay the tile where the object "
+        "will be"
+    ),
     UNSTEADY: "Look at the supply of the LEDs and at room light, then acquire again",
     RESTLESS: "Look at the supply of the LEDs and at room light, then acquire again",
 }
@@ -63,11 +66,11 @@ class CausesFound:
     error: ModelError
     """Its step are the shared figures [c]."""
     modes: Floats
-    """[n, modes] what coefficients of 1 do to each observation."""
+    """[n, modes] change of each observation if a coefficient is 1."""
     mean_modes: Floats
     """[leds, modes] weighted mean of the modes of each LED."""
     pattern: Floats
-    """[n] what lobe and drift do to each observation, against the mean of its LED."""
+    """[n] change of each observation by lobe and drift, less the mean change over its LED's views."""
     gloss: float
     """Reflectance of the lobe for light along the normal."""
     drift: float
@@ -108,8 +111,8 @@ class CausesFound:
 
 
 def names_of(causes: CausesFound, parts: PartsFound) -> Iterator[str]:
-    """Yield the suspects that are named. A lobe of the tile that Ward's lobes do not follow looks like a fall-off,
-    so beside a lobe no fall-off is named."""
+    """Yield the suspects that are named. If the tile has a lobe of another form than Ward's, its error looks like
+    a fall-off. Therefore no fall-off is named if a lobe is named."""
     yield from (suspect.name for suspect in (*causes.suspects, parts.stain) if suspect.evidence >= CLEAR)
     if parts.evidence >= CLEAR_FALL_OFF and not causes.names_lobe:
         yield DIES

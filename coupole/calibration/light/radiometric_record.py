@@ -22,7 +22,7 @@ class Findings:
 
     parameters: Sequence[Parameter]
     covariance: Floats
-    """[p, p] of the parameters, in their order."""
+    """[p, p] covariance of the parameters, in their order."""
     limits: Sequence[Limit]
     files: Mapping[str, bytes] = field(default_factory=dict)
     """Maps and tables beside the record, by their names."""

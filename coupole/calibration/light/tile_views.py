@@ -285,7 +285,7 @@ def without_dark(
     seen_leds = {row.led for row in rows}
     dead = np.array([int(led) in seen_leds - alive for led in ids])
     if dead.any():
-        remarks.append(f"dead LEDs, or hidden in every view: {list_of(ids[dead])}")
+        remarks.append(f"LEDs that are dead, or hidden in every view: {list_of(ids[dead])}")
     for v, view in enumerate(views):
         shadowed_leds = [row.led for row in rows if row.view == v and row.led in alive and not lit(row)]
         if shadowed_leds:

@@ -48,7 +48,7 @@ class Sticker:
     normals: Floats
     """[2, 3] normals of these disks, camera frame, towards the camera."""
     covariance: Floats
-    """[2, 2] of the middle, px^2."""
+    """[2, 2] covariance of the middle, px^2."""
     radius_px: float
     """Longer radius of the ellipse."""
     distance_mm: float
@@ -63,7 +63,7 @@ class Ellipse:
     shape: Floats
     """[2, 2], symmetric."""
     covariance: Floats
-    """[2, 2] of the centre."""
+    """[2, 2] covariance of the centre."""
     rms: float
     point_mask: NDArray[np.bool_]
 

@@ -208,4 +208,7 @@ def _remarks(pose: MeshPose) -> tuple[str, ...]:
 
 def _of_the_arm(arm: CalibratedArm) -> str:
     zeros = ", ".join(f"A{axis} {zero:+.4f}" for axis, zero in enumerate(arm.zeros_deg[1:], start=2))
-    return f"poses are corrected by the axis zeros of the hand-eye record ({zeros} deg); use them with the mesh"
+    return (
+        f"poses are corrected by the axis zeros of the hand-eye record ({zeros} deg); use these zeros with this "
+        "mesh"
+    )

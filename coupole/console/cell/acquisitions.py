@@ -73,7 +73,7 @@ class Acquisitions:
         for state in [self.state] if self.state and Path(self.state["run"]).name == run else running():
             if Path(state["run"]).name == run and self._is_ours(state):
                 return self._send_command(state, command)
-        raise InputError(f"{run}: is not being acquired in this cell")
+        raise InputError(f"{run}: this run is not being acquired in this cell")
 
     def _send_command(self, state: State, command: Command) -> State:
         if command == "stop" and self._queue.running:
@@ -85,7 +85,10 @@ class Acquisitions:
             if command != "stop" or entry is None or entry.pid != state["pid"]:
                 raise
             self.stop(entry)
-            return {**state, "trouble": ["not sure: the run does not answer; its process was told to end"]}
+            return {
+                **state,
+                "trouble": ["perhaps not stopped yet: the run does not answer; its process was told to end"],
+            }
 
     def stop(self, entry: Entry) -> None:
         """Interrupt the process of an entry as by Ctrl-C, also before its run has a name. Raises InputError."""

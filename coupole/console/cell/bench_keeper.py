@@ -147,7 +147,12 @@ class Bench:
             if (task := self._running) is None:
                 raise
             task.stop()
-            return ["not sure: the devices do not answer; their process was told to make the cell safe and end"]
+            return [
+                (
+                    "perhaps not safe: the devices do not answer; their process was told to make the cell safe "
+                    "and end"
+                )
+            ]
 
     def ask(self, command: str, **fields: Any) -> dict[str, Any]:
         """Send a command to the bench and return its answer. Raises InputError with the bench's words if it did
@@ -236,4 +241,4 @@ class Bench:
         if self.work.get("state") == "running":
             self._acted_s = now_s
         if self.is_own and state is not None and now_s - self._acted_s > IDLE_S:
-            self._close(f"nobody has used them for {IDLE_S / 60:g} minutes")
+            self._close(f"nobody has used the devices for {IDLE_S / 60:g} minutes")

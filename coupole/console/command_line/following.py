@@ -121,7 +121,7 @@ class _Followed:
             if self._has_ended:
                 return []
             time.sleep(_LOOK_EVERY_S)
-        return ["not sure: the run gives no answer"]
+        return ["perhaps not stopped: the run gives no answer"]
 
     def _take_out(self) -> bool:
         """Let the console stop the entry's process. Return True if the entry had not begun and never will. Raises
@@ -266,6 +266,6 @@ class _Followed:
             "cell",
             expected="the process that acquires to end by itself",
             happened=self._entry["said"] or "it was killed",
-            remedy="Look at the cell: without it lights and arm stop by their own watchdogs"
+            remedy="Look at the cell: without this process, lights and arm stop by their own watchdogs"
             + (f"; go on with `coupole acquire --resume {run}`." if run else "."),
         )

@@ -19,6 +19,6 @@ def _account(request: Request) -> Account:
 
 Who = Annotated[Account, Depends(_account)]
 REFUSALS: dict[int | str, dict[str, Any]] = {
-    403: {"description": "Not for this role, or without a fresh token."},
+    403: {"description": "This role may not do it, or the token is not fresh."},
     409: {"description": "Somebody else is in control, or the cell cannot do this now."},
 }

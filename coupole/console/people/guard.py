@@ -64,7 +64,7 @@ def guard(app: FastAPI, service: Service) -> None:
         if int(request.headers.get("content-length", "0") or 0) > most:
             return _no(413, f"expected at most {most} bytes")
         if "transfer-encoding" in request.headers:
-            return _no(411, "expected a body with its length")
+            return _no(411, "expected a body whose length is stated")
         if why := _foreign(request, service):
             return why
         session = session_of(request, service)
@@ -75,7 +75,7 @@ def guard(app: FastAPI, service: Service) -> None:
         if request.method not in _READING and session is not None and not public:
             ambient = not is_command_line(request) and not bearer_of(request)
             if ambient and not service.sessions.spend(session, request.headers.get("x-coupole-token", "")):
-                return _no(403, "expected in X-Coupole-Token a fresh token of /api/v1/token, good for once")
+                return _no(403, "expected in X-Coupole-Token a fresh token of /api/v1/token, which is valid once")
         if not begins_nothing(request.method, request.url.path) and (refusal := why_unwanted(request, service)):
             return _no(409, refusal)
         response: Response = await call_next(request)
@@ -161,7 +161,7 @@ def _foreign(request: Request, service: Service) -> Response | None:
         return _no(400, "expected this console's own address as host")
     origin = request.headers.get("origin")
     if origin is not None and origin not in service.origins:
-        return _no(403, "asked by the page of another site")
+        return _no(403, "the request comes from the page of another site")
     return None
 
 

@@ -102,8 +102,8 @@ class InControl:
 
 
 class Control:
-    """Control of the cell. One person at a time is in control, until control is handed over or given up, or the
-    person does nothing for some time."""
+    """Control of the cell. One person at a time is in control, until that person hands control over, releases it,
+    or does nothing for some time."""
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s, self._lock = now_s, threading.Lock()

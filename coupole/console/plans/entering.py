@@ -68,7 +68,9 @@ class Entering:
             return self._queue.add(by, before=request.before, hold=request.hold)
         for_command_line = request.output or request.with_mesh or request.result
         if not by_command_line and (for_command_line or (request.plan and request.resume)):
-            raise InputError("`output`, `with_mesh`, `result` and `plan` with `resume` are for the command line")
+            raise InputError(
+                "`output`, `with_mesh`, `result`, and `plan` together with `resume`, are only for the command line"
+            )
         run = self._run(request.resume, anywhere=by_command_line) if request.resume else None
         plan = self._plan(request.plan, anywhere=by_command_line) if request.plan else None
         fields: dict[str, Any] = {
@@ -114,7 +116,7 @@ class Entering:
         run = Run(path)
         begun_on = read_cell(run.rig_path)
         if begun_on.state_folder.resolve() != self._cell.state_folder.resolve():
-            raise InputError(f"{path}: was begun in another cell, {begun_on.rig.name}")
+            raise InputError(f"{path}: this run was begun in another cell, {begun_on.rig.name}")
         return run
 
     # -- preflight --------------------------------------------------------------------------------------------

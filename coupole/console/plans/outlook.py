@@ -24,7 +24,7 @@ class AtWork:
 def expected_times(
     entries: Sequence[Entry], now: datetime, *, left_s: float | None, is_halted: bool
 ) -> dict[str, tuple[datetime | None, datetime | None]]:
-    """Return the expected begin and end of each running or waiting entry, by its id.
+    """Return the times, by id, at which each running or waiting entry is expected to begin and to end.
 
     A time is None if a person decides on it (a hold, a halted queue), or if it is not known. `left_s` is the time
     that the present run still needs.

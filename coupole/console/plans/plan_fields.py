@@ -53,7 +53,7 @@ class PlanFields:
 def fields_of(path: Path, text: str) -> PlanFields:
     """Read the fields from a plan's text. Raises InputError if it is not YAML, or too long for a form."""
     if len(text) > LONGEST:
-        raise InputError(f"a text of more than {LONGEST:,} characters: write it in an editor of texts")
+        raise InputError(f"a text of more than {LONGEST:,} characters: write it in a text editor")
     data = yamlfile.parse(path, text).data
     object_keys = data.get("object") if isinstance(data.get("object"), dict) else {}
     assert isinstance(object_keys, dict)

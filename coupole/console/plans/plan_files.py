@@ -95,7 +95,7 @@ class PlanFiles:
         path = self.path(name)
         with self._lock:
             if not path.is_file() or yamlfile.text_of(path) != before:
-                raise InputError(f"{name}: another person has changed it meanwhile; open it again")
+                raise InputError(f"{name}: another person has changed this plan meanwhile; open it again")
             self._write(path, text)
         return name
 

@@ -138,8 +138,9 @@ class PlanQueue:
     def add(self, by: str, *, before: str = "", at_once: bool = False, **fields: Any) -> Entry:
         """Add an entry with these fields, before another waiting entry or at the end; return it.
 
-        `at_once`: the entry begins now, whatever the end of the last plan was. Raises InputError if too many wait,
-        or (with `at_once`) if something runs, waits or holds; StorageError.
+        `at_once`: the entry begins now, whatever the end of the last plan was. Raises InputError if too many
+        entries wait, or (with `at_once`) if a plan runs or waits, or the queue is at a hold; StorageError if the
+        queue cannot be written.
         """
         with self._lock:
             if len(self.waiting) >= MOST_WAITING:
@@ -217,8 +218,8 @@ class PlanQueue:
             self._keep(entries, halt or self.halt_reason)
 
     def halt(self, why: str) -> None:
-        """Begin nothing more until a person continues the queue. This holds even if it cannot be written. Raises
-        StorageError."""
+        """Begin nothing more until a person continues the queue. The queue is halted even if this cannot be
+        written to the disk; then StorageError is raised."""
         with self._lock:
             self._kept = self._kept.model_copy(update={"halted": why})
             self._keep(self.entries, why)

@@ -84,7 +84,9 @@ class WarmProcess:
             if future.done():
                 raise
             self.end()
-            raise InputError(f"the process that {self._what} was ended: not done within {within_s:g} s") from error
+            raise InputError(
+                f"the process that {self._what} was not done within {within_s:g} s, and was ended"
+            ) from error
         except (BrokenProcessPool, CancelledError) as error:
             if self._pool is not pool:
                 raise InputError(f"the process that {self._what} was ended") from error

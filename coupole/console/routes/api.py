@@ -64,7 +64,9 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
             return sign_in_page()
         return RedirectResponse("/run", 303)
 
-    @app.post("/api/v1/sign-in", responses={401: {"description": "Wrong, or tried too often."}})
+    @app.post(
+        "/api/v1/sign-in", responses={401: {"description": "Name or password is wrong, or was tried too often."}}
+    )
     def sign_in(credentials: SignIn, request: Request, response: Response) -> dict[str, str]:
         """Begin a session. Browsers get a cookie; scripts get `session`, to be sent as `Authorization: Bearer`."""
         here = is_of_this_machine(request)
@@ -73,7 +75,7 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
         else:
             account = service.accounts.sign_in_first(credentials.token) if here else None
         if account is None:
-            raise NotAllowed(401, "name or password are wrong, or were wrong too often: try again in a minute")
+            raise NotAllowed(401, "name or password is wrong, or was wrong too often: try again in a minute")
         secret = service.sessions.begin(account, script=credentials.script)
         answer = {"name": account.name, "role": account.role.word}
         if credentials.script:
@@ -177,8 +179,8 @@ async def _events(service: Service, request: Request) -> AsyncIterator[str]:
 def _add_people(app: FastAPI, service: Service) -> None:
     @app.post("/api/v1/control/take", responses=REFUSALS)
     def take(person: Who) -> dict[str, str]:
-        """Take control, or ask for it. An engineer takes it; so does any operator if the person in control has
-        done nothing for five minutes."""
+        """Take control, or ask for it. An engineer gets control at once, and any operator does if the person in
+        control has done nothing for five minutes."""
         allow(service, person, Role.OPERATOR, "take control")
         return asdict(service.control.take(person))
 

@@ -52,7 +52,9 @@ def add_routes_at_the_cell(app: FastAPI, service: Service) -> None:
 def _add_loan(app: FastAPI, service: Service) -> None:
     def borrower(request: Request) -> int:
         if not is_command_line(request) or request.client is None:
-            raise NotAllowed(403, "the cell is lent to commands on this machine, by the console's own socket")
+            raise NotAllowed(
+                403, "the cell is lent only to commands on this machine, through the console's own socket"
+            )
         return request.client.port
 
     @app.post("/api/v1/cell/lease", responses=REFUSALS)

@@ -72,8 +72,8 @@ def add_bench_routes(app: FastAPI, service: Service) -> None:
     async def hold(socket: WebSocket) -> None:
         """Move an axis while a button is held. The page sends `{axis, direction, share}`. A renewal also has the
         word of the newest answer (`renew`), so it cannot be sent before this answer has come. Renewals that wait
-        in the network, or are sent in advance, have no effect. When the button is let go, or the connection is
-        lost, the connection ends, and so does the motion.
+        in the network, or are sent in advance, have no effect. When the button is released or the connection is
+        lost, the motion ends.
         """
         await socket.accept()
         await _Hold(service, socket).serve()
@@ -135,7 +135,10 @@ class _Hold:
         if word != self._next_word:
             raise InputError("renew: expected the word of the newest answer; a renewal sent before it is void")
         if any(request[key] != self._asked[key] for key in ("axis", "direction")):
-            raise InputError("a renewal is for the axis and the direction of the press")
+            raise InputError(
+                "expected the axis and the direction with which the button was pressed; a renewal cannot change "
+                "them"
+            )
 
     def _let_go(self) -> str:
         """End the motion at once: a command in the opposite direction ends it."""

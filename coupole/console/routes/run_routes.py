@@ -64,7 +64,7 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
         """Return a support bundle that was made at the console; for engineers."""
         session: Session = request.state.session
         if account_here(session.account, of_this_machine=is_of_this_machine(request)).role < Role.ENGINEER:
-            raise NotAllowed(403, "support bundles: only for engineers")
+            raise NotAllowed(403, "support bundles are only for engineers")
         return FileResponse(service.bundles.path(name), media_type="application/zip", filename=name)
 
     @app.get("/api/v1/runs/{run}/look", response_class=FileResponse)
@@ -106,7 +106,7 @@ def _so_far(result: Path, name: str) -> Path:
     """Return the path of a file that is shown during a run. Raises InputError for any other file."""
     path = file_so_far(result, name)
     if path is None:
-        raise InputError(f"{name}: there is no such picture or page, or it is not whole")
+        raise InputError(f"{name}: there is no such picture or page, or it is not complete")
     return path
 
 

@@ -47,14 +47,17 @@ def words_of(event: events.Event) -> str:  # noqa: PLR0912  a case for each even
         case events.FaultNoted():
             return f"{'held' if event.is_hold else 'fault'}: {event.message}"
         case events.InputsChanged():
-            return f"changed on the disk, but the run uses the files as it read them: {'; '.join(event.files)}"
+            return (
+                "these files were changed on the disk, but the run uses them as it read them: "
+                f"{'; '.join(event.files)}"
+            )
         case events.Paused():
             return "paused: lights off, arm still"
         case events.Continued():
             return "went on"
         case events.TextUnread():
             waiting = f"{event.waiting_bytes} bytes waited"
-            return f"nobody read the text: {event.lost_lines} lines were dropped, {waiting}"
+            return f"nobody read the text output: {event.lost_lines} lines were dropped, {waiting}"
         case events.ViewSealed():
             return f"view {event.view} is finished"
         case events.SessionStopped():

@@ -60,7 +60,7 @@ class _SignsOfLife:
 
     signs: tuple[float, ...] = ()
     since_s: float = 0.0
-    """Monotonic time at which they were seen first."""
+    """Monotonic time at which these values were seen first."""
 
     def missing_s(self, result: Path) -> float:
         """Return the seconds since the newest sign; 0 if no process is at work."""
@@ -132,7 +132,7 @@ class RunWatch:
         if followed_run is not None and followed_run.run.folder.name == name and followed_run.result:
             return Path(followed_run.result)
         if (result := run.asked_result) is None:
-            raise InputError(f"{name}: is not processed during its acquisition")
+            raise InputError(f"{name}: this run is not processed during its acquisition")
         return result
 
     def of(self, name: str) -> Watched:
@@ -175,8 +175,8 @@ def _processing(followed_run: _Followed, result: Path) -> Processing:
     if processing.is_at_work and not processing.why and missing_s > SILENT_S:
         pid = holder_of(result / LOCK)
         why = (
-            f"its process {pid} told nothing and computed nothing for {duration_text(missing_s)}: it hangs, or "
-            f"other work leaves it no processor. The run goes on; `kill {pid}` ends this process alone"
+            f"its process {pid} reported nothing and computed nothing for {duration_text(missing_s)}: it hangs, "
+            f"or other work leaves it no processor. The run goes on; `kill {pid}` ends this process alone"
         )
         return replace(processing, why=why)
     return processing

@@ -217,8 +217,11 @@ class _Hand:
 
 def _why_not(*, here: bool) -> str:
     if here:
-        return "Only operators move the arm."
-    return "Only from a console at the cell: this browser's address is not in `console: at_the_cell:` of the rig."
+        return "Only operators may move the arm."
+    return (
+        "The arm is moved only from a console at the cell: this browser's address is not in `console: "
+        "at_the_cell:` of the rig."
+    )
 
 
 def _pads(title: str, axes: dict[str, str], may: bool) -> str:

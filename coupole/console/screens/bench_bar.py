@@ -78,6 +78,6 @@ class BenchBar:
                 lies = f"the object of {bench.plan} lies on the support" if bench.plan else "the support is empty"
                 return f"The devices are open; {lies}."
         if busy:
-            return "A run has the devices."
+            return "A run is using the devices."
         why = f" ({bench.closed_because})" if bench.closed_because else ""
         return f"The devices are closed{why}."

@@ -83,7 +83,7 @@ class _Screen:
             self._figures = with_name(ui.html("", sanitize=False), "exposed").style("width:100%")
             with ui.row().classes("bar"):
                 self._white_button = button(
-                    "White is in the region", self._take_white, icon="colorize", name="white"
+                    "White point from the region", self._take_white, icon="colorize", name="white"
                 )
                 button(
                     "Colours of the sensor", lambda: self._settings.set_white(None), name="no-white", kind="flat"

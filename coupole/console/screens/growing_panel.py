@@ -17,7 +17,7 @@ from coupole.storage.growing_pictures import Growing, PictureShown, ViewPictures
 from coupole.storage.processing import Processing, go_on_command
 from coupole.storage.so_far import LINK, REPORT
 
-_MISSING = "This picture is not there, or not whole. A new one comes after the next view."
+_MISSING = "This picture is missing, or not complete. A new one comes after the next view."
 _NO_PICTURES = "There are no pictures yet. The first ones come when all frames of a view are there."
 _NO_PAGE = "The page to relight comes with the first result so far."
 _NEWEST = ""

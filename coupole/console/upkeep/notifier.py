@@ -101,7 +101,7 @@ class Notifier:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the threads; messages that are not sent yet are given up."""
+        """End the threads; messages that are not sent yet are dropped."""
         self._ending.set()
         with contextlib.suppress(queue.Full):
             self._messages.put_nowait(None)
@@ -151,7 +151,9 @@ class Notifier:
 
 def send_test(settings: Settings, cell: str) -> dict[str, str]:
     """Send a message by each way, once; return the error of each, empty if it was sent."""
-    message = Message.now(cell, "test", "a test of its notifications", "If you read this, they reach you.")
+    message = Message.now(
+        cell, "test", "a test of its notifications", "If you read this, notifications reach you."
+    )
     error_of_way = {}
     for way, send in ways(settings).items():
         begun_s = time.monotonic()

@@ -118,7 +118,7 @@ def read_textured_mesh(path: Path) -> TexturedMesh:
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"--uv {path}: expected a mesh with the ending {', '.join(SUFFIXES)}")
     if not path.is_file():
-        raise InputError(f"--uv {path}: expected a mesh file; there is none")
+        raise InputError(f"--uv {path}: expected a mesh file; there is no such file")
     parts = _parts(path)
     if not parts:
         raise InputError(f"--uv {path}: has no triangles")
@@ -126,7 +126,7 @@ def read_textured_mesh(path: Path) -> TexturedMesh:
         raise InputError(f"--uv {path}: has no texture coordinates (`vt` of an OBJ); unwrap the mesh first")
     corners, uv = np.concatenate([corners for corners, _ in parts]), np.concatenate([uv for _, uv in parts])
     if not np.isfinite(uv).all() or not np.isfinite(corners).all():
-        raise InputError(f"--uv {path}: has coordinates that are no numbers")
+        raise InputError(f"--uv {path}: has coordinates that are not numbers")
     is_outside = ((uv < -1e-6) | (uv > 1.0 + 1e-6)).any(axis=(1, 2))
     if is_outside.any():
         raise InputError(

@@ -196,7 +196,8 @@ def at_middles_over_means(samples: Samples, lobes: Lobes) -> Array:
 
 
 def _left_out(design: Any, log_misses: Array, of_photograph: NDArray[np.intp], smoothness: float) -> Array:
-    """Predict each photograph's samples by a table of the others; with only one photograph, by the lobes alone."""
+    """Predict each photograph's samples by a table of the other photographs. If there is only one photograph, the
+    lobes alone predict them."""
     guess = np.zeros_like(log_misses)
     numbers = np.unique(of_photograph)
     for number in numbers if len(numbers) > 1 else []:

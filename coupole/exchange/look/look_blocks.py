@@ -94,7 +94,7 @@ def log_coded(values: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 
 def octahedral(normals: NDArray[np.float64]) -> NDArray[np.uint16]:
-    """[n, 2] of unit vectors [n, 3]: the faces of an octahedron unfolded into a square (Meyer et al., On
+    """[n, 2] codes of unit vectors [n, 3]: the faces of an octahedron unfolded into a square (Meyer et al., On
     floating-point normal vectors, 2010), with an error of at most 0.004 degrees. Vectors that are not finite
     become z."""
     unit = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, [0.0, 0.0, 1.0])

@@ -101,8 +101,10 @@ def look_of_run(folder: Path, patterns: Sequence[str], say: Said) -> Look:
 
 
 _ERRORS = {
-    "frames": f"means of squares, at most {MOST_PX} pixels on the longer side; JPEG of 8 bit, as sRGB has it, up "
-    "to the brightest pixel of each",
+    "frames": (
+        f"means of squares, at most {MOST_PX} pixels on the longer side; JPEG of 8 bit, encoded as sRGB, up to "
+        "the brightest pixel of each picture"
+    ),
     "between LEDs": "see Missed",
 }
 

@@ -48,8 +48,11 @@ def look_of_pictures(folder: Path) -> Look:
         "unit": "share of the pictures' full scale, divided by their intensities",
         "told": {
             "Pictures": f"{len(result.directions)} of {width} x {height}",
-            "Light": "distant, without the shadows that the object casts. Strength 1 is that of the pictures. "
-            "`coupole reflectance relight` comes nearer to them: it interpolates between the pictures.",
+            "Light": (
+                "distant, without the shadows that the object casts. Strength 1 is that of the pictures. "
+                "`coupole reflectance relight` comes nearer to the photographs, because it interpolates between "
+                "the pictures."
+            ),
             "Seen from afar": "the mean materials of 2 x 2 pixels, of 4 x 4 and so on. The gloss of a mean "
             "material differs from the mean of the glosses.",
         },

@@ -164,13 +164,13 @@ _ERRORS_OF_TEXELS = {
     "kd, ks": "8 bit of the root, relative to the brightest, in JPEG",
     "roughness": "0.4 % of the root of alpha",
     "uncertainties": "2.3 % of their value; means over triangles",
-    "measured frames": "8 bit, at most 640 pixels wide, as sRGB has it up to their brightest thousandth",
+    "measured frames": "8 bit, at most 640 pixels wide, encoded as sRGB up to the 99.9 % quantile",
 }
 _ERRORS = {
     "normals": "0.004 degrees",
     "kd, ks, roughness": "0.05 % or 3e-8",
     "uncertainties": "2.3 % of their value",
-    "measured frames": "8 bit, at most 640 pixels wide, as sRGB has it up to their brightest thousandth",
+    "measured frames": "8 bit, at most 640 pixels wide, encoded as sRGB up to the 99.9 % quantile",
 }
 
 

@@ -160,8 +160,10 @@ def _about(scene: PlainScene, folder: Path, powers: dict[str, Array], materials:
         "unit": "1/sr",
         "told": {
             "Object": "a hypothesis: described and computed, never measured",
-            "Colours": "from 81 bands, 380 to 780 nm, with the spectrum of each light; "
-            f"CIE {scene.observer} observer",
+            "Colours": (
+                f"computed from 81 bands, 380 to 780 nm, with the spectrum of each light; CIE {scene.observer} "
+                "observer"
+            ),
             "Light": "straight from lamps and from the upper half of the sky, with shadows of lamps; none from "
             "surface to surface, and no mirror images of other objects."
             + (" Lamps near by are disks far away, as strong as at the camera's target." if lamps else ""),
@@ -188,7 +190,9 @@ def _makie(thing: MakieTile, materials: _Materials) -> list[_Part]:
     black = Lacquer(kind="lacquer")
     layers = (*layers_of(metal, materials.folder), *layers_of(black, materials.folder))
     drawing = materials.add(
-        [layers], f"a share of {describe_material(metal)} over {describe_material(black)}", is_drawn=True
+        [layers],
+        f"{describe_material(metal)}, by its share of the area, over {describe_material(black)}",
+        is_drawn=True,
     )
     face = objects.placed_piece(Piece(tile.face, black), thing).corners_mm
     body = objects.placed_piece(Piece(tile.body, black), thing).corners_mm
@@ -253,7 +257,7 @@ def _box(parts: Sequence[_Part]) -> list[list[float]]:
 
 
 def _material_codes(parts: Sequence[_Part]) -> NDArray[np.uint16]:
-    """[n, 2] for triangles: number of the material, and code of the first layer's share."""
+    """[n, 2] codes of triangles: number of the material, and code of the first layer's share."""
     blocks = []
     for part in parts:
         block = np.full((len(part.corners_mm), 2), _WHOLE, np.uint16)

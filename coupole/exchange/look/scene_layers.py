@@ -93,7 +93,7 @@ def tables(
 ) -> NDArray[np.float32]:
     """[illuminants, materials, LAYERS, COLUMNS, 4] linear sRGB of white 1 under each illuminant.
 
-    Columns: `mirror` at `COSINES` with `passing` as fourth number; body (1/sr) and roughness; then 1 if each
+    Columns: `mirror` at `COSINES`, with `passing` as the fourth number; body (1/sr) and roughness; then 1 if each
     triangle has its own share of the first layer (the second layer has the rest), otherwise 0; and the colour of
     white. Colours outside the gamut have numbers below 0.
     """

@@ -139,7 +139,7 @@ def view_of_result(result: PictureResult, say: Said) -> LitView:
     """Return the view of a result of pictures; it is black outside its mask."""
     about, height, width = result.about, *result.mask.shape
     kinds: dict[Any, str] = {True: "simulated", False: "measured"}
-    kind = kinds.get(about.get("simulated"), "not known whether measured or simulated")
+    kind = kinds.get(about.get("simulated"), "not known whether it was measured or simulated")
     of = about.get("uncalibrated_run") or result.folder.name
     return _lit_view(
         name=result.folder.name,

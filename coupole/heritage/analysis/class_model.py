@@ -151,7 +151,7 @@ class ClassModel:
 
     @cached_property
     def _scale(self) -> Array:
-        """log b, t0 and t1. A reference that is alone in its class can only be left out with the class."""
+        """log b, t0 and t1. If a class has only one reference, leaving out this reference leaves out the class."""
         from scipy.optimize import minimize
 
         without_row, all_of_class = self._left_out

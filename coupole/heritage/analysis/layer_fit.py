@@ -6,8 +6,9 @@ h, sigma = S h, x^2 = alpha^2 - sigma^2 and beta = x coth x, a film over a groun
 
     R = (sigma - g (alpha - beta))/(alpha + beta - g sigma)
 
-inside the binder, and (sigma)/(alpha + x) if it is opaque. The formula also holds for K a little below 0, as noise
-can give for a white paint. Such estimates are not clipped, so that intervals hold.
+inside the binder, and (sigma)/(alpha + x) if it is opaque. The formula is also valid for K a little below 0, which
+noise can give for a white paint. Such estimates are not clipped, so that intervals contain the truth as often as
+stated.
 
 Uncertainties are propagated linearly (JCGM 100): noise of each spectrum, of each ground, and the thicknesses,
 which are common to all bands and to all films of the same thickness.
@@ -169,8 +170,8 @@ def _check(films: Sequence[Film]) -> None:
     kinds = {(film.ground_name, film.ground is None, film.thickness_mm) for film in films}
     if len(kinds) < 2:
         raise InputError(
-            "expected films over two grounds, of two thicknesses, or an opaque one; found films that are alike: "
-            "these cannot separate K from S"
+            "expected films over two grounds, of two thicknesses, or an opaque film; found films that are "
+            "alike, which cannot separate K from S"
         )
 
 
@@ -202,7 +203,7 @@ def _one_seen(k: Array, s: Array, film: Film, face: Face, h: float, ground: Arra
 
 
 def _jacobian(k: Array, s: Array, films: Sequence[Film], face: Face) -> Array:
-    """[n, films, 2] derivatives by K and S."""
+    """[n, films, 2] derivatives with respect to K and S."""
     step = 1e-5 * (np.abs(k) + s)
     return np.stack(
         [

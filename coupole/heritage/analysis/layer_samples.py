@@ -193,9 +193,9 @@ def _check_level(reflectance: Array, path: Path, nm: Array, binder_face: Face, n
     if len(wrong):
         at = wrong[0]
         raise InputError(
-            f"{path}: is {reflectance[at]:.3g} at {nm[at]:g} nm; a paint under this face can have a reflectance "
-            f"of {low[at]:.3g} to {high[at]:.3g}; check whether gloss is included, the binder's index, and "
-            "whether values are percent or fractions"
+            f"{path}: the reflectance is {reflectance[at]:.3g} at {nm[at]:g} nm; a paint under this face can "
+            f"have a reflectance of {low[at]:.3g} to {high[at]:.3g}; check whether gloss is included, the "
+            "binder's index, and whether values are percent or fractions"
         )
 
 

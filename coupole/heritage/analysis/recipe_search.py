@@ -196,8 +196,9 @@ class _Problem:
         if np.abs(clipped_target - target).max() > 5.0 * noise:
             at = int(np.argmax(np.abs(clipped_target - target)))
             raise InputError(
-                f"the target is {target[at]:.3g} at {WAVELENGTHS_NM[bands][at]:g} nm, which no paint under this "
-                "face can have: check whether gloss is included, and percent or fractions"
+                f"the target is {target[at]:.3g} at {WAVELENGTHS_NM[bands][at]:g} nm, a value that no paint "
+                "under this face can have: check whether gloss is included, and whether values are percent or "
+                "fractions"
             )
         inside = np.maximum(self.face.inside(MeasuredReflectance(clipped_target)).values, _DARKEST)
         q = kubelka_munk.k_over_s(inside)

@@ -57,12 +57,12 @@ class ImageRegion:
     """[bands of the cube] standard deviation of its pixels."""
     finding: PigmentFinding
     draws_alike: float
-    """Share of draws of the mean, by its standard error, with the same first class (or, of unknown, unknown
-    too)."""
+    """The mean spectrum is drawn many times with its standard error. This is the share of draws with the same
+    first class (or, if the finding is unknown, the share that is unknown too)."""
     agreement: float
-    """Share of its pixels whose own spectrum gives the region's answer."""
+    """Share of the region's pixels whose own spectra give the region's answer."""
     code: int
-    """Its code in the map."""
+    """The region's code in the map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +200,7 @@ class _Job:
         self._refuse_other_quantities(pixels)
         pairs_left, pairs_right = np.concatenate(left_pixels), np.concatenate(right)
         if not len(pairs_left):
-            raise InputError("expected neighbouring pixels, from which noise is known; found none")
+            raise InputError("expected neighbouring pixels, from which the noise is estimated; found none")
         result = find_regions(pixels @ self._matrix, noise_of_neighbours(pairs_left, pairs_right), most)
         self.state.save(
             "found", mean=result.mean, noise=result.noise, basis=result.basis, centres=result.centres,

@@ -74,5 +74,5 @@ class KeptState:
 
     def _error(self, error: Exception) -> StorageError:
         return StorageError(
-            f"{self._folder}: {reason(error)}; free its disk, or delete this folder to begin again"
+            f"{self._folder}: {reason(error)}; free space on its disk, or delete this folder to begin again"
         )

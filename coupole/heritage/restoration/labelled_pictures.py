@@ -69,7 +69,8 @@ def captioned_picture(picture: Picture, hypothesis: Hypothesis, lines: int | Non
 
 
 def caption_lines(width_px: int, hypothesis: Hypothesis) -> list[str]:
-    """Return the lines of the strip, broken for a picture of this width. The last line tells what is left out."""
+    """Return the lines of the strip, broken for a picture of this width. If the sources are too long, the last
+    line says where all of them are."""
     references = "; ".join(dict.fromkeys(source.reference for source in hypothesis.sources))
     words = [f"Hypothesis: {hypothesis.title} (simulated)", f"Sources: {references}"]
     lines = [line for paragraph in words for line in break_lines(paragraph, width_px)]

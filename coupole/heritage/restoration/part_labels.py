@@ -202,7 +202,7 @@ def _texture_colours(mesh: PaintedMesh, rule: Texture, document: Document) -> ND
     if mesh.uv is None:
         raise InputError(f"{mesh.path}: its corners have no places in a picture (UV); choose another kind of rule")
     if picture is None:
-        raise InputError(f"{mesh.path}: names no picture; name it as `image`")
+        raise InputError(f"{mesh.path}: names no picture; name the picture as `image`")
     middles: Floats = mesh.uv[mesh.triangles].mean(axis=1) % 1.0
     height, width = picture.shape[:2]
     column = np.minimum((middles[:, 0] * width).astype(int), width - 1)

@@ -138,7 +138,9 @@ class RestorationFile(Model):
         if len(set(set_names)) < len(set_names):
             raise ValueError("two of `other_lights` have the same name; nobody could tell them apart")
         if not self.outputs.xyz:
-            raise ValueError("`outputs: {xyz: false}`: pictures are shown and compared by X, Y, Z; leave it out")
+            raise ValueError(
+                "`outputs: {xyz: false}`: pictures are shown and compared by X, Y, Z; leave this setting out"
+            )
         return self
 
 

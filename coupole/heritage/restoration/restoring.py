@@ -159,7 +159,9 @@ class Made:
             with OpenEXR.File(str(self.exr), separate_channels=True) as file:
                 planes = [np.asarray(file.channels()[name].pixels, np.float32) for name in "XYZ"]
         except (OSError, RuntimeError, KeyError) as error:
-            raise StorageError(f"{self.exr}: cannot be read: {error}; remove it, and it is made again") from error
+            raise StorageError(
+                f"{self.exr}: cannot be read: {error}; remove this file, and it is made again"
+            ) from error
         return np.stack(planes, axis=-1)
 
 

@@ -75,7 +75,9 @@ def refuse_other_lights(out: Path, lights: str | None) -> None:
     earlier = read_json(path, allow_nan=True) if path.is_file() else None
     if isinstance(earlier, dict) and "hypotheses" in earlier and earlier.get("lights") != lights:
         under = f"the lights {earlier['lights']}" if earlier.get("lights") else "the file's own `lights`"
-        raise InputError(f"--out {out}: has pictures under {under}; name another folder for those under others")
+        raise InputError(
+            f"--out {out}: has pictures under {under}; name another folder for pictures under other lights"
+        )
 
 
 # -- helpers --------------------------------------------------------------------------------------------------

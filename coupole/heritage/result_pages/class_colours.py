@@ -18,7 +18,8 @@ _CLASSES: tuple[RGB, ...] = (
     (0, 114, 178), (213, 94, 0), (0, 158, 115), (240, 228, 66), (204, 121, 167), (86, 180, 233), (230, 159, 0),
     (102, 51, 153), (128, 0, 0), (0, 90, 60),
 )  # fmt: skip
-"""The first seven are those that all eyes tell apart (Okabe and Ito, Color Universal Design, 2008)."""
+"""The first seven can be distinguished by people with any kind of colour vision (Okabe and Ito, Color Universal
+Design, 2008)."""
 _GOLDEN = 0.618034
 _ROW_PX, _PATCH_PX, _LETTER_PX = 26, 18, 8
 _SMALLEST_PX, _LARGEST_PX = 480, 1600

@@ -138,14 +138,14 @@ def check_record(folder: Path) -> RecordCheck:
         raise InputError(f"{path}: expected a record of an identification with checksums, found something else")
     problems = []
     if _digest({key: value for key, value in whole.items() if key != "sha256"}) != whole.get("sha256"):
-        problems.append(f"{RECORD}: its content is not that of its checksum: it was changed after it was written")
+        problems.append(f"{RECORD}: its content does not match its checksum: it was changed after it was written")
     content = {key: value for key, value in whole.items() if key not in _SUMS}
     if _digest(content) != whole.get("content_sha256"):
-        problems.append(f"{RECORD}: its content is not that of the checksum which the page prints")
+        problems.append(f"{RECORD}: its content does not match the checksum that the page prints")
     for name, digest in whole["files"].items():
         try:
             if Path(name).name != name:
-                raise OSError("its name is not that of a file in this folder")
+                raise OSError("its name is not the name of a file in this folder")
             if sha256(folder / name) != digest:
                 problems.append(f"{name}: it was changed after the record was written")
         except OSError as error:

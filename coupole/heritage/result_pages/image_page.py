@@ -189,7 +189,7 @@ def _steadiness(finding: ImageFinding) -> str:
     shares = ", ".join(
         f"{region.draws_alike:.0%} of those of region {region.number}" for region in unsteady_regions
     )
-    return f"{words}{shares}, and in {_STEADY:.0%} or more of the draws of the others."
+    return f"{words}{shares}, and in {_STEADY:.0%} or more of the draws of the other regions."
 
 
 def _answer(region: ImageRegion) -> str:

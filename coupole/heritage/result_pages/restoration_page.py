@@ -28,7 +28,7 @@ def write(result: Mapping[str, Any], folder: Path) -> None:
         next_step=[
             "Weigh the ",
             Link(f"#{_name(result['hypotheses'][0])}", "sources"),
-            ", not the pictures: they decide.",
+            ", not at the pictures: the sources decide.",
         ],
         sections=[
             *(_view(view, result, folder, is_first=view is views[0]) for view in views),

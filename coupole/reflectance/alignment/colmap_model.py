@@ -49,7 +49,7 @@ class ColmapImage:
     """Name of the image's file."""
     camera: int
     camera_from_world: Floats
-    """[4, 4] with x right, y down, z forward, in the model's unit."""
+    """[4, 4] pose of the camera: x right, y down, z forward, in the model's unit."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def _camera(path: Path, model: str, size_px: tuple[int, int], parameters: list[f
 
 
 def _image(path: Path, name: str, camera: int, pose: list[float]) -> ColmapImage:
-    """Return the record of a picture; `pose` is a quaternion, w first, and a translation."""
+    """Return the record of a picture; `pose` has a quaternion, w first, and then a translation."""
     w, x, y, z, *shift = pose
     if not np.isfinite(pose).all() or abs(math.hypot(w, x, y, z) - 1.0) > _UNIT:
         raise InputError(f"{path}: image {name}: expected a unit quaternion and a translation; found {pose}")
@@ -150,8 +150,8 @@ Record = TypeVar("Record")
 
 
 def _records(path: Path, read_record: Callable[[bytes, int], tuple[Record, int]]) -> Iterator[Record]:
-    """Yield each record that `read_record` makes of the data at a place. `read_record` also returns the place of
-    the next record."""
+    """Yield the records that `read_record` reads, one after the other, from the data. `read_record` also returns
+    the place of the next record."""
     try:
         data = path.read_bytes()
         (count,), at = struct.unpack_from("<Q", data), 8

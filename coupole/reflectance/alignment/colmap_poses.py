@@ -4,7 +4,8 @@ A bundle adjustment may move, turn and scale its model. With three views or more
 centres onto the centres of the records by least squares (Umeyama, PAMI 13(4), 1991). With one or two views the
 model is taken as it is, in the frame of `coupole export RUN --to colmap`: the support frame, in mm. Poses that are
 farther from the records than `MOST_APART` times the records' standard uncertainty are refused. A lens that is not
-the records' lens is refused too. COLMAP's files state no uncertainties, so the poses take those of the records.
+the records' lens is refused too. COLMAP's files state no uncertainties, so the uncertainties of the records are
+used for these poses.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from coupole.reflectance.extraction.measured_run import MeasuredRun
 from coupole.storage.durable import sha256
 
 LEAST_FITTED = 3
-"""Least number of views that fix a similarity."""
+"""Least number of views that determine a similarity."""
 _TO_CENTRE_PX = 0.5
 """Shift from our pixel coordinates to COLMAP's, px. In COLMAP the first pixel ends at 1."""
 _SAME = 1e-6
@@ -169,7 +170,7 @@ def _refuse_a_line(path: Path, centres_mm: Floats, u_mm: Floats) -> None:
     if spread_mm[1] < MOST_APART * u_mm.max():
         raise InputError(
             f"{path}: the run's cameras stand on a line (within {spread_mm[1]:.2g} mm), about which COLMAP's "
-            "model may be turned; take more views, or `coupole reflectance refine`"
+            "model may be turned; take more views, or use `coupole reflectance refine`"
         )
 
 
@@ -185,7 +186,8 @@ def _refuse_far(poses: ColmapPoses, measured_run: MeasuredRun) -> None:
         else "in the support's frame, in mm; with one or two views the model must be in this frame"
     )
     raise InputError(
-        f"{poses.path}: the camera of {measured_run.views[view].name} is {how_far} from its place in the records, "
-        f"{conditions}: {poses.over_u[view, kind]:.1f} times their standard uncertainty; expected {MOST_APART:g} "
-        "at most. Is it another run's model, or a reconstruction that failed? Else calibrate hand-eye anew"
+        f"{poses.path}: the camera of {measured_run.views[view].name} is {how_far} from its place in the "
+        f"records, {conditions}: {poses.over_u[view, kind]:.1f} times their standard uncertainty; expected "
+        f"{MOST_APART:g} at most. Is it another run's model, or a reconstruction that failed? Else calibrate "
+        "hand-eye anew"
     )

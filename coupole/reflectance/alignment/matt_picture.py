@@ -21,7 +21,7 @@ from coupole.reflectance.extraction.radiance import RANGE_LEFT_OUT, Radiometry
 MOST_LEDS = 24
 FEWEST_LEDS = 5
 LOW_RANK, HIGH_RANK = 0.2, 0.6
-"""Ranks of an LED's brightness at a place, 0 for the darkest, between which the mean is taken."""
+"""The mean is taken between these ranks of the LEDs' brightness at a place; 0 is the rank of the darkest LED."""
 ALL_BUT = 1e-3
 """Share of a picture's blocks that may be clipped before a shorter exposure is used."""
 GREEN = "G"
@@ -34,8 +34,8 @@ def common_leds(views: Sequence[MeasuredView]) -> list[int]:
     common = sorted(set.intersection(*(set(view.by_led) for view in views)))
     if len(common) < FEWEST_LEDS:
         raise InputError(
-            f"views are compared under the same LEDs: expected {FEWEST_LEDS} or more that all views have, found "
-            f"{len(common)}; name runs that share more"
+            f"views are compared under the same LEDs: expected {FEWEST_LEDS} or more LEDs that all views have, "
+            f"found {len(common)}; name runs that share more LEDs"
         )
     places = np.linspace(0, len(common) - 1, min(len(common), MOST_LEDS)).round().astype(int)
     return [common[place] for place in places]
@@ -68,7 +68,7 @@ def matt_picture(
 @kernel
 def _green_blocks(raw, dark, flat, green, top_dn, exposure_us, means):  # type: ignore[no-untyped-def]
     """Fill `means` [h / 2, w / 2] with the green signal of blocks, where `means` is infinite and the frame is
-    below `top_dn`. The two greens of a block lie evenly about its middle."""
+    below `top_dn`. The two green pixels of a block lie symmetrically about its middle."""
     for row in range(means.shape[0]):
         for column in range(means.shape[1]):
             if not np.isinf(means[row, column]):

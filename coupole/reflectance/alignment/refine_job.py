@@ -45,7 +45,7 @@ class RefineRequest:
     calibrations: tuple[Path, ...] = ()
     doubts: Doubts = STATED
     search_mm: float = 3.0
-    """The largest disagreement of views that is searched, mm."""
+    """The largest disagreement of views for which the search is made, mm."""
 
 
 def refine_runs(request: RefineRequest, out: Path, say: Said) -> dict[str, Any]:

@@ -40,10 +40,10 @@ TOLD = {
 }
 MATCH_FIELDS = {
     "reference": "place in `views` of the view that sees the spot in the greatest detail",
-    "other": "of the view that is compared with it",
+    "other": "place in `views` of the view that is compared with it",
     "blocks": "[n, 2] column and row of blocks of 2 x 2 pixels in the reference",
     "points_mm": "place of the spot by the reference, base frame",
-    "shifts_mm": "from there to the place of the spot by the other view",
+    "shifts_mm": "from `place` to the place of the same spot by the other view",
 }
 
 

@@ -33,10 +33,10 @@ Said = Callable[[str, int, int], None]
 
 ROUNDS = 4
 SETTLED_MM = 0.005
-"""Change of the median disagreement from round to round below which the matches are not made again."""
+"""The matches are not made again if the median disagreement changes by less than this from round to round."""
 SEARCH_SHRINKS = 3.0
 LEAST_SEARCH_MM = 0.3
-"""A search is not narrowed below this."""
+"""Least width to which a search is narrowed."""
 FEWEST_MATCHES = 30
 MATCHES, STATED = "matches", "records and scan"
 _GROUPS = (Group(MATCHES, is_estimated=True, rejects=2), Group(STATED, is_estimated=False))
@@ -67,8 +67,8 @@ class Refined:
 
     @property
     def chi2_of_steps(self) -> float:
-        """Square of the steps over the records' covariance. The value is near `determined_count` if records and
-        scan state their uncertainties well.
+        """Square of the steps, weighted by the inverse of the records' covariance. The value is near
+        `determined_count` if records and scan state their uncertainties well.
         """
         return float(self.steps @ np.linalg.solve(self.unknowns.covariance, self.steps))
 

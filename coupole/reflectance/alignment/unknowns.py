@@ -53,7 +53,8 @@ class Given:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The vector of steps: its parts, its covariance before the pictures, and the geometry that it gives."""
+    """The vector of steps: its parts, its covariance before the pictures are used, and the geometry that follows
+    from it."""
 
     prior_geometry: Given
     doubts: Doubts
@@ -159,7 +160,7 @@ class Unknowns:
 
 
 def vertex_normals(vertices_mm: Floats, triangles: NDArray[np.uint32]) -> Floats:
-    """[n, 3] unit; means of the triangles' normals, weighted by their areas."""
+    """[n, 3] unit normals of vertices: means of the triangles' normals, weighted by the triangles' areas."""
     corners = vertices_mm[triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     corner_normals = np.repeat(across, 3, axis=0)

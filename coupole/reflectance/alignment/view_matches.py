@@ -33,8 +33,8 @@ _LEAST_SHARE = 0.8
 _MARGIN = 3
 """Blocks around the searched area, for interpolation."""
 _HIDDEN_BEYOND = 4.0
-"""Distance between a place and the surface that the other view sees there, in blocks that face the view. Beyond
-this distance the place is hidden."""
+"""Largest distance, in blocks that face the view, between a place and the surface that the other view sees there.
+Beyond it the place is hidden."""
 _STEPS = 25
 _SETTLED = 1e-3
 _MOST_FINER = 1.5
@@ -308,7 +308,8 @@ def _finer(template, reference_points_mm, warped_picture, reach, right, down):  
 
 @kernel
 def _invert(matrix):  # type: ignore[no-untyped-def]
-    """Invert a positive definite matrix in place (Gauss and Jordan); False if it is not."""
+    """Invert a positive definite matrix in place (Gauss and Jordan); return False if it is not positive
+    definite."""
     for k in range(len(matrix)):
         pivot = matrix[k, k]
         if not pivot > 0.0:

@@ -30,10 +30,10 @@ class ViewSurface:
     """A view's picture, and the place on the mesh that each of its blocks shows."""
 
     picture: NDArray[np.float32]
-    """[h, w]; NaN where it is clipped."""
+    """[h, w] signal of the blocks; NaN where it is clipped."""
     points_mm: NDArray[np.float32]
-    """[h, w, 3] base frame; NaN beside the object, at silhouettes, at grazing angles, and where the picture is
-    clipped."""
+    """[h, w, 3] places in the base frame; NaN beside the object, at silhouettes, at grazing angles, and where the
+    picture is clipped."""
     base_from_camera: Floats
     lens: Intrinsics
     """Lens in units of blocks."""

@@ -1,4 +1,4 @@
-"""Samples of some frames of a view that still arrives, to look at. They are no part of the result."""
+"""Samples of some frames of a view that still arrives, to look at. The samples are not part of the result."""
 
 from __future__ import annotations
 

@@ -31,7 +31,8 @@ from coupole.storage.run import Run
 _LOOK_EVERY_S = 0.2
 _TELL_EVERY_S = 1.0
 _FIRST_EARLY_LOOK = 32
-"""Frames under LEDs that a view has when it is drawn first. It is drawn again when it has twice as many."""
+"""Number of frames under LEDs at which a view is drawn for the first time. It is drawn again each time that this
+number has doubled."""
 _DEFECT = "this is a defect of Coupole: please report it"
 _NONE_SO_FAR = "result so far and page to relight"
 Say = Callable[[dict[str, Any]], object]
@@ -55,7 +56,8 @@ def process_run(folder: Path, result: Path, say: Say, at_the_end: AtTheEnd, page
 
 
 def _words_on(error: Exception) -> str:
-    """Return why there is no result. An error is told in any case, but it is no defect if memory ran short."""
+    """Return why there is no result. An error is always reported, but it is not called a defect if memory ran
+    short."""
     is_expected = isinstance(error, CoupoleError | OSError)
     words = reason(error) if is_expected else f"{type(error).__name__}: {error}"
     if shortage := memory_behind(error):
@@ -130,7 +132,8 @@ class _Follower:
         self._tried_views: tuple[str, ...] = ()
         """Views of the newest partial result that was made or tried."""
         self._may_give_up = True
-        """True if the newest result of the views so far was not given up, so that the next one may be."""
+        """True if the newest result of the views so far was not abandoned, so that the next one may be
+        abandoned."""
 
     def until_all_frames_are_there(self) -> None:
         """Take samples, look ahead and make results so far while the run goes on. Raises as `reflectance_of`."""
@@ -198,7 +201,7 @@ class _Follower:
         return True
 
     def _draw(self, subject: str, draw: Callable[[], None]) -> None:
-        """Draw what is only looked at. The result does not need it, so a failure is reported and no more."""
+        """Draw pictures that are only looked at. The result does not need them, so a failure is only reported."""
         try:
             draw()
         except Exception as error:  # noqa: BLE001  of a picture alone

@@ -1,8 +1,8 @@
 """A result of the views so far, while the run goes on: fits, check and report of the samples that are there.
 
 It uses the samples of the final result through links to their files. These files are only replaced whole, never
-changed. So this result can be given up at any time, and it does not change the final result. It leaves the kernels
-of all fits compiled. Steps that do not depend on later views are remembered for the final result.
+changed. So this result can be abandoned at any time, and it does not change the final result. Afterwards the
+kernels of all fits are compiled. Steps that do not depend on later views are remembered for the final result.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ exist side by side."""
 _FREE_BYTES = 2**30
 """Free space that must remain: more than a rig keeps free by default (`reserve_bytes`)."""
 _SHARE_OF_MEMORY = 8
-"""A result so far takes blocks of work that are smaller by this factor, so that it is given up without delay."""
+"""Factor by which the blocks of work are smaller for a result so far, so that it can be abandoned without
+delay."""
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,8 @@ class ThreadForTheEnd:
 
 def yield_to_all_others(but: ThreadForTheEnd) -> None:
     """Use processors and disk only while no other process wants them, and be the first to be ended if memory is
-    short. Threads that begin later inherit this, except those of one thread. Each of the four measures is taken
-    where the system has it."""
+    short. Threads that begin later inherit this, except those of one thread. Each of the four measures is taken if
+    the system supports it."""
     if sys.platform != "linux":
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, 0, 19)

@@ -82,7 +82,7 @@ class PageMaker:
         return lines[-1] if lines else f"its process ended with code {code}"
 
     def end(self) -> None:
-        """End the work on a page."""
+        """End the process that makes a page."""
         self._next_source = None
         if self._process is not None:
             self._process.kill()

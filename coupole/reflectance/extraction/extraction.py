@@ -41,7 +41,7 @@ Say = Callable[[str, int, int], None]
 _newest_surface: Remembered[SeenSurface] = Remembered(1)
 _newest_codes = CodesAhead()
 _LEDS_AHEAD = 16
-"""Number of LEDs whose codes are found between two looks at whether this is still wanted."""
+"""Number of LEDs whose codes are found before the function asks again whether the work is still wanted."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def surface_of(measured_run: MeasuredRun, geometry: Geometry, view: MeasuredView
 
 
 def _sight_of(measured_run: MeasuredRun, view: MeasuredView) -> str:
-    """Identify the surface that a view sees, by all that decides it."""
+    """Return a key of the surface that a view sees, made of all data that determine it."""
     sight = hashlib.sha256(measured_run.corners_mm.tobytes())
     sight.update(repr((measured_run.lens, measured_run.frames.size_px, measured_run.optics)).encode())
     sight.update(view.base_from_camera.tobytes())
@@ -176,8 +176,8 @@ def find_codes_ahead(
     leds: NDArray[np.int64],
     is_wanted: Callable[[], bool],
 ) -> None:
-    """Find where the object hides LEDs from what a view sees, for `extract_view`. No frame of these LEDs is
-    needed. It ends when `is_wanted` says so; what was found remains.
+    """Find where the object hides LEDs from the surface that a view sees, for `extract_view`. No frame of these
+    LEDs is needed. It ends when `is_wanted` says so; the codes that were found are kept.
     """
     threads = len(os.sched_getaffinity(0))
     facets = geometry.of(surface_of(measured_run, geometry, view, threads).triangles)
@@ -192,7 +192,8 @@ def find_codes_ahead(
 
 
 def forget_codes() -> None:
-    """Free the memory of what `find_codes_ahead` has found, when the samples of its view are there."""
+    """Free the memory of the codes that `find_codes_ahead` has found, when the samples of their view are
+    complete."""
     _newest_codes.begin("")
 
 
@@ -252,7 +253,7 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface, digest: A
     file["seen"].attrs["told"] = "[h, w] place in `triangles` of what a pixel sees, -1 where it is not used"
     _dataset(file, "triangles", surface.triangles, "numbers of the mesh's triangles, from 0", digest)
     _dataset(file, "pixels", work.reader.pixels, "pixels of each channel on each triangle", digest)
-    description = "relative standard uncertainty, shared by a triangle's samples, from pixels' own responses"
+    description = "relative standard uncertainty from the pixels' own responses, shared by a triangle's samples"
     _dataset(file, "u_response", work.reader.u_response, description, digest)
     _dataset(file, "centres_mm", work.facets.centres_mm, "of the triangles, mm, base frame", digest)
     _dataset(file, "normals", work.facets.normals, "of the triangles, unit, base frame", digest)
@@ -302,7 +303,7 @@ def _begin_samples(file: h5py.File, work: ViewPass) -> dict[str, h5py.Dataset]:
     (count, channels), leds = work.reader.pixels.shape, len(work.leds)
     codes = ", ".join(f"{code} {name}" for name, code in CODES.items())
     kinds: dict[str, tuple[Any, tuple[int, ...], str]] = {
-        "f": (np.float16, (count, leds, channels), "reflectance, 1/sr; NaN where there is none"),
+        "f": (np.float16, (count, leds, channels), "reflectance, 1/sr; NaN where there is no sample"),
         "u_own": (np.float16, (count, leds, channels), "relative standard uncertainty, of noise"),
         "codes": (np.uint8, (count, leds), f"of a triangle and an LED: {codes}"),
     }

@@ -18,7 +18,7 @@ from coupole.kernels import kernel
 Floats = NDArray[np.float64]
 
 GLARE, U_GLARE = "glare", "led_u_glare"
-"""Names in a view's file of samples: the subtracted veil over the remaining signal, and its relative
+"""Names in a view's file of samples: the subtracted veil divided by the remaining signal, and the veil's relative
 uncertainty."""
 
 

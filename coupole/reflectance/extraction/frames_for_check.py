@@ -59,7 +59,9 @@ def write_frames(
     with h5py.File(to, "w") as file, ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         shape = (len(leds), height // 2, width // 2, radiometry.channels)
         data = file.create_dataset("share", shape, np.float16, track_times=False)
-        data.attrs["told"] = "[leds, h / 2, w / 2, channels] of the camera's range; NaN where there is none"
+        data.attrs["told"] = (
+            "[leds, h / 2, w / 2, channels] signal as a share of the camera's range; NaN where there is none"
+        )
         noise = np.full(len(leds), np.nan)
         for number, (values, noise_picture) in enumerate(pool.map(picture, leds)):
             data[number], noise[number] = values, noise_picture
@@ -69,7 +71,7 @@ def write_frames(
             "mean absolute error of `share` by noise; NaN without a record of the response"
         )
         file.create_dataset("offsets", data=offsets, track_times=False)
-        file["offsets"].attrs["told"] = "[channels, 2] row and column in a block of the pixel that counts"
+        file["offsets"].attrs["told"] = "[channels, 2] row and column, within a block, of the pixel that counts"
 
 
 def block_offsets(channel: NDArray[np.int8], channels: int) -> NDArray[np.int64]:

@@ -139,11 +139,11 @@ def _away(centres, normals, led_centre, led_normal, least_cosine, codes):  # typ
 
 @kernel
 def lit_by(centre, led_centre, led_normal, paper, towards):  # type: ignore[no-untyped-def]
-    """E / Phi in m^-2 on a surface at `centre` that faces the LED. The direction to the LED is written to
+    """Return E / Phi, m^-2, on a surface at `centre` that faces the LED. The direction to the LED is written to
     `towards` [3].
 
-    The LED is a small Lambertian emitter, cos / (pi d^2). At 0.5 m, a square of 7 mm differs from it by 7e-5. With
-    `paper` the emitter's cosine counts twice (seed 003, Eq. 2).
+    The LED is a small Lambertian emitter, cos / (pi d^2). At 0.5 m, the irradiance from a square of 7 mm differs
+    from this by 7e-5. With `paper` the emitter's cosine counts twice (seed 003, Eq. 2).
     """
     for k in range(3):
         towards[k] = led_centre[k] - centre[k]

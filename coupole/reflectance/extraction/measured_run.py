@@ -80,11 +80,11 @@ class Powers:
     power: Floats
     """[leds, channels] DN s^-1 m^2 sr; NaN or 0 for an LED without power."""
     board_c: Floats
-    """[leds] temperature of the board for which the power holds."""
+    """[leds] temperature of the board for which the power is valid."""
     u_own: Floats
-    """[leds, channels] relative standard uncertainty that an LED shares with no other."""
+    """[leds, channels] relative standard uncertainty that an LED shares with no other LED."""
     u_shared: Floats
-    """[leds, channels] relative standard uncertainty that all LEDs share: of the tile and its place."""
+    """[leds, channels] relative standard uncertainty that all LEDs share: it comes from the tile and its place."""
 
     @cached_property
     def _row(self) -> dict[int, int]:
@@ -266,7 +266,7 @@ def refuse_other_gain(path: Path, record: Record, gain_db: float) -> None:
     record_db = record.fixed.get("gain_db", 0.0)
     if abs(record_db - gain_db) > SAME_GAIN_DB:
         raise InputError(
-            f"{path}: holds for a gain of {record_db:g} dB; the run has {gain_db:g} dB. Name one of that gain"
+            f"{path}: holds for a gain of {record_db:g} dB; the run has {gain_db:g} dB. Name a record of this gain"
         )
 
 

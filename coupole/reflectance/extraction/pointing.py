@@ -32,7 +32,7 @@ class Doubts:
     """Standard uncertainty of the mesh's place in the base frame, in each direction."""
     mesh_deg: float = 0.02
     shape_mm: float = 0.03
-    """Standard uncertainty of the surface along its normals, the same over `scale_mm`."""
+    """Standard uncertainty of the surface along its normals; the error is about the same over `scale_mm`."""
     scale_mm: float = 20.0
 
     @property

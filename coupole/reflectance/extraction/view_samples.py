@@ -33,7 +33,8 @@ from coupole.reflectance.parts_in_threads import first_alone
 BLOCK = 4096
 """Number of triangles in a block."""
 _AHEAD = 4
-"""Number of blocks of triangles for each thread that are worked on, or wait until their samples are taken."""
+"""Number of blocks of triangles, for each thread, that are being processed or wait until their samples are
+taken."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Samples:
     u_own: NDArray[np.float16]
     """Relative standard uncertainty from noise."""
     glare: NDArray[np.float16]
-    """Subtracted veil over the remaining signal; [0, 0, 0] without a record of the glare."""
+    """Subtracted veil divided by the remaining signal; [0, 0, 0] without a record of the glare."""
 
 
 @dataclass(frozen=True)

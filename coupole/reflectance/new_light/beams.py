@@ -1,4 +1,5 @@
-"""Lights as beams: a beam is light from one direction or from one place. An area or an environment is many beams.
+"""Lights as beams: a beam is light from one direction or from one place. An area or an environment is represented
+by many beams.
 
 A beam's irradiance on a surface that faces it is its strength. If the beam comes from a place, it is the strength
 times cos^k / d^2 (d in m), where cos is the cosine of the angle to the emitter's axis. Values of pictures are

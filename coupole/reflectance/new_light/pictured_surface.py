@@ -93,8 +93,8 @@ class FreeCamera:
 
 
 def surface_of_view(result: RunResult, view: ViewSamples) -> Surface:
-    """Return the surface of a measured view. If the view sees fewer than some hundred triangles, the triangles'
-    centres are used as places."""
+    """Return the surface of a measured view. If the view sees too few triangles to find the directions of its
+    pixels, the triangles' centres are used as the places of the pixels."""
     with h5py.File(view.path, "r") as file:
         triangle_of_pixel, centres_mm, normals = file["seen"][()], file["centres_mm"][()], file["normals"][()]
     places_mm = np.full((*triangle_of_pixel.shape, 3), np.nan, np.float32)
@@ -222,9 +222,10 @@ def _seen_centres(triangle_of_pixel: NDArray[np.int32], centres_mm: Floats, came
 def _directions(
     triangle_of_pixel: NDArray[np.int32], centres_mm: Floats, camera_mm: Floats
 ) -> tuple[Floats, Floats, Floats] | None:
-    """Return the numbers that convert a pixel to its direction: [3] middle column, middle row and the scale of
-    both; [6, 6, 2] coefficients of column^i row^j; [3, 3] rows: axes of the directions' frame, the last one
-    forward. None for too few triangles."""
+    """Return three arrays that convert a pixel to its direction. The first, [3], has the middle column, the middle
+    row and the scale of both. The second, [6, 6, 2], has the coefficients of column^i row^j. The rows of the
+    third, [3, 3], are the axes of the frame of directions; the last axis points forward. Returns None if there are
+    too few triangles."""
     centres = _seen_centres(triangle_of_pixel, centres_mm, camera_mm)
     if centres is None:
         return None
@@ -247,7 +248,7 @@ def pixels_of_places(surface: Surface, places_mm: NDArray[np.floating]) -> Float
 
 
 def _polynomial(given: Floats, wanted: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Fit `wanted` [n, 2] by polynomials of `given` [n, 2]. Return the middle and scale of `given` [3], and the
+    """Fit `wanted` [n, 2] with polynomials in `given` [n, 2]. Return the middle and scale of `given` [3], and the
     coefficients [6, 6, 2] of x^i y^j. Triangles that are only partly visible are left out."""
     middle = 0.5 * (given.min(axis=0) + given.max(axis=0))
     scale = max(0.5 * float(np.ptp(given, axis=0).max()), 1e-9)

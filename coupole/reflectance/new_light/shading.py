@@ -71,7 +71,8 @@ def add_beams(
     picture: Picture, surface: Surface, coats: Coats, codes: Codes, beams: Sequence[Beam], lobe_rays: int
 ) -> None:
     """Add the light that GGX materials of the surface's triangles reflect from some of the `alike` beams, where
-    `codes` [8, h, w] say that they reach. If `lobe_rays` are drawn for their emitter, add only the beams' part."""
+    `codes` [8, h, w] say that they reach. If `lobe_rays` are drawn for the emitter of these beams, add only the
+    part that the beams contribute."""
 
     def across(of: Callable[[Beam], Floats]) -> NDArray[np.float32]:
         """[..., 8]: one lane for each beam."""

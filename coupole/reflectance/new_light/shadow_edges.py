@@ -155,9 +155,8 @@ def _asked_in(codes, cells):  # type: ignore[no-untyped-def]
 
 @kernel
 def _open_neighbours(codes, open_cells, fresh):  # type: ignore[no-untyped-def]
-    """Open each closed neighbour of the cells [n, 2] that has a different pixel at the common side; return the
-    opened
-    cells."""
+    """Open each closed neighbour of the cells [n, 2] if it has a pixel with another code at the common side;
+    return the opened cells."""
     down, across = open_cells.shape
     opened_cells = np.empty((4 * len(fresh), 2), np.int64)
     count = 0
@@ -176,7 +175,7 @@ def _open_neighbours(codes, open_cells, fresh):  # type: ignore[no-untyped-def]
 
 @kernel
 def _differs(codes, row, column, down, across, expected_code):  # type: ignore[no-untyped-def]
-    """Tell whether a pixel at the side of a cell is shaded although `expected_code` is lit, or the reverse."""
+    """Tell whether a pixel at the side of a cell is shaded although `expected_code` says lit, or the reverse."""
     height, width = codes.shape
     opposite = SHADED if expected_code == LIT else LIT
     for step in range(CELL_PX):

@@ -1,8 +1,8 @@
 """Chooses the views of a run one after the other.
 
-The best candidate is the one whose expected decrease of the uncertainty is largest for what it costs. A view's
-cost is the sum of its shares of the plan's limits: one of the number of views, and, where they are limited, of
-frames, seconds and light. Among candidates that are nearly as good, the arm goes to the nearest one.
+The best candidate has the largest expected decrease of the uncertainty in proportion to its cost. A view's cost is
+the sum of its shares of the plan's limits: one of the number of views, and, where they are limited, of frames,
+seconds and light. Among candidates that are nearly as good, the arm goes to the nearest one.
 
 The same plan and the same earlier views give the same choice.
 """
@@ -60,7 +60,7 @@ class _Weighed:
     view: str
     gain: float
     score: float
-    """Gain for the share of the limits that it costs."""
+    """Gain divided by the cost, which is a share of the limits."""
     leg_s: float
     """Time of the motion to it, s."""
     cost: Spent
@@ -154,7 +154,8 @@ class NextViews:
         costs: CostOfViews,
         schedule: Schedule,
     ) -> tuple[list[_Weighed], list[str]]:
-        """Return the best of the candidates that the limits allow, and the limits that the others exceed.
+        """Return the best of the candidates that the limits allow, and the limits that the other candidates
+        exceed.
 
         A straight motion is faster than any other, so a score with its time is an upper bound. Paths are planned
         from the highest bound on, until no other candidate can be nearly as good as the best, or gain more.

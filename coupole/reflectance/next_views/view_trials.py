@@ -27,7 +27,7 @@ from coupole.reflectance.triangle_fit import FEWEST
 Floats = NDArray[np.float64]
 
 _MOST_LEDS = 240
-"""Number of LEDs that represent all LEDs of the plan; they are spread over them."""
+"""Greatest number of LEDs with which a view is tried. They are spread over all LEDs of the plan."""
 _MESH_NOISE_UM = 30.0
 """Usual standard uncertainty of the mesh's vertices."""
 
@@ -72,7 +72,7 @@ class Trials:
 
     of_view: dict[str, Trial]
     shares: Floats
-    """[parts] share of the surface that each part is."""
+    """[parts] area of each part, as a share of the surface."""
     priors: tuple[Information, ...]
     """Knowledge before any view, for each supposed material."""
 
@@ -118,8 +118,8 @@ def trials_of(job: Job) -> Trials:
 
 
 def _judging_leds(job: Job) -> tuple[NDArray[np.int64], float]:
-    """Return rows of the LED table that stand for the plan's LEDs, and how many each stands for. If LEDs are
-    chosen in the run, they are supposed to be spread."""
+    """Return rows of the LED table that represent the plan's LEDs, and the number of LEDs that each of them
+    represents. If LEDs are chosen in the run, they are supposed to be spread."""
     lights, leds = job.plan.lights, job.cell.leds
     rows = select_leds(lights, leds, job.cell.rig.support.base_from_support.matrix())
     count = min(len(rows), lights.until.lights) if isinstance(lights, AdaptiveLights) else len(rows)

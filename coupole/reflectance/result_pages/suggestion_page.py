@@ -84,9 +84,9 @@ def _page(name: str, suggestion: Suggestion) -> Page:
 _LIMITS = (
     "The figures are those of the fits themselves, made of drawn samples: the frames' noise, each LED's own power "
     "and place, the noise of the arm's poses, and a highlight with Fresnel's term.",
-    "Not in them: light from surface to surface, edges of shadows, translucency, errors of the mesh, the light of "
-    "two triangles in one pixel, and materials that are no sum of a matt part and a highlight. With these, "
-    "uncertainties are larger.",
+    "The figures do not include: light from surface to surface, edges of shadows, translucency, errors of the "
+    "mesh, the light of two triangles in one pixel, and materials that are no sum of a matt part and a highlight. "
+    "Where these matter, the uncertainties will be larger.",
 )
 
 

@@ -49,7 +49,7 @@ class CameraNoise:
     least_dn: float
     """Signal above black below which a mean is not used."""
     most_dn: float
-    """Signal above black at which a pixel is not used."""
+    """Signal above black from which on a pixel is not used."""
     channel_share: Floats
     """[channels] share of the pixels that have this colour."""
 
@@ -265,10 +265,10 @@ def _camera_noise(sensor: Sensor, response: Record, channels: Sequence[str], cha
 def reflectances(
     surface: Surface, view: SeenParts, material: SupposedMaterial, leds_mm: Floats, parts: NDArray[np.int64]
 ) -> tuple[Floats, Floats]:
-    """[parts, leds] reflectance, 1/sr, and cosine of incidence of some parts under LEDs at [leds, 3]; NaN where no
-    light reaches the visible part.
+    """Return two arrays [parts, leds] for some parts of the surface and LEDs at `leds_mm` [leds, 3]: the
+    reflectance, 1/sr, and the cosine of incidence. They are NaN where no light reaches the visible part.
 
-    Like a real highlight, it grows towards grazing angles, here by Schlick's Fresnel term (1994).
+    Like a real highlight, the reflectance grows towards grazing angles, here by Schlick's Fresnel term (1994).
     """
     f, cosines = np.full((2, len(parts), len(leds_mm)), np.nan)
     _fill_reflectances(

@@ -106,7 +106,7 @@ def write_view_texels(path: Path, texels: ViewTexels, head: TexelFileHead) -> No
             numbers = file.create_dataset(
                 _OF_PIXEL, data=texels.texel_of_pixel, compression="gzip", shuffle=True, track_times=False
             )
-            numbers.attrs["told"] = "[h, w] which of the texels a pixel belongs to, -1 for none"
+            numbers.attrs["told"] = "[h, w] number of the texel that a pixel belongs to, -1 for none"
         of_pixel = "relative standard uncertainty of kd and ks, of a pixel's own response"
         of_several = "relative standard uncertainty of kd and ks, of the responses of a texel's pixels"
         _dataset(file, "u_pixel", head.u_pixel, of_several if is_of_several else of_pixel)
@@ -190,9 +190,9 @@ def refuse_other_size(folder: Path, size: TexelSize) -> None:
     there = size_of_texels(folder)
     if there is not None and there != size:
         raise InputError(
-            f"--texels {size.text}: {folder} has texels of {there.in_words} already. `--texels {there.text}` goes "
-            f"on with them. To have the others instead, move the folder {folder / FOLDER} away: nothing else is "
-            "made again"
+            f"--texels {size.text}: {folder} has texels of {there.in_words} already. `--texels {there.text}` "
+            f"goes on with them. To make these texels instead, move the folder {folder / FOLDER} away: nothing "
+            "else is made again"
         )
 
 

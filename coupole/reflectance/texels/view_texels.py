@@ -47,7 +47,7 @@ class Fitted:
     normals: Singles
     """[h, w, 3]"""
     deviation: Singles
-    """[h, w, 5] deviations from the centres: tilts, logarithms."""
+    """[h, w, 5] deviations from the centres: two tilts of the normal, and the logarithms of kd, ks and alpha."""
     covariance: Singles
     """[h, w, 15]"""
     is_fitted: NDArray[np.bool_]

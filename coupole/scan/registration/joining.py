@@ -21,8 +21,8 @@ AGREEMENT_PITCHES = 3.0
 """Two motions agree if their positions of a scan's points differ by at most this number of cells of the coarse
 grid."""
 _MOST_CROSS_CHECKS, _FEW_CHECKS, _EVERY = 300, 30, 5
-"""Greatest number of pairs of scans of two groups that are checked; number of pairs above which only some points
-are checked; step between these points."""
+"""Limits for the check of two groups against each other. The first is the greatest number of pairs of scans that
+are checked. From the second number of pairs on, only some points are checked, in steps of the third number."""
 
 
 @dataclass
@@ -141,7 +141,7 @@ def _contradict(
 
 
 def spheres_meet(first_scan: PreparedScan, second_scan: PreparedScan, one_from_other: Floats) -> bool:
-    """Tell whether the bounding spheres of two scans meet; only then the scans may overlap."""
+    """Tell whether the bounding spheres of two scans meet; only then can the scans overlap."""
     (middle_one, radius_one), (middle_other, radius_other) = first_scan.coarse.sphere, second_scan.coarse.sphere
     apart = np.linalg.norm(moved_points(one_from_other, middle_other[None])[0] - middle_one)
     return bool(apart < radius_one + radius_other)

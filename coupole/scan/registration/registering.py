@@ -80,8 +80,8 @@ class Registration:
     """The joint adjustment of all poses."""
 
     def is_merged_on_site(self, cell_mm: float) -> bool:
-        """True if mesh and clouds are in the control points' frame. This needs such a frame, and coordinates in it
-        that 32 bits resolve to a hundredth of a cell."""
+        """True if mesh and clouds are in the control points' frame. They are in it if there are control points,
+        and if numbers of 32 bits resolve the coordinates there to a hundredth of a cell."""
         if self.site_from_first is None:
             return False
         farthest_mm = max(

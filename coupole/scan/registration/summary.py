@@ -136,8 +136,7 @@ def remarks(registration: Registration) -> Iterator[str]:
     names = registration.names
     yield (
         f"{len(registration.placed_numbers)} of {len(names)} scans placed by {registration.pairs} overlapping "
-        f"pairs; surfaces agree "
-        f"within {registration.fit.rms_mm:.3g} mm (root mean square along their normals)"
+        f"pairs; surfaces agree within {registration.fit.rms_mm:.3g} mm (root mean square along their normals)"
     )
     if registration.loops:
         middle = float(np.median([loop.error_mm for loop in registration.loops]))

@@ -83,7 +83,7 @@ class DepthPicture:
         self._nearest = np.where(around, nearest, -np.inf).reshape(-1)
 
     def folded_share(self, step_mm: float) -> float:
-        """Share of the cells that hold surfaces farther apart than a step along the ray."""
+        """Share of the cells in which surfaces are farther apart than a step along the ray."""
         near, far = self._own
         is_filled = np.isfinite(near)
         return float(np.mean(far[is_filled] - near[is_filled] > step_mm))
@@ -121,7 +121,7 @@ def _level(points_mm: Floats) -> Floats:
 
 
 def _gap(azimuths: Floats) -> float:
-    """Return an azimuth at which the scanner saw nothing, or least; the picture begins there."""
+    """Return an azimuth at which the scanner saw nothing, or saw the fewest points; the picture begins there."""
     counts, borders = np.histogram(np.mod(azimuths, 2 * np.pi), 360, (0, 2 * np.pi))
     return float(borders[int(np.argmin(counts))])
 

@@ -87,7 +87,7 @@ class StreamStatistics:
     skipped_ids: int = 0
     """Frame ids without a complete image, including those of `incomplete_images`."""
     underruns: int = 0
-    """Times that libaravis found no free buffer; several may concern one frame."""
+    """Number of times that libaravis found no free buffer; several of them may concern one frame."""
 
 
 class Stream:
@@ -138,7 +138,7 @@ class Stream:
                 return image
 
     def _evaluate(self, buffer: int, first_id: int, last_id: int) -> Taken | None:
-        """Return a complete image, or None after its buffer was queued again."""
+        """Return the image if it is complete. Otherwise queue its buffer again, and return None."""
         library = self._library
         status = library.arv_buffer_get_status(buffer)
         with self._lock:

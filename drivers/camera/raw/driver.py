@@ -109,7 +109,7 @@ class RawFiles:
         if not files:
             raise DeviceRefused(
                 self._name,
-                expected="one RAW file of this camera, to tell what frames look like",
+                expected="one RAW file of this camera, which shows the format of the frames",
                 happened=f"none is in {self._settings.folder}",
                 remedy="Take a picture, or name a file as `sample` in the rig.",
             )

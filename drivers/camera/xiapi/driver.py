@@ -175,7 +175,7 @@ class XiCamera:
             raise DeviceLost(
                 self._name,
                 expected="a camera that is connected and works",
-                happened="xiAPI says that it is gone",
+                happened="xiAPI reports that the camera is gone",
                 remedy="Check cable and power, then resume the run.",
             )
 

@@ -4,7 +4,7 @@
     corrections still count from this session's start. And the distance from the axes that this packet reports to
     the answer's place must be at most the lag of the arm plus one cycle's step.
 
-*Proof.* A packet proves this if three conditions hold. First, the controller's counter of late answers contains
+*Proof.* A packet proves this if three conditions are met. First, the controller's counter of late answers contains
 every cycle of the IPOC since the last answered packet that was not answered. Second, the counter has not
 decreased, unless it counts only late answers in a row. Third, every silence on the machine's clock is also a
 silence by the IPOC.

@@ -84,7 +84,7 @@ def test_devices_that_nobody_uses_for_ten_minutes_are_closed(kept: Kept, use: Ca
     kept.now_s += 3.0
     use(bench)
     bench._look()
-    assert (bench.phase, bench.closed_because) == ("closed", "nobody has used them for 10 minutes")
+    assert (bench.phase, bench.closed_because) == ("closed", "nobody has used the devices for 10 minutes")
     assert not kept.task.running
 
 

@@ -73,7 +73,7 @@ def test_what_was_given_up_while_the_console_was_stopped_is_not_begun_later(
         ended = cells.finish(asked)
     assert ended.code == 130
     if command == "queue":
-        assert "will not be carried out" in ended.err
+        assert "will not carry out the request" in ended.err
     assert stays_empty(engineer)
 
 

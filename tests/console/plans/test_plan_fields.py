@@ -104,7 +104,7 @@ def test_a_plan_is_new_written_over_only_by_who_has_seen_it_and_stays_in_its_fol
     assert "rig.yaml" not in plans.names()
     before = plans.read_text("new-round.yaml")
     plans.write("new-round.yaml", before + "# mine\n", before)
-    with pytest.raises(InputError, match="another person has changed it"):
+    with pytest.raises(InputError, match="another person has changed this plan"):
         plans.write("new-round.yaml", before, before)
     for name in ("../out.yaml", "/etc/passwd", "rig.json", ""):
         with pytest.raises(InputError):

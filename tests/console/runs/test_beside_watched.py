@@ -82,7 +82,7 @@ def test_a_process_that_hangs_is_told_and_one_that_computes_is_not(
         if kind == "computes":
             assert whys == {""}
             return
-        assert whys == {"", f"its process {process.pid} told nothing and computed nothing"}
+        assert whys == {"", f"its process {process.pid} reported nothing and computed nothing"}
         words, sign = state_in_words(run, processing, is_acquired=True)
         assert sign == "warm"
         assert "it hangs" in words

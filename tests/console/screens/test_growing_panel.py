@@ -182,13 +182,13 @@ def says_what_is_missing(house: House) -> None:
     half.write_bytes(kept[0][:-9])
     gone.unlink()
     cells.wait_until(lambda: len(ada.all(".value-pictures img")) == len(before) - 2, "two pictures less")
-    assert ada.sees(".value-pictures", "not whole").count("not whole") == 2
+    assert ada.sees(".value-pictures", "not complete").count("not complete") == 2
     half.write_bytes(kept[0])
     gone.write_bytes(kept[1])
     cells.wait_until(lambda: len(ada.all(".value-pictures img")) == len(before), "all pictures")
     lost = ada.at(".value-pictures img")
     ada.driver.execute_script("arguments[0].src = '/api/v1/runs/none/pictures-so-far/none.png'", lost)
-    assert "not whole" in ada.sees(".value-pictures figure:first-child", "not whole")
+    assert "not complete" in ada.sees(".value-pictures figure:first-child", "not complete")
     assert all("none.png" in trouble for trouble in ada.browser.troubles())
 
 

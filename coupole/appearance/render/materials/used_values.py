@@ -57,7 +57,7 @@ def _unused_names(material: BaseModel, folder: Path) -> set[str]:
 
 
 def _unused_of_paint(paint: Paint | PaintLayer) -> set[str]:
-    """Return the unused keys of an opaque paint: it hides its ground, and its colour depends on K over S alone."""
+    """Return the unused keys of an opaque paint: it hides its ground, and its colour depends only on K / S."""
     if paint.thickness_mm is None:
         return {"ground", "scattering_per_mm"}
     return {"scattering_per_mm"} if isinstance(paint.pigment, MeasuredPaint) else set()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import time
@@ -166,8 +167,12 @@ class _Stopping:
         return working_sessions or meant
 
     def _ask_session(self, path: Path, state: State) -> None:
-        """Stop a session, or its run if that has begun meanwhile. One that is ending already is only noted. Raises
+        """Stop a session, or its run if that has begun meanwhile. If the run has its last frame, the process is
+        interrupted as by Ctrl-C, so that nothing follows. One that is being stopped already is only noted. Raises
         InputError if it does not answer."""
+        import os
+        import signal
+
         from coupole.acquisition.run_control import NoRun, ask
         from coupole.acquisition.sessions_without_run import SessionEnded, ask_session, name_of
 
@@ -175,14 +180,14 @@ class _Stopping:
             reply = ask_session(path, state, "stop", _alarm)
         except SessionEnded:
             return
-        is_ending = state["state"] == "stopping"
         if reply["state"] == "running":
             try:
                 reply = ask(Path(reply["run"]), "stop", _alarm)
             except NoRun:
-                is_ending = True
-        if is_ending:
-            _alarm(f"{name_of(state)} is being stopped already, or is ending: waiting for its end")
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(reply["pid"], signal.SIGINT)
+        if state["state"] == "stopping":
+            _alarm(f"{name_of(state)} is being stopped already: waiting for its end")
         self.replies[reply["pid"]] = reply
 
     def _starting(self, starting_processes: Iterable[StartingProcess]) -> dict[int, str]:

@@ -142,7 +142,9 @@ from coupole.acquisition import runtime_folder
 from coupole.acquisition.sessions_without_run import SessionWithoutRun
 runtime_folder._BASE = Path(sys.argv[1])
 try:
-    with SessionWithoutRun("acquire", Path(sys.argv[2]), None):
+    with SessionWithoutRun("acquire", Path(sys.argv[2]), None) as session:
+        if run := sys.argv[4:]:
+            session.begin_run(Path(run[0]))
         print("serves", flush=True)
         time.sleep(60)
 except KeyboardInterrupt:
@@ -160,9 +162,10 @@ cli.main()
 
 
 @contextmanager
-def _starts(plan: Path, *, ends_in_s: float = 0.0) -> Iterator[subprocess.Popen[str]]:
-    """A process that is starting, for as long as nobody stops it; it then takes some time to end."""
-    arguments = [sys.executable, "-c", _STARTING, str(runtime_folder._BASE), str(plan), str(ends_in_s)]
+def _starts(plan: Path, *runs: Path, ends_in_s: float = 0.0) -> Iterator[subprocess.Popen[str]]:
+    """A process that is starting, or has a run, for as long as nobody stops it; it then takes some time to end."""
+    words = (runtime_folder._BASE, plan, ends_in_s, *runs)
+    arguments = [sys.executable, "-c", _STARTING, *map(str, words)]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
@@ -227,6 +230,18 @@ def test_a_session_that_ends_before_its_answer_was_sent_is_stopped(apart: Path) 
         state = {"run": "", "plan": "plan.yaml", "rig": "", "doing": "acquire", "pid": 1}
         assert ask_session(path, state, "stop", print)["state"] == "stopping"
         closing.join()
+
+
+def test_a_process_whose_run_has_its_last_frame_is_interrupted(apart: Path, tmp_path: Path) -> None:
+    """The run's own socket has gone: the report is written, or a result is made, and then more might follow."""
+    cell = CellFolder(tmp_path)
+    run = Path(cells.here("acquire", cell.plan, "--yes", "--json").document["run"])
+    with _starts(cell.plan, run) as process:
+        stopped = cells.here("stop", cell.plan)
+        assert stopped.code == 0, stopped.err
+        assert "lights are off" in stopped.err
+        assert process.stdout is not None
+        assert process.stdout.read() == "ends\n"
 
 
 def test_a_session_whose_socket_has_gone_is_not_said_to_give_no_answer(apart: Path) -> None:

@@ -90,7 +90,7 @@ def _read_dome(path: Path, dome: dict[str, Any]) -> LightFile:
         refuse(path, f"{key}: expected a list of lights, each with x, y and z; there is none")
     adjust = _vectors(path, dome, "ledAdjust", "rgb") if dome.get("ledAdjust") else None
     if adjust is not None and (len(adjust) != len(directions) or not np.all(adjust > 0)):
-        refuse(path, f"ledAdjust: expected {len(directions)} entries of positive r, g, b")
+        refuse(path, f"ledAdjust: expected positive r, g, b for each light ({len(directions)})")
     return LightFile(directions, intensities=None if adjust is None else 1.0 / adjust)
 
 

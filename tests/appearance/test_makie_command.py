@@ -101,8 +101,8 @@ def test_noise_and_shadow_are_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--metal", "10,10", "--lacquer", "30,99"], "--lacquer 30,99: expected X,Y of a pixel"),
-        (["--metal", "10", "--lacquer", "30,10"], "--metal 10: expected X,Y of a pixel"),
+        (["--metal", "10,10", "--lacquer", "30,99"], "--lacquer 30,99: expected X,Y, with column and row"),
+        (["--metal", "10", "--lacquer", "30,10"], "--metal 10: expected X,Y, with column and row"),
         (["--metal", "10,10", "--lacquer", "12,10"], "of another colour than the lacquers"),
         (["--metal", "10,10", *["--lacquer", "30,10"] * 4], "one to three"),
         (["--metal", "10,10"], "--lacquer"),

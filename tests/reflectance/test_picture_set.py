@@ -199,7 +199,7 @@ def test_a_dome_file_has_lights_for_pictures_in_the_order_of_their_names(folder:
         ("a.dome", "[1", "is no JSON"),
         ("a.dome", "{}", "directions: expected a list of lights, each with x, y and z; there is none"),
         ("a.dome", '{"directions": [{"x": 1, "y": true, "z": 1}]}', "directions, number 0: expected x, y, z"),
-        ("a.dome", '{"directions": [[1, 2, 3]], "ledAdjust": [[1, 0, 1]]}', "ledAdjust: expected 1 of positive"),
+        ("a.dome", '{"directions": [[1, 2, 3]], "ledAdjust": [[1, 0, 1]]}', "ledAdjust: expected positive r"),
         ("a.relight", '{"dome": {}}', "expected a project of relight"),
         ("a.relight", '{"dome": {"directions": [[0, 0, 1]]}, "images": []}', "1 lights; 0 pictures are used of 0"),
         (

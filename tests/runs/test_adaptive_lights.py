@@ -305,7 +305,7 @@ def test_more_than_the_bound_is_never_fired(tmp_path: Path) -> None:
     [
         ({"exposure": {"kind": "bracket", "exposures_us": [2000, 8000]}}, "`exposure: {kind: fixed}`"),
         ({"repeats": 2}, "`repeats: 1`"),
-        ({"views": [TOP, {**SIDE, "lights": {"kind": "panels"}}]}, "no panels"),
+        ({"views": [TOP, {**SIDE, "lights": {"kind": "panels"}}]}, "panels or dark frames alone are not allowed"),
         ({"lights": {**ADAPTIVE, "until": {"lights": 5}}}, "lights"),
         ({"lights": {**ADAPTIVE, "until": {"lights": 1000}, "burst_lights": 1}}, "at most 128 bursts"),
         ({"lights": {**ADAPTIVE, "among": {"kind": "ids", "ids": [4000]}}}, "no LED 4000"),

@@ -184,7 +184,7 @@ def test_a_measured_material_is_read_at_its_own_angles(tmp_path: Path) -> None:
     np.testing.assert_allclose(found / [1, 2, 3], np.repeat(expected[:, None], 3, axis=1), rtol=5e-3)
     planes[1, 3, 4, 5] = np.nan
     path.write_bytes(np.array([90, 90, 180], "<i4").tobytes() + planes.astype("<f8").tobytes())
-    with pytest.raises(InputError, match="no numbers"):
+    with pytest.raises(InputError, match="not numbers"):
         read_merl(path)
 
 

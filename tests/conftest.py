@@ -97,6 +97,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if not item.get_closest_marker("full")]
 
 
+@pytest.fixture(autouse=True)
+def _leaves_signals_as_they_were() -> Generator[None]:
+    """A command ignores signals when it exits. If that stays so in a worker, each process that a later test starts
+    ignores Ctrl-C too."""
+    before = signal.getsignal(signal.SIGINT)
+    yield
+    assert signal.getsignal(signal.SIGINT) is before, "the test leaves another handler of SIGINT: use `cells.here`"
+
+
 def pytest_collection_finish() -> None:
     """The garbage collector need not go through half a million objects of the tests' modules, time and again."""
     gc.freeze()

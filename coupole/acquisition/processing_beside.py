@@ -30,6 +30,7 @@ from coupole.preflight.machine import little_address_space
 from coupole.storage.journal_events import FramesDiscarded
 from coupole.storage.processing import Progress, default_result, go_on_command, tell
 from coupole.storage.run import Run
+from coupole.storage.run_status import is_complete
 from coupole.storage.so_far import LINK
 from coupole.storage.stopped_process import cpu_time_s, is_stopped
 from coupole.viewing.terminal import alarm, step_bars
@@ -96,12 +97,7 @@ class ProcessingBeside:
     def __exit__(self, *_: object) -> None:
         """End the process if it has not ended. Its results are kept."""
         if self._end() and self._run is not None:
-            self._why = "the processing ended with the run, which is not complete"
-            self._console.print(
-                f"reflectance: the processing ended with the run; the samples of {self._views_text} are kept "
-                "until the run is resumed",
-                markup=False,
-            )
+            self._say_stopped(self._run)
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
             self._process.stdin.close()
@@ -176,8 +172,9 @@ class ProcessingBeside:
     # -- after the last frame ---------------------------------------------------------------------------------
 
     def wait(self) -> None:
-        """Wait for the result, after all frames are there and no device is open. A signal ends the wait and the
-        process. The run's exit code depends on the frames only."""
+        """Wait for the result, after all frames are there and no device is open. A signal ends the process, and
+        then the command. The run stays complete. A result that fails changes no exit code: it tells of the
+        frames."""
         if self._run is None:
             return
         try:
@@ -185,7 +182,8 @@ class ProcessingBeside:
                 self._wait_for_end(say)
         except (KeyboardInterrupt, SignalReceived):
             self._end()
-            self._why = "stopped while it was made"
+            self._say_stopped(self._run)
+            raise
         if self._is_whole:
             self._console.print(f"  result  {self._result}", markup=False)
         else:
@@ -248,6 +246,19 @@ class ProcessingBeside:
             return words
         said_nothing = (self._process.returncode or 0) < 0 or words == _NOTHING_SAID or "MemoryError" in words
         return f"{_NO_MEMORY}: {self._shortage} ({words})" if said_nothing else f"{words} ({self._shortage})"
+
+    def _say_stopped(self, run: Path) -> None:
+        """Say what is kept after a stop, and what goes on with it."""
+        if is_complete(run):
+            self._why = "stopped while it was made"
+            self._say_unfinished()
+            return
+        self._why = "the processing ended with the run, which is not complete"
+        self._console.print(
+            f"reflectance: the processing ended with the run; the samples of {self._views_text} are kept until the "
+            "run is resumed",
+            markup=False,
+        )
 
     def _say_unfinished(self) -> None:
         assert self._run is not None

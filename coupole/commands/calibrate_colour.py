@@ -13,9 +13,9 @@ from coupole.calibration.colour.acceptance import COLOUR
 from coupole.commands.calibrate_light import (
     TargetCalibrations,
     frames_with_poses,
-    lens_of,
+    lit_cell_of,
 )
-from coupole.commands.calibrating import Work, bar, calibration, emission_of, rig_of
+from coupole.commands.calibrating import Work, bar, calibration, rig_of
 from coupole.errors import InputError
 
 if TYPE_CHECKING:
@@ -122,8 +122,6 @@ def _by_runs(runs: list[Path], options: _GivenOptions) -> Work:
     from coupole.calibration.colour.chart_views import ChartSetting
     from coupole.calibration.colour.colour_workflow import Origin, colour_outcome, see_in_runs
     from coupole.calibration.light.frames import open_light_frames
-    from coupole.calibration.light.led_power_tile import calibrated_positions
-    from coupole.calibration.light.tile_views import Positions
     from coupole.plan.cell import read_cell
 
     calibrations, white = options.calibrations, options.white
@@ -138,27 +136,8 @@ def _by_runs(runs: list[Path], options: _GivenOptions) -> Work:
         )
         rig_path = calibrations.rig or rig_of(runs[0])
         cell = read_cell(rig_path)
-        by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)
-        files = (
-            *patches.files,
-            rig_path,
-            calibrations.leds or cell.leds_path,
-            calibrations.hand_eye,
-            calibrations.camera,
-        )
-        setting = ChartSetting(
-            chart=patches.chart,
-            base_from_support=cell.rig.support.base_from_support.matrix(),
-            positions=by_table if calibrations.leds is None else calibrated_positions(calibrations.leds),
-            lens=lens_of(calibrations.camera, frames),
-            corners_px=corners_of(options.corners),
-            dark=calibrations.dark_record,
-            response=calibrations.response_record,
-            flat=calibrations.flat,
-            glare=calibrations.glare,
-            emission=emission_of(calibrations.emission),
-            files=tuple(path for path in files if path is not None),
-        )
+        lit_cell = lit_cell_of(frames, cell, calibrations, (*patches.files, rig_path))
+        setting = ChartSetting(**vars(lit_cell), chart=patches.chart, corners_px=corners_of(options.corners))
         with bar(console, "frames of the chart") as progress:
             sightings = see_in_runs(frames, setting, whites, progress)
         with bar(console, "patches left out") as progress:

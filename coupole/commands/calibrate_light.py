@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from coupole.calibration.artefact import LightSpectrum
     from coupole.calibration.light.frames import LightFrames
     from coupole.calibration.light.led_power_tile import Setting
+    from coupole.calibration.light.lit_cell import LitCell
     from coupole.calibration.optics import Intrinsics
     from coupole.calibration.report import Outcome
     from coupole.calibration.request import Request
@@ -207,17 +208,38 @@ def frames_with_poses(
 def setting_of(frames: LightFrames, tile: Path, rig: Path, calibrations: TargetCalibrations) -> Setting:
     """Return the descriptions and calibrations that are used to read frames of a tile. Raises InputError for
     invalid files."""
-    from coupole.calibration.light.led_power_tile import Setting, calibrated_positions
+    from coupole.calibration.light.led_power_tile import Setting
     from coupole.calibration.light.spectralon import read_tile
-    from coupole.calibration.light.tile_views import Positions
     from coupole.plan.cell import read_cell
 
     cell = read_cell(rig)
-    by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)
     spectrum = None if cell.rig.dome.spectrum is None else cell.document.resolve(cell.rig.dome.spectrum)
-    files = (tile, rig, calibrations.leds or cell.leds_path, spectrum, calibrations.hand_eye, calibrations.camera)
-    return Setting(
-        tile=read_tile(tile),
+    lit_cell = lit_cell_of(frames, cell, calibrations, (tile, rig), spectrum)
+    return Setting(**vars(lit_cell), tile=read_tile(tile), light=light_of(cell))
+
+
+def lit_cell_of(
+    frames: LightFrames,
+    cell: Cell,
+    calibrations: TargetCalibrations,
+    artefact_files: tuple[Path, ...],
+    spectrum: Path | None = None,
+) -> LitCell:
+    """Return a cell with the calibrations with which its frames are read. `artefact_files` describe what is seen
+    in them. Raises InputError for invalid files."""
+    from coupole.calibration.light.led_power_tile import calibrated_positions
+    from coupole.calibration.light.lit_cell import LitCell
+    from coupole.calibration.light.tile_views import Positions
+
+    by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)
+    files = (
+        *artefact_files,
+        calibrations.leds or cell.leds_path,
+        spectrum,
+        calibrations.hand_eye,
+        calibrations.camera,
+    )
+    return LitCell(
         base_from_support=cell.rig.support.base_from_support.matrix(),
         positions=by_table if calibrations.leds is None else calibrated_positions(calibrations.leds),
         lens=lens_of(calibrations.camera, frames),
@@ -227,7 +249,6 @@ def setting_of(frames: LightFrames, tile: Path, rig: Path, calibrations: TargetC
         glare=calibrations.glare,
         emission=emission_of(calibrations.emission),
         files=tuple(path for path in files if path is not None),
-        light=light_of(cell),
     )
 
 

@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 def certificate(
     records: Annotated[
         list[Path],
-        typer.Argument(
-            help="Records in force, or folders of them.", metavar="RECORD_OR_FOLDER...", show_default=False
-        ),
+        typer.Argument(help="Records in force, or folders of them.", metavar="RECORD_OR_FOLDER..."),
     ],
     about: Annotated[
         Path,
@@ -33,11 +31,7 @@ def certificate(
     ],
     earlier: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--earlier",
-            help="Records of earlier calibrations, which show how fast figures drift.",
-            show_default=False,
-        ),
+        typer.Option("--earlier", help="Records of earlier calibrations, which show how fast figures drift."),
     ] = None,
     out: Annotated[Path, typer.Option("--out", help="Write this page, and JSON beside it.")] = Path(
         "certificate.html"

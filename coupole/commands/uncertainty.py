@@ -68,12 +68,10 @@ def budget(
         ),
     ] = None,
     plan: Annotated[
-        Path | None,
-        typer.Option("--plan", help="Add the records of other kinds that this plan names."),
+        Path | None, typer.Option("--plan", help="Add the records of other kinds that this plan names.")
     ] = None,
     beside: Annotated[
-        list[Path] | None,
-        typer.Option("--beside", help="Records of another cell, for a separate column in the table."),
+        list[Path] | None, typer.Option("--beside", help="Records of another cell, for a separate column.")
     ] = None,
     earlier: Annotated[
         list[Path] | None,

@@ -67,23 +67,15 @@ def cluster_result(
             f"--without-view: expected one of {', '.join(settings['view_names'])}; got {without_view}"
         )
     materials = result.materials(_FROM)
-    is_fitted = np.isfinite(materials.alpha)
-    most = int(np.count_nonzero(is_fitted))
-    count = count or int(np.clip(most // USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS))
-    if most < count:
-        raise InputError(
-            f"--clusters: expected at most {most}, the number of triangles with a material; got {count}"
-        )
-    cluster = np.full(len(is_fitted), -1, np.int64)
-    cluster[is_fitted] = clusters_of(looks(materials.at(np.flatnonzero(is_fitted))), count)
-    members = np.bincount(cluster[is_fitted])
+    cluster = _clusters_that_look_alike(materials, count)
+    members = np.bincount(cluster[cluster >= 0])
     pool = empty_pool(len(members), materials.kd.shape[1])
     random = np.random.default_rng(0)
     for block in result.blocks(memory_bytes):
         sample_mask = _sample_mask(result, block, settings["left_out"], without_view)
         samples, normals = result.samples(block), materials.normals[block]
         pool_samples(pool, samples, sample_mask, normals, cluster[block], members, random)
-        say("pool samples", block.stop, len(is_fitted))
+        say("pool samples", block.stop, len(cluster))
     fits = fit_pool(pool, _medians(materials, cluster, len(members)))
     harmonics = fit_pairs(pool, degrees)
     is_borrowed = _borrow(result, fits, cluster, settings["left_out"], without_view, memory_bytes, say)
@@ -105,6 +97,21 @@ def cluster_result(
     except OSError as error:
         raise disk_error(out, error) from error
     return report
+
+
+def _clusters_that_look_alike(materials: TriangleMaterials, count: int | None) -> NDArray[np.int64]:
+    """Return [triangles], the cluster of each, or -1 where there is no material. Raises InputError if `count` is
+    more than the number of materials."""
+    is_fitted = np.isfinite(materials.alpha)
+    most = int(np.count_nonzero(is_fitted))
+    count = count or int(np.clip(most // USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS))
+    if most < count:
+        raise InputError(
+            f"--clusters: expected at most {most}, the number of triangles with a material; got {count}"
+        )
+    cluster = np.full(len(is_fitted), -1, np.int64)
+    cluster[is_fitted] = clusters_of(looks(materials.at(np.flatnonzero(is_fitted))), count)
+    return cluster
 
 
 def _sample_mask(

@@ -6,12 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cells
 import numpy as np
 import pytest
 from painted_films import in_air, two_fluxes
 
 from coupole.appearance.matter.paint_file import read_paint
-from coupole.commands import cli
 
 NM = np.arange(400, 701, 10)
 K, S = np.linspace(12.0, 2.0, len(NM)), np.linspace(18.0, 24.0, len(NM))
@@ -35,13 +35,9 @@ def films(tmp_path: Path) -> dict[str, str]:
     return {name: spectrum(tmp_path, name, values) for name, values in made.items()}
 
 
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
-    monkeypatch.setattr("sys.argv", ["coupole", *words])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    said = capsys.readouterr()
-    assert isinstance(ended.value.code, int)
-    return ended.value.code, said.out, said.err
+def run(*words: str) -> tuple[int, str, str]:
+    ended = cells.here(*words)
+    return ended.code, ended.out, ended.err
 
 
 def options(films: dict[str, str], **changed: str) -> list[str]:
@@ -50,10 +46,10 @@ def options(films: dict[str, str], **changed: str) -> list[str]:
 
 
 def test_a_drawdown_card_gives_k_and_s_in_their_intervals_a_paint_file_and_a_page(
-    films: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    films: dict[str, str], tmp_path: Path
 ) -> None:
     asked = [*options(films, thickness_um="30", u_thickness_um="0.1", noise="0.002", name="ochre"), "--json"]
-    code, out, _ = run(monkeypatch, capsys, "layer", *asked, "--out", str(tmp_path / "out"))
+    code, out, _ = run("layer", *asked, "--out", str(tmp_path / "out"))
 
     told: dict[str, Any] = json.loads(out)
     nm = np.array(told["wavelength_nm"])
@@ -68,19 +64,19 @@ def test_a_drawdown_card_gives_k_and_s_in_their_intervals_a_paint_file_and_a_pag
     assert (page.count("<polygon"), page.count("<script")) == (2, 0)
     (tmp_path / "out" / "ochre.html").unlink()
     (tmp_path / "out" / "ochre.paint.csv").write_text("mine")
-    code, _, err = run(monkeypatch, capsys, "layer", *asked, "--out", str(tmp_path / "out"))
+    code, _, err = run("layer", *asked, "--out", str(tmp_path / "out"))
     assert (code, (tmp_path / "out" / "ochre.paint.csv").read_text()) == (2, "mine")
     assert "ochre.paint.csv: exists already" in err
     assert not (tmp_path / "out" / "ochre.html").exists()
-    code, _, _ = run(monkeypatch, capsys, "layer", *asked, "--out", str(tmp_path / "out"), "--overwrite")
+    code, _, _ = run("layer", *asked, "--out", str(tmp_path / "out"), "--overwrite")
     assert (code, read_paint(tmp_path / "out" / "ochre.paint.csv").name) == (0, "ochre")
 
 
 def test_a_film_is_predicted_at_another_thickness_with_its_interval_in_text_json_and_page(
-    films: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    films: dict[str, str], tmp_path: Path
 ) -> None:
     asked = ["layer", *options(films, thickness_um="30", noise="0.002", name="ochre"), "--at-um", "60"]
-    code, out, _ = run(monkeypatch, capsys, *asked, "--json", "--out", str(tmp_path / "out"))
+    code, out, _ = run(*asked, "--json", "--out", str(tmp_path / "out"))
 
     told = json.loads(out)["at"]
     assert (code, [film["over"] for film in told]) == (0, ["black.csv", "white.csv"])
@@ -91,18 +87,16 @@ def test_a_film_is_predicted_at_another_thickness_with_its_interval_in_text_json
         assert np.mean(off < film["half_width"]) > 0.9
         assert np.all(np.array(film["half_width"]) > film["half_width_of_model"])
     assert "Predicted at 60 um" in (tmp_path / "out" / "ochre.html").read_text()
-    assert "at 60 um over white.csv" in "".join(run(monkeypatch, capsys, *asked)[1:])
+    assert "at 60 um over white.csv" in "".join(run(*asked)[1:])
 
 
-def test_a_thickness_cannot_be_asked_for_without_that_of_the_films(
-    films: dict[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, _, err = run(monkeypatch, capsys, "layer", *options(films), "--at-um", "60")
+def test_a_thickness_cannot_be_asked_for_without_that_of_the_films(films: dict[str, str]) -> None:
+    code, _, err = run("layer", *options(films), "--at-um", "60")
     assert (code, "give --thickness-um" in err) == (2, True)
 
 
 def test_a_series_in_a_yaml_file_is_solved_and_says_how_well_it_agrees(
-    films: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    films: dict[str, str], tmp_path: Path
 ) -> None:
     thick = in_air(np.array([two_fluxes(k, s, 0.06, 0.9) for k, s in zip(K, S, strict=True)]))
     spectrum(tmp_path, "thick", thick)
@@ -112,7 +106,7 @@ def test_a_series_in_a_yaml_file_is_solved_and_says_how_well_it_agrees(
         "  - {spectrum: over-white.csv, over: white.csv, thickness_um: 30}\n"
         "  - {spectrum: thick.csv, over: white.csv, thickness_um: 60}\n"
     )
-    code, out, _ = run(monkeypatch, capsys, "layer", str(tmp_path / "series.yaml"), "--json")
+    code, out, _ = run("layer", str(tmp_path / "series.yaml"), "--json")
 
     told = json.loads(out)
     assert (code, told["spectra"]) == (0, 3)
@@ -136,8 +130,6 @@ def test_films_that_contradict_themselves_are_refused_by_name(
     words: str,
     films: dict[str, str],
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     rows = Path(films["over-white"]).read_text().splitlines()
     (tmp_path / "percent.csv").write_text("nm,R\n" + "".join(f"{nm},1.0\n" for nm in NM))
@@ -145,14 +137,12 @@ def test_films_that_contradict_themselves_are_refused_by_name(
     (tmp_path / "micrometres.csv").write_text("nm,R\n" + "".join(f"{nm / 1000},0.4\n" for nm in NM))
     named = {key: value if key == "geometry" else str(tmp_path / f"{value}.csv") for key, value in changed.items()}
 
-    code, _, err = run(monkeypatch, capsys, "layer", *options(films, **named))
+    code, _, err = run("layer", *options(films, **named))
 
     assert code == 2
     assert words in err
 
 
-def test_one_spectrum_is_refused_with_what_else_is_needed(
-    films: dict[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, _, err = run(monkeypatch, capsys, "layer", "--over-white", films["over-white"])
+def test_one_spectrum_is_refused_with_what_else_is_needed(films: dict[str, str]) -> None:
+    code, _, err = run("layer", "--over-white", films["over-white"])
     assert (code, "--over-white: needs --white" in err) == (2, True)

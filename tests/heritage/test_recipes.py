@@ -16,7 +16,6 @@ from places import REPO
 from coupole.appearance.matter.glossy_face import face
 from coupole.appearance.matter.paint_file import read_paint
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM
-from coupole.commands import cli
 from coupole.errors import InputError
 from coupole.heritage.analysis import colour_match, recipe_search
 from coupole.heritage.analysis.palette import Paint, read_palette
@@ -219,9 +218,7 @@ def test_a_library_is_not_known_where_its_k_or_s_are_no_coefficients(tmp_path: P
     assert set(unknown) <= {*WAVELENGTHS_NM[:5], 595.0, 600.0, 605.0, *WAVELENGTHS_NM[77:]}
 
 
-def test_the_command_tells_shares_lights_costs_and_draws_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_tells_shares_lights_costs_and_draws_them(tmp_path: Path) -> None:
     rows = "".join(f"{nm},{value:.6f}\n" for nm, value in zip(NM, target(SHARES), strict=True))
     (tmp_path / "sleeve.csv").write_text(f"nm,R\n{rows}")
     palette = library(tmp_path, list(paints()))
@@ -229,11 +226,8 @@ def test_the_command_tells_shares_lights_costs_and_draws_them(
     words += ["--noise", str(NOISE), "--out", str(tmp_path / "sleeve.html")]
 
     def run(*more: str) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["coupole", *words, *more])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        said = capsys.readouterr()
-        return int(str(ended.value.code)), said.out, said.err
+        ended = cells.here(*words, *more)
+        return ended.code, ended.out, ended.err
 
     code, out, _ = run("--json")
     told = json.loads(out)

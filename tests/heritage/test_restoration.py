@@ -15,8 +15,6 @@ import pytest
 from painted_plate import PARTS, PX, RESTORATION, plate_ply
 from PIL import Image
 
-from coupole.commands import cli
-
 LIGHT, DARK = 0.5, 0.2
 LETTER = "A letter of 1300 about the façade, «very light»"
 
@@ -34,10 +32,7 @@ class Restored:
         """What it prints."""
         files = ("plate.ply", "--parts", "parts.yaml", "--materials", "restoration.yaml", "--out", "out")
         given = [str(self.folder / word) if Path(word).suffix or word == "out" else word for word in files]
-        with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as ended:  # noqa: PT012
-            patch.setattr("sys.argv", ["coupole", "restore", *given, "--json", *words])
-            cli.main()
-        assert ended.value.code == 0
+        assert cells.here("restore", *given, "--json", *words).code == 0
         return dict(json.loads((self.out / "result.json").read_text()))
 
     def exr(self, hypothesis: str) -> tuple[dict[str, Any], np.ndarray]:

@@ -17,10 +17,6 @@ from benches import ASKS, HERE, Bench, begun, bench, holding
 from cells import CellFolder
 from PIL import Image
 
-from coupole.acquisition.cell_bench import bench_arm
-from coupole.acquisition.cell_bench.bench_arm import HoldLostError
-from coupole.acquisition.cell_bench.bench_requests import JogAsked
-from coupole.clock import SystemClock
 from sim.devices.kuka_kinematics import flange_pose as flange_by_the_simulation
 from sim.world.client import World
 
@@ -182,53 +178,6 @@ def test_an_arm_whose_console_is_killed_stops_at_once(asked: Bench, world: World
     assert "is held by another process" in asked.ask("jog", **again)["error"]
     time.sleep(0.3)
     assert np.allclose(joints_deg(world), rested["joints_deg"], atol=0.01)
-
-
-class ClockByHand(SystemClock):
-    """The rig's clock and, for `bench_arm.time`, the machine's: both go on only when they are told to."""
-
-    def __init__(self) -> None:
-        self.rig_s = self.machine_s = 0.0
-
-    def now_ns(self) -> int:
-        return round(self.rig_s * 1e9)
-
-    def monotonic(self) -> float:
-        return self.machine_s
-
-
-@pytest.fixture
-def held(monkeypatch: pytest.MonkeyPatch) -> tuple[bench_arm._Hold, ClockByHand]:
-    """A button that is held, and its clock."""
-    clock = ClockByHand()
-    monkeypatch.setattr(bench_arm, "time", clock)
-    asked = JogAsked.model_validate({"version": 1, "command": "jog", "axis": "A1", "direction": 1, "from": HERE})
-    return bench_arm._Hold(1, asked, 0, clock), clock
-
-
-def test_a_renewal_that_comes_late_revives_no_hold(held: tuple[bench_arm._Hold, ClockByHand]) -> None:
-    """As after a freeze of the bench, when the renewal is read before the watch looks at the time."""
-    hold, clock = held
-    clock.rig_s = clock.machine_s = 0.99 * bench_arm.HOLD_S
-    hold.check()
-    hold.renew()
-    clock.rig_s = clock.machine_s = 2.0 * bench_arm.HOLD_S
-    hold.renew()
-    with pytest.raises(HoldLostError, match="it was not renewed for 300 ms"):
-        hold.check()
-
-
-@pytest.mark.parametrize("other", ["rig_s", "machine_s"])
-def test_in_a_slow_or_a_fast_world_a_hold_has_its_time_on_both_clocks(
-    held: tuple[bench_arm._Hold, ClockByHand], other: str
-) -> None:
-    hold, clock = held
-    clock.rig_s = clock.machine_s = 10.0 * bench_arm.HOLD_S
-    setattr(clock, other, 0.9 * bench_arm.HOLD_S)
-    hold.check()
-    setattr(clock, other, 1.1 * bench_arm.HOLD_S)
-    with pytest.raises(HoldLostError):
-        hold.check()
 
 
 def test_towards_the_support_it_stops_before_it(asked: Bench, cell: CellFolder, world: World) -> None:

@@ -145,6 +145,18 @@ def test_a_run_does_not_wait_for_a_processing_that_is_stopped(tmp_path: Path) ->
     assert not cells.alive(worker)
 
 
+def test_a_stop_during_the_fits_ends_the_command_and_the_run_stays_complete(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path)
+    process, worker = begun(cell)
+    cells.wait_until(lambda: cells.events(cell.run_folder, "stop"), "the end of the session")
+    process.send_signal(signal.SIGINT)
+    ended = cells.finish(process)
+    assert ended.code == 130, ended.err
+    assert "the frames are complete; their result is not: stopped while it was made" in ended.err
+    assert not cells.alive(worker)
+    assert cells.events(cell.run_folder, "stop")[-1]["outcome"] == "done"
+
+
 def test_a_processing_that_gets_no_more_memory_says_so_and_is_no_defect(tmp_path: Path) -> None:
     cell = cell_of_three_views(tmp_path)
     process, worker = begun(cell)

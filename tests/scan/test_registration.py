@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cells
 import numpy as np
 import pytest
 import trimesh
@@ -16,7 +16,6 @@ from ray_scanner import RayScan, RayScanner, tower
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from coupole.commands import cli
 from coupole.errors import InputError
 from coupole.scan.mesh_defects import find_defects
 from coupole.scan.mesh_files import read_mesh
@@ -188,7 +187,7 @@ def test_control_points_place_the_scans_in_the_site(surveyed: Surveyed, tmp_path
 
 
 def test_with_control_points_the_command_writes_the_mesh_in_their_frame(
-    surveyed: Surveyed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    surveyed: Surveyed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spheres = {"s1": (900.0, 0.0, -300.0), "s2": (600.0, 700.0, 100.0), "s3": (100.0, 950.0, 400.0)}
     lines = ["scan,name,x,y,z,u_mm"]
@@ -203,11 +202,9 @@ def test_with_control_points_the_command_writes_the_mesh_in_their_frame(
     monkeypatch.chdir(tmp_path)
     scans = [str(surveyed.folder / f"side{k}.ply") for k in range(2)]
     tables = ["--targets", "targets.csv", "--control", "control.csv", "--mesh-mm", "16", "--out", "on-site"]
-    monkeypatch.setattr(sys, "argv", ["coupole", "register", *scans, *tables])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert end.value.code == 0
-    assert "frame: site" in capsys.readouterr().err.replace("\n", " ")
+    ended = cells.here("register", *scans, *tables)
+    assert ended.code == 0, ended.err
+    assert "frame: site" in ended.err.replace("\n", " ")
     assert json.loads((tmp_path / "on-site/registration.json").read_text())["mesh"]["frame"] == "site"
     mesh = trimesh.load(tmp_path / "on-site/mesh.ply")
     of_sides = [surveyed.scans[f"side{k}.ply"] for k in range(2)]

@@ -76,8 +76,9 @@ class Acquisitions:
         raise InputError(f"{run}: this run is not being acquired in this cell")
 
     def _send_command(self, state: State, command: Command) -> State:
-        if command == "stop" and self._queue.running:
-            self._stopped_ids.add(self._queue.running.id)
+        entry = self._queue.running
+        if command == "stop" and entry is not None and entry.pid == state["pid"]:
+            self._stopped_ids.add(entry.id)
         try:
             return ask(Path(state["run"]), command)
         except InputError:

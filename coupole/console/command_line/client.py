@@ -208,12 +208,13 @@ def is_served(cell: Cell) -> bool:
     return True
 
 
-def ask_permission(cell: Cell, action: str) -> None:
+def ask_permission(cell: Cell, action: str) -> int:
     """Ask the cell's console whether this process may act with devices that are open already; without a console,
-    no permission is needed. Raises InputError if another person is in control, or if the console does not
-    answer."""
+    no permission is needed. Return the number of times that somebody came into control until now. Raises
+    InputError if another person is in control, or if the console does not answer."""
     with contextlib.suppress(NotServed):
-        call(cell, "POST", "/api/v1/bench/permission", {"action": action})
+        return int(call(cell, "POST", "/api/v1/bench/permission", {"action": action})["taken_count"])
+    return 0
 
 
 @contextlib.contextmanager

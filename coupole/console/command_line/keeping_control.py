@@ -35,11 +35,14 @@ class KeptControl:
 
 @contextmanager
 def kept_control(cell: Cell, action: str) -> Iterator[KeptControl]:
-    """Ask the cell's console every 0.1 s, in another thread, who is in control, while the context lasts. The
-    console's log says that the `action` was ended. At a console that is frozen nobody can take control, so
-    nothing ends until it runs again; the same is true without a console."""
+    """Ask the cell's console for permission; then ask every 0.1 s, in another thread, who came into control since,
+    while the context lasts. The console's log says that the `action` was ended. At a console that is frozen nobody
+    can take control, so nothing ends until it runs again; the same is true without a console. Raises InputError if
+    another person is in control, or if the console does not answer."""
     control, over = KeptControl(), threading.Event()
-    watch = threading.Thread(target=_watch, args=(cell, action, control, over), name="control", daemon=True)
+    taken_count = ask_permission(cell, action)
+    arguments = (cell, action, taken_count, control, over)
+    watch = threading.Thread(target=_watch, args=arguments, name="control", daemon=True)
     watch.start()
     try:
         yield control
@@ -48,18 +51,16 @@ def kept_control(cell: Cell, action: str) -> Iterator[KeptControl]:
         watch.join(_LOGGED_WITHIN_S)
 
 
-def _watch(cell: Cell, action: str, control: KeptControl, over: threading.Event) -> None:
-    query = ""
+def _watch(cell: Cell, action: str, taken_count: int, control: KeptControl, over: threading.Event) -> None:
     while not (over.wait(_LOOK_EVERY_S) or control.lost_because):
         with contextlib.suppress(InputError):  # nobody answers
             now = call(
                 cell,
                 "GET",
-                f"/api/v1/bench/permission{query}",
+                f"/api/v1/bench/permission?taken_count={taken_count}",
                 given_up=over.is_set,
                 meanwhile="; the motion goes on, as nobody can take control there meanwhile",
             )
-            query = query or f"?taken_count={now['taken_count']}"
             if not now["may_act"]:
                 control.lose(f"{now['in_control']} took control at the console")
                 ask_permission(cell, f"{action}, under way")  # its refusal is logged

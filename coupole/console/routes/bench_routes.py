@@ -51,20 +51,21 @@ def add_bench_routes(app: FastAPI, service: Service) -> None:
         return FileResponse(path)
 
     @app.post("/api/v1/bench/permission", responses=REFUSALS)
-    def permit(question: Permission, person: Who, request: Request) -> dict[str, str]:
+    def permit(question: Permission, person: Who, request: Request) -> Permitted:
         """Tell a command whether it may act with the devices that the bench holds: nobody else is in control. The
         command then asks the bench itself, which ends the motion when that process ends."""
         request.state.about = question.action
+        count = service.control.taken_count
         allow(service, person, Role.OPERATOR, question.action, acts=True)
-        return {"in_control": service.control.now.name}
+        return Permitted(in_control=service.control.now.name, may_act=True, taken_count=count)
 
     @app.get("/api/v1/bench/permission", responses=REFUSALS)
-    def still_permitted(person: Who, taken_count: int | None = None) -> Permitted:
+    def still_permitted(person: Who, taken_count: int) -> Permitted:
         """Tell a command that drives the arm whether this person may still do so. It stops the arm if not.
-        `taken_count` is that of the first answer: another person who came into control since then, even for a
-        moment, ends the permission."""
+        `taken_count` is that of the permission: another person who came into control since then, even for a
+        moment, ends it."""
         control, count = service.control, service.control.taken_count
-        taker = "" if taken_count is None else control.taken_since(taken_count, person.name)
+        taker = control.taken_since(taken_count, person.name)
         may_act = not taker and control.may_act(person)
         return Permitted(in_control=taker or control.now.name, may_act=may_act, taken_count=count)
 

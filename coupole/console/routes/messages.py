@@ -99,9 +99,9 @@ class Permitted(BaseModel):
     in_control: str
     """The person in control; empty if nobody is."""
     may_act: bool
-    """True unless another person is in control, or was since the first question."""
+    """True unless another person is in control, or was since the permission."""
     taken_count: int
-    """Number of times that somebody came into control. Send it with the next question."""
+    """Number of times that somebody came into control. Later questions send that of the permission."""
 
 
 class Light(Asked):

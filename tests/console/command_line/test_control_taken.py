@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -126,7 +125,6 @@ def test_an_arm_of_an_open_bench_stops_when_another_person_takes_control(driven:
 def test_an_arm_that_is_driven_stops_though_control_is_given_back_at_once(driven: Driven) -> None:
     """Between two questions of the command: it asks every 0.1 s who is in control."""
     with driven.driving("park") as drive:
-        time.sleep(0.3)  # it has asked once
         driven.takes_control("taking it")
         assert driven.engineer.post("/api/v1/control/give", {}).status == 200
     ended = cells.finish(drive)

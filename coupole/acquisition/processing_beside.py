@@ -255,8 +255,8 @@ class ProcessingBeside:
             return
         self._why = "the processing ended with the run, which is not complete"
         self._console.print(
-            f"reflectance: the processing ended with the run; the samples of {self._views_text} are kept until the "
-            "run is resumed",
+            f"reflectance: the processing ended with the run; the samples of {self._views_text} are kept "
+            "until the run is resumed",
             markup=False,
         )
 

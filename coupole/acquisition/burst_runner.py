@@ -224,6 +224,7 @@ class BurstRunner:
             if len(running.log) == len(burst.table) and last_frames is None:
                 last_frames = Deadline(clock, readout_s + self._cell.camera.delivery_s)
                 edges = box.edges()
+                grabber.expect_end()
             complete = last_frames is not None and (taken_frames >= edges or last_frames.has_expired)
             if complete:
                 in_transfer = Deadline(clock, readout_s)  # a surplus frame, exposed before now like all others

@@ -15,7 +15,8 @@ from coupole.bounded import Workers
 from coupole.devices import Camera, Frame
 from coupole.storage.view_writer import WRITERS
 
-_TAKE_TIMEOUT_S = 0.05
+_TAKE_TIMEOUT_S, _LAST_TIMEOUT_S = 0.05, 0.005
+"""Longest wait for a frame in one call of the camera: while the burst runs, and when its end is near."""
 _STALL_S = 2.0
 """Duration of a stall of disk or host that the camera's buffers must cover, if memory allows."""
 _FEWEST_BUFFERS = 16
@@ -47,6 +48,7 @@ class FrameGrabber:
         self._slots: list[Future[int]] = []
         self._error: BaseException | None = None
         self._stopping = threading.Event()
+        self._timeout_s = _TAKE_TIMEOUT_S
         self._thread = threading.Thread(target=self._take, name="grabber", daemon=True)
 
     def start(self) -> None:
@@ -55,7 +57,7 @@ class FrameGrabber:
     def _take(self) -> None:
         try:
             while not self._stopping.is_set():
-                frame = self._camera.next_frame(_TAKE_TIMEOUT_S)
+                frame = self._camera.next_frame(self._timeout_s)
                 if frame is not None:
                     self._slots.append(self._pool.submit(self._store_frame, frame))
                     self._timestamps_ns.append(frame.timestamp_ns)
@@ -101,6 +103,10 @@ class FrameGrabber:
     def slot(self, frame: int) -> int:
         """Return the frame's slot; waits for its bytes to be written. Raises the error of writing."""
         return self._slots[frame].result()
+
+    def expect_end(self) -> None:
+        """Wait for frames only briefly from now on, so that the thread ends soon after `end_soon`."""
+        self._timeout_s = _LAST_TIMEOUT_S
 
     def end_soon(self) -> None:
         """Request no more frames after the frame for which the thread is waiting. Does not wait; `stop` does."""

@@ -62,6 +62,21 @@ def test_a_camera_that_fails_after_its_last_frame_is_told_and_no_frame_is_lost(
     assert cell.done[-2:] == ["camera disarmed", "BurstEnded"]
 
 
+def test_the_end_of_a_burst_does_not_wait_for_frames_that_cannot_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next burst begins only when the last call for a frame has returned."""
+    cell = Cell(BURST, take(BURST))
+    take_one, timeouts_s = cell.camera.next_frame, []
+
+    def next_frame(timeout_s: float) -> Frame | None:
+        timeouts_s.append(timeout_s)
+        return take_one(timeout_s)
+
+    monkeypatch.setattr(cell.camera, "next_frame", next_frame)
+    cell.fire()
+    assert timeouts_s[0] > 0.02, "the thread does not turn in vain while the burst runs"
+    assert timeouts_s[-1] < 0.01
+
+
 def test_most_of_a_burst_is_proven_while_it_runs() -> None:
     cell = Cell(BURST, take(BURST), moves_at_s=BURST.duration_s - 0.1)
     with pytest.raises(ArmMovedError):

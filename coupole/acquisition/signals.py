@@ -1,7 +1,8 @@
 """Signals that end a session (Ctrl-C, SIGTERM, and SIGHUP when the terminal is gone), and signals that stop its
 process.
 
-Outside a session they raise `SignalReceived` in the main thread, again if Python drops it (`unheard_end`). In a
+Outside a session they raise `SignalReceived` in the main thread, again if Python drops it (`unheard_end`), and
+not before code that an exception would leave broken has ended (`_BREAKABLE`). In a
 session (`obeyed_by`) a thread of their own obeys them at once, whatever the main thread waits for. The main thread
 learns of them from `Control`. While a cell is made safe (`drop_signals`) they do nothing, so that a second Ctrl-C
 does not cut it short.
@@ -23,6 +24,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from types import FrameType
 from typing import Any
 
 from coupole import bounded
@@ -44,7 +46,11 @@ two. They are dropped, because an exception within the handling of the first wou
 
 _PULSE_S, _TOLD_WITHIN_S = 0.25, 0.1
 _AGAIN_AFTER_S = 0.02
-"""Time after which a signal that Python has dropped is sent again."""
+"""Time after which a signal that Python has dropped, or that came within `_BREAKABLE` code, is sent again."""
+_BREAKABLE = "llvmlite"
+"""Package in whose code no signal raises. It frees LLVM's objects by hand: an exception between a call of LLVM and
+the line that notes that it has taken an object frees the object twice, and the process crashes. numba uses it to
+compile."""
 _LEAVES_WITHIN_S = 300.0
 """The closing of hanging devices and the writing of a report take less time."""
 _STOPS_WITHIN_S = 0.1
@@ -95,12 +101,28 @@ def _stays_ignored(number: int) -> bool:
     return number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN
 
 
-def _raise(number: int, _: Any) -> None:
+def _raise(number: int, frame: FrameType | None) -> None:
     now_s = time.monotonic()
     _heard_s.append(now_s)
-    if now_s > _raised_s[-1] + _SAME_S:
+    if _is_within(_BREAKABLE, frame):
+        _send_later(number)
+    elif now_s > _raised_s[-1] + _SAME_S:
         _raised_s.append(now_s)
         raise SignalReceived(number)
+
+
+def _is_within(package: str, frame: FrameType | None) -> bool:
+    """Tell whether a function of a package is under way in the thread of a frame."""
+    while frame is not None:
+        if str(frame.f_globals.get("__name__", "")).partition(".")[0] == package:
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _send_later(number: int) -> None:
+    """Send a signal to this process a moment later, and thus elsewhere in the main thread."""
+    threading.Timer(_AGAIN_AFTER_S, os.kill, (os.getpid(), number)).start()
 
 
 def _drop(number: int, _: Any) -> None:
@@ -134,11 +156,10 @@ def unheard_end() -> Iterator[None]:
 
 
 def _send_again(otherwise: Callable[[Any], object], dropped: Any) -> None:
-    """Send the signal behind an exception that Python drops again, a moment later and thus elsewhere in the main
-    thread. `otherwise` gets all other exceptions."""
+    """Send the signal behind an exception that Python drops again. `otherwise` gets all other exceptions."""
     if isinstance(dropped.exc_value, SignalReceived):
         _raised_s.append(-math.inf)
-        threading.Timer(_AGAIN_AFTER_S, os.kill, (os.getpid(), dropped.exc_value.number)).start()
+        _send_later(dropped.exc_value.number)
     else:
         otherwise(dropped)
 

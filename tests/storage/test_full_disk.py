@@ -72,6 +72,27 @@ def test_a_view_for_which_there_is_no_room_is_refused_and_leaves_no_file(small_d
     assert list(small_disk.iterdir()) == []
 
 
+@pytest.mark.parametrize("left_bytes", [0, 4096, 8192, 16384, 32768, 65536])
+def test_a_view_for_which_a_disk_has_hardly_any_room_is_refused(small_disk: Path, left_bytes: int) -> None:
+    """HDF5 crashes if it meets the full disk itself, when it closes the file: the arm moved then."""
+    fill(small_disk, left_bytes)
+    program = (
+        "import sys; from pathlib import Path; from view_files import FORMAT, METADATA\n"
+        "from coupole.errors import DiskFull; from coupole.storage.frame_file_creation import create\n"
+        "try: create(Path(sys.argv[1]), 20, FORMAT, METADATA)\n"
+        "except DiskFull: print('told')\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", program, str(small_disk / "top.h5")],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert (ended.returncode, ended.stdout) == (0, "told\n"), ended.stderr
+    assert not list(small_disk.glob("top*"))
+
+
 def test_a_run_that_cannot_be_made_leaves_no_folder(small_disk: Path, tmp_path: Path) -> None:
     fill(small_disk, 16384)
     for name in ("plan.yaml", "rig.yaml"):

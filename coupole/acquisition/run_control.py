@@ -63,11 +63,12 @@ class RunControl:
         halt: Callable[[], Sequence[Safeguard]],
         progress: Callable[[], Progress | None],
         light_after_lux_h: Mapping[str, float] = MappingProxyType({}),
-        when_served: Callable[[Path], None] = lambda _: None,
+        when_served: Callable[[Path], bool] = lambda _: False,
     ) -> None:
         """`halt` switches the lights off and stops the arm, at once, from any thread. `progress` is the newest
         progress. `light_after_lux_h` is the total light of each object (by its id) when the run is complete, as
-        preflight expects it. `when_served` is called with the run when the socket is there, or cannot be."""
+        preflight expects it. `when_served` is called with the run when the socket is there, or cannot be. It
+        returns whether the session was told to stop before."""
         self._when_served = when_served
         files = {"plan": str(paths.plan.resolve()), "rig": str(paths.rig.resolve())}
         self._about: State = {"version": VERSION, "run": str(paths.run), **files, "pid": os.getpid()}
@@ -82,7 +83,8 @@ class RunControl:
         except (OSError, InputError) as error:
             self.trouble = f"`coupole pause` and `coupole stop` will not reach this run: {reason(error)}"
         self._served = stack
-        self._when_served(self._run)
+        if self._when_served(self._run):
+            self._control.stop_by(signal.SIGINT, "`coupole stop`, or the console")
         return self
 
     def __exit__(self, *_: object) -> None:

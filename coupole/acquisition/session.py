@@ -90,7 +90,7 @@ class SessionRequest:
     """True to copy a mesh of more than 100 MB into the folder too."""
     beside: ProcessingBeside | None = None
     """Processes the run's views while it is acquired."""
-    when_served: Callable[[Path], None] = lambda _: None
+    when_served: Callable[[Path], bool] = lambda _: False
     """Called when the run has a socket of its own."""
 
 
@@ -104,7 +104,7 @@ class _Session:
     faults: ArmFaults
     begun_s: float
     """Time of its first line in the journal, by `_unset_clock_s`."""
-    when_served: Callable[[Path], None]
+    when_served: Callable[[Path], bool]
 
 
 def acquire_plan(job: Job, console: Console, request: SessionRequest, figures: dict[str, Any]) -> None:

@@ -90,10 +90,12 @@ class SessionWithoutRun:
         """Tell the plan and its rig, now that they are known."""
         self._about |= {"plan": str(plan.resolve()), "rig": str(rig.resolve())}
 
-    def begin_run(self, run: Path) -> None:
-        """Tell that the run has a socket now."""
+    def begin_run(self, run: Path) -> bool:
+        """Tell that the run has a socket now. Return whether the session was told to stop before, although its
+        signal has ended nothing."""
         self._about |= {"run": str(run.resolve()), "begun": True}
         self._pass_on("running")
+        return self._state == "stopping"
 
     def end(self) -> None:
         """Tell that nothing can be stopped here from now on."""

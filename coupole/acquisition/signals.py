@@ -40,6 +40,9 @@ _heard_s = deque([-math.inf], maxlen=1)
 
 _raised_s = deque([-math.inf], maxlen=1)
 """Time when a SignalReceived was last raised."""
+_raised_number = deque([0], maxlen=1)
+"""Number of the first signal that was raised outside sessions; 0 for none. A session that begins afterwards obeys
+it: other people's code has caught the exception (a bare `except` around an import, say)."""
 _SAME_S = 1.0
 """Signals outside sessions within this time after another one are the same wish: a terminal that closes may send
 two. They are dropped, because an exception within the handling of the first would hide it."""
@@ -73,6 +76,7 @@ def raise_outside_sessions() -> None:
     """Have each signal raise SignalReceived from now on. A hang-up that is ignored (`nohup`) stays ignored. Ctrl-C
     and SIGTERM always count, even in the background of a script."""
     _raised_s.append(-math.inf)
+    _raised_number.append(0)
     for number in ENDING:
         if not _stays_ignored(number):
             signal.signal(number, _raise)
@@ -80,6 +84,7 @@ def raise_outside_sessions() -> None:
 
 def ignore_from_now() -> None:
     """Ignore signals from now on, because the process is about to exit with its code."""
+    _raised_number.append(0)
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
 
@@ -108,6 +113,7 @@ def _raise(number: int, frame: FrameType | None) -> None:
         _send_later(number)
     elif now_s > _raised_s[-1] + _SAME_S:
         _raised_s.append(now_s)
+        _raised_number.append(_raised_number[0] or number)
         raise SignalReceived(number)
 
 
@@ -190,6 +196,7 @@ def drop_signals() -> Iterator[None]:
 @contextmanager
 def obeyed_by(control: Control, act: Act, *, is_watched: bool = True) -> Iterator[None]:
     """Obey signals. A signal that ends the session sets `control.stop` and calls `act` at once, in another thread.
+    A signal that was raised before the session, and did not end the program, counts too.
     SIGUSR1 pauses the session or continues it. Ctrl-Z calls `act`, stops the process, and holds the session. `act`
     begins to make the cell safe. It returns its `Safeguard`s, and sentences on devices that are perhaps not safe.
 
@@ -215,6 +222,9 @@ def obeyed_by(control: Control, act: Act, *, is_watched: bool = True) -> Iterato
             | {signal.SIGUSR1: lambda *_: control.toggle_pause()}
             | {number: lambda *_: None for number in (signal.SIGTSTP, signal.SIGCONT)}
         ):
+            if _raised_number[0]:
+                control.stop_by(_raised_number[0])
+                act()
             yield
     finally:
         signal.set_wakeup_fd(before)

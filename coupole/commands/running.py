@@ -137,7 +137,7 @@ def _acquire_here(
     with _beside(job, console, resume, result, summary, is_asked=is_asked) as beside:
         wanted_session = replace(wanted_session, beside=beside, when_served=starting.begin_run)
         acquire_plan(job, console, wanted_session, summary)
-        starting.end()  # what is processed beside the run goes on
+    starting.end()
 
 
 @contextmanager

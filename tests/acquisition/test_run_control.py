@@ -21,6 +21,7 @@ from coupole.acquisition import run_control, runtime_folder, user_socket
 from coupole.acquisition.observer import Control
 from coupole.acquisition.run_control import RunControl, RunPaths, ask, running
 from coupole.acquisition.safeguard import Safeguard
+from coupole.acquisition.sessions_without_run import SessionWithoutRun, socket_of
 from coupole.errors import InputError
 from coupole.viewing.progress import Progress
 
@@ -221,6 +222,20 @@ def test_without_a_folder_for_its_socket_a_run_is_acquired_all_the_same(
     paths = RunPaths(tmp_path, tmp_path / "plan.yaml", tmp_path / "rig.yaml")
     with RunControl(paths, Control(), list, lambda: None) as control:
         assert "will not reach this run" in control.trouble
+
+
+def test_a_run_stops_if_its_session_was_told_so_before_and_the_signal_ended_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other people's code may catch the exception of the signal."""
+    monkeypatch.setattr(os, "kill", lambda *_: None)
+    session, control = SessionWithoutRun("acquire", tmp_path / "plan.yaml"), Control()
+    paths = RunPaths(tmp_path, tmp_path / "plan.yaml", tmp_path / "rig.yaml")
+    with session:
+        assert run_control.exchange_command(socket_of(os.getpid()), "stop")["state"] == "stopping"
+        with RunControl(paths, control, list, lambda: None, when_served=session.begin_run):
+            assert control.stop.is_set()
+    assert control.interruption().exit_code == 130
 
 
 def test_who_has_gone_before_the_word_is_heard_does_not_end_a_pause(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
@@ -33,6 +34,7 @@ def as_in_a_terminal() -> Iterator[None]:
     """Whoever runs the tests may have ignored a signal."""
     before = {number: signal.signal(number, signal.SIG_DFL) for number in ENDING}
     yield
+    raise_outside_sessions()  # forgets what a test has received
     for number, handler in before.items():
         signal.signal(number, handler)
 
@@ -96,6 +98,19 @@ def test_a_signal_that_python_drops_ends_the_session_that_has_begun_meanwhile() 
             assert acted.wait(10.0)
     with pytest.raises(Interrupted):
         control.go_on()
+
+
+def test_a_signal_that_other_code_swallows_ends_the_session_that_has_begun_meanwhile() -> None:
+    """A library catches all exceptions, around an import, say."""
+    control, acted = Control(), threading.Event()
+    raise_outside_sessions()
+    with contextlib.suppress(BaseException):
+        signal.raise_signal(signal.SIGTERM)
+    with obeyed_by(control, lambda: acted.set() or ()):
+        assert acted.is_set()
+    with pytest.raises(Interrupted) as stopped:
+        control.go_on()
+    assert stopped.value.exit_code == 143
 
 
 def test_other_exceptions_that_python_drops_are_told_as_before(monkeypatch: pytest.MonkeyPatch) -> None:

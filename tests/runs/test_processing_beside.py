@@ -145,11 +145,16 @@ def test_a_run_does_not_wait_for_a_processing_that_is_stopped(tmp_path: Path) ->
     assert not cells.alive(worker)
 
 
-def test_a_stop_during_the_fits_ends_the_command_and_the_run_stays_complete(tmp_path: Path) -> None:
+@pytest.mark.parametrize("by", ["Ctrl-C", "coupole stop"])
+def test_a_stop_during_the_fits_ends_the_command_and_the_run_stays_complete(tmp_path: Path, by: str) -> None:
     cell = cell_of_three_views(tmp_path)
     process, worker = begun(cell)
     cells.wait_until(lambda: cells.events(cell.run_folder, "stop"), "the end of the session")
-    process.send_signal(signal.SIGINT)
+    if by == "Ctrl-C":
+        process.send_signal(signal.SIGINT)
+    else:
+        stopped = cells.here("stop", cell.plan)
+        assert stopped.code == 0, stopped.err
     ended = cells.finish(process)
     assert ended.code == 130, ended.err
     assert "the frames are complete; their result is not: stopped while it was made" in ended.err

@@ -67,12 +67,16 @@ class Acquisitions:
 
     def tell(self, run: str, command: Command) -> State:
         """Send `pause`, `go-on` or `stop` to the run with this name. If a run that the queue has begun does not
-        answer a `stop`, it is stopped as by Ctrl-C. Raises InputError if the run is not being acquired, or does
-        not answer.
+        answer a `stop`, or has its last frame, it is stopped as by Ctrl-C. Raises InputError if the run is not
+        being acquired, or does not answer.
         """
         for state in [self.state] if self.state and Path(self.state["run"]).name == run else running():
             if Path(state["run"]).name == run and self._is_ours(state):
                 return self._send_command(state, command)
+        entry = self._queue.running
+        if command == "stop" and entry is not None and entry.run and Path(entry.run).name == run:
+            self.stop(entry)  # its result is made
+            return {"run": entry.run, "plan": entry.plan, "pid": entry.pid, "state": "stopping", "trouble": []}
         raise InputError(f"{run}: this run is not being acquired in this cell")
 
     def _send_command(self, state: State, command: Command) -> State:

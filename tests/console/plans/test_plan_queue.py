@@ -210,8 +210,9 @@ def test_a_run_that_falls_silent_is_still_at_work_and_a_stop_interrupts_its_proc
         assert process.wait(10.0) == -signal.SIGINT
 
 
+@pytest.mark.parametrize("by", ["its entry", "its run"])
 def test_the_queue_halts_after_a_stop_that_came_when_the_run_was_complete(
-    queue: PlanQueue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    queue: PlanQueue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str
 ) -> None:
     """The process ends with 0 then; the person believes that all stands."""
     found = Acquisitions(queue, read_cell(CellFolder(tmp_path).rig), tmp_path / "output")
@@ -220,10 +221,13 @@ def test_the_queue_halts_after_a_stop_that_came_when_the_run_was_complete(
         assert process.stdout is not None
         assert process.stdout.readline()
         found._process = process
-        queue.change(entry.id, state="running", pid=process.pid)
+        queue.change(entry.id, state="running", pid=process.pid, run=str(tmp_path / "20261201-one"))
         (tmp_path / "output").mkdir()
         monkeypatch.setattr(found, "_is_alive", lambda _: process.poll() is None)
-        found.stop(queue.entry(entry.id))
+        if by == "its entry":
+            found.stop(queue.entry(entry.id))
+        else:
+            assert found.tell("20261201-one", "stop")["state"] == "stopping"
         process.wait()
     found._look_after(queue.entry(entry.id))
     assert (queue.entry(entry.id).state, queue.entry(entry.id).exit_code) == ("done", 0)

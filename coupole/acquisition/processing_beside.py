@@ -316,7 +316,7 @@ class ProcessingBeside:
     def _tell_of_failure(self) -> None:
         self._leave_word()
         alarm(
-            f"reflectance failed: {self._reason}. The acquisition continues without it; "
+            f"reflectance failed: {self._reason.rstrip('.')}. The acquisition continues without it; "
             f"the samples of {self._views_text} are kept"
         )
 

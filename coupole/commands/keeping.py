@@ -174,11 +174,10 @@ def _show_verified(console: Console, run: Run, verification: Verification) -> No
     if verification.listed_count and not verification.bad:
         console.print(f"{verification.listed_count} files have the checksums of manifest.sha256")
     if verification.unlisted:
-        are_of_views = all(name.startswith("views/") for name in verification.unlisted)
         console.print(
             f"not listed in manifest.sha256: {', '.join(verification.unlisted[:5])}"
-            f"{' ...' if verification.unlisted[5:] else ''}"
-            f"{' (views that are not complete are not listed yet)' if are_of_views else ''}"
+            f"{' ...' if verification.unlisted[5:] else ''} (`--manifest` adds these files)",
+            markup=False,
         )
 
 

@@ -24,6 +24,7 @@ from coupole.commands.reflectance_options import (
     PicturesWithoutRecords,
     SamplesOfRuns,
     SchedulerOption,
+    SourcesOfResult,
     TexelsOption,
     Workers,
     bytes_of,
@@ -260,10 +261,36 @@ def check(result: ResultArgument, memory: MemoryOption = "2GB", as_json: JsonOpt
 
 
 @reflectance_app.command()
-def ablate(result: ResultArgument, as_json: JsonOption = False) -> None:
-    """Compute the errors of the fits with fewer LEDs, without grazing light, with fewer coefficients: one page."""
+@flatten_options
+def ablate(
+    result: ResultArgument,
+    runs: Annotated[
+        list[Path] | None,
+        typer.Argument(help="With --texels, the runs of the result.", show_default=False),
+    ] = None,
+    *,
+    texels: Annotated[
+        bool,
+        typer.Option(
+            "--texels",
+            help="Errors of the result's texels instead of those of its fits. The frames of the runs are read "
+            "again: give the runs, and --mesh, --calibrations, --refined and --poses as for the result.",
+        ),
+    ] = False,
+    sources: SourcesOfResult,
+    memory: MemoryOption = "2GB",
+    as_json: JsonOption = False,
+) -> None:
+    """Compute the errors of the fits with fewer LEDs, without grazing light, with fewer coefficients: one page.
+    With --texels, compute the errors of texels with fewer LEDs and without grazing light, beside those of their
+    triangles.
+    """
 
     def step(say: Said) -> dict[str, Any]:
+        if texels:
+            return _ablate_texels(result, runs or [], sources, bytes_of(memory), say)
+        if runs or sources.has_any:
+            raise InputError("RUNS, --mesh, --calibrations, --refined, --poses: are for --texels")
         from coupole.reflectance.result_pages import ablation_page
         from coupole.reflectance.run_ablation import ablate_result
 
@@ -271,6 +298,22 @@ def ablate(result: ResultArgument, as_json: JsonOption = False) -> None:
         return {**document, "report": str(ablation_page.write(result, document))}
 
     _do(step, as_json=as_json)
+
+
+def _ablate_texels(
+    result: Path, runs: list[Path], sources: SourcesOfResult, memory_bytes: int, say: Said
+) -> dict[str, Any]:
+    """Ablate texels. Raises InputError without runs."""
+    from coupole.reflectance.result_pages import texel_ablation_page
+    from coupole.reflectance.texels.texel_ablation import ablate_texels
+
+    if not runs:
+        raise InputError(
+            "--texels: needs the frames; give the runs of the result, and its records, such as "
+            f"`coupole reflectance ablate {result} RUN --texels --calibrations calibrations`"
+        )
+    document = ablate_texels(sources.request(runs, result, memory_bytes), result, say=say)
+    return {**document, "report": str(texel_ablation_page.write(result, document))}
 
 
 @reflectance_app.command()

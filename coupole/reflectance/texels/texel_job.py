@@ -43,6 +43,7 @@ from coupole.reflectance.texels.texel_check import check_texels
 from coupole.reflectance.texels.texel_grid import pixel_mm, texel_grid
 from coupole.reflectance.texels.texel_size import TexelSize
 from coupole.reflectance.texels.texel_values import TexelReader
+from coupole.reflectance.texels.view_centres import start_of
 from coupole.reflectance.texels.view_texels import texels_of_view
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import make_folder
@@ -80,13 +81,9 @@ def add_texels(
     """
     token, size = uuid4().hex, size or TexelSize()
     refuse_other_size(out, size)
-    measured_runs = read_runs(request, token)
-    settings = read_settings(out)
     try:
-        if settings != json.loads(json.dumps(settings_of(request, token, measured_runs))):
-            raise InputError(f"{out}: is a result of other runs, records or settings")
-        result = RunResult(out.resolve())
-        result.refuse_unfinished(settings, fits=True)
+        result = open_result_of(request, token, out)
+        measured_runs, settings = read_runs(request, token), read_settings(out)
         tasks = [
             _View(
                 run.resolve(), view.name, view_file_name(measured_runs, measured_run, view), out.resolve(),
@@ -108,6 +105,16 @@ def add_texels(
         forget()
 
 
+def open_result_of(request: RunRequest, token: str, out: Path) -> RunResult:
+    """Open a complete result. Raises InputError if it is incomplete, or belongs to another request."""
+    settings = read_settings(out)
+    if settings != json.loads(json.dumps(settings_of(request, token, read_runs(request, token)))):
+        raise InputError(f"{out}: is a result of other runs, records or settings")
+    result = RunResult(out.resolve())
+    result.refuse_unfinished(settings, fits=True)
+    return result
+
+
 def _fit(sources: Sources, token: str, tasks: list[_View], shop: Workshop, say: Said) -> None:
     for task in tasks:
         shop.refuse_blind(task.run, RUN_JSON)
@@ -125,16 +132,17 @@ def _texels_of_one(token: str, sources: Sources, threads: int | None, say: Said,
     surface = surface_of_view(result, samples)
     width_mm = pixel_mm(surface)
     side_px = task.size.side_px(width_mm)
-    fit_with = (
-        task.left_out, task.memory_bytes, threads or len(os.sched_getaffinity(0)),
-        lambda count, of: say(f"texels of {task.view}", count, of),
-    )  # fmt: skip
-    of_run, u_pixel = (measured_run, geometry, radiometry, view), radiometry.u_pixel
+    threads = threads or len(os.sched_getaffinity(0))
+    read_with = task.memory_bytes, threads, lambda count, of: say(f"texels of {task.view}", count, of)
+    fitted_view = FittedView(measured_run, geometry, radiometry, view, surface, samples)
+    u_pixel = radiometry.u_pixel
     if side_px == 1:
-        texels = texels_of_view(result, samples, PixelReader(FittedView(*of_run, surface, samples)), *fit_with)
+        start = start_of(result, samples, surface.triangle_of_pixel, surface.normals, task.left_out)
+        texels = texels_of_view(start, PixelReader(fitted_view).read_all(*read_with), threads)
     else:
-        reader = TexelReader(FittedView(*of_run, surface, samples), texel_grid(surface, side_px))
-        texels = texels_of_grid(result, samples, reader, *fit_with)
+        reader = TexelReader(fitted_view, texel_grid(surface, side_px))
+        start = start_of(result, samples, reader.grid.triangle, surface.normals, task.left_out)
+        texels = texels_of_grid(start, reader.squares(), reader.read_all(*read_with), threads)
         u_pixel = u_pixel / np.sqrt(reader.pixels_of_channels)
     head = TexelFileHead(
         samples.view, measured_run.frames.size_px, task.size, width_mm, u_pixel, result.u_shared,

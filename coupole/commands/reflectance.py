@@ -30,6 +30,7 @@ from coupole.commands.reflectance_options import (
     bytes_of,
 )
 from coupole.commands.relight import relight
+from coupole.commands.texel_steps import ablate_texels_of, cluster_texels_of
 from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -288,7 +289,7 @@ def ablate(
 
     def step(say: Said) -> dict[str, Any]:
         if texels:
-            return _ablate_texels(result, runs or [], sources, bytes_of(memory), say)
+            return ablate_texels_of(result, runs or [], sources, bytes_of(memory), say)
         if runs or sources.has_any:
             raise InputError("RUNS, --mesh, --calibrations, --refined, --poses: are for --texels")
         from coupole.reflectance.result_pages import ablation_page
@@ -298,22 +299,6 @@ def ablate(
         return {**document, "report": str(ablation_page.write(result, document))}
 
     _do(step, as_json=as_json)
-
-
-def _ablate_texels(
-    result: Path, runs: list[Path], sources: SourcesOfResult, memory_bytes: int, say: Said
-) -> dict[str, Any]:
-    """Ablate texels. Raises InputError without runs."""
-    from coupole.reflectance.result_pages import texel_ablation_page
-    from coupole.reflectance.texels.texel_ablation import ablate_texels
-
-    if not runs:
-        raise InputError(
-            "--texels: needs the frames; give the runs of the result, and its records, such as "
-            f"`coupole reflectance ablate {result} RUN --texels --calibrations calibrations`"
-        )
-    document = ablate_texels(sources.request(runs, result, memory_bytes), result, say=say)
-    return {**document, "report": str(texel_ablation_page.write(result, document))}
 
 
 @reflectance_app.command()
@@ -353,7 +338,7 @@ def cluster(
 
     def step(say: Said) -> dict[str, Any]:
         if texels:
-            return _cluster_texels(result, clusters, bytes_of(memory), degrees, without_view, say)
+            return cluster_texels_of(result, clusters, bytes_of(memory), degrees, without_view, say)
         from coupole.reflectance.result_pages import cluster_page
         from coupole.reflectance.run_clusters import cluster_result
 
@@ -363,23 +348,6 @@ def cluster(
         return {**document, "report": str(cluster_page.write(result, document))}
 
     _do(step, as_json=as_json)
-
-
-def _cluster_texels(
-    result: Path, clusters: int | None, memory_bytes: int, degrees: int, without_view: str | None, say: Said
-) -> dict[str, Any]:
-    """Group texels. Raises InputError for options that only samples of triangles have a meaning for."""
-    from coupole.reflectance.pair_harmonics import USUAL_DEGREES
-    from coupole.reflectance.result_pages import texel_cluster_page
-    from coupole.reflectance.texels.texel_clusters import cluster_texels
-
-    if without_view is not None or degrees != USUAL_DEGREES:
-        raise InputError(
-            "--without-view, --degrees: are for clusters of triangles, which are fitted to samples; clusters of "
-            "texels are means of their materials"
-        )
-    document = cluster_texels(result, clusters, memory_bytes, say=say)
-    return {**document, "report": str(texel_cluster_page.write(result, document))}
 
 
 def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool, closing_words: str = "") -> None:

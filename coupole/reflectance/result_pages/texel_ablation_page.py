@@ -37,7 +37,7 @@ def _page(name: str, document: dict[str, Any]) -> Page:
         next_step="Take as many LEDs as the error that you can accept needs; the tables have the figures.",
         sections=[
             *settings_told(document["mae"], _FITS),
-            _known(document["share_with_material"]),
+            _known_share(document["share_with_material"]),
             Section(
                 "compared",
                 "What is compared",
@@ -51,7 +51,7 @@ def _page(name: str, document: dict[str, Any]) -> Page:
     )
 
 
-def _known(shares: dict[str, Any]) -> Section:
+def _known_share(shares: dict[str, Any]) -> Section:
     tables = [
         Table(
             setting[0].upper() + setting[1:],

@@ -61,10 +61,11 @@ class TexelView:
 
 
 def open_views(
-    result: RunResult, read: Callable[[RunResult, ViewSamples], ViewTexels] = read_view_texels
+    result: RunResult, read_view: Callable[[RunResult, ViewSamples], ViewTexels] = read_view_texels
 ) -> list[TexelView]:
-    """Open the views that have texels; `read` reads the texels of one. Raises InputError if no view has texels."""
-    return [_open_view(result, view, read(result, view)) for view in views_with_texels(result)]
+    """Open the views that have texels; `read_view` reads those of a view. Raises InputError if
+    no view has texels."""
+    return [_open_view(result, view, read_view(result, view)) for view in views_with_texels(result)]
 
 
 def gather(views: Sequence[TexelView], places_mm: NDArray[np.floating]) -> Gathered:

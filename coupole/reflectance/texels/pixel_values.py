@@ -6,7 +6,6 @@ A larger memory needs fewer readings and gives the same result.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -28,8 +27,6 @@ from coupole.reflectance.new_light.pictured_surface import Surface
 from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.run_result import INTER_REFLECTION, ViewSamples
 
-Say = Callable[[int, int], None]
-"""Function that takes the number of texels that are done, and the number of all."""
 _TRIANGLES = 512
 """Number of triangles whose pixels a thread fills at a time."""
 
@@ -100,16 +97,6 @@ class PixelReader:
             rows.append(slice(first, end))
             first = end
         return rows
-
-    def read_all(self, memory_bytes: int, threads: int, say: Say) -> Iterator[PixelBlock]:
-        """Yield all pixels in blocks that fit into a memory. All frames are read for each of them. The number of
-        pixels that are done is given to `say`. Raises StorageError for a damaged frame."""
-        count = 0
-        for rows in self.blocks(memory_bytes):
-            block = self.read_block(rows, threads)
-            yield block
-            count += len(block.pixels)
-            say(count, self.count)
 
     def read_block(self, rows: slice, threads: int) -> PixelBlock:
         """Read all frames, for the pixels of some rows. Raises StorageError for a damaged frame."""

@@ -92,14 +92,14 @@ def ablate_texels(request: RunRequest, out: Path, *, say: Said = silent) -> dict
         variants = {variant for steps in FEWER_SAMPLES.values() for _, variant in steps}
         errors: dict[Variant, dict[str, list[Floats]]] = {}
         known_counts: dict[Variant, int] = {}
-        for count, variant in enumerate(sorted(variants, key=str), start=1):
+        for number, variant in enumerate(sorted(variants, key=str), start=1):
             triangles = _fit_triangles(result, places, variant, settings, request.memory_bytes)
             parts = [
                 _errors(result, view, patch, triangles, variant, settings) for view, patch in _all_patches(views)
             ]
             errors[variant] = {name: [of_fits[name] for of_fits, _ in parts] for name in (TEXELS, GGX_NORMAL.name)}
-            known_counts[variant] = sum(known for _, known in parts)
-            say("ablate texels", count, len(variants))
+            known_counts[variant] = sum(count for _, count in parts)
+            say("ablate texels", number, len(variants))
         report = _report(views, errors, known_counts)
         write_synced(out / TEXEL_ABLATION, json.dumps(report, indent=1) + "\n")
     except OSError as error:
@@ -167,7 +167,7 @@ def _fit_triangles(
         some = places[(places >= block.start) & (places < block.stop)] - block.start
         if not len(some):
             continue
-        samples = _reduced(result.samples(block).of_triangles(some), variant)
+        samples = _reduced_samples(result.samples(block).of_triangles(some), variant)
         leds = result.along_samples(block, "leds")
         sample_mask = np.isin(leds, leds_of(variant, leds, settings["left_out"]))
         materials = GGX_NORMAL.fit(samples, sample_mask, noise_um, None)
@@ -180,7 +180,7 @@ def _fit_triangles(
     return _Triangles(places, join_materials(parts), np.concatenate(covariances))
 
 
-def _reduced(samples: TriangleSamples, variant: Variant) -> TriangleSamples:
+def _reduced_samples(samples: TriangleSamples, variant: Variant) -> TriangleSamples:
     """Return the samples without those of light that is too grazing for a variant."""
     angles_deg = incidence_deg(samples.centres_mm, samples.normals, samples.led_mm)
     values = np.where(angles_deg[..., None] <= variant.most_incidence_deg, samples.values, np.float32(np.nan))

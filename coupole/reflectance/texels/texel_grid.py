@@ -33,9 +33,11 @@ class TexelGrid:
     places_mm: NDArray[np.float32]
     """[rows, columns, 3] mean of the places that a texel's pixels see, base frame."""
 
-    def cut(self, rows: slice, columns: slice) -> TexelGrid:
+    def part(self, rows: slice, columns: slice) -> TexelGrid:
         """Return a part of the grid, whose texels are numbered anew."""
-        of_pixels = tuple(slice(part.start * self.side_px, part.stop * self.side_px) for part in (rows, columns))
+        of_pixels = tuple(
+            slice(of_side.start * self.side_px, of_side.stop * self.side_px) for of_side in (rows, columns)
+        )
         number = self.texel_of_pixel[of_pixels]
         row, column = np.divmod(number, self.triangle.shape[1])
         new_number = (row - rows.start) * (columns.stop - columns.start) + column - columns.start
@@ -61,10 +63,10 @@ class TexelSquares:
     channel_shares: NDArray[np.float64]
     """[channels] each channel's share of the pixels."""
 
-    def cut(self, rows: slice, columns: slice) -> TexelSquares:
+    def part(self, rows: slice, columns: slice) -> TexelSquares:
         """Return a part of the texels."""
         bend, offsets = self.bend[rows, columns], self.channel_offsets[rows, columns]
-        return TexelSquares(self.grid.cut(rows, columns), bend, offsets, self.channel_shares)
+        return TexelSquares(self.grid.part(rows, columns), bend, offsets, self.channel_shares)
 
 
 def pixel_mm(surface: Surface) -> float:

@@ -80,7 +80,7 @@ class Patch:
 def read_patches(fitted_view: FittedView, side_px: int, count: int, threads: int) -> list[Patch]:
     """Read the frames of a view for about `count` of its patches. Raises StorageError for a damaged frame."""
     surface = fitted_view.surface
-    parts = _spread(surface.triangle_of_pixel >= 0, _SIDE * side_px, count)
+    parts = _spread_parts(surface.triangle_of_pixel >= 0, _SIDE * side_px, count)
     triangle = np.full_like(surface.triangle_of_pixel, -1)
     for part in parts:
         triangle[part] = surface.triangle_of_pixel[part]
@@ -90,7 +90,7 @@ def read_patches(fitted_view: FittedView, side_px: int, count: int, threads: int
     return list(_of_squares(view_of_parts, side_px, parts, threads))
 
 
-def _spread(is_seen: NDArray[np.bool_], side_px: int, count: int) -> list[Part]:
+def _spread_parts(is_seen: NDArray[np.bool_], side_px: int, count: int) -> list[Part]:
     """Return parts of a picture in which much of the object is seen."""
     height, width = is_seen.shape
     parts = [
@@ -100,8 +100,8 @@ def _spread(is_seen: NDArray[np.bool_], side_px: int, count: int) -> list[Part]:
     ]
     seen_counts = np.array([np.count_nonzero(is_seen[part]) for part in parts])
     full_parts = np.flatnonzero(seen_counts >= max(1.0, _FULL * seen_counts.max()))
-    chosen = np.unique(np.linspace(0, len(full_parts) - 1, count).astype(int))
-    return [parts[number] for number in full_parts[chosen]]
+    numbers = np.unique(np.linspace(0, len(full_parts) - 1, count).astype(int))
+    return [parts[number] for number in full_parts[numbers]]
 
 
 def _of_pixels(fitted_view: FittedView, parts: list[Part], threads: int) -> Iterator[Patch]:
@@ -124,9 +124,16 @@ def _of_squares(fitted_view: FittedView, side_px: int, parts: list[Part], thread
     for pixels in parts:
         rows, columns = (slice(of.start // side_px, -(-of.stop // side_px)) for of in pixels)
         some, places = _inside((rows, columns), row, column)
-        cut = squares.cut(rows, columns)
+        patch_squares = squares.part(rows, columns)
         no_channel = np.empty(0, np.int64)
-        yield Patch(cut.grid.triangle, places, block.places_mm[some], block.values[some], no_channel, cut)
+        yield Patch(
+            patch_squares.grid.triangle,
+            places,
+            block.places_mm[some],
+            block.values[some],
+            no_channel,
+            patch_squares,
+        )
 
 
 def _inside(
@@ -142,10 +149,10 @@ def _inside(
     return some[order], places[order]
 
 
-def _of_all(texels: ViewTexels, fitted: NDArray[np.int64], count: int) -> TriangleMaterials:
-    """Return materials of `count` texels, of which some were `fitted`."""
+def _of_all(texels: ViewTexels, fitted_rows: NDArray[np.int64], count: int) -> TriangleMaterials:
+    """Return materials of `count` texels, of which `fitted_rows` were fitted."""
     rows = [texels.normals, texels.kd, texels.ks, texels.alpha]
     whole = [np.full((count, *values.shape[1:]), np.nan) for values in rows]
     for values, of_fitted in zip(whole, rows, strict=True):
-        values[fitted] = of_fitted
+        values[fitted_rows] = of_fitted
     return TriangleMaterials(*whole, np.zeros(count))

@@ -7,7 +7,6 @@ the values of the pixels. The lists of a band's pixels are filled for eight LEDs
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from coupole.reflectance.extraction.sample_kernel import NO_VALUE
 from coupole.reflectance.extraction.seen_surface import SeenSurface
 from coupole.reflectance.extraction.view_samples import ViewPass
 from coupole.reflectance.parts_in_threads import first_alone
-from coupole.reflectance.texels.pixel_values import FittedView, LitPixels, Say, fill_rows, light_of
+from coupole.reflectance.texels.pixel_values import FittedView, LitPixels, fill_rows, light_of
 from coupole.reflectance.texels.texel_grid import TexelGrid, TexelSquares
 
 _TEXELS = 1 << 13
@@ -108,16 +107,6 @@ class TexelReader:
                 rows.append(slice(first, end))
             first = end
         return rows
-
-    def read_all(self, memory_bytes: int, threads: int, say: Say) -> Iterator[TexelBlock]:
-        """Yield all texels in bands that fit into a memory. All frames are read for each of them. The number of
-        texels that are done is given to `say`. Raises StorageError for a damaged frame."""
-        count = 0
-        for rows in self.bands(memory_bytes):
-            block = self.read_band(rows, threads)
-            yield block
-            count += len(block.texels)
-            say(count, self.count)
 
     def read_band(self, rows: slice, threads: int) -> TexelBlock:
         """Read all frames, for the texels of some rows of the grid. Raises StorageError for a damaged frame."""

@@ -142,7 +142,7 @@ def lights_of(result: RunResult, view: ViewSamples, left_out: Sequence[int]) -> 
 
 @dataclass(frozen=True)
 class FitStart:
-    """What the fits of a view's texels begin with."""
+    """Start of the fits of a view's texels."""
 
     triangle: NDArray[np.int32]
     """[h, w] for each texel the triangle that it sees, -1 for none."""

@@ -26,7 +26,7 @@ from coupole.reflectance.model_bias import unbiased_normals
 from coupole.reflectance.new_light.pictured_surface import surface_of_view
 from coupole.reflectance.result_folder import read_settings
 from coupole.reflectance.run_ablation import FEWER_SAMPLES, Variant, incidence_deg, leds_of, mean_errors
-from coupole.reflectance.run_job import RunRequest, forget, prepare_run, view_file_name
+from coupole.reflectance.run_job import RunRequest, forget, prepare_run, read_runs, view_file_name
 from coupole.reflectance.run_result import RunResult, ViewSamples
 from coupole.reflectance.texels.pixel_file import size_of_texels, views_with_texels
 from coupole.reflectance.texels.pixel_values import FittedView
@@ -133,7 +133,7 @@ def _all_patches(views: list[_View]) -> Iterable[tuple[_View, Patch]]:
 
 def _places(result: RunResult, view: _View, patch: Patch) -> NDArray[np.int64]:
     """Return the places, in the result's `triangles`, of the triangles that a patch sees."""
-    rows = np.unique(patch.rows)
+    rows = np.unique(patch.triangle[patch.triangle >= 0])
     return np.searchsorted(result.triangles, view.samples.triangles[rows])
 
 
@@ -141,11 +141,11 @@ def _read_views(request: RunRequest, token: str, result: RunResult, say: Said) -
     """Read the patches of all views, from the frames of the runs."""
     with_texels = {samples.path.stem: samples for samples in views_with_texels(result)}
     size, views = size_of_texels(result.folder) or TexelSize(), []
-    runs = [prepare_run(token, run.resolve(), request.sources)[0] for run in request.runs]
-    for run, measured_run in zip(request.runs, runs, strict=True):
-        _, geometry, radiometry = prepare_run(token, run.resolve(), request.sources)
+    measured_runs = read_runs(request, token)
+    for run in request.runs:
+        measured_run, geometry, radiometry = prepare_run(token, run.resolve(), request.sources)
         for view in measured_run.views:
-            samples = with_texels.get(view_file_name(runs, measured_run, view))
+            samples = with_texels.get(view_file_name(measured_runs, measured_run, view))
             if samples is None:
                 continue
             surface = surface_of_view(result, samples)
@@ -203,14 +203,14 @@ def _errors(
     triangle[patch.triangle >= 0] = number
     at = np.searchsorted(triangles.places, np.searchsorted(result.triangles, samples.triangles[rows]))
     of_triangles, mesh_normals = triangles.materials.at(at), view.mesh_normals[rows]
-    lights = lights_of(result, samples, np.setdiff1d(samples.leds, leds_of(variant, samples.leds, left_out)))
+    unused_leds = np.setdiff1d(samples.leds, leds_of(variant, samples.leds, left_out)).tolist()
     start = FitStart(
         triangle,
         centres_of(of_triangles, triangles.covariance[at], triangle, mesh_normals),
-        lights,
+        lights_of(result, samples, unused_leds),
         np.zeros((len(rows), 15), np.float32),  # the materials do not depend on it
     )
-    texel_triangle = triangle.reshape(-1)[patch.places]
+    texel_triangle = triangle.reshape(-1)[patch.places].astype(np.int64)
     angles_deg = incidence_deg(patch.places_mm, mesh_normals[texel_triangle], samples.led_mm)
     is_used = angles_deg <= variant.most_incidence_deg
     inner = np.flatnonzero(patch.is_inner)

@@ -47,11 +47,6 @@ class Patch:
     """None for single pixels."""
 
     @property
-    def rows(self) -> NDArray[np.int32]:
-        """[n] the texels' triangles."""
-        return self.triangle.reshape(-1)[self.places]
-
-    @property
     def is_inner(self) -> NDArray[np.bool_]:
         """[n] True for texels that have all their neighbours."""
         height, width = self.triangle.shape
@@ -67,7 +62,9 @@ class Patch:
         values = np.where(is_used[:, None], self.values, np.float16(np.nan))
         if self.squares is None:
             own_values = values[np.arange(len(values)), self.channel]
-            block = PixelBlock(self.places, self.rows, self.channel, self.places_mm, own_values)
+            triangle = self.triangle.reshape(-1)[self.places].astype(np.int64)
+            pixels = self.places.astype(np.int32)
+            block = PixelBlock(pixels, triangle, self.channel, self.places_mm, own_values)
             texels = texels_of_view(start, [block], threads)
             fitted_places = texels.pixels
         else:
@@ -155,4 +152,5 @@ def _of_all(texels: ViewTexels, fitted_rows: NDArray[np.int64], count: int) -> T
     whole = [np.full((count, *values.shape[1:]), np.nan) for values in rows]
     for values, of_fitted in zip(whole, rows, strict=True):
         values[fitted_rows] = of_fitted
-    return TriangleMaterials(*whole, np.zeros(count))
+    normals, kd, ks, alpha = whole
+    return TriangleMaterials(normals, kd, ks, alpha, np.zeros(count))

@@ -59,7 +59,7 @@ class Centres:
 
     @property
     def channels(self) -> int:
-        return self.logs.shape[2] // 2
+        return int(self.logs.shape[2]) // 2
 
     def prior(self, block: PixelBlock) -> Prior:
         """Return the centres of a block's pixels in their own channels; NaN without material."""

@@ -103,11 +103,12 @@ FEWER = {
 """Settings of `ablate --texels` with a value for texels under 41 LEDs."""
 
 
-def ablated(made: Made, folder: Path) -> tuple[Path, dict[str, Any]]:
-    """A copy of a result after `ablate --texels`, and what the command said."""
+def ablated(made: Made, folder: Path, *settings: str) -> tuple[Path, dict[str, Any]]:
+    """A copy of a result after `ablate --texels` with some settings of `FEWER`, and what the command said."""
+    fewer = {setting: FEWER[setting] for setting in settings}
     out = Path(shutil.copytree(made[1], folder / "ablated"))
     arguments = (made[0].run_folder, "--calibrations", made[0].folder / "records", "--texels", "--json")
-    with mock.patch("coupole.reflectance.texels.texel_ablation.FEWER_SAMPLES", FEWER):
+    with mock.patch("coupole.reflectance.texels.texel_ablation.FEWER_SAMPLES", fewer):
         ended = cells.here("reflectance", "ablate", out, *arguments)
     assert ended.code == 0, ended.err
     return out, ended.document

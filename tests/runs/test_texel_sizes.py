@@ -209,7 +209,7 @@ def test_texels_that_the_disk_cannot_hold_are_refused_before_the_work(
 def test_ablation_of_squares_tells_what_fewer_leds_cost(coarse: Made, tmp_path: Path) -> None:
     """With all LEDs, the values of squares are means of their pixels, without the detail that squares lack; so the
     error is smaller than that of pictures."""
-    _, document = ablated(coarse, tmp_path)
+    _, document = ablated(coarse, tmp_path, "share of the LEDs")
     whole, half = (of_fits for _, of_fits in document["mae"]["share of the LEDs"])
     assert document["side_px"] == coarse[2]["texels"]["side_px"]
     assert whole[TEXELS] < coarse[2]["texels"]["mae"][TEXELS]

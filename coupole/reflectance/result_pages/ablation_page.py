@@ -78,7 +78,7 @@ def quality(mae: dict[str, Any], fits: Sequence[Fit]) -> str:
     titles = {fit.name: fit.title for fit in fits}
     best = min(known_errors, key=lambda name: known_errors[name])
     return (
-        f"With the most ({setting} {value:g}) {titles[best]} has the smallest error: "
+        f"With the most ({setting} {value:g}) the smallest error is that of {titles[best]}: "
         f"{100 * known_errors[best]:.3f} % of range."
     )
 
@@ -104,7 +104,8 @@ def plot_png(mae: dict[str, Any], fits: Sequence[Fit]) -> bytes:
 
     figure = Figure(figsize=(11, 4.5), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
-    for ax, (setting, steps) in zip(figure.subplots(1, len(mae), sharey=True), mae.items(), strict=True):
+    axes = figure.subplots(1, len(mae), sharey=True, squeeze=False)[0]
+    for ax, (setting, steps) in zip(axes, mae.items(), strict=True):
         for fit in fits:
             errors = [(value, 100 * of[fit.name]) for value, of in steps if of[fit.name] is not None]
             places = zip(*errors, strict=True) if errors else ([], [])

@@ -17,9 +17,12 @@ def formats(incomplete: str) -> list[tuple[str, str]]:
 
 def fits(incomplete: str) -> list[tuple[str, str]]:
     """Fits of `coupole reflectance relight --fit`, with their descriptions."""
-    from coupole.reflectance.fits import FITS, RELIT, TEXELS
+    from coupole.reflectance.fits import FITS, RELIT, TEXEL_CLUSTERS, TEXELS
 
-    titles = {name: fit.title for name, fit in FITS.items()} | {TEXELS: "GGX of single pixels"}
+    titles = {name: fit.title for name, fit in FITS.items()} | {
+        TEXELS: "GGX of single pixels",
+        TEXEL_CLUSTERS: "of clusters of texels",
+    }
     return [(name, titles.get(name, "of clusters")) for name in RELIT if name.startswith(incomplete)]
 
 

@@ -98,7 +98,7 @@ EXAMPLES: dict[str, tuple[str, str]] = {
     "reflectance extract": ("reflectance extract RUN --out result", "reflectance extract RUN RUN2 --out result"),
     "reflectance fit": ("reflectance fit RESULT", "reflectance fit RESULT --memory 4GB"),
     "reflectance check": ("reflectance check RESULT", "reflectance check RESULT --json"),
-    "reflectance ablate": ("reflectance ablate RESULT", "reflectance ablate RESULT --json"),
+    "reflectance ablate": ("reflectance ablate RESULT", "reflectance ablate RESULT RUN --texels"),
     "reflectance cluster": (
         "reflectance cluster RESULT --clusters 40",
         "reflectance cluster RESULT --texels --clusters 12",

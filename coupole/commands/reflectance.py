@@ -24,11 +24,13 @@ from coupole.commands.reflectance_options import (
     PicturesWithoutRecords,
     SamplesOfRuns,
     SchedulerOption,
+    SourcesOfResult,
     TexelsOption,
     Workers,
     bytes_of,
 )
 from coupole.commands.relight import relight
+from coupole.commands.texel_steps import ablate_texels_of, cluster_texels_of
 from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -260,10 +262,36 @@ def check(result: ResultArgument, memory: MemoryOption = "2GB", as_json: JsonOpt
 
 
 @reflectance_app.command()
-def ablate(result: ResultArgument, as_json: JsonOption = False) -> None:
-    """Compute the errors of the fits with fewer LEDs, without grazing light, with fewer coefficients: one page."""
+@flatten_options
+def ablate(
+    result: ResultArgument,
+    runs: Annotated[
+        list[Path] | None,
+        typer.Argument(help="With --texels, the runs of the result.", show_default=False),
+    ] = None,
+    *,
+    texels: Annotated[
+        bool,
+        typer.Option(
+            "--texels",
+            help="Errors of the result's texels instead of those of its fits. The frames of the runs are read "
+            "again: give the runs, and --mesh, --calibrations, --refined and --poses as for the result.",
+        ),
+    ] = False,
+    sources: SourcesOfResult,
+    memory: MemoryOption = "2GB",
+    as_json: JsonOption = False,
+) -> None:
+    """Compute the errors of the fits with fewer LEDs, without grazing light, with fewer coefficients: one page.
+    With --texels, compute the errors of texels with fewer LEDs and without grazing light, beside those of their
+    triangles.
+    """
 
     def step(say: Said) -> dict[str, Any]:
+        if texels:
+            return ablate_texels_of(result, runs or [], sources, bytes_of(memory), say)
+        if runs or sources.has_any:
+            raise InputError("RUNS, --mesh, --calibrations, --refined, --poses: are for --texels")
         from coupole.reflectance.result_pages import ablation_page
         from coupole.reflectance.run_ablation import ablate_result
 
@@ -310,7 +338,7 @@ def cluster(
 
     def step(say: Said) -> dict[str, Any]:
         if texels:
-            return _cluster_texels(result, clusters, bytes_of(memory), degrees, without_view, say)
+            return cluster_texels_of(result, clusters, bytes_of(memory), degrees, without_view, say)
         from coupole.reflectance.result_pages import cluster_page
         from coupole.reflectance.run_clusters import cluster_result
 
@@ -320,23 +348,6 @@ def cluster(
         return {**document, "report": str(cluster_page.write(result, document))}
 
     _do(step, as_json=as_json)
-
-
-def _cluster_texels(
-    result: Path, clusters: int | None, memory_bytes: int, degrees: int, without_view: str | None, say: Said
-) -> dict[str, Any]:
-    """Group texels. Raises InputError for options that only samples of triangles have a meaning for."""
-    from coupole.reflectance.pair_harmonics import USUAL_DEGREES
-    from coupole.reflectance.result_pages import texel_cluster_page
-    from coupole.reflectance.texels.texel_clusters import cluster_texels
-
-    if without_view is not None or degrees != USUAL_DEGREES:
-        raise InputError(
-            "--without-view, --degrees: are for clusters of triangles, which are fitted to samples; clusters of "
-            "texels are means of their materials"
-        )
-    document = cluster_texels(result, clusters, memory_bytes, say=say)
-    return {**document, "report": str(texel_cluster_page.write(result, document))}
 
 
 def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool, closing_words: str = "") -> None:

@@ -147,6 +147,34 @@ class SamplesOfRuns:
 
 
 @dataclass(frozen=True)
+class SourcesOfResult:
+    """Runs of a complete result, and the files that gave their geometry."""
+
+    mesh: MeshOption = None
+    calibrations: RecordsOption = None
+    refined_folder: RefinedOption = None
+    poses: PosesOption = None
+
+    @property
+    def has_any(self) -> bool:
+        return any((self.mesh, self.calibrations, self.refined_folder, self.poses))
+
+    def request(self, runs: Sequence[Path], out: Path, memory_bytes: int) -> RunRequest:
+        """Return the request by which the result was made; what is not a file is in its settings. Raises
+        InputError if there is no result."""
+        from coupole.calibration.record import records_named
+        from coupole.reflectance.result_folder import read_settings
+        from coupole.reflectance.run_job import RunRequest
+
+        settings = read_settings(out)
+        return RunRequest(
+            tuple(runs), self.mesh, records_named(self.calibrations or []), tuple(settings["left_out"]),
+            settings["scan_noise_um"], memory_bytes, settings["support_reflectance"], not settings["subtracted"],
+            self.refined_folder, self.poses,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class PicturesWithoutRecords:
     """Pictures under known lights, or a view of a run without records."""
 

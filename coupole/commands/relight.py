@@ -95,7 +95,8 @@ FitOption = Annotated[
         "--fit",
         autocompletion=fits,
         help=f"Fit of a result of runs: {', '.join(RELIT[:-1])} or {RELIT[-1]}; by default the fit with the "
-        f"smallest error in the check (with --uncertainty: of {', '.join(MATERIALS)} and {TEXELS}).",
+        f"smallest error in the check. --uncertainty and --interval are for {', '.join(MATERIALS)} and {TEXELS}, "
+        "and then one of these is the default.",
     ),
 ]
 UncertaintyOption = Annotated[

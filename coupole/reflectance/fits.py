@@ -135,9 +135,11 @@ CLUSTERED, PAIR_HARMONICS = "clusters", "harmonics"
 directions."""
 TEXELS = "texels"
 """Name of the fit that `--texels` adds: materials of single pixels of each view."""
-ANYWHERE = (*MATERIALS, CLUSTERED, PAIR_HARMONICS, TEXELS)
+TEXEL_CLUSTERS = "texel_clusters"
+"""Name of the fit that `coupole reflectance cluster --texels` adds: materials that texels share."""
+ANYWHERE = (*MATERIALS, CLUSTERED, PAIR_HARMONICS, TEXELS, TEXEL_CLUSTERS)
 """Fits that are valid from all directions."""
-RELIT = (*FITS, CLUSTERED, PAIR_HARMONICS, TEXELS)
+RELIT = (*FITS, CLUSTERED, PAIR_HARMONICS, TEXELS, TEXEL_CLUSTERS)
 """All values that `--fit` of `coupole reflectance relight` accepts."""
 
 

@@ -49,11 +49,28 @@ class Variant:
     coefficients: int = 100
 
 
-VARIANTS: dict[str, list[tuple[float, Variant]]] = {
+Variants = dict[str, list[tuple[float, Variant]]]
+"""Values of settings and their variants, by the settings' names."""
+FEWER_SAMPLES: Variants = {
     "share of the LEDs": [(1.0 / step, Variant(led_step=step)) for step in LED_STEPS],
     "most incidence, degrees": [(deg, Variant(most_incidence_deg=deg)) for deg in MOST_INCIDENCES_DEG],
+}
+VARIANTS: Variants = {
+    **FEWER_SAMPLES,
     "coefficients": [(count, Variant(coefficients=count)) for count in COEFFICIENTS],
 }
+
+
+def leds_of(variant: Variant, leds: NDArray[np.integer], left_out: list[int]) -> NDArray[np.integer]:
+    """Return the LEDs, of those of some samples, that a variant is fitted to."""
+    return np.setdiff1d(leds, left_out)[:: variant.led_step]
+
+
+def incidence_deg(places_mm: NDArray[np.floating], normals: Floats, led_mm: Floats) -> Floats:
+    """[n, leds] angles of incidence at places [n, 3] with normals [n, 3]."""
+    ways = led_mm - places_mm[:, None]
+    cosine = np.einsum("nsk,nk->ns", ways, normals) / np.linalg.norm(ways, axis=2)
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 def ablate_result(out: Path, *, say: Said = lambda step, done, of: None) -> dict[str, Any]:
@@ -76,16 +93,21 @@ def ablate_result(out: Path, *, say: Said = lambda step, done, of: None) -> dict
                 for name, off in of_fits.items():
                     errors[variant].setdefault(name, []).append(off)
             say("ablate", count, len(blocks))
-    mae = {
-        setting: [[value, {name: _mean(off) for name, off in errors[variant].items()}] for value, variant in steps]
-        for setting, steps in VARIANTS.items()
-    }
-    report = {"triangles": sum(block.stop - block.start for block in blocks), "mae": mae}
+    report = {"triangles": sum(block.stop - block.start for block in blocks), "mae": mean_errors(VARIANTS, errors)}
     try:
         write_synced(out / ABLATION, json.dumps(report, indent=1) + "\n")
     except OSError as error:
         raise disk_error(out, error) from error
     return report
+
+
+def mean_errors(variants: Variants, errors: dict[Variant, dict[str, list[Floats]]]) -> dict[str, Any]:
+    """Return for each setting and value the mean absolute error of each fit, None without any; `errors` are by
+    variant and fit."""
+    return {
+        setting: [[value, {name: _mean(off) for name, off in errors[variant].items()}] for value, variant in steps]
+        for setting, steps in variants.items()
+    }
 
 
 def _mean(off: list[Floats]) -> float | None:
@@ -107,6 +129,7 @@ class _Case:
     samples: TriangleSamples
     leds: NDArray[np.int64]
     """[samples]"""
+    left_out: list[int]
     left_out_mask: NDArray[np.bool_]
     """[samples] True for samples under LEDs that were left out."""
     incidence_deg: Floats
@@ -123,21 +146,19 @@ def _case(result: RunResult, block: slice, settings: dict[str, Any]) -> _Case:
         result.along_samples(block, "led_normals"),
         settings["emission"] == "paper",
     )
-    ways = samples.led_mm - samples.centres_mm[:, None]
-    cosine = np.einsum("nsk,nk->ns", ways, samples.normals) / np.linalg.norm(ways, axis=2)
     return _Case(
         samples,
         leds,
+        settings["left_out"],
         np.isin(leds, settings["left_out"]),
-        np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))),
+        incidence_deg(samples.centres_mm, samples.normals, samples.led_mm),
         lit[..., None] * result.along_samples(block, "full_scales"),
     )
 
 
 def _errors(case: _Case, variant: Variant, noise_um: float) -> dict[str, Floats]:
     """Return the errors of each fit under the LEDs that were left out, for samples where every fit has a value."""
-    of_leds = np.unique(case.leds[~case.left_out_mask])[:: variant.led_step]
-    is_fitted = np.isin(case.leds, of_leds)
+    is_fitted = np.isin(case.leds, leds_of(variant, case.leds, case.left_out))
     values = np.where(case.incidence_deg[..., None] <= variant.most_incidence_deg, case.samples.values, np.nan)
     samples = replace(case.samples, values=values.astype(np.float32))
     models = {

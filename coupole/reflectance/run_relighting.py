@@ -22,6 +22,7 @@ from coupole.reflectance.fits import (
     MATERIALS,
     PAIR_HARMONICS,
     RELIT,
+    TEXEL_CLUSTERS,
     TEXELS,
     ViewFit,
 )
@@ -49,8 +50,9 @@ from coupole.reflectance.new_light.shadow_edges import trace_beam
 from coupole.reflectance.pair_harmonics import pair_values
 from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.run_result import RunResult, ViewSamples, read_about
-from coupole.reflectance.texels.gathered import gather, open_views
-from coupole.reflectance.texels.pixel_file import read_texel_errors, read_view_texels
+from coupole.reflectance.texels.gathered import TexelView, gather, open_views
+from coupole.reflectance.texels.pixel_file import ViewTexels, read_texel_errors, read_view_texels
+from coupole.reflectance.texels.texel_cluster_file import read_shared_texels
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
 
 Say = Callable[[int, int], None]
@@ -59,6 +61,8 @@ SAMPLES = 256
 _FAR_MM = 1e5
 """Distance at which distant light is placed for a slice."""
 _TRIANGLES = 1 << 13
+_READ_TEXELS = {TEXELS: read_view_texels, TEXEL_CLUSTERS: read_shared_texels}
+"""Functions that read a view's texels, by the fits that have materials of texels."""
 
 
 def best_fit(result: RunResult, among: Collection[str] = FITS) -> str:
@@ -232,8 +236,9 @@ def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = 
     surface = surface_of_view(result, pictured_view)
     order = (pictured_view, *(run_view for run_view in result.views if run_view is not pictured_view))
     mesh = PacketMesh(result.corners_mm, compact=False)
-    if name == TEXELS:
-        return RelitScene(result, name, surface, _texels_of(result, pictured_view, surface), order, mesh)
+    if name in _READ_TEXELS:
+        texels = _texels_of(_READ_TEXELS[name](result, pictured_view), surface)
+        return RelitScene(result, name, surface, texels, order, mesh)
     known_fit = FITS.get(name)
     if not isinstance(known_fit, ViewFit):
         return RelitScene(result, name, surface, _from_anywhere(result, name, surface), order, mesh)
@@ -256,8 +261,9 @@ def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) ->
     name = fit or best_with_texels(result, MATERIALS)
     mesh = PacketMesh(result.corners_mm, compact=False)
     surface = surface_from(result, mesh, camera)
-    if name == TEXELS:
-        return RelitScene(result, name, surface, _gathered_texels(result, surface), result.views, mesh)
+    if name in _READ_TEXELS:
+        texels = _gathered_texels(open_views(result, _READ_TEXELS[name]), surface)
+        return RelitScene(result, name, surface, texels, result.views, mesh)
     return RelitScene(result, name, surface, _from_anywhere(result, name, surface), result.views, mesh)
 
 
@@ -270,8 +276,7 @@ def best_with_texels(result: RunResult, among: Collection[str] = FITS) -> str:
     return TEXELS if best == TEXELS else best_fit(result, among)
 
 
-def _texels_of(result: RunResult, view: ViewSamples, surface: Surface) -> Texels:
-    texels = read_view_texels(result, view)
+def _texels_of(texels: ViewTexels, surface: Surface) -> Texels:
     is_seen = surface.triangle_of_pixel >= 0
     of_pixel = np.where(is_seen, texels.in_picture(is_seen.shape) + np.int32(1), np.int32(-1))
     values = (texels.normals, texels.kd, texels.ks, texels.alpha, texels.covariance)
@@ -281,10 +286,10 @@ def _texels_of(result: RunResult, view: ViewSamples, surface: Surface) -> Texels
     return Texels(TriangleMaterials(normals, kd, ks, alpha, np.zeros_like(alpha)), covariance, of_pixel)
 
 
-def _gathered_texels(result: RunResult, surface: Surface) -> Texels:
+def _gathered_texels(views: Sequence[TexelView], surface: Surface) -> Texels:
     """Return the texels of a picture from any camera: a material for each of its pixels."""
     seen = surface.triangle_of_pixel >= 0
-    gathered = gather(open_views(result), surface.places_mm[seen])
+    gathered = gather(views, surface.places_mm[seen])
     of_pixel = np.full(seen.shape, -1, np.int32)
     of_pixel[seen] = np.arange(np.count_nonzero(seen))
     return Texels(gathered.materials, gathered.covariance, of_pixel)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import cells
 import h5py
@@ -14,6 +16,7 @@ from cells import CellFolder
 
 sys.path.insert(0, str(cells.REPO / "tools"))
 
+from coupole.reflectance.run_ablation import Variant
 from drawn_records import draw_records
 
 RECORDS = cells.REPO / "configs/calibrations"
@@ -91,6 +94,24 @@ def detailed_result(folder: Path) -> Made:
     )
     assert ended.code == 0, ended.err
     return cell, out, ended.document
+
+
+FEWER = {
+    "share of the LEDs": [(1.0, Variant()), (0.5, Variant(led_step=2))],
+    "most incidence, degrees": [(89, Variant()), (60, Variant(most_incidence_deg=60))],
+}
+"""Settings of `ablate --texels` with a value for texels under 41 LEDs."""
+
+
+def ablated(made: Made, folder: Path, *settings: str) -> tuple[Path, dict[str, Any]]:
+    """A copy of a result after `ablate --texels` with some settings of `FEWER`, and what the command said."""
+    fewer = {setting: FEWER[setting] for setting in settings}
+    out = Path(shutil.copytree(made[1], folder / "ablated"))
+    arguments = (made[0].run_folder, "--calibrations", made[0].folder / "records", "--texels", "--json")
+    with mock.patch("coupole.reflectance.texels.texel_ablation.FEWER_SAMPLES", fewer):
+        ended = cells.here("reflectance", "ablate", out, *arguments)
+    assert ended.code == 0, ended.err
+    return out, ended.document
 
 
 def frame_share(cell: CellFolder, view: str, led: int) -> np.ndarray:

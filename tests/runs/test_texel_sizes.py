@@ -12,7 +12,7 @@ import cells
 import numpy as np
 import pytest
 from dask_cluster import cluster
-from relief_cells import DIFFUSE, Made
+from relief_cells import DIFFUSE, Made, ablated
 from texel_truth import seen_by_texels
 
 from coupole.calibration.record import records_named
@@ -204,3 +204,13 @@ def test_texels_that_the_disk_cannot_hold_are_refused_before_the_work(
     assert re.search(r"texels need some \d\.\d\d GB, and 0\.00 GB are free", " ".join(ended.err.split()))
     assert "of disk; after the fits" in " ".join(ended.out.split()) + " ".join(ended.err.split())
     assert not out.exists()
+
+
+def test_ablation_of_squares_tells_what_fewer_leds_cost(coarse: Made, tmp_path: Path) -> None:
+    """With all LEDs, the values of squares are means of their pixels, without the detail that squares lack; so the
+    error is smaller than that of pictures."""
+    _, document = ablated(coarse, tmp_path, "share of the LEDs")
+    whole, half = (of_fits for _, of_fits in document["mae"]["share of the LEDs"])
+    assert document["side_px"] == coarse[2]["texels"]["side_px"]
+    assert whole[TEXELS] < coarse[2]["texels"]["mae"][TEXELS]
+    assert half[TEXELS] > 1.2 * whole[TEXELS]

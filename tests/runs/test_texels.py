@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from dask_cluster import cluster
 from lazily import lazily
-from relief_cells import DIFFUSE, RECORDS, Made
+from relief_cells import DIFFUSE, FEWER, RECORDS, Made, ablated
 from scipy.ndimage import gaussian_filter
 from texel_truth import seen_by
 
@@ -22,6 +22,7 @@ from coupole.reflectance.fits import TEXELS
 from coupole.reflectance.new_light.light_kinds import DistantLight, LedLight
 from coupole.reflectance.new_light.pictured_surface import FreeCamera, pixels_of_places
 from coupole.reflectance.relit_uncertainty import uncertainty_of_picture
+from coupole.reflectance.run_ablation import Variant, leds_of
 from coupole.reflectance.run_job import RunRequest
 from coupole.reflectance.run_pictures import read_check_frames
 from coupole.reflectance.run_relighting import scene_from, scene_of_view
@@ -229,3 +230,55 @@ def test_without_texels_the_remedy_is_told(made: Made, tmp_path: Path) -> None:
         )
         assert ended.code == 2
         assert "--texels auto" in ended.err
+
+
+def test_ablation_tells_what_fewer_leds_and_less_grazing_light_cost(made: Made, tmp_path: Path) -> None:
+    """With all values, the error is that of pictures in the check, which are made in another way."""
+    out, document = ablated(made, tmp_path, *FEWER)
+    mae = {setting: dict(steps) for setting, steps in document["mae"].items()}
+    whole, half = mae["share of the LEDs"][1.0], mae["share of the LEDs"][0.5]
+    steep = mae["most incidence, degrees"][60]
+    assert mae["most incidence, degrees"][89] == whole
+    assert whole[TEXELS] == pytest.approx(made[2]["texels"]["mae"][TEXELS], rel=0.1)
+    assert whole["ggx_normal"] == pytest.approx(made[2]["mae"]["ggx_normal"], rel=0.2)
+    assert 1.5 < half[TEXELS] / whole[TEXELS] < 3.0
+    assert 1.05 < half["ggx_normal"] / whole["ggx_normal"] < 1.5
+    assert 1.08 < steep[TEXELS] / whole[TEXELS] < 1.5
+    assert steep["ggx_normal"] > whole["ggx_normal"]
+    shares = dict(document["share_with_material"]["share of the LEDs"])
+    assert 0.99 < shares[1.0] <= 1.0
+    assert 0.9 < shares[0.5] < shares[1.0]
+    written = json.loads((out / "texel_ablation.json").read_text())
+    assert written == {name: value for name, value in document.items() if name != "report"}
+    page = (out / "texel_ablation.html").read_text()
+    assert f"{100 * half[TEXELS]:.3f}" in page
+    assert "Most incidence, degrees" in page
+
+
+def test_every_second_led_is_one_of_those_that_are_not_left_out() -> None:
+    assert list(leds_of(Variant(led_step=2), np.arange(10), [0, 5])) == [1, 3, 6, 8]
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--texels",), "--texels: needs the frames; give the runs of the result"),
+        (("RUN",), "are for --texels"),
+        (("--calibrations", "RECORDS"), "are for --texels"),
+        (("RUN", "--texels", "--calibrations", "SHIPPED"), "is a result of other runs, records or settings"),
+    ],
+)
+def test_an_ablation_that_is_not_possible_is_refused(made: Made, options: tuple[str, ...], told: str) -> None:
+    paths = {"RUN": made[0].run_folder, "RECORDS": made[0].folder / "records", "SHIPPED": RECORDS}
+    ended = cells.here("reflectance", "ablate", made[1], *(paths.get(option, option) for option in options))
+    assert ended.code == 2
+    assert told in " ".join(ended.err.split())
+
+
+def test_a_result_without_texels_cannot_be_ablated(made: Made, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(made[1], tmp_path / "result", ignore=shutil.ignore_patterns("texels")))
+    ended = cells.here(
+        "reflectance", "ablate", copy, made[0].run_folder, "--texels", "--calibrations", made[0].folder / "records"
+    )
+    assert ended.code == 2
+    assert "has no texels" in ended.err

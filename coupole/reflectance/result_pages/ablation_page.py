@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from coupole.pages.page_parts import Page, Picture, Section, Table
 from coupole.pages.page_rendering import write_page
-from coupole.reflectance.fits import FITS
+from coupole.reflectance.fits import FITS, Fit
 
 PAGE = "ablation.html"
 
@@ -21,27 +22,19 @@ def write(folder: Path, document: dict[str, Any]) -> Path:
 
 
 def _page(name: str, document: dict[str, Any]) -> Page:
-    tables = [
-        Section(
-            f"setting-{number}",
-            setting[0].upper() + setting[1:],
-            tables=[Table("Mean error, % of range", ("fit", *(f"{value:g}" for value, _ in steps)), _rows(steps))],
-            notes=_notes(steps),
-        )
-        for number, (setting, steps) in enumerate(document["mae"].items())
-    ]
+    fits = list(FITS.values())
     return Page(
         title=f"{name}: fewer LEDs, samples, coefficients",
         pictures=[
-            Picture("Mean error of each fit by the amount of data", _plot_png(document["mae"]), is_broad=True)
+            Picture("Mean error of each fit by the amount of data", plot_png(document["mae"], fits), is_broad=True)
         ],
         summary=f"Each fit was repeated with less data, for {document['triangles']:,} triangles spread over the "
         "object.",
-        quality=_quality(document["mae"]),
+        quality=quality(document["mae"], fits),
         next_step="Take the fit with the smallest error for the number of LEDs that you can afford; the tables "
         "have the figures.",
         sections=[
-            *tables,
+            *settings_told(document["mae"], fits),
             Section(
                 "published",
                 "Beside what is published",
@@ -60,15 +53,32 @@ def _page(name: str, document: dict[str, Any]) -> Page:
     )
 
 
-def _quality(mae: dict[str, Any]) -> str:
+def settings_told(mae: dict[str, Any], fits: Sequence[Fit]) -> list[Section]:
+    """Return a section with the errors of each setting."""
+    return [
+        Section(
+            f"setting-{number}",
+            setting[0].upper() + setting[1:],
+            tables=[
+                Table("Mean error, % of range", ("fit", *(f"{value:g}" for value, _ in steps)), _rows(steps, fits))
+            ],
+            notes=_notes(steps),
+        )
+        for number, (setting, steps) in enumerate(mae.items())
+    ]
+
+
+def quality(mae: dict[str, Any], fits: Sequence[Fit]) -> str:
+    """Say which fit has the smallest error with the most LEDs."""
     setting, steps = next(iter(mae.items()))
     value, errors = max(steps, key=lambda step: float(step[0]))
     known_errors = {name: error for name, error in errors.items() if error is not None}
     if not known_errors:
         return "The error is not known, because no LEDs were kept for the check."
+    titles = {fit.name: fit.title for fit in fits}
     best = min(known_errors, key=lambda name: known_errors[name])
     return (
-        f"With the most ({setting} {value:g}) {FITS[best].title} has the smallest error: "
+        f"With the most ({setting} {value:g}) the smallest error is that of {titles[best]}: "
         f"{100 * known_errors[best]:.3f} % of range."
     )
 
@@ -78,24 +88,26 @@ def _notes(steps: list[Any]) -> list[str]:
     return [f"At {', '.join(missing)} there were not enough samples for all of the fits."] if missing else []
 
 
-def _rows(steps: list[Any]) -> list[tuple[str, ...]]:
+def _rows(steps: list[Any], fits: Sequence[Fit]) -> list[tuple[str, ...]]:
     rows = []
-    for fit in FITS.values():
+    for fit in fits:
         errors = (step[fit.name] for _, step in steps)
         rows.append((fit.title, *("" if error is None else f"{100 * error:.3f}" for error in errors)))
     return rows
 
 
-def _plot_png(mae: dict[str, Any]) -> bytes:
+def plot_png(mae: dict[str, Any], fits: Sequence[Fit]) -> bytes:
+    """Draw the errors of each fit by each setting."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import StrMethodFormatter
 
     figure = Figure(figsize=(11, 4.5), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
-    for ax, (setting, steps) in zip(figure.subplots(1, len(mae), sharey=True), mae.items(), strict=True):
-        for name, fit in FITS.items():
-            errors = [(value, 100 * of[name]) for value, of in steps if of[name] is not None]
+    axes = figure.subplots(1, len(mae), sharey=True, squeeze=False)[0]
+    for ax, (setting, steps) in zip(axes, mae.items(), strict=True):
+        for fit in fits:
+            errors = [(value, 100 * of[fit.name]) for value, of in steps if of[fit.name] is not None]
             places = zip(*errors, strict=True) if errors else ([], [])
             ax.plot(*places, marker="o", label=fit.title, color=fit.colour)
         ax.set_xlabel(setting)

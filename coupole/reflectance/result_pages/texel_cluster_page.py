@@ -14,7 +14,7 @@ from coupole.pages.page_rendering import write_page
 from coupole.reflectance.result_pages.cluster_page import cluster_figures
 from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.texels.pixel_file import read_view_texels
-from coupole.reflectance.texels.texel_clusters import read_texel_clusters
+from coupole.reflectance.texels.texel_cluster_file import read_texel_clusters
 
 PAGE = "texel_clusters.html"
 _TOLD = {"own": "texels by their own material", "clustered": "the same texels by their cluster's material"}
@@ -52,7 +52,9 @@ def _page(folder: Path, document: dict[str, Any]) -> Page:
         else f"With its cluster's material a texel is off by {100 * cluster_mae:.3f} % of range, with its own by "
         f"{100 * own_mae:.3f} %.",
         next_step=[
-            "Find fewer or more materials: ",
+            "See them under another light: ",
+            Code(f"coupole reflectance relight {name} --fit texel_clusters --direction 1,0,0.5 --to relit.png"),
+            ". Find fewer or more materials: ",
             Code(f"coupole reflectance cluster {name} --texels --clusters {max(1, document['clusters'] // 2)}"),
             ".",
         ],

@@ -7,7 +7,7 @@ A place is looked up in each view by its direction. Materials are interpolated b
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,9 +60,12 @@ class TexelView:
     power."""
 
 
-def open_views(result: RunResult) -> list[TexelView]:
-    """Open the views that have texels. Raises InputError if no view has texels."""
-    return [_open_view(result, view) for view in views_with_texels(result)]
+def open_views(
+    result: RunResult, read_view: Callable[[RunResult, ViewSamples], ViewTexels] = read_view_texels
+) -> list[TexelView]:
+    """Open the views that have texels; `read_view` reads those of a view. Raises InputError if
+    no view has texels."""
+    return [_open_view(result, view, read_view(result, view)) for view in views_with_texels(result)]
 
 
 def gather(views: Sequence[TexelView], places_mm: NDArray[np.floating]) -> Gathered:
@@ -87,8 +90,8 @@ def gather(views: Sequence[TexelView], places_mm: NDArray[np.floating]) -> Gathe
     return Gathered(materials, covariance)
 
 
-def _open_view(result: RunResult, view: ViewSamples) -> TexelView:
-    texels, surface = read_view_texels(result, view), surface_of_view(result, view)
+def _open_view(result: RunResult, view: ViewSamples, texels: ViewTexels) -> TexelView:
+    surface = surface_of_view(result, view)
     texel_of_pixel = texels.in_picture(surface.triangle_of_pixel.shape)
     steps = np.linalg.norm(surface.places_mm[:, 1:] - surface.places_mm[:, :-1], axis=2)
     u_common = math.hypot(*texel_uncertainty(result, view))

@@ -7,7 +7,7 @@ All channels of a texel are measured. They give its colour, together with the ch
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -18,12 +18,13 @@ from coupole.kernels import kernel
 from coupole.reflectance.ggx import lobe
 from coupole.reflectance.normal_fit import colour_weight
 from coupole.reflectance.parts_in_threads import in_threads
-from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples
+from coupole.reflectance.run_result import VARIANCES
 from coupole.reflectance.texels.pixel_file import ViewTexels
 from coupole.reflectance.texels.pixel_fit import Lights, PixelMaterials, fit_pixels
-from coupole.reflectance.texels.texel_values import TexelBlock, TexelReader
-from coupole.reflectance.texels.view_centres import ALPHA, KD, KS, centres_of, lights_of
-from coupole.reflectance.texels.view_texels import Fitted, Say, view_texels
+from coupole.reflectance.texels.texel_grid import TexelSquares
+from coupole.reflectance.texels.texel_values import TexelBlock
+from coupole.reflectance.texels.view_centres import ALPHA, KD, KS, FitStart
+from coupole.reflectance.texels.view_texels import Fitted, view_texels
 from coupole.reflectance.triangle_fit import between, towards
 
 Floats = NDArray[np.float64]
@@ -43,24 +44,14 @@ _SPREAD_PX, _LEAST_SPREAD = 2.5, 1.0
 
 
 def texels_of_grid(
-    result: RunResult,
-    view: ViewSamples,
-    reader: TexelReader,
-    left_out: Sequence[int],
-    memory_bytes: int,
-    threads: int,
-    say: Say,
+    start: FitStart, squares: TexelSquares, blocks: Iterable[TexelBlock], threads: int
 ) -> ViewTexels:
-    """Fit all texels of a view, under its LEDs except those `left_out`. Frames are read once for each band of
-    texels with values that fit into the memory. Raises StorageError for a damaged frame."""
-    grid, channels = reader.grid, result.channels
-    centres = centres_of(result, view, grid.triangle, reader.mesh_normals)
-    lights = lights_of(result, view, left_out)
-    fits, count = Fitted.empty(grid.triangle.shape), 0
+    """Fit the texels of a view, block by block."""
+    grid, centres, lights = squares.grid, start.centres, start.lights
+    channels, fits = centres.channels, Fitted.empty(grid.triangle.shape)
     colours = np.zeros((grid.triangle.size, channels), np.float32)
     u_colours = np.zeros(grid.triangle.size, np.float32)
-    for rows in reader.bands(memory_bytes):
-        block = reader.read_band(rows, threads)
+    for block in blocks:
         for first in range(0, len(block.texels), _TOGETHER):
             some = slice(first, min(first + _TOGETHER, len(block.texels)))
             part = TexelBlock(block.texels[some], block.places_mm[some], block.values[some])
@@ -70,23 +61,20 @@ def texels_of_grid(
             fits.add(part.texels, prior, fit)
             of_fits = colours_of(values, part.places_mm, lights, fit, shine, threads)
             colours[part.texels], u_colours[part.texels] = of_fits
-        count += len(block.texels)
-        say(count, reader.count)
     of_grid = colours.reshape(*grid.triangle.shape, channels), u_colours.reshape(grid.triangle.shape)
     fits.is_fitted[...] &= np.isfinite(of_grid[0]).all(axis=-1)
     is_fitted = fits.is_fitted
     lightness = np.log(np.exp(centres.logs[..., :channels]).mean(axis=-1)) + fits.deviation[..., KD]
-    level_colours = without_slopes(of_grid[0], lightness, is_fitted, reader.channel_offsets())
+    level_colours = without_slopes(of_grid[0], lightness, is_fitted, squares.channel_offsets)
     whole_colours, u_whole = colours_around(level_colours, of_grid[1], centres.colours, is_fitted, grid.side_px)
-    normals = fits.settle(view, centres, lights, grid.triangle)
+    normals = fits.settle(start)
     fits.covariance[is_fitted, VARIANCES[KD]] *= _wider(whole_colours[is_fitted])
     fits.covariance[is_fitted, VARIANCES[KD]] += u_whole[is_fitted] ** 2
-    fits.covariance[is_fitted, :3:2] += reader.bend()[is_fitted, None]
+    fits.covariance[is_fitted, :3:2] += squares.bend[is_fitted, None]
     logs = centres.logs[is_fitted].astype(np.float64)
     deviation = fits.deviation[is_fitted]
     grey = np.log(np.exp(logs[:, :channels]).mean(axis=1)) + deviation[:, KD]
-    shares = reader.pixels_of_channels / reader.pixels_of_channels.sum()
-    grey += of_all_pixels(of_grid[0][is_fitted], whole_colours[is_fitted], shares)
+    grey += of_all_pixels(of_grid[0][is_fitted], whole_colours[is_fitted], squares.channel_shares)
     logs[:, :channels] = grey[:, None] + whole_colours[is_fitted]
     logs[:, channels:-1] += deviation[:, KS, None]
     logs[:, -1] += deviation[:, ALPHA]
@@ -110,7 +98,7 @@ def without_slopes(
     colours: Singles, lightness: Singles, is_fitted: NDArray[np.bool_], channel_offsets: Singles
 ) -> Singles:
     """Return colours of texels [h, w, channels] without what only looks like a colour: paint gets lighter across a
-    texel, and the channels' pixels are at different places (`TexelReader.channel_offsets`). `lightness` [h, w] is
+    texel, and the channels' pixels are at different places (`TexelSquares`). `lightness` [h, w] is
     the logarithm of kd; its slope is that between the texels on both sides."""
     known_lightness = np.where(is_fitted, lightness, np.float32(np.nan))
     framed_lightness = np.pad(known_lightness, 1, constant_values=np.nan)

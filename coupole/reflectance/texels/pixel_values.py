@@ -72,10 +72,6 @@ class PixelReader:
     def __init__(self, fitted_view: FittedView) -> None:
         surface, samples = fitted_view.surface, fitted_view.samples
         self._samples = samples
-        self.triangle_of_pixel = surface.triangle_of_pixel
-        """[h, w] for each pixel the row, in the view's file, of the triangle that it sees; -1 for none."""
-        self.mesh_normals = surface.normals
-        """[triangles, 3]"""
         self._places_mm = surface.places_mm.reshape(-1, 3)
         self._reader = SignalReader(
             fitted_view.radiometry, SeenSurface(surface.triangle_of_pixel, samples.triangles)

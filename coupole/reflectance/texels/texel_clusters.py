@@ -10,65 +10,32 @@ Texels are read part by part. Only the number of each texel's cluster is kept, 4
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.reflectance.block_work import Said, silent
 from coupole.reflectance.clustering import LEARNT_FROM, centres_of_points, looks, nearest_of
-from coupole.reflectance.fits import TEXELS
-from coupole.reflectance.new_light.light_kinds import LedLight
+from coupole.reflectance.fits import TEXEL_CLUSTERS, TEXELS
 from coupole.reflectance.result_folder import complete, read_settings
 from coupole.reflectance.run_clusters import FEWEST_CLUSTERS, MOST_CLUSTERS, USUAL_MEMBERS
-from coupole.reflectance.run_relighting import RelitScene, Texels, scene_of_view
-from coupole.reflectance.run_result import RunResult, ViewSamples
+from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.texels.pixel_file import TexelPart, count_view_texels, read_texel_parts
-from coupole.reflectance.texels.texel_check import held_out_pictures
-from coupole.reflectance.triangle_fit import TriangleMaterials
+from coupole.reflectance.texels.texel_check import held_out_pictures, picture_maker
+from coupole.reflectance.texels.texel_cluster_file import PATH, TexelClusters, write_texel_clusters
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import write_synced
 
-TEXEL_CLUSTERS, ABOUT_TEXEL_CLUSTERS = "fits/texel_clusters.h5", "texel_clusters.json"
+ABOUT_TEXEL_CLUSTERS = "texel_clusters.json"
 _LEAST_VARIANCE = 1e-6
 """Least variance of a logarithm, so that no texel decides alone."""
 _BYTES = 1_000
 """Memory that a texel of a part takes, bytes: it is read, and its looks and distances are computed."""
-_TOLD = {
-    "kd": "of the clusters, 1/sr, by channel",
-    "ks": "of the clusters, by channel; f = kd + ks D V",
-    "alpha": "of the clusters, GGX's roughness",
-    "members": "number of texels of a cluster",
-}
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class TexelClusters:
-    """Materials that texels share, and the cluster of each texel."""
-
-    kd: Floats
-    """[clusters, channels]"""
-    ks: Floats
-    alpha: Floats
-    members: NDArray[np.int64]
-    """[clusters]"""
-    cluster: dict[str, NDArray[np.int32]]
-    """Key: name of a view's files; value: the cluster of each of its texels."""
-
-    def at(self, name: str, texels: TriangleMaterials) -> TriangleMaterials:
-        """Return the materials of a view's texels by their clusters, with the texels' own normals. The first of
-        `texels` is that of pixels without a texel, as scenes have it, and stays."""
-        number = self.cluster[name]
-        kd, ks, alpha = (
-            np.concatenate([own_values[:1], values[number]])
-            for own_values, values in ((texels.kd, self.kd), (texels.ks, self.ks), (texels.alpha, self.alpha))
-        )
-        return replace(texels, kd=kd, ks=ks, alpha=alpha)
 
 
 def cluster_texels(out: Path, count: int | None, memory_bytes: int, *, say: Said = silent) -> dict[str, Any]:
@@ -82,8 +49,8 @@ def cluster_texels(out: Path, count: int | None, memory_bytes: int, *, say: Said
     result.refuse_unfinished(settings)
     clusters = group_texels(result, count, memory_bytes, say=say)
     try:
-        complete(out / TEXEL_CLUSTERS, lambda path: _write(path, clusters))
-        mae = _mae(result, clusters, say)
+        complete(out / PATH, lambda path: write_texel_clusters(path, clusters))
+        mae = _mae(result, say)
         report = {
             "clusters": len(clusters.alpha),
             "texels": int(clusters.members.sum()),
@@ -181,38 +148,13 @@ class _Sums:
         )
 
 
-def _write(path: Path, clusters: TexelClusters) -> None:
-    with h5py.File(path, "w") as file:
-        for name, description in _TOLD.items():
-            values = getattr(clusters, name)
-            stored_values = values if name == "members" else values.astype(np.float32)
-            file.create_dataset(name, data=stored_values, track_times=False).attrs["told"] = description
-        for name, numbers in clusters.cluster.items():
-            of_view = file.create_dataset(f"cluster/{name}", data=numbers, track_times=False)
-            of_view.attrs["told"] = f"of the texels of texels/{name}.h5"
-
-
-def read_texel_clusters(folder: Path) -> TexelClusters:
-    """Read the clusters of texels of a result. Raises InputError if there are none."""
-    path = folder / TEXEL_CLUSTERS
-    if not path.exists():
-        raise InputError(f"{path}: is not there; `coupole reflectance cluster {folder} --texels` makes it")
-    with h5py.File(path, "r") as file:
-        kd, ks, alpha = (file[name][()].astype(np.float64) for name in ("kd", "ks", "alpha"))
-        numbers = {name: dataset[()] for name, dataset in file["cluster"].items()}
-        return TexelClusters(kd, ks, alpha, file["members"][()], numbers)
-
-
-def _mae(result: RunResult, clusters: TexelClusters, say: Said) -> dict[str, float | None]:
+def _mae(result: RunResult, say: Said) -> dict[str, float | None]:
     """Return mean absolute errors, in shares of the camera's range, of pictures of left-out LEDs: by the texels'
     own materials, and by those of their clusters, in the pixels where both have a value."""
     sums, values = {"own": 0.0, "clustered": 0.0}, 0
     for number, view in enumerate(result.views, start=1):
-        own_scene = scene_of_view(result, view.view, TEXELS)
-        scenes = {"own": own_scene, "clustered": _of_clusters(own_scene, view, clusters)}
-        makers = {
-            name: lambda led, scene=scene: scene.picture([LedLight(number=led)]) for name, scene in scenes.items()
-        }
+        fits = {"own": TEXELS, "clustered": TEXEL_CLUSTERS}
+        makers = {name: picture_maker(result, view, fit) for name, fit in fits.items()}
         for measured_picture, pictures in held_out_pictures(result, view, makers):
             has_both = np.isfinite(measured_picture) & np.logical_and.reduce(
                 [picture > 0.0 for picture in pictures.values()]
@@ -222,8 +164,3 @@ def _mae(result: RunResult, clusters: TexelClusters, say: Said) -> dict[str, flo
                 sums[name] += float(np.abs(picture - measured_picture)[has_both].sum(dtype=np.float64))
         say("check of clusters of texels", number, len(result.views))
     return {name: total / values if values else None for name, total in sums.items()}
-
-
-def _of_clusters(scene: RelitScene, view: ViewSamples, clusters: TexelClusters) -> RelitScene:
-    assert isinstance(scene.reflecting, Texels)
-    return scene.with_materials(clusters.at(view.path.stem, scene.reflecting.materials))

@@ -33,6 +33,41 @@ class TexelGrid:
     places_mm: NDArray[np.float32]
     """[rows, columns, 3] mean of the places that a texel's pixels see, base frame."""
 
+    def part(self, rows: slice, columns: slice) -> TexelGrid:
+        """Return a part of the grid, whose texels are numbered anew."""
+        of_pixels = tuple(
+            slice(of_side.start * self.side_px, of_side.stop * self.side_px) for of_side in (rows, columns)
+        )
+        number = self.texel_of_pixel[of_pixels]
+        row, column = np.divmod(number, self.triangle.shape[1])
+        new_number = (row - rows.start) * (columns.stop - columns.start) + column - columns.start
+        return TexelGrid(
+            self.side_px,
+            self.triangle[rows, columns],
+            np.where(number >= 0, new_number, -1).astype(np.int32),
+            self.places_mm[rows, columns],
+        )
+
+
+@dataclass(frozen=True)
+class TexelSquares:
+    """Texels of a view as squares of pixels, which measure different channels at different places."""
+
+    grid: TexelGrid
+    bend: NDArray[np.float32]
+    """[rows, columns] variance, rad^2, of each tilt, from triangles within a texel that are turned to each
+    other."""
+    channel_offsets: NDArray[np.float32]
+    """[rows, columns, channels, 2] middle of each channel's pixels from the middle of all pixels of a texel, to
+    the right and down, in widths of a texel."""
+    channel_shares: NDArray[np.float64]
+    """[channels] each channel's share of the pixels."""
+
+    def part(self, rows: slice, columns: slice) -> TexelSquares:
+        """Return a part of the texels."""
+        bend, offsets = self.bend[rows, columns], self.channel_offsets[rows, columns]
+        return TexelSquares(self.grid.part(rows, columns), bend, offsets, self.channel_shares)
+
 
 def pixel_mm(surface: Surface) -> float:
     """Return the width of a view's pixels on the surface, mm: the root of the area that a pixel sees, as the

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from uuid import uuid4
 
 import numpy as np
@@ -38,15 +39,18 @@ from coupole.reflectance.texels.pixel_file import (
     texels_path,
     write_view_texels,
 )
-from coupole.reflectance.texels.pixel_values import FittedView, PixelReader
+from coupole.reflectance.texels.pixel_values import FittedView, PixelBlock, PixelReader
 from coupole.reflectance.texels.texel_check import check_texels
 from coupole.reflectance.texels.texel_grid import pixel_mm, texel_grid
 from coupole.reflectance.texels.texel_size import TexelSize
-from coupole.reflectance.texels.texel_values import TexelReader
+from coupole.reflectance.texels.texel_values import TexelBlock, TexelReader
+from coupole.reflectance.texels.view_centres import start_of
 from coupole.reflectance.texels.view_texels import texels_of_view
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import make_folder
 from coupole.storage.run_json import RUN_JSON
+
+_Block = TypeVar("_Block", PixelBlock, TexelBlock)
 
 
 @dataclass(frozen=True)
@@ -80,13 +84,9 @@ def add_texels(
     """
     token, size = uuid4().hex, size or TexelSize()
     refuse_other_size(out, size)
-    measured_runs = read_runs(request, token)
-    settings = read_settings(out)
     try:
-        if settings != json.loads(json.dumps(settings_of(request, token, measured_runs))):
-            raise InputError(f"{out}: is a result of other runs, records or settings")
-        result = RunResult(out.resolve())
-        result.refuse_unfinished(settings, fits=True)
+        result = open_result_of(request, token, out)
+        measured_runs, settings = read_runs(request, token), read_settings(out)
         tasks = [
             _View(
                 run.resolve(), view.name, view_file_name(measured_runs, measured_run, view), out.resolve(),
@@ -108,6 +108,16 @@ def add_texels(
         forget()
 
 
+def open_result_of(request: RunRequest, token: str, out: Path) -> RunResult:
+    """Open a complete result. Raises InputError if it is incomplete, or belongs to another request."""
+    settings = read_settings(out)
+    if settings != json.loads(json.dumps(settings_of(request, token, read_runs(request, token)))):
+        raise InputError(f"{out}: is a result of other runs, records or settings")
+    result = RunResult(out.resolve())
+    result.refuse_unfinished(settings, fits=True)
+    return result
+
+
 def _fit(sources: Sources, token: str, tasks: list[_View], shop: Workshop, say: Said) -> None:
     for task in tasks:
         shop.refuse_blind(task.run, RUN_JSON)
@@ -125,19 +135,38 @@ def _texels_of_one(token: str, sources: Sources, threads: int | None, say: Said,
     surface = surface_of_view(result, samples)
     width_mm = pixel_mm(surface)
     side_px = task.size.side_px(width_mm)
-    fit_with = (
-        task.left_out, task.memory_bytes, threads or len(os.sched_getaffinity(0)),
-        lambda count, of: say(f"texels of {task.view}", count, of),
-    )  # fmt: skip
-    of_run, u_pixel = (measured_run, geometry, radiometry, view), radiometry.u_pixel
+    threads = threads or len(os.sched_getaffinity(0))
+    say_view = partial(say, f"texels of {task.view}")
+    fitted_view = FittedView(measured_run, geometry, radiometry, view, surface, samples)
+    u_pixel = radiometry.u_pixel
     if side_px == 1:
-        texels = texels_of_view(result, samples, PixelReader(FittedView(*of_run, surface, samples)), *fit_with)
+        pixels = PixelReader(fitted_view)
+        start = start_of(result, samples, surface.triangle_of_pixel, surface.normals, task.left_out)
+        read_block = partial(pixels.read_block, threads=threads)
+        blocks = _blocks(pixels.blocks(task.memory_bytes), read_block, pixels.count, say_view)
+        texels = texels_of_view(start, blocks, threads)
     else:
-        reader = TexelReader(FittedView(*of_run, surface, samples), texel_grid(surface, side_px))
-        texels = texels_of_grid(result, samples, reader, *fit_with)
+        reader = TexelReader(fitted_view, texel_grid(surface, side_px))
+        start = start_of(result, samples, reader.grid.triangle, surface.normals, task.left_out)
+        read_band = partial(reader.read_band, threads=threads)
+        bands = _blocks(reader.bands(task.memory_bytes), read_band, reader.count, say_view)
+        texels = texels_of_grid(start, reader.squares(), bands, threads)
         u_pixel = u_pixel / np.sqrt(reader.pixels_of_channels)
     head = TexelFileHead(
         samples.view, measured_run.frames.size_px, task.size, width_mm, u_pixel, result.u_shared,
         measured_run.run.is_simulated,
     )  # fmt: skip
     complete(texels_path(result, samples), lambda path: write_view_texels(path, texels, head))
+
+
+def _blocks(
+    parts: Iterable[slice], read_part: Callable[[slice], _Block], total: int, say: Callable[[int, int], None]
+) -> Iterator[_Block]:
+    """Yield the texels of a view part by part; all frames are read for each part. After a part, the number of
+    texels that are done is given to `say`."""
+    count = 0
+    for part in parts:
+        block = read_part(part)
+        yield block
+        count += len(block.values)
+        say(count, total)

@@ -24,7 +24,7 @@ from coupole.reflectance.extraction.seen_surface import SeenSurface
 from coupole.reflectance.extraction.view_samples import ViewPass
 from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.texels.pixel_values import FittedView, LitPixels, fill_rows, light_of
-from coupole.reflectance.texels.texel_grid import TexelGrid
+from coupole.reflectance.texels.texel_grid import TexelGrid, TexelSquares
 
 _TEXELS = 1 << 13
 """Number of texels whose means a thread computes at a time."""
@@ -55,8 +55,7 @@ class TexelReader:
         self._facets, self._samples = fitted_view.facets, fitted_view.samples
         self._triangle_of_pixel = surface.triangle_of_pixel
         self._seen_mm = surface.places_mm.reshape(-1, 3)
-        self.mesh_normals = surface.normals
-        """[triangles, 3]"""
+        self._mesh_normals = surface.normals
         self.grid = grid
         self.pixels_of_channels = grid.side_px**2 * channel_shares(radiometry)
         """[channels] number of pixels of a full texel."""
@@ -66,12 +65,17 @@ class TexelReader:
         """Number of the texels."""
         return int(np.count_nonzero(self.grid.triangle >= 0))
 
-    def bend(self) -> NDArray[np.float32]:
+    def squares(self) -> TexelSquares:
+        """Return the texels with what their pixels' places do to them."""
+        shares = self.pixels_of_channels / self.pixels_of_channels.sum()
+        return TexelSquares(self.grid, self._bend(), self._channel_offsets(), shares)
+
+    def _bend(self) -> NDArray[np.float32]:
         """[rows, columns] variance, rad^2, of each tilt of a texel whose pixels see triangles that are turned to
         each other: half of the variance of their mean, because under some LEDs not all of the pixels are lit."""
         texel = self.grid.texel_of_pixel.reshape(-1)
         pixels = np.flatnonzero(texel >= 0)
-        seen_normals = self.mesh_normals[self._triangle_of_pixel.reshape(-1)[pixels]]
+        seen_normals = self._mesh_normals[self._triangle_of_pixel.reshape(-1)[pixels]]
         shape = self.grid.triangle.shape
         counts = np.maximum(np.bincount(texel[pixels], minlength=self.grid.triangle.size), 1)
         sums = [np.bincount(texel[pixels], column, len(counts)) / counts for column in seen_normals.T]
@@ -79,7 +83,7 @@ class TexelReader:
         bend: NDArray[np.float32] = (0.5 * tilt_variance / counts).astype(np.float32).reshape(shape)
         return np.where(self.grid.triangle >= 0, bend, np.float32(0.0))
 
-    def channel_offsets(self) -> NDArray[np.float32]:
+    def _channel_offsets(self) -> NDArray[np.float32]:
         """[rows, columns, channels, 2] middle of each channel's pixels from the middle of all pixels of a texel,
         to the right and down, in widths of a texel."""
         texel, width = self.grid.texel_of_pixel, self.grid.triangle.size

@@ -19,6 +19,7 @@ from coupole.reflectance.run_result import (
     RunResult,
     ViewSamples,
 )
+from coupole.reflectance.texels.inter_reflection_error import covariance_of_inter_reflection
 from coupole.reflectance.texels.neighbours import (
     TRIANGLES_AROUND,
     WINDOW_PX,
@@ -29,7 +30,7 @@ from coupole.reflectance.texels.neighbours import (
 )
 from coupole.reflectance.texels.pixel_fit import LEAST_KS, LOG_ALPHA, LOG_KS, TILT, Lights, Prior
 from coupole.reflectance.texels.pixel_values import PixelBlock
-from coupole.reflectance.triangle_fit import LEAST_KD, turned_normals
+from coupole.reflectance.triangle_fit import LEAST_KD, TriangleMaterials, turned_normals
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -56,15 +57,18 @@ class Centres:
     covariance: Singles
     """[h, w, 15]"""
 
+    @property
+    def channels(self) -> int:
+        return int(self.logs.shape[2]) // 2
+
     def prior(self, block: PixelBlock) -> Prior:
         """Return the centres of a block's pixels in their own channels; NaN without material."""
         at = np.unravel_index(block.pixels, self.logs.shape[:2])
-        logs, channels = self.logs[at].astype(np.float64), self.logs.shape[2] // 2
-        rows = np.arange(len(logs))
+        logs, rows = self.logs[at].astype(np.float64), np.arange(len(block.pixels))
         return Prior(
             self.normals[at].astype(np.float64),
             np.exp(logs[rows, block.channel]),
-            np.exp(logs[rows, channels + block.channel]),
+            np.exp(logs[rows, self.channels + block.channel]),
             np.exp(logs[:, -1]),
         )
 
@@ -72,7 +76,7 @@ class Centres:
         """Return the materials at places [n], row by row, as means of the channels; and ks of each channel [n,
         channels] over this mean. NaN without material."""
         at = np.unravel_index(places, self.logs.shape[:2])
-        values, channels = np.exp(self.logs[at].astype(np.float64)), self.logs.shape[2] // 2
+        values, channels = np.exp(self.logs[at].astype(np.float64)), self.channels
         ks = values[:, channels:-1].mean(axis=1)
         prior = Prior(self.normals[at].astype(np.float64), values[:, :channels].mean(axis=1), ks, values[:, -1])
         return prior, values[:, channels:-1] / ks[:, None]
@@ -90,12 +94,10 @@ class Centres:
 
 
 def centres_of(
-    result: RunResult, view: ViewSamples, triangle_of_pixel: NDArray[np.int32], mesh_normals: Floats
+    materials: TriangleMaterials, of_triangles: Floats, triangle_of_pixel: NDArray[np.int32], mesh_normals: Floats
 ) -> Centres:
-    """Return the centres of a view; `mesh_normals` [triangles, 3] are used for triangles without a fit."""
-    places = np.searchsorted(result.triangles, view.triangles)
-    materials = result.materials(GGX_NORMAL.name, places)
-    of_triangles = result.material_covariances(GGX_NORMAL.name, places)
+    """Return the centres of pixels from the materials of triangles and their covariances [triangles, 5, 5];
+    `mesh_normals` [triangles, 3] are used for triangles without a fit."""
     kd, alpha = np.maximum(materials.kd, LEAST_KD), materials.alpha
     triangle_logs = np.log(np.column_stack([kd, np.maximum(materials.ks, LEAST_KS * kd), alpha]))
     has_fit = np.isfinite(triangle_logs).all(axis=1) & np.isfinite(of_triangles).all(axis=(1, 2))
@@ -103,7 +105,7 @@ def centres_of(
     has_fit &= (np.einsum("nii->ni", of_triangles)[:, :3] < MOST_VARIANCE[:3]).all(axis=1)
     is_seen = triangle_of_pixel >= 0
     is_known = is_seen & np.append(has_fit, False)[triangle_of_pixel]
-    triangle, channels = triangle_of_pixel[is_known], result.channels
+    triangle, channels = triangle_of_pixel[is_known], kd.shape[1]
     covariance = np.zeros((*is_seen.shape, UNKNOWNS * (UNKNOWNS + 1) // 2), np.float32)
     covariance[is_known] = lower_half(of_triangles)[triangle]
     logs = np.full((*is_seen.shape, 2 * channels + 1), np.nan, np.float32)
@@ -136,3 +138,34 @@ def lights_of(result: RunResult, view: ViewSamples, left_out: Sequence[int]) -> 
     columns = np.flatnonzero(~np.isin(view.leds, left_out))
     columns = columns[np.argsort(group[columns], kind="stable")]
     return Lights(columns, view.led_mm[columns], group[columns], view.camera_mm)
+
+
+@dataclass(frozen=True)
+class FitStart:
+    """Start of the fits of a view's texels."""
+
+    triangle: NDArray[np.int32]
+    """[h, w] for each texel the triangle that it sees, -1 for none."""
+    centres: Centres
+    lights: Lights
+    inter_reflection: Singles
+    """[triangles, 15] covariance from the inter-reflection that was subtracted."""
+
+
+def start_of(
+    result: RunResult,
+    view: ViewSamples,
+    triangle: NDArray[np.int32],
+    mesh_normals: Floats,
+    left_out: Sequence[int],
+) -> FitStart:
+    """Return the start of the fits of a view under its LEDs except those `left_out`. `triangle` [h, w] is the row
+    of the view's file that each texel sees."""
+    places = np.searchsorted(result.triangles, view.triangles)
+    materials = result.materials(GGX_NORMAL.name, places)
+    of_triangles = result.material_covariances(GGX_NORMAL.name, places)
+    centres = centres_of(materials, of_triangles, triangle, mesh_normals)
+    lights = lights_of(result, view, left_out)
+    start_materials = centres.of_triangles(triangle, len(view.triangles))
+    inter_reflection = lower_half(covariance_of_inter_reflection(view, start_materials, lights))
+    return FitStart(triangle, centres, lights, inter_reflection)

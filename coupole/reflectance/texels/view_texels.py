@@ -4,7 +4,7 @@ shrinkage by neighbours, and colours between the pixels of the pattern."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,28 +12,17 @@ from numpy.typing import NDArray
 
 from coupole.reflectance.ggx import UNKNOWNS
 from coupole.reflectance.normal_fit import LEAST_ALPHA
-from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples
-from coupole.reflectance.texels.inter_reflection_error import covariance_of_inter_reflection
+from coupole.reflectance.run_result import VARIANCES
 from coupole.reflectance.texels.mosaic import all_channels
 from coupole.reflectance.texels.neighbours import bend_around, lower_half, settle, tilts_from
 from coupole.reflectance.texels.pixel_file import ViewTexels
-from coupole.reflectance.texels.pixel_fit import Lights, PixelMaterials, Prior, fit_pixels
-from coupole.reflectance.texels.pixel_values import PixelReader
-from coupole.reflectance.texels.view_centres import (
-    ALPHA,
-    KD,
-    KS,
-    MOST_KD,
-    MOST_VARIANCE,
-    Centres,
-    centres_of,
-    lights_of,
-)
+from coupole.reflectance.texels.pixel_fit import PixelMaterials, Prior, fit_pixels
+from coupole.reflectance.texels.pixel_values import PixelBlock
+from coupole.reflectance.texels.view_centres import ALPHA, KD, KS, MOST_KD, MOST_VARIANCE, FitStart
 from coupole.reflectance.triangle_fit import MOST_KS, turned_normals
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
-Say = Callable[[int, int], None]
 MOST_OFF = 5.0
 """Largest deviation of logarithms from a triangle; fits that are farther away have failed."""
 _ALIKE = 1e-3
@@ -72,48 +61,30 @@ class Fitted:
             & (self.covariance[at][:, VARIANCES] < MOST_VARIANCE).all(axis=1)
         )
 
-    def settle(self, view: ViewSamples, centres: Centres, lights: Lights, triangle: NDArray[np.int32]) -> Singles:
-        """Take the neighbours into account, and add the uncertainty from inter-reflection. It is taken from the
-        `triangle` [h, w] of each texel. Return the normals [fitted, 3] of the fitted texels.
-        """
+    def settle(self, start: FitStart) -> Singles:
+        """Take the neighbours into account, and add the uncertainty from inter-reflection. Return the normals
+        [fitted, 3] of the fitted texels."""
         is_fitted = self.is_fitted
         before = self.deviation[is_fitted][:, :2]
-        bend = bend_around(centres.normals, is_fitted)
-        settle(self.deviation, self.covariance, is_fitted, centres.covariance, bend)
-        materials = centres.of_triangles(triangle, len(view.triangles))
-        of_triangles = lower_half(covariance_of_inter_reflection(view, materials, lights))
-        self.covariance[is_fitted] += of_triangles[triangle[is_fitted]]
+        bend = bend_around(start.centres.normals, is_fitted)
+        settle(self.deviation, self.covariance, is_fitted, start.centres.covariance, bend)
+        self.covariance[is_fitted] += start.inter_reflection[start.triangle[is_fitted]]
         normals = turned_normals(
             self.normals[is_fitted].astype(np.float64), self.deviation[is_fitted][:, :2] - before
         )
         return np.asarray(normals, np.float32)
 
 
-def texels_of_view(
-    result: RunResult,
-    view: ViewSamples,
-    reader: PixelReader,
-    left_out: Sequence[int],
-    memory_bytes: int,
-    threads: int,
-    say: Say,
-) -> ViewTexels:
-    """Fit all pixels of a view, under its LEDs except those `left_out`. Frames are read once for each part of the
-    pixels with values that fit into the memory. Raises StorageError for a damaged frame."""
-    centres = centres_of(result, view, reader.triangle_of_pixel, reader.mesh_normals)
-    lights = lights_of(result, view, left_out)
-    shape = reader.triangle_of_pixel.shape
-    channel = np.zeros(shape, np.int8)
-    fits, count = Fitted.empty(shape), 0
-    for rows in reader.blocks(memory_bytes):
-        block = reader.read_block(rows, threads)
+def texels_of_view(start: FitStart, blocks: Iterable[PixelBlock], threads: int) -> ViewTexels:
+    """Fit the pixels of a view, block by block."""
+    centres, shape = start.centres, start.triangle.shape
+    channel, fits = np.zeros(shape, np.int8), Fitted.empty(shape)
+    for block in blocks:
         prior = centres.prior(block)
-        fits.add(block.pixels, prior, fit_pixels(block.values, block.places_mm, lights, prior, threads))
+        fits.add(block.pixels, prior, fit_pixels(block.values, block.places_mm, start.lights, prior, threads))
         channel[np.unravel_index(block.pixels, shape)] = block.channel
-        count += len(block.pixels)
-        say(count, reader.count)
-    is_fitted, channels = fits.is_fitted, result.channels
-    texel_normals = fits.settle(view, centres, lights, reader.triangle_of_pixel)
+    is_fitted, channels = fits.is_fitted, centres.channels
+    texel_normals = fits.settle(start)
     logs = centres.logs[is_fitted].astype(np.float64)
     logs[:, :channels] = _with_colours(logs[:, :channels], centres.colours[is_fitted], channel[is_fitted])
     for first, unknown in ((0, KD), (channels, KS)):

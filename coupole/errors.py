@@ -159,7 +159,8 @@ class ArmUnattended(DeviceError):
         super().__init__(
             "robot",
             expected="a check of the arm every 0.1 s while it moves",
-            happened=f"nobody looked for {silent_s:.2f} s (the program stood still, or waited for something), so "
+            happened=f"the arm was not checked for {silent_s:.2f} s (the program stood still, or "
+            f"waited for something), so "
             "the arm braked on its path",
             remedy="Check that the cell is clear, then continue.",
         )

@@ -155,7 +155,7 @@ def _end_unheard(read_fd: int) -> None:
         if _heard_s[-1] > since_s - ASKS_FROM_S:  # the handler may have been faster than this thread
             heard_s, since_s = min(heard_s, since_s), math.inf
         if time.monotonic() > heard_s + _LEAVES_WITHIN_S or time.monotonic() > since_s + bounded.STOPPED_S:
-            _tell("the program waits in a call that does not return (of a disk?), and was ended\n")
+            _tell("the program waited in a call that does not return (perhaps to a disk), and was ended\n")
             os._exit(128 + number)
 
 

@@ -132,7 +132,7 @@ def _next_step(record: Record) -> Inline:
         return [
             "Keep ",
             record_file,
-            f" with the cell's records: it holds until {record.validity.expires:%Y-%m-%d}.",
+            f" with the cell's records: it is valid until {record.validity.expires:%Y-%m-%d}.",
         ]
     return [
         "Remove the cause and calibrate again",

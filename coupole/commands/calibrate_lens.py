@@ -151,7 +151,8 @@ def hand_eye(
     rig: Annotated[
         Path | None,
         typer.Option(
-            "--rig", help="The arm's rig. With it, the zero errors of the arm's axes are estimated too (for runs)."
+            "--rig",
+            help="The arm's rig. With the rig, the zero errors of the arm's axes are estimated too (for runs).",
         ),
     ] = None,
     *,

@@ -66,7 +66,11 @@ def makie(
     ] = False,
     inside: Annotated[
         bool,
-        typer.Option("--inside", help="Pixels hold metal and lacquer only, no shadow: exact for three colours."),
+        typer.Option(
+            "--inside",
+            help="Assume that the pixels show metal and lacquer only, without shadow; this "
+            "is exact for three colours.",
+        ),
     ] = False,
     known_shares: Annotated[
         list[str] | None,
@@ -78,7 +82,8 @@ def makie(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Separate a photograph of makie: alpha is the share of metal, and the colours are those of the lacquers.
+    """Separate a photograph of makie into metal and lacquers: alpha is the share of metal, and the colours are the
+    lacquers' colours.
 
     Photograph in diffuse light, so that all of the metal is equally bright. X counts columns from the left, Y rows
     from the top, both from 0.

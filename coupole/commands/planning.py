@@ -178,8 +178,9 @@ def plan_new(
 ) -> None:
     """Write a plan to start from. Choosing the views of `leds` for the rig's dome takes a minute or two.
 
-    For a calibration in a simulated cell it also writes NAME-rig.yaml, the rig with the board, card or tile on its
-    support, and NAME-board.yaml or NAME-tile.yaml, its description for `coupole calibrate`.
+    For a calibration in a simulated cell, the command also writes NAME-rig.yaml, the rig with the board, card or
+    tile on its support, and NAME-board.yaml or NAME-tile.yaml, the description of board or tile for `coupole
+    calibrate`.
     """
     from coupole.plan.base_model import NAME_PATTERN
     from coupole.plan.templates import LEDS, TEMPLATES

@@ -289,7 +289,7 @@ def _unsafe(run: Run) -> list[str]:
     from coupole.storage import journal
     from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
 
-    reasons = ["the session has no end in its journal: its process was killed, or could not write it"]
+    reasons = ["the session has no end in its journal: its process was killed, or could not write the end"]
     has_end = False
     for event in journal.read_events(run.journal_path):
         if isinstance(event, SessionStarted | SessionResumed):

@@ -88,8 +88,8 @@ def budget(
     out: Annotated[Path | None, typer.Option("--out", help="Write this PNG, and HTML and JSON beside it.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute the uncertainty of a reflectance and its dominant sources, and compare the accuracies with those of
-    the paper.
+    """Compute the uncertainty of a reflectance and its dominant sources, and compare the accuracies with the
+    paper's.
 
     The intervals are by Monte Carlo (JCGM 101); the linear formula checks them.
     """
@@ -304,7 +304,7 @@ def _show_accuracies(console: Console, result: _Result) -> None:
         table.add_row(line.quantity, line.paper, *(line.cell(number) for number in range(len(cases))))
     console.print()
     console.print(table)
-    console.print("standard uncertainties, all directions together; samples over a dome: their 68 % intervals")
+    console.print("standard uncertainties, all directions together; for samples over a dome, their 68 % intervals")
     for trace in result.traces:
         console.print(f"traceability: {trace}")
     for doubt in result.doubts:

@@ -80,7 +80,7 @@ def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None
     white_balance = signals / white[:, None]
     if np.linalg.cond(white_balance @ covariance @ white_balance.T) > _LARGEST_CONDITION:
         raise InputError(
-            f"{sensor}: its channels are too similar under the light of {leds} to tell colours apart; expected "
+            f"{sensor}: its channels are too similar under the light of {leds} to distinguish colours; expected "
             "sensitivities of red, green and blue that have different shapes"
         )
     matrix = _least_missing(white_balance, towards, covariance)

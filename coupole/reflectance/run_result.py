@@ -62,7 +62,8 @@ FIELDS = {
     "residual": "weighted rms of the residuals of the values' square roots, as a share of sqrt(kd)",
 }
 UNCERTAIN = {
-    "covariance": "lower half, row by row, of tilts (rad) along two tangents of the normal and of the logarithms "
+    "covariance": "lower half, row by row, of the covariance of tilts (rad) along two tangents of the "
+    "normal and of the logarithms "
     "of kd, ks (the channels' mean) and alpha; without u_triangle and u_shared",
     "u_kd": "relative standard uncertainty by channel, without u_triangle and u_shared",
     "u_ks": "the same of ks",

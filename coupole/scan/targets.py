@@ -42,7 +42,7 @@ def read_targets(path: Path) -> Targets:
     except FileNotFoundError:
         raise InputError(f"{path}: expected a table of targets; there is no such file") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected text (UTF-8); byte {error.start} is not") from None
+        raise InputError(f"{path}: expected text (UTF-8); byte {error.start} is not UTF-8") from None
     rows: list[tuple[int, list[str]]] = []
     units: dict[str, int] = {}
     for number, line in enumerate(lines, start=1):

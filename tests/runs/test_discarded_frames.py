@@ -334,7 +334,7 @@ def test_a_view_whose_samples_are_damaged_or_gone_is_told_and_nothing_is_made_of
     path = result / "samples/top.h5"
     whole = path.read_bytes()
     spoil(path)
-    for words in ("is not what was proven", "is missing"):
+    for words in ("differs from what was proven", "is missing"):
         ended = cells.here("verify", run)
         assert ended.code == 6, ended.err
         assert words in ended.err

@@ -238,7 +238,7 @@ def test_what_cannot_be_made_is_refused_before_anything_moves(tmp_path: Path) ->
     ("plan", "words"),
     [
         ({"object": {"id": "nobody"}}, "expected the object's mesh"),
-        ({"gain_db": 6.0}, "holds for a gain of"),
+        ({"gain_db": 6.0}, "is valid for a gain of"),
         ({"lights": {"kind": "panels", "panels": [1]}}, "expected single LEDs"),
     ],
 )

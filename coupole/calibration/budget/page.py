@@ -42,7 +42,7 @@ def page(
                     "Accuracies beside the paper's",
                     tables=[_accuracies(cases, accuracies)],
                     notes=[
-                        "Standard uncertainties, all directions together; samples over a dome: their 68 % "
+                        "Standard uncertainties, all directions together; for samples over a dome, their 68 % "
                         "intervals."
                     ],
                 ),

@@ -115,7 +115,8 @@ def _of_views(power: LedPower, limits: Sequence[Limit]) -> list[str]:
     if figures["left_out"].is_met and figures["scatter"].is_met:
         return [line]
     return [
-        f"{line}. Views contradict each other by more than noise, and what is named does not explain it. Look for "
+        f"{line}. Views contradict each other by more than noise, and the named causes do not explain it. Look "
+        f"for "
         "a tile, camera or lamp that moved between the views; then take the views anew"
     ]
 

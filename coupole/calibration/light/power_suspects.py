@@ -44,7 +44,7 @@ _WORDS = {
     DRIFT: "gain or light drifted over the session",
     UNSTEADY: "gain or light wavered during the session",
     RESTLESS: "gain or light wavered many times during the session",
-    DIES: "dies are tilted, or their lobes differ: light falls off otherwise than by the cosine law",
+    DIES: "dies are tilted, or their lobes differ: their light does not follow the cosine law",
 }
 _REMEDIES = {
     STAIN: "Clean the tile or turn another part of it up",

@@ -57,7 +57,7 @@ def _watch(cell: Cell, action: str, control: KeptControl, over: threading.Event)
                 "GET",
                 f"/api/v1/bench/permission{query}",
                 given_up=over.is_set,
-                meanwhile="; the motion goes on, as nobody can take control there meanwhile",
+                meanwhile="; the motion goes on, because nobody can take control there now",
             )
             query = query or f"?taken_count={now['taken_count']}"
             if not now["may_act"]:

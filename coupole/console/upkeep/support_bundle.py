@@ -46,13 +46,13 @@ _SECRETS = (
 _README = """\
 Coupole, support bundle of {t}.
 
-versions.json   this machine, and the versions of what Coupole uses
+versions.json   this machine, and the versions of the software that Coupole uses
 disk.json       of the runs
 rig/            the rig, its LED table, and its records of calibrations without their maps
 plans/          the folder of plans
 state/          faults of the arm, and other facts of the cell
 runs/           of the {runs} newest runs: description, journal, plan and rig; no frames
-console/        who asked for what; the queue; what commands and acquisitions printed
+console/        who requested what; the queue; the output of commands and acquisitions
 
 It contains names of people (who asked for what) and of objects. Values of keys that look like passwords or
 tokens are replaced by {left_out}; accounts and notifications are not included.

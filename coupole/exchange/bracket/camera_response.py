@@ -137,7 +137,7 @@ def _samples(values: NDArray[np.float32]) -> Array:
     useful = (hat(values.astype(float)) > 0.0).sum(axis=0) >= 2
     if np.count_nonzero(useful) < 50:
         raise InputError(
-            "bracket: expected many pixels that two photographs show, neither dark nor saturated; found "
+            "bracket: expected many pixels that are neither dark nor saturated in two photographs; found "
             f"{np.count_nonzero(useful)}; take photographs in steps of 2 times the exposure"
         )
     flat = useful & (steep <= np.quantile(steep[useful], 0.6))

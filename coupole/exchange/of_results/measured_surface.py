@@ -118,7 +118,9 @@ def read_surface(
     result = RunResult(folder)
     name = fit or _best(result, takes_texels=takes_texels)
     if name not in (*MATERIALS, TEXELS):
-        raise InputError(f"--fit: expected {' or '.join(MATERIALS)}, which hold from everywhere; got {name}")
+        raise InputError(
+            f"--fit: expected {' or '.join(MATERIALS)}, which are valid from every direction; got {name}"
+        )
     if name == TEXELS and not takes_texels:
         raise InputError("--fit texels: is for formats with maps; this one has one material for each triangle")
     of_triangles = best_fit(result, MATERIALS) if name == TEXELS else name

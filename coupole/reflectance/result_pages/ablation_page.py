@@ -68,7 +68,7 @@ def _quality(mae: dict[str, Any]) -> str:
         return "The error is not known, because no LEDs were kept for the check."
     best = min(known_errors, key=lambda name: known_errors[name])
     return (
-        f"With the most ({setting} {value:g}) {FITS[best].title} has the smallest error: "
+        f"With the most data ({setting} {value:g}) {FITS[best].title} has the smallest error: "
         f"{100 * known_errors[best]:.3f} % of range."
     )
 

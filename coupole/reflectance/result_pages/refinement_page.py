@@ -101,7 +101,7 @@ _ARROWS = (
     f"with the greatest detail; they are {LONGER:g} times as long as the true distance. The first two are at the "
     "top."
 )
-_STEPS = "Steps along the base's axes and about the camera's, with standard uncertainties."
+_STEPS = "Steps along the base's axes and about the camera's axes, with standard uncertainties."
 
 
 def _next_step(name: str, about: dict[str, Any]) -> Inline:
@@ -115,8 +115,8 @@ def _unknowns(about: dict[str, Any]) -> str:
         f"{about['unknowns']} unknowns, of which the pictures determine {about['determined']:.0f}; square sum of "
         f"the steps divided by the stated uncertainties: {about['chi2_of_steps']:.0f}. Matches scatter "
         f"{about['noise_factor']:.1f} times as much as noise and texture alone explain, and are weighted "
-        f"accordingly; {about['rejected']} were rejected. Motions that pictures cannot determine, such as that "
-        "of mesh and cameras together, keep their stated uncertainty."
+        f"accordingly; {about['rejected']} were rejected. Motions that pictures cannot determine, such as a "
+        f"common motion of mesh and cameras, keep their stated uncertainty."
     )
 
 
@@ -153,7 +153,7 @@ def _cameras(about: dict[str, Any]) -> Table:
 def _mesh(about: dict[str, Any]) -> Section:
     mesh = about["mesh"]
     note = (
-        f"Along its normals it was moved by {mesh['shape_rms_mm']:.3f} mm (root mean square of points "
+        f"Along its normals the mesh was moved by {mesh['shape_rms_mm']:.3f} mm (root mean square of points "
         f"{mesh['scale_mm']:g} mm apart); their median standard uncertainty is {mesh['shape_median_u_mm']:.3f} "
         "mm, "
         f"{mesh['shape_stated_u_mm']:g} mm was stated."

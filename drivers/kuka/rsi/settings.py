@@ -114,7 +114,8 @@ class Settings(BaseModel):
         standard = np.allclose(self.wrist.opw_from_flange, np.eye(4), rtol=0.0, atol=1e-9)
         if self.corrects == "pose" and not standard:
             raise ValueError(
-                f"corrections of the pose need KUKA's flange, its z axis along axis 6, not that of "
+                f"corrections of the pose need a flange like KUKA's, with its z axis along "
+                f"axis 6, not the flange of "
                 f"{self.arm_model.name}; set `corrects: axes`"
             )
         return self

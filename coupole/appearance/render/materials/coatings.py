@@ -122,7 +122,9 @@ class Layers(Model):
     def _check_top_leaf(self) -> Layers:
         first = self.layers[0]
         if isinstance(first, Leaf) and first.uncovered:
-            raise ValueError("a leaf on top has no face where it is `uncovered`: take `kind: worn`, or varnish it")
+            raise ValueError(
+                "a leaf on top needs a varnish if parts of it are `uncovered`: take `kind: worn`, or varnish it"
+            )
         return self
 
 

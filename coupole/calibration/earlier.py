@@ -1,4 +1,4 @@
-"""Earlier records that a calibration uses. They must be accepted, and must hold for its images."""
+"""Earlier records that a calibration uses. They must be accepted, and must be valid for its images."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def refuse_same_images(path: Path, record: Record, inputs: Sequence[tuple[str, s
 
 
 def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, int]) -> None:
-    """Raise InputError unless a record holds for these images: their time, camera, lens, focus, frame size and
+    """Raise InputError unless a record is valid for these images: their time, camera, lens, focus, frame size and
     temperature."""
     holds = record.validity
     if about.begun is not None and record.simulated != about.is_simulated:

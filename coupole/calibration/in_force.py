@@ -65,7 +65,8 @@ def read_in_force(paths: Sequence[Path], files: InputFiles | None = None) -> tup
 
 
 def refusals(plan_records: Sequence[InForce], here: Situation, needed_kinds: Sequence[str] = NEEDED) -> list[str]:
-    """Return the reasons why a plan that names these records must not be acquired here; empty if it may."""
+    """Return the reasons why a plan that names these records must not be acquired here; empty if the plan may be
+    acquired."""
     counts = Counter[str](item.record.kind for item in plan_records)
     reasons = [
         f"calibrations: no record of the kind `{kind}` is named" for kind in needed_kinds if not counts[kind]

@@ -1,9 +1,9 @@
 """The record of a calibration: result, uncertainty, inputs and validity.
 
 It is a YAML file with a SHA-256 of its own content, so that a record which was edited by hand is refused. Values
-of a rigid transform are given in mm and KUKA's A B C. Their uncertainty is that of a small step: `x_mm y_mm z_mm`
-along the axes of the frame on the left of the transform's name, and `rx_deg ry_deg rz_deg` about the axes of the
-frame on the right.
+of a rigid transform are given in mm and KUKA's A B C. Their uncertainty is the uncertainty of a small step: `x_mm
+y_mm z_mm` along the axes of the frame on the left of the transform's name, and `rx_deg ry_deg rz_deg` about the
+axes of the frame on the right.
 """
 
 from __future__ import annotations

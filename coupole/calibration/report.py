@@ -33,7 +33,7 @@ class Outcome:
     files: Mapping[str, bytes] = field(default_factory=dict)
     """Files by name, as `record.files` lists them: tables and maps that are too large for YAML."""
     sections: Sequence[Section] = ()
-    """Parts of the page in addition to those of all records."""
+    """Parts of the page in addition to the parts that all records have."""
 
 
 def write_outcome(record_path: Path, outcome: Outcome) -> tuple[Path, Path]:

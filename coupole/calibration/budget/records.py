@@ -229,7 +229,7 @@ _KINDS = ", ".join(kind for kind in get_args(Kind) if reader_of(kind))
 
 
 def camera_reach_mm(record: Record) -> float:
-    """Return the distance from the middle of the flange to that of the camera."""
+    """Return the distance from the middle of the flange to the middle of the camera."""
     return float(np.linalg.norm(record.transforms[_SEEN_FROM_HAND_EYE].translation_mm))
 
 

@@ -246,7 +246,7 @@ Parts = Callable[[Floats, Floats, Floats], Floats]
 def _by_noise(
     patch_signals: Balanced, profile: Profile, balanced_channels: Floats, parts: Parts, free: Floats, lab: Floats
 ) -> Sequence[Floats]:
-    """Return changes of the misses by one standard uncertainty of each signal. They include the change of the
+    """Return changes of the errors by one standard uncertainty of each signal. They include the change of the
     balance."""
     columns = []
     grey = list(patch_signals.neutral)

@@ -186,7 +186,7 @@ def _refuse_curved(view: _ChartView, known_chart: KnownChart) -> None:
 
 
 def _refuse_tints(views: Sequence[_ChartView], known_chart: KnownChart, remarks: list[str]) -> None:
-    """Raise InputError if the light's colour differs between pictures: a profile holds for one light."""
+    """Raise InputError if the light's colour differs between pictures: a profile is valid for one light."""
     grey = list(known_chart.neutral)
     tints = []
     for view in views:

@@ -86,7 +86,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
 
 
 def power_limits(powers: Mapping[str, LedPower], operator_limits: Mapping[str, float]) -> tuple[Limit, ...]:
-    """Compare the powers with their limits: those of green, and the worst channel's causes."""
+    """Compare the powers with their limits: the powers of green, and the worst channel's causes."""
     green = powers["G"]
     good = np.isfinite(green.power) & (green.power > 0)
     u = green.u_against_mean()
@@ -122,7 +122,8 @@ def _of_views(power: LedPower, limits: Sequence[Limit]) -> list[str]:
 
 
 def with_equal_figures(powers: Mapping[str, LedPower]) -> dict[str, LedPower]:
-    """Return the powers with as many figures of causes in each channel; those that are added change nothing."""
+    """Return the powers with the same number of figures of causes in each channel; added figures change
+    nothing."""
     most = max(powers.values(), key=lambda power: len(power.common_names)).common_names
     equal = {}
     for channel, power in powers.items():

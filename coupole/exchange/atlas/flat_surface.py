@@ -99,8 +99,8 @@ class FlatSurface:
 
 
 def flatten(surface: MeasuredSurface) -> FlatSurface:
-    """Lay a surface out in maps. The width of texels is that of the options. By default, it is the width of those
-    in the finest view, or it follows from the allowed width of the map.
+    """Lay a surface out in maps. The width of texels is that of the options. By default, it is the width of the
+    texels in the finest view, or it follows from the allowed width of the map.
 
     Raises InputError if the maps would be wider than the options or `MOST_SIDE_PX` allow, or if nothing has a
     material.

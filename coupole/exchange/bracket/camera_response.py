@@ -201,7 +201,7 @@ def _predict_values(samples: Array, weights: Array, log_t: Array, g: Array, powe
 
 
 def _with_noise(g: Array, weights: Array, off: Array, slope: Array, least_noise: float) -> _Fit:
-    """Return the fit with the noise of its residuals. `off` is the samples' ln of exposure minus that of the
+    """Return the fit with the noise of its residuals. `off` is the samples' ln of exposure minus the ln of the
     time."""
     free = 1.0 - weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
     residuals = (off - _pixel_means(weights, off)) / slope / np.sqrt(np.maximum(free, 1e-3))

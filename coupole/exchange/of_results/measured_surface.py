@@ -45,7 +45,7 @@ class ExportChoice:
     most_error: float | None = None
     """Greatest relative error of tables that adapt to their material; None for plain tables."""
     texel_mm: float | None = None
-    """Width of a map's texels; None for that of the views."""
+    """Width of a map's texels; None for the width of the views' pixels."""
     map_px: int | None = None
     """Greatest width of maps; None for no limit."""
     uv_mesh: Path | None = None

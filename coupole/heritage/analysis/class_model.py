@@ -121,9 +121,9 @@ class ClassModel:
 
     @cached_property
     def threshold(self) -> float:
-        """A spectrum counts as known from this probability on that its class is in the library. If the class of a
-        reference is left out of the library, only a share of 0.05 of the references reach this probability.
-        References that a family (`pigment_classes`) excludes count as not reaching it.
+        """Probability that the class of a spectrum is in the library, from which the spectrum counts as known. If
+        the class of a reference is left out of the library, only a share of 0.05 of the references reach this
+        probability. References that a family (`pigment_classes`) excludes count as not reaching it.
         """
         probabilities = self.held_out.without_class
         known_probability = 1.0 - probabilities[:, -1]

@@ -65,7 +65,7 @@ def yield_to_all_others(but: ThreadForTheEnd) -> None:
 
 def end_with(parent: int) -> None:
     """Let the system end this process by SIGKILL when the thread that began it ends, even while it is stopped
-    (prctl(2)). On systems without this call, the process learns it from the end of its input."""
+    (prctl(2)). On systems without this call, the process learns of this from the end of its input."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:  # it has died before

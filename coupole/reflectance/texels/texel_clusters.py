@@ -62,7 +62,7 @@ class TexelClusters:
 
     def at(self, name: str, texels: TriangleMaterials) -> TriangleMaterials:
         """Return the materials of a view's texels by their clusters, with the texels' own normals. The first of
-        `texels` is that of pixels without a texel, as scenes have it, and stays."""
+        `texels` belongs to pixels without a texel, as in scenes, and does not change."""
         number = self.cluster[name]
         kd, ks, alpha = (
             np.concatenate([own_values[:1], values[number]])
@@ -205,7 +205,7 @@ def read_texel_clusters(folder: Path) -> TexelClusters:
 
 def _mae(result: RunResult, clusters: TexelClusters, say: Said) -> dict[str, float | None]:
     """Return mean absolute errors, in shares of the camera's range, of pictures of left-out LEDs: by the texels'
-    own materials, and by those of their clusters, in the pixels where both have a value."""
+    own materials, and by the materials of their clusters, in the pixels where both have a value."""
     sums, values = {"own": 0.0, "clustered": 0.0}, 0
     for number, view in enumerate(result.views, start=1):
         own_scene = scene_of_view(result, view.view, TEXELS)

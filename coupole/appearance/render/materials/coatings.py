@@ -62,7 +62,8 @@ class FourFlux(Model):
     coefficients: FourFluxes
     thickness_mm: Positive
     ground: Reflectance = _BLACK
-    """Reflectance of the ground inside the binder; a measured one was measured under a face of the same index."""
+    """Reflectance of the ground inside the binder; a measured reflectance was measured under a face of the same
+    index."""
     ground_mirror: Share = 0.0
     """Reflectance of a glossy ground for directed light, in addition to `ground`."""
     ground_roughness: Roughness = 0.1
@@ -113,7 +114,8 @@ class Layers(Model):
     kind: Literal["layers"]
     layers: Annotated[tuple[Layer, ...], Field(min_length=1, max_length=20)]
     ground: Reflectance = _BLACK
-    """Reflectance of the ground inside the binder; a measured one was measured under a face of the same index."""
+    """Reflectance of the ground inside the binder; a measured reflectance was measured under a face of the same
+    index."""
     index: Refraction = indices.BINDER
     roughness: Roughness = 0.05
     """Roughness of the face; a leaf on top has its own roughness."""

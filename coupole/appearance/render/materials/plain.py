@@ -61,8 +61,8 @@ class Paint(Model):
 
     kind: Literal["paint"]
     pigment: Colouring
-    """Reflectance of an opaque layer, or K and S. A measured reflectance is that under the face; others are inside
-    the binder."""
+    """Reflectance of an opaque layer, or K and S. A measured reflectance is valid under the face; others are
+    inside the binder."""
     thickness_mm: Positive | None = None
     ground: Reflectance = Constant(kind="constant", value=0.0)
     """Reflectance of the ground. A measured reflectance is that of the ground under a face of the same index;

@@ -99,7 +99,8 @@ def _record_refusals(record: Record, here: Situation) -> list[str]:
         if off_mm > holds.focus_tolerance_mm:
             reasons.append(
                 f"is valid for a focus of {holds.focus_distance_mm:g} mm (within {holds.focus_tolerance_mm:g}); "
-                f"the rig is focused at {here.focus_distance_mm:g} mm. Calibrate at this focus, or turn the ring back"
+                f"the rig is focused at {here.focus_distance_mm:g} mm. "
+                "Calibrate at this focus, or turn the ring back"
             )
     for label, unit, valid, rig_figure in (
         ("focal length", " mm", holds.focal_length_mm, here.focal_length_mm),

@@ -66,11 +66,7 @@ def makie(
     ] = False,
     inside: Annotated[
         bool,
-        typer.Option(
-            "--inside",
-            help="Assume that the pixels show metal and lacquer only, without shadow; this "
-            "is exact for three colours.",
-        ),
+        typer.Option("--inside", help="Assume only metal and lacquer, without shadow; exact for three colours."),
     ] = False,
     known_shares: Annotated[
         list[str] | None,
@@ -82,8 +78,7 @@ def makie(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Separate a photograph of makie into metal and lacquers: alpha is the share of metal, and the colours are the
-    lacquers' colours.
+    """Separate a photograph of makie: alpha is the share of metal, and the colours are the lacquers' colours.
 
     Photograph in diffuse light, so that all of the metal is equally bright. X counts columns from the left, Y rows
     from the top, both from 0.

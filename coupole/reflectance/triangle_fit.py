@@ -1,8 +1,8 @@
 """GGX materials of triangles from the samples of all views, with the mesh's normal and with a fitted one.
 
 The normal of the mesh is the prior of the fitted normal. Its variance comes from noise of the scanner's vertices.
-For a triangle of area A this variance is about that of an equilateral triangle: 2 s^2 / a^2 with a^2 = 4 A / sqrt
-3 (a plane through three points, each with an error s). The fit is that of `coupole.reflectance.normal_fit`,
+For a triangle of area A this variance is about the variance of an equilateral triangle: 2 s^2 / a^2 with a^2 = 4 A
+/ sqrt 3 (a plane through three points, each with an error s). The fit is that of `coupole.reflectance.normal_fit`,
 computed by `coupole.reflectance.ggx_fit`.
 """
 

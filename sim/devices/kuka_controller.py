@@ -117,7 +117,8 @@ class KukaController:
         return self._delay
 
     def true_base_from_flange(self) -> Transform:
-        """True pose of the flange: the controller's, with the arm's constant error and that of the last stop."""
+        """True pose of the flange: the controller's, with the arm's constant error and the error of the last
+        stop."""
         return self.errors.true_flange_pose(self.joints_deg, self._axes.stops, self._axes.came_from_deg)
 
     def estop(self) -> None:

@@ -282,7 +282,11 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface, digest: A
     )
     scales = np.stack([_dn_share(measured_run, view, int(led)) for led in leds])
     _dataset(
-        file, "full_scales", scales, "share of the camera's range for f cos_i E/Phi = 1 in the longest exposure", digest
+        file,
+        "full_scales",
+        scales,
+        "share of the camera's range for f cos_i E/Phi = 1 in the longest exposure",
+        digest,
     )
 
 

@@ -151,7 +151,7 @@ class ArmUnattended(DeviceError):
     """The arm braked on its path because nobody watched its motion. No fault is latched, and the arm may move
     again.
 
-    `silent_s` is the time for which nobody looked, on the machine's clock.
+    `silent_s` is the time for which the arm was not checked, on the machine's clock.
     """
 
     def __init__(self, silent_s: float) -> None:

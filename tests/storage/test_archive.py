@@ -310,7 +310,7 @@ def test_a_frame_that_changed_on_the_disk_is_not_archived(made: MadeRun) -> None
 def test_a_record_that_contradicts_the_journal_is_not_archived(made: MadeRun) -> None:
     path, slot = made.run.view_path("top"), made.run.proven()[ShotId.parse("top/led0001/e0")].index
     flip_byte(path, frame_file.read_layout(path).table_offset + slot * frame_file.FRAME_DTYPE.itemsize + 12)
-    archive_is_refused(made, f"slot {slot} is not recorded as top/led0001/e0")
+    archive_is_refused(made, f"slot {slot} should be recorded as top/led0001/e0")
 
 
 def test_an_archive_that_does_not_read_back_does_not_replace_the_file(made: MadeRun) -> None:

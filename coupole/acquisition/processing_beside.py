@@ -310,8 +310,8 @@ class ProcessingBeside:
         )
 
     def _shortage_now(self) -> str:
-        """Return how little memory the process, which has not been waited for, may have; empty if it may have
-        enough."""
+        """Return a sentence on the limit of the process's memory, before the process is waited for; empty if the
+        limit is high enough."""
         return little_address_space(self._process.pid)
 
     def _leave_word(self) -> None:

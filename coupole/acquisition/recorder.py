@@ -1,4 +1,5 @@
-"""Recorders for a run's frames and events: the one that the sequencer needs, and that of a run folder."""
+"""Recorders for a run's frames and events: the recorder that the sequencer needs, and the recorder of a run
+folder."""
 
 from __future__ import annotations
 

@@ -39,8 +39,9 @@ _heard_s = deque([-math.inf], maxlen=1)
 _raised_s = deque([-math.inf], maxlen=1)
 """Time when a SignalReceived was last raised."""
 _SAME_S = 1.0
-"""Signals outside sessions within this time after another one are the same wish: a terminal that closes may send
-two. They are dropped, because an exception within the handling of the first would hide it."""
+"""A signal outside a session counts as the same request as a signal less than this time before it: a terminal that
+closes may send two. The later signal is dropped, because an exception within the handling of the first signal
+would hide the first."""
 
 _PULSE_S, _TOLD_WITHIN_S = 0.25, 0.1
 _AGAIN_AFTER_S = 0.02

@@ -40,7 +40,7 @@ class Caller:
         self.pid = peer_pid(connection)
 
     def is_gone(self) -> bool:
-        """Tell whether the other end is closed. An open end that only sends nothing more does not count."""
+        """Tell whether the other end is closed. An end that is open but sends nothing more does not count."""
         poll = select.poll()
         poll.register(self._connection, 0)
         return any(events & (select.POLLHUP | select.POLLERR) for _, events in poll.poll(0))
@@ -106,7 +106,7 @@ def peer_pid(connection: socket.socket) -> int:
 
 
 def _peer(connection: socket.socket) -> tuple[int, int, int]:
-    """Return process, user and group at the other end; for a server, those of the process that listens."""
+    """Return process, user and group at the other end; for a server, of the process that listens."""
     credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     pid, uid, gid = struct.unpack("3i", credentials)
     return pid, uid, gid

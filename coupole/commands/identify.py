@@ -90,7 +90,7 @@ def identify(
     report: ReportOptions,
     as_json: JsonOption = False,
 ) -> None:
-    """Which class of pigments each spectrum shows, or that the library has none for it.
+    """Find which class of pigments each spectrum shows, or that the library has no class for it.
 
     A verdict is match, mixture, ambiguous or unknown. The class and its probability are printed beside every
     verdict. The last lines are the error rates with which the library identifies its own spectra. For an image

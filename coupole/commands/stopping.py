@@ -1,4 +1,4 @@
-"""Stop of what other processes of this user do with a cell: an acquisition, or a session without a run."""
+"""Stops the work of this user's other processes at a cell: an acquisition, or a session without a run."""
 
 from __future__ import annotations
 
@@ -76,11 +76,11 @@ class _Stopping:
     replies: dict[int, State] = field(default_factory=dict)
     """Answers of what was stopped, by process."""
     other_names: list[str] = field(default_factory=list)
-    """Names of what was found and not stopped, because only one can be meant without a name."""
+    """Names of sessions that were found and not stopped, because only one can be meant without a name."""
     _unclear: dict[int, str] = field(default_factory=dict)
     """Names of sessions whose rig is not known yet, by process."""
     _told_pids: set[int] = field(default_factory=set)
-    """Processes of which it was said that they are waited for."""
+    """Processes for which the command has said that it waits for them."""
     _no_run: InputError | None = None
     """Reason why no run was stopped."""
 
@@ -168,8 +168,8 @@ class _Stopping:
 
     def _ask_session(self, path: Path, state: State) -> None:
         """Stop a session, or its run if that has begun meanwhile. If the run has its last frame, the process is
-        interrupted as by Ctrl-C, so that nothing follows. One that is being stopped already is only noted. Raises
-        InputError if it does not answer."""
+        interrupted as by Ctrl-C, so that nothing follows. A session that is being stopped already is only noted.
+        Raises InputError if it does not answer."""
         import os
         import signal
 

@@ -140,7 +140,7 @@ def in_world(rig: Rig, *, dry_run: bool) -> bool:
 
 
 def device_for(rig: Rig, kind: str, *, dry_run: bool) -> tuple[DriverName, dict[str, Any]]:
-    """Return the driver and settings to open for a device: those of its twin in a dry run, its own otherwise."""
+    """Return the driver and settings to open for a device: its twin's in a dry run, otherwise its own."""
     device: Device = getattr(rig, kind)
     settings = dict(device.settings)
     driver = device.driver
@@ -219,8 +219,8 @@ def driver_problems(document: Document, rig: Rig) -> list[Problem]:
 
 def _unlike_stand_in(document: Document, rig: Rig) -> list[Problem]:
     """Refuse, in a rig of stand-ins, an arm other than the one that the stand-in moves. Otherwise the poses would
-    be those of the arm, but the pictures those of the stand-in. (A UR's stand-in moves the driver's `model`, or
-    its settings are refused.)
+    come from the arm, but the pictures from the stand-in. (A UR's stand-in moves the driver's `model`, or its
+    settings are refused.)
     """
     moved_arm, arm = ARMS_OF_DRIVERS.get(rig.robot.driver), described_arm(rig)
     if moved_arm is None or arm is None or not in_world(rig, dry_run=False):

@@ -1,7 +1,7 @@
 """Tables of positioning targets (retro-reflective stickers) as text, from VXelements or spreadsheets.
 
 No file of the real scanner was available, so many variants are read: comments; tabs, commas, semicolons or blanks
-between columns; decimal commas; a line of headings; a name in the first column; normals in the last ones. An
+between columns; decimal commas; a line of headings; a name in the first column; normals in the last columns. An
 ambiguous line is refused with its number.
 """
 

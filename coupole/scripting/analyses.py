@@ -188,7 +188,7 @@ def compare(
     """Find significant changes of shape and colour between two states of an object, like `coupole compare`.
 
     Both are meshes or clouds (PLY, STL, OBJ) in `unit`, or folders of a result of reflectance. `noise_mm` is the
-    standard deviation of a point (by default estimated from the scatter); with `is_aligned` both states are
+    standard deviation of a point (by default it is estimated from the scatter); with `is_aligned` both states are
     already in one frame. Raises InputError, ExtraMissing.
     """
     from coupole.heritage.comparison import state_comparison

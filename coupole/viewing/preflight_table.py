@@ -19,8 +19,8 @@ _ON_THE_DISK_MM = 0.05
 
 
 def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> None:
-    """Print the summary of a preflight. For a resumed run the figures are for the rest of the run, beside those
-    for the whole run.
+    """Print the summary of a preflight. For a resumed run the figures are for the rest of the run, beside the
+    figures for the whole run.
     """
     whole = report.whole
     table = Table(title=f"{name} on {rig}", title_justify="left", box=None, show_header=False)

@@ -30,7 +30,7 @@ from coupole.storage.run import Run
 
 
 class EntryRefused(InputError):
-    """The entry may not be run; `exit_code` is that of `coupole check`."""
+    """The entry may not be run; `exit_code` is the exit code of `coupole check`."""
 
     def __init__(self, problems: Sequence[Problem], exit_code: int = PreflightRefused.exit_code) -> None:
         super().__init__(problems)

@@ -61,7 +61,7 @@ def add_bench_routes(app: FastAPI, service: Service) -> None:
     @app.get("/api/v1/bench/permission", responses=REFUSALS)
     def still_permitted(person: Who, taken_count: int | None = None) -> Permitted:
         """Tell a command that drives the arm whether this person may still do so. It stops the arm if not.
-        `taken_count` is that of the first answer: another person who came into control since then, even for a
+        `taken_count` is the count of the first answer: another person who came into control since then, even for a
         moment, ends the permission."""
         control, count = service.control, service.control.taken_count
         taker = "" if taken_count is None else control.taken_since(taken_count, person.name)

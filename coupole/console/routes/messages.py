@@ -69,7 +69,7 @@ class NewEntry(Asked):
     """Process the views during the acquisition, and make the result at its end. A resumed run that began with this
     option keeps it in any case."""
     result: Text = ""
-    """Folder of that result; by default the run's name followed by `-reflectance`; for the command line."""
+    """Folder of the result; by default the run's name followed by `-reflectance`; for the command line."""
 
 
 class Move(Asked):

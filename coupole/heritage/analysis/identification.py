@@ -156,9 +156,9 @@ def _judge(
     flat = "; the spectrum has no bands, so its level decides" if log_k_over_s(reflectance).std() < _FLAT else ""
     if mixture is not None and mixture.is_settled and not _lacks_siblings(of_bands, mixture):
         return "mixture", (
-            f"two references leave a residual of {mixture.residual:.1%} of K/S; one alone is worse by "
+            f"two references leave a residual of {mixture.residual:.1%} of K/S; a single reference is worse by "
             f"{mixture.gain:.0f} and "
-            f"two of other classes by {mixture.lead:.0f} in Schwarz's criterion"
+            f"two references of other classes by {mixture.lead:.0f} in Schwarz's criterion"
         )
     if not model.is_known(probabilities)[0]:
         return "unknown", (

@@ -138,7 +138,7 @@ class _State:
         return max(1.0, float(np.sqrt(np.median(np.diag(honest)[self.free] / np.diag(bread)[self.free]))))
 
     def covariances(self) -> tuple[Floats, Floats]:
-        """[6 n, 6 n] covariances from errors of overlaps, and from those of targets and prior knowledge."""
+        """[6 n, 6 n] covariances from errors of overlaps, and from errors of targets and prior knowledge."""
         bread = self._inverse(self.normal)
         meat = self._meat(bread, self.inflation_used)
         return bread @ meat @ bread, bread @ (self.targets_normal + np.diag(self.prior)) @ bread

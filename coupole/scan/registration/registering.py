@@ -224,7 +224,7 @@ def _groups_by_search(
 def _some(
     untried_pairs: Sequence[tuple[int, int]], groups: Groups, round_number: int
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Return pairs for a round, a few for each scan, drawn from those of different groups; and the remaining
+    """Return pairs for a round, a few for each scan, drawn from the pairs of different groups; and the remaining
     pairs."""
     order = np.random.default_rng(round_number).permutation(len(untried_pairs))
     partner_counts: dict[int, int] = {}

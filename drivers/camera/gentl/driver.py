@@ -202,7 +202,7 @@ class GenTLCamera:
             self._features.write("TriggerSoftware", True)
 
     def statistics(self) -> CameraStatistics:
-        """Counts of the present acquisition; while disarmed, those of the last one."""
+        """Counts of the present acquisition; while disarmed, the counts of the last acquisition."""
         if self._armed.is_set():
             with self._lock, reporting(self._name, "the camera's counters"):
                 self._last = self._statistics()

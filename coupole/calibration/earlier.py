@@ -127,7 +127,7 @@ def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, 
         )
     if holds.temperature_c is not None and about.temperature_c is not None:
         low, high = holds.temperature_c
-        room = about.temperature_c[0]  # of the coolest LED board, which is nearest to that of room and camera
+        room = about.temperature_c[0]  # the coolest LED board is nearest to the room's temperature
         if not low <= room <= high:
             raise InputError(
                 f"{path}: is valid from {low:g} to {high:g} C; the coolest LED board of these images had "

@@ -60,7 +60,8 @@ class Warmth:
             "--board-c",
             min=-50.0,
             max=100.0,
-            help="Temperature of a board with a certificate, C; by default that of the run's coolest LED board.",
+            help="Temperature of a board with a certificate, C; by default the temperature of the "
+            "run's coolest LED board.",
             show_default=False,
         ),
     ] = None

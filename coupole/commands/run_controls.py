@@ -156,7 +156,8 @@ def _run_of(named: Path | None) -> Path:
 
 
 def sessions(patience_s: float) -> tuple[dict[Path, State], dict[Path, State]]:
-    """Return sockets and states of the sessions without a run: those that answer, and those that do not."""
+    """Return sockets and states of the sessions without a run: the sessions that answer, and the sessions that do
+    not."""
     from coupole.acquisition.sessions_without_run import sessions_without_run
 
     answering_sessions: dict[Path, State] = {}

@@ -138,7 +138,7 @@ class _Result:
     dome_spread: Spread
     """Spread over the dome by our own records."""
     cases: list[Case]
-    """Our own records, then those of `--beside`."""
+    """Our own records, then the records of `--beside`."""
     table: tuple[Accuracy, ...]
     doubts: tuple[str, ...]
     traces: tuple[str, ...]
@@ -169,7 +169,8 @@ def _propagate(
     emission: str,
     coverages: Sequence[float],
 ) -> _Result:
-    """Compute the budget from our own records, and a table that compares these records with those of `beside`."""
+    """Compute the budget from our own records, and a table that compares these records with the records of
+    `beside`."""
     from coupole.calibration.budget.accuracy import Case, accuracies
     from coupole.calibration.budget.budget import budget_of
     from coupole.calibration.budget.records import doubts, known_from, read_records, traces

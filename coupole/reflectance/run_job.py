@@ -71,8 +71,8 @@ class RunRequest:
     keep_inter_reflection: bool = False
     """True if inter-reflection is not subtracted from the samples."""
     refined_folder: Path | None = None
-    """Folder of `coupole reflectance refine`. Its poses, lens and mesh are used instead of those of records and
-    scan."""
+    """Folder of `coupole reflectance refine`. Its poses, lens and mesh are used instead of the values in records
+    and scan."""
     poses: Path | None = None
     """COLMAP folder of one run. Its poses are used instead of the records' poses."""
 

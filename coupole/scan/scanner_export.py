@@ -112,7 +112,9 @@ def _refuse(path: Path, mesh: Mesh, defects: Defects, *, accept_defects: bool) -
 
 def _targets_unit(path: Path, table: Targets, stated_unit: str | None, mesh_unit: str) -> str:
     if stated_unit and table.unit and stated_unit != table.unit:
-        raise InputError(f"{path}: the unit in the table is {table.unit}, that of --targets-unit {stated_unit}")
+        raise InputError(
+            f"{path}: the unit in the table is {table.unit}, the unit of --targets-unit is {stated_unit}"
+        )
     return stated_unit or table.unit or mesh_unit
 
 

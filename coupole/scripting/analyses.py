@@ -45,9 +45,9 @@ def fit_reflectance(
 ) -> Result:
     """Fit the materials of an object to proven frames of its runs, like `coupole reflectance RUN --out OUT`.
 
-    `mesh` and `calibrations` (records, or folders of them) replace those of the runs' plans. `left_out` are LEDs
-    that are kept for the check (by default every twelfth). `texels` adds materials of single pixels, or of texels
-    of a width in mm on the surface. A job that was stopped continues when it is called again.
+    `mesh` and `calibrations` (records, or folders of them) replace the mesh and records of the runs' plans.
+    `left_out` are LEDs that are kept for the check (by default every twelfth). `texels` adds materials of single
+    pixels, or of texels of a width in mm on the surface. A job that was stopped continues when it is called again.
 
     Raises InputError if there are no runs, or if the records do not belong to them; StorageError,
     ChecksumMismatch.

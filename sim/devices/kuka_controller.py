@@ -221,7 +221,7 @@ class KukaController:
                 self._refusals.note_refusal(*answer)
             elif answer.ipoc != expected_ipoc:
                 self._refusals.note_refusal(
-                    "an answer with another IPOC than that of the last packet is ignored",
+                    "an answer whose IPOC differs from the IPOC of the last packet is ignored",
                     f"{answer.ipoc}, expected {expected_ipoc}",
                 )
             else:

@@ -120,7 +120,7 @@ class LedBoxFirmware:
         self._dropped_edges: set[int] = set()
         self._doubled_edges: dict[int, int] = {}
         self.dead_leds: set[int] = set()
-        """LEDs that from their next step on draw no current and give no light."""
+        """LEDs that draw no current and give no light from their next step on."""
         self._panels = dict.fromkeys(_PANELS, False)
         self.enabling_switch = settings.enabling_switch
         self._burst: Burst | None = None

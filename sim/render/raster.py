@@ -306,7 +306,7 @@ def _fill_triangle(v, box, member, lens, shift, rooks, top, nearest):  # type: i
 
 @kernel
 def _span(row, start, stop, edges, lens, shift):  # type: ignore[no-untyped-def]
-    """Reduce a row's columns, `start` to before `stop`, to those between a triangle's edges."""
+    """Reduce a row's columns, `start` to before `stop`, to the columns between a triangle's edges."""
     a0, b0, c0, a1, b1, c1, a2, b2, c2 = edges
     focal, centre_x, centre_y = lens[0], lens[1], lens[2]
     y, shift_x, spare = (row - centre_y) / focal, 0.0, lens[8] / focal

@@ -54,7 +54,7 @@ class PaintFile:
     head_lines: Mapping[str, Any] = field(default_factory=dict)
     """Other lines of the head, about the measurement."""
     other: Mapping[str, Array] = field(default_factory=dict)
-    """Further columns [n], such as those of four fluxes."""
+    """Further columns [n], such as the columns of four fluxes."""
 
     def on_grid(self) -> Pigment:
         """Return the paint as a pigment on 380 to 780 nm, linear between its wavelengths and constant beyond its

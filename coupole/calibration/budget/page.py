@@ -1,4 +1,5 @@
-"""The uncertainty budget as a page: result, dominant sources, accuracies beside those of the paper, all inputs."""
+"""The uncertainty budget as a page: result, dominant sources, accuracies beside the paper's accuracies, all
+inputs."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ class Pictures:
 
 
 def records_in_force(paths: Sequence[Path]) -> tuple[InForce, ...]:
-    """Return all records except those of other checks."""
+    """Return all records except the records of other checks."""
     return tuple(item for item in read_in_force(paths) if item.record.kind != "artefact-check")
 
 

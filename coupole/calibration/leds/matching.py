@@ -235,7 +235,7 @@ def _places(
         rows = np.flatnonzero(here == place)
         leds = tuple(int(ids[row]) for row in rows)
         text = (
-            f"LEDs {' and '.join(map(str, leds))} light at the same place, that of LED {ids[place]}. Look at "
+            f"LEDs {' and '.join(map(str, leds))} light at the same place: the place of LED {ids[place]}. Look at "
             "the wires"
         )
         faults.append(LedFault("miswired", leds, text))

@@ -50,7 +50,7 @@ class Spot:
     """[2, 2], px^2."""
     area_px: float
     fill: float
-    """Area, divided by that of the ellipse with the same second moments."""
+    """Area, divided by the area of the ellipse with the same second moments."""
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ A primary lens on a die shifts its image across the die's normal, towards the vi
 the angle between both. A shift along the ray is not seen, so this is a change of height by the cosine: the part of
 it that all views share looks like another height of the LED. A lens that is not round, or a reflecting wall of the
 package, shifts the image by another linear function of the direction. Spots of LEDs are far out of the focus in
-which the camera was calibrated: their picture may be larger than by its record, all of it or more that of near
-LEDs (a pupil that is vignetted, or elsewhere).
+which the camera was calibrated: their picture may be larger than the record says, either as a whole, or more so
+for near LEDs (a pupil that is vignetted, or elsewhere).
 
 Each suspect is a set of modes, whose coefficients are first estimated freely beside all other unknowns. The
 variance under which these estimates are most likely is their prior variance in the second adjustment (empirical

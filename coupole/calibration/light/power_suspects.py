@@ -33,7 +33,7 @@ _DOUBTFUL = 1.64
 cells."""
 _SLOW, _FASTER, _FAST = 3, 9, 24
 """Number of half waves over the session: slow ones, with faster ones, all. Slow ones become smaller by their
-number, like those of a random walk."""
+number, like the steps of a random walk."""
 _LEAST, _LEAST_REDUNDANCY = 1e-9, 10.0
 """Least amplitude, and least number of observations beyond one for each LED, from which a cause is determined."""
 REACH_MM = 40.0

@@ -96,7 +96,7 @@ class Angles:
     """Cosine between the light and the half vector."""
 
     def at(self, row: int) -> Angles:
-        """Return those of one LED."""
+        """Return the cosines of one LED."""
         return Angles(self.incidence[row], self.observation[row], self.half[row], self.difference[row])
 
 

@@ -66,7 +66,7 @@ class Evidence:
     runner_up: Array
     """[n] reflectance of the nearest reference of the second class, scaled in the same way."""
     fit: Array
-    """[n] reflectance of the answer: that of the nearest reference, or of the mixture's two references
+    """[n] reflectance of the answer: of the nearest reference, or of the mixture's two references
     together."""
     log_odds: Array
     """[n] for the first class against the second: positive where the spectrum is nearer to the first, in units of

@@ -39,7 +39,7 @@ class Deserved:
 
 @dataclass(frozen=True)
 class GrainRatio:
-    """Mean grain size of one grinding, relative to that of another."""
+    """Mean grain size of one grinding, relative to the mean grain size of another."""
 
     ratio: float
     u_ratio: float

@@ -202,7 +202,8 @@ class _Problem:
             )
         inside = np.maximum(self.face.inside(MeasuredReflectance(clipped_target)).values, _DARKEST)
         q = kubelka_munk.k_over_s(inside)
-        # dR/dQ inside, then d(seen)/dR: residuals of the linear problem are about those of what is seen.
+        # dR/dQ inside, then d(seen)/dR: residuals of the linear problem are about the residuals of the seen
+        # reflectance.
         slope = inside / np.sqrt(np.maximum(q * (q + 2.0), 1e-9))
         slope = slope * self.face.passing / (1.0 - self.face.inner * inside) ** 2
         self.system = slope[:, None] * (self.k - q[:, None] * self.s)

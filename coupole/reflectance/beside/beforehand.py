@@ -61,7 +61,7 @@ def _of_folder(result: Path | None, run: Path | None) -> Iterator[str]:
         return
     is_own = run is not None and is_of_run(result, run.name)
     if not result.is_dir() or (not is_own and any(result.iterdir())):
-        yield f"--result {result}: expected a new folder, or that of this run's result; found other content"
+        yield f"--result {result}: expected a new folder, or the folder of this run's result; found other content"
 
 
 def _other_result(run: Run, result: Path | None) -> Path | None:

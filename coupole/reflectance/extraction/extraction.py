@@ -34,7 +34,7 @@ from coupole.storage.array_digest import ArrayDigest
 Floats = NDArray[np.float64]
 
 _PATCHES_BESIDE = 9
-"""Number of patches: a patch and those around it."""
+"""Number of patches: a patch and the patches around it."""
 MOST_BLUR_PX = 2.0
 """Largest diameter of the circle of confusion of a pixel that is used, px."""
 Say = Callable[[str, int, int], None]

@@ -57,7 +57,7 @@ class CodesAhead:
         self._codes: dict[bytes, NDArray[np.uint8]] = {}
 
     def begin(self, sight: str) -> None:
-        """Keep the codes of this view; those of another view are forgotten. `sight` identifies what the view
+        """Keep the codes of this view; the codes of another view are forgotten. `sight` identifies what the view
         sees."""
         if sight != self._sight:
             self._sight, self._codes = sight, {}

@@ -55,8 +55,8 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
     if poses := about.get("poses"):
         yield (
             f"cameras have the poses of COLMAP, {poses['median_moved_mm']:.3g} mm and "
-            f"{poses['median_turned_deg']:.2g} degrees (median) from those of the records; their uncertainty is "
-            "assumed to be that of the records"
+            f"{poses['median_turned_deg']:.2g} degrees (median) from the records' poses; their uncertainty is "
+            "assumed to be the records' uncertainty"
         )
     if about["not_fitted"]:
         yield f"{about['not_fitted']} triangles have fewer than {FEWEST} samples and no material"

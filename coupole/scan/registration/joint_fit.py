@@ -60,7 +60,7 @@ class JointFit:
     median_nearest_mm: float
     """Median distance from points to the nearest points of other scans, over all overlaps."""
     inflation: float
-    """Standard uncertainties, relative to those that independent errors of all points would give."""
+    """Standard uncertainties, relative to the uncertainties that independent errors of all points would give."""
     sightings: tuple[Sighting, ...]
     """Targets, with their residuals."""
 

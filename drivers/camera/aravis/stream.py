@@ -85,7 +85,7 @@ class StreamStatistics:
     incomplete_images: int = 0
     """Images that arrived with missing packets."""
     skipped_ids: int = 0
-    """Frame ids without a complete image, including those of `incomplete_images`."""
+    """Frame ids without a complete image, including the ids of `incomplete_images`."""
     underruns: int = 0
     """Number of times that libaravis found no free buffer; several of them may concern one frame."""
 

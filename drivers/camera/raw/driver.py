@@ -246,7 +246,9 @@ class RawFiles:
         if before is not None and exif.iso != before.iso:
             raise self._bad_picture(path, f"ISO {before.iso} as before", f"it was ISO {exif.iso}")
         if before is not None and exif.taken_ns <= before.taken_ns:
-            raise self._bad_picture(path, "a capture time after that of the picture before", "it is not later")
+            raise self._bad_picture(
+                path, "a capture time after the capture time of the picture before", "it is not later"
+            )
 
     def trigger(self) -> None:
         if self._exposure is None or self._exposure.hardware_trigger:

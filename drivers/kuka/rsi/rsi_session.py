@@ -116,7 +116,7 @@ class RsiSession:
         self._velocity_deg_s: tuple[float, ...] = (0.0,) * 6
         self._ipoc = self._ipoc_step = self._astray_ipoc = self._astray_run = 0
         self._packet_ns = opened_ns
-        """Time of the last packet, including those of a session that another program began."""
+        """Time of the last packet, including the packets of a session that another program began."""
         self._session_over = self._leaves = False
         self._last_words = _LAST_WORDS
         self._last_answer: bytes | None = None
@@ -355,7 +355,7 @@ class RsiSession:
             self.fail(shared_state.RESTARTED, "RSI was restarted: its packets have begun to count anew")
 
     def _watch(self, packet: Packet, *, strays: bool) -> None:
-        """Compare the measured axes with those commanded in the last answer."""
+        """Compare the measured axes with the axes commanded in the last answer."""
         config, motion = self._config, self.motion
         if packet.joints_deg == self._measured_deg:
             self._velocity_deg_s = (0.0,) * 6

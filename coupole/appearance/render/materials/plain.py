@@ -65,8 +65,8 @@ class Paint(Model):
     inside the binder."""
     thickness_mm: Positive | None = None
     ground: Reflectance = Constant(kind="constant", value=0.0)
-    """Reflectance of the ground. A measured reflectance is that of the ground under a face of the same index;
-    other reflectances are inside the binder.
+    """Reflectance of the ground. A measured reflectance is the reflectance of the ground under a face of the same
+    index; other reflectances are inside the binder.
     """
     scattering_per_mm: Positive = 30.0
     """Scattering of a pigment that is given by its reflectance; a paint file has its own."""

@@ -239,8 +239,8 @@ class ProcessingBeside:
 
     @property
     def _reason(self) -> str:
-        """Return why the process has ended. Its own word counts; a limit of memory is named as the cause only if
-        it could say nothing."""
+        """Return why the process has ended. The reason that the process itself gives counts; a limit of memory is
+        named as the cause only if the process gave none."""
         if why := self._why or self._progress.why:
             return why
         words = self._last_words

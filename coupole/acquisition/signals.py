@@ -39,9 +39,9 @@ _heard_s = deque([-math.inf], maxlen=1)
 _raised_s = deque([-math.inf], maxlen=1)
 """Time when a SignalReceived was last raised."""
 _SAME_S = 1.0
-"""A signal outside a session counts as the same request as a signal less than this time before it: a terminal that
-closes may send two. The later signal is dropped, because an exception within the handling of the first signal
-would hide the first."""
+"""Outside a session, two signals within this time count as one request, because a terminal that closes may send
+two. The later signal is dropped, because an exception within the handling of the first signal would hide the
+first."""
 
 _PULSE_S, _TOLD_WITHIN_S = 0.25, 0.1
 _AGAIN_AFTER_S = 0.02
@@ -49,8 +49,8 @@ _AGAIN_AFTER_S = 0.02
 _LEAVES_WITHIN_S = 300.0
 """The closing of hanging devices and the writing of a report take less time."""
 _STOPS_WITHIN_S = 0.1
-"""A process that stops itself may run on for a moment. This allows for it, so that the time of the stop does not
-count as a freeze."""
+"""A process that stops itself may run on for a moment. This allowance keeps the time of the stop from counting as
+a freeze."""
 _SAFE_WITHIN_S = 4.0
 """Ctrl-Z stops the process after this time even if the cell is perhaps not safe; a message says so."""
 

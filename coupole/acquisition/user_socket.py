@@ -27,7 +27,8 @@ LONGEST_REQUEST_BYTES = 65536
 PATIENCE_S = 10.0
 _SAID_AFTER_S = 1.5
 _MOST_WAITING = 256
-"""Connections that a process may leave waiting, as one that is stopped does with each `coupole status`."""
+"""Number of connections that may wait for a process; a stopped process leaves one waiting for each `coupole
+status`."""
 _CONNECTS_AGAIN_S = 0.05
 _LONGEST_ANSWER_BYTES = 16 * 1024**2
 
@@ -163,8 +164,8 @@ def _connect(connection: socket.socket, path: Path, patience_s: float) -> None:
 
 @contextmanager
 def told_if_given_up(words: str, say: Callable[[str], object]) -> Iterator[None]:
-    """Give `words` to `say`, if there are any, when a request ends without an answer from a process that is
-    there."""
+    """If a process exists but does not answer a request, pass `words` to `say` when the request ends; without
+    `words`, do nothing."""
     try:
         yield
     except (FileNotFoundError, ConnectionRefusedError):

@@ -211,8 +211,8 @@ class Record(Model):
     faults: tuple[LedFault, ...] = Field(default=(), exclude_if=_none_found)
     """Faults of LEDs; their texts are among the remarks."""
     artefacts: tuple[UsedArtefact, ...] = Field(default=(), exclude_if=_none_found)
-    """Boards, tiles and charts that it was made from, with their certificates. There are none in a record that is
-    not traceable, or that rests on other records."""
+    """Boards, tiles and charts from which the record was made, with their certificates. A record that is not
+    traceable, or that rests on other records, has none."""
     comparisons: tuple[Comparison, ...] = Field(default=(), exclude_if=_none_found)
     """Values of a check with an independent artefact."""
     inputs: Annotated[tuple[Input, ...], Field(min_length=1)]

@@ -99,8 +99,8 @@ def running_run(run: Path | None) -> State:
 
 
 def _state_after(run: Path | None, command: Command, *, until: str = "") -> State:
-    """Send a command; return the state after it, or the state in which it is `until`. Raises InputError if the run
-    is not being acquired, or has ended."""
+    """Send a command; return the state after it, or, with `until`, the first state of this name. Raises InputError
+    if the run is not being acquired, or has ended."""
     from coupole.acquisition.run_control import ask
 
     state = _answer_to(run, command)

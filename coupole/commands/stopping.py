@@ -76,7 +76,8 @@ class _Stopping:
     replies: dict[int, State] = field(default_factory=dict)
     """Answers of what was stopped, by process."""
     other_names: list[str] = field(default_factory=list)
-    """Names of sessions that were found and not stopped, because only one can be meant without a name."""
+    """Names of sessions that were found and not stopped: without a name, a session is stopped only if it is the
+    only one."""
     _unclear: dict[int, str] = field(default_factory=dict)
     """Names of sessions whose rig is not known yet, by process."""
     _told_pids: set[int] = field(default_factory=set)
@@ -156,8 +157,8 @@ class _Stopping:
         )
 
     def _only(self, meant: Mapping[Path, State]) -> Mapping[Path, State]:
-        """Return the only session; if there is none that works, those that are stopping. Raises InputError if
-        there are several."""
+        """Return the only session; if no session works, return the sessions that are stopping. Raises InputError
+        if there are several."""
         from coupole.acquisition.sessions_without_run import name_of
 
         working_sessions = {path: state for path, state in meant.items() if state["state"] != "stopping"}
@@ -203,7 +204,7 @@ class _Stopping:
         return processes | (self._unclear if may_be_rig else {})
 
     def _tell(self, starting: Mapping[int, str], waited_s: float) -> None:
-        """Say for what this waits, if it takes a while; wait a moment."""
+        """If the wait takes a while, say what is awaited; wait a moment."""
         for pid, name in starting.items():
             if waited_s > _SAID_AFTER_S and pid not in self._told_pids:
                 self._told_pids.add(pid)

@@ -189,7 +189,7 @@ def devices_of(step: Step, identities: Mapping[str, Identity]) -> dict[str, str]
 
 def why_outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identity] | None = None) -> str:
     """Return why a step's result does not fit the rig (and the opened devices) any more; empty if it still
-    does."""
+    fits."""
     before, now = result.settings, settings_of(cell, result.step)
     lacking = []
     if result.covers is None:

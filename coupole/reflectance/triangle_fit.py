@@ -29,7 +29,8 @@ FEWEST = 24
 """Least number of samples of a triangle: about five times the number of unknowns."""
 USUAL = 0.1
 """Weight of the usual roughness and ks; a sample can have a weight of about 6. This prior decides where no sample
-is near a highlight. Without it, one triangle in thousands was five times as bright as white between the LEDs."""
+is near a highlight. Without this prior, one triangle in thousands was five times as bright as white between the
+LEDs."""
 _USUAL_MATERIAL = (USUAL_KS, USUAL_ALPHA, USUAL / SPREAD_KS**2, USUAL)
 """The usual material in the form of `ggx_fit.fit_packs`."""
 MOST_KS = 1.0

@@ -72,8 +72,8 @@ def records_by_kind(items: Sequence[InForce], kinds: Sequence[Kind]) -> dict[Kin
 
 
 def refuse_dependent(artefact: Artefact | None, path: Path, items: Sequence[InForce]) -> Artefact:
-    """Return the artefact of a description. Raises InputError if it has no certificate, or if it was used in a fit
-    of the records."""
+    """Return the artefact of a description. Raises InputError if the artefact has no certificate, or if it was
+    used in a fit of the records."""
     if artefact is None or artefact.certificate is None:
         raise InputError(
             f"{path}: a check needs the artefact's identity and certificate: expected a block `artefact` with "

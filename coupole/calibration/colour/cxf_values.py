@@ -34,7 +34,7 @@ _LEAST_BANDS = 10
 
 
 def read_cxf_values(path: Path, unit: Unit = "auto", object_type: str | None = None) -> ChartValues:
-    """Return the colours of the named objects; of only one type, if it is given.
+    """Return the colours of the named objects; if a type is given, only of objects of this type.
 
     Raises InputError if the file is not CxF3, a patch occurs twice, spectra have no wavelengths, or colours are
     missing or under another light.

@@ -31,7 +31,8 @@ PRIMARY, OVAL, FIELD = "primary lens", "lens not round", "field out of focus"
 GROWTH, NEAR_MM = 1e-4, 1000.0
 """Unit of the growth of the picture, and the distance at which the growth for near LEDs has its stated value."""
 _WIDE_MM, _WIDE_GROWTHS = 2.0, 50.0
-"""Prior standard deviations of freely estimated coefficients: much more than any lens on a die, or focus."""
+"""Prior standard deviations of freely estimated coefficients: much larger than the effect of any lens on a die, or
+of focus."""
 _LEAST, _CANDIDATES = 1e-6, 400
 _BY_CHANCE, _DOUBTFUL = 1e-4, 0.1
 """Two probabilities that noise alone explains a suspect: below the first it is named, below the second it may have

@@ -215,7 +215,8 @@ class Bench:
                 self._look()
 
     def _end_drive_of_another(self) -> None:
-        """Stop the arm if it is driven for a person, and another one has come into control since it began."""
+        """Stop the arm if it is driven for a person, and another person has come into control since the motion
+        began."""
         if not self._driver or not (name := self._control.taken_since(self._taken_count, self._driver)):
             return
         try:

@@ -102,9 +102,9 @@ def _value_without(value: Any) -> Any:
 
 
 def _line_without(line: str) -> tuple[str, tuple[int, bool] | None]:
-    """Return a line of YAML or of text without secrets. Also return where the left-out value continues: following
-    lines belong to it if they begin beyond this column. The last value says whether items of a list may begin at
-    this column.
+    """Return a line of YAML or of text without secrets. Also return the column that shows where the left-out value
+    continues: following lines belong to it if they begin beyond this column. The last value says whether items of
+    a list may begin at this column.
     """
     words, end = line.rstrip("\r\n"), line[len(line.rstrip("\r\n")) :]
     if (entry := _ENTRY.search(words)) is None:

@@ -30,8 +30,8 @@ SATURATED, DARK = 0.98, 0.01
 """A pixel gives only a bound if its value is at least the first or at most the second of these."""
 _PIXELS = 3000
 _WIDE = 2.6
-"""Smallest factor between exposure times for which waves of the response stay undetermined: 4 is such a factor, 2
-is not."""
+"""Smallest factor between exposure times that leaves waves of the response undetermined: 4 leaves them
+undetermined, 2 does not."""
 _ROUNDS, _SMOOTH_ROUNDS, _OUTLIER = 10, 6, 4.0
 """Number of rounds of the fit; number of first rounds, which have a stiff response; standard deviations above
 which a sample has less weight in the next round."""

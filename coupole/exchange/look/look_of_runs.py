@@ -67,7 +67,8 @@ class OtherState:
 def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice | None = None) -> Look:
     """Return the page's contents for a complete result.
 
-    Raises InputError if it is not one, if it has no material, or if a residual is asked for together with texels.
+    Raises InputError if the folder is not a complete result, if the result has no material, or if a residual is
+    asked for together with texels.
     """
     choice = choice or PageChoice()
     source_about = read_about(folder)

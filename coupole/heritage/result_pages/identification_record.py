@@ -50,7 +50,7 @@ class LibraryFacts:
     table: str
     """Table with the classes of its spectra."""
     licence: str
-    """Words of its licence; empty if it is not stated."""
+    """Words of the library's licence; empty if no licence is stated."""
 
 
 @dataclass(frozen=True)

@@ -204,7 +204,7 @@ class RawFiles:
             time.sleep(min(_LOOK_S, left_s))
 
     def _frame(self, path: Path, timeout_s: float) -> Frame | None:
-        """Return the next frame. None if no memory became free in time; the file then remains the next one."""
+        """Return the next frame. None if no memory became free in time; the file then remains the next file."""
         slot = self._pool.take(timeout_s)
         if slot is None:
             return None

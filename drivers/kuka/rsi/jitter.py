@@ -46,8 +46,8 @@ class Jitter(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """True if no answer was late, because the controller's counter of late answers allows only few in a whole
-        session."""
+        """True if no answer was late. No answer may be late, because the controller's counter allows only few late
+        answers in a whole session."""
         return self.late_share == 0.0
 
 

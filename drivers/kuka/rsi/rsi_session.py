@@ -229,9 +229,9 @@ class RsiSession:
         return (self._stop_template if ends else self._template) % (*values, packet.ipoc)
 
     def _silent(self) -> bool:
-        """Tell whether the driver has stopped answering. After a fault it ends the session in this way, so that no
-        old correction reaches a new session. It is silent at once if a new session may have begun, otherwise when
-        the commanded axes, and so the arm, are at rest."""
+        """Tell whether the driver has stopped answering. After a fault the driver ends the session in this way, so
+        that no old correction reaches a new session. The driver is silent at once if a new session may have begun,
+        otherwise when the commanded axes, and so the arm, are at rest."""
         if self.fault != shared_state.NO_FAULT and self.motion.phase == shared_state.STANDING:
             self._last_words -= 1
         return self._session_over or self._last_words < 0

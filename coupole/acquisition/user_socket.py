@@ -154,8 +154,8 @@ def _connect(connection: socket.socket, path: Path, patience_s: float) -> None:
             if time.monotonic() - begun_s > patience_s:
                 raise TimeoutError(
                     f"the process behind {path.name} accepts no connection, and {_MOST_WAITING} wait already. It "
-                    "is stopped (Ctrl-Z, SIGSTOP) or hangs: `ps -eo pid,stat,args` shows stopped ones by T, and "
-                    "`kill -CONT PID` lets one run again"
+                    "is stopped (Ctrl-Z, SIGSTOP) or hangs: `ps -eo pid,stat,args` shows stopped processes by T, "
+                    "and `kill -CONT PID` lets a process run again"
                 ) from error
             time.sleep(_CONNECTS_AGAIN_S)
         else:
@@ -164,8 +164,8 @@ def _connect(connection: socket.socket, path: Path, patience_s: float) -> None:
 
 @contextmanager
 def told_if_given_up(words: str, say: Callable[[str], object]) -> Iterator[None]:
-    """If a process exists but does not answer a request, pass `words` to `say` when the request ends; without
-    `words`, do nothing."""
+    """Pass `words` to `say` when a request ends without an answer from a process that exists; without `words`, do
+    nothing."""
     try:
         yield
     except (FileNotFoundError, ConnectionRefusedError):

@@ -229,8 +229,8 @@ def _unlike_stand_in(document: Document, rig: Rig) -> list[Problem]:
     if arm.arm.chain == stand_in.arm.chain:
         return []
     message = (
-        f"expected the chain of a {stand_in.name}, the only one that the stand-in of `{rig.robot.driver}` moves, "
-        f"found that of `{arm.name}`. Name your devices and leave `world:` out; `check` and `view` open none"
+        f"expected the chain of a {stand_in.name}, the only arm that the stand-in of `{rig.robot.driver}` moves, "
+        f"found the chain of `{arm.name}`. Name your devices and leave `world:` out; `check` and `view` open none"
     )
     return [document.problem(("arm",), message)]
 

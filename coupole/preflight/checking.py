@@ -61,7 +61,7 @@ def preflight_of(
     job, report = check_job(job, storage, paths=paths, proven=proven)
     if measure and not storage.write_bytes_s and not storage.trouble:
         report.warnings.append(
-            f"storage {folder}: too little room to measure the disk's speed; it is not considered"
+            f"storage {folder}: too little room to measure the disk's speed, so this speed is not considered"
         )
     report.warnings += trusted_by_name(job.cell.rig)
     report.refusals += commissioning_refusals(job.cell)

@@ -50,8 +50,7 @@ class Settings(BaseModel):
     """Board of an LED: led // leds_per_board."""
     serial_number: str = "SIM-0001"
     enabling_switch: Literal["none", "released", "held"] = "none"
-    """State of the enabling switch at power-on, on the box's input for a switch; `none`: the box has no such
-    input."""
+    """State of the enabling switch at power-on, on the box's input for it; `none`: the box has no such input."""
     clock_offset_ns: int = Field(default=5_000_000_000, ge=0)
     """Reading of the box's clock at world time 0."""
     clock_ppm: float = Field(default=12.0, ge=-1000, le=1000)

@@ -67,8 +67,7 @@ class OtherState:
 def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice | None = None) -> Look:
     """Return the page's contents for a complete result.
 
-    Raises InputError if the folder is not a complete result, if the result has no material, or if a residual is
-    asked for together with texels.
+    Raises InputError for an incomplete result, for one without material, and for a residual together with texels.
     """
     choice = choice or PageChoice()
     source_about = read_about(folder)

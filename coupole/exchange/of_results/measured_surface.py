@@ -122,7 +122,7 @@ def read_surface(
             f"--fit: expected {' or '.join(MATERIALS)}, which are valid from every direction; got {name}"
         )
     if name == TEXELS and not takes_texels:
-        raise InputError("--fit texels: is for formats with maps; this one has one material for each triangle")
+        raise InputError("--fit texels: is for formats with maps; this format has one material for each triangle")
     of_triangles = best_fit(result, MATERIALS) if name == TEXELS else name
     path = result.materials_path(of_triangles)
     if not path.exists():

@@ -49,7 +49,9 @@ def reasons_against(plan: Path, rig: Path | None, result: Path | None, run: Path
 
 def _of_folder(result: Path | None, run: Path | None) -> Iterator[str]:
     if run is not None and (other := _other_result(Run(run), result)):
-        yield f"--result: frames of this run were discarded for the samples in {other}; no other can be made"
+        yield (
+            f"--result: frames of this run were discarded for the samples in {other}; no other result can be made"
+        )
     if result is None:
         return
     if not result.exists():

@@ -49,7 +49,7 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
         )
     if surprising(about):
         yield (
-            "poses, lens and mesh were moved farther than records, scan and options state: square sum "
+            "poses, lens and mesh were moved farther than records, scan and options state: the sum of squares is "
             f"{about['chi2_of_steps']:.0f}, where about {about['determined']:.0f} is expected. State larger "
             "uncertainties, or look for a record that does not belong to these runs"
         )
@@ -112,8 +112,10 @@ def _next_step(name: str, about: dict[str, Any]) -> Inline:
 
 def _unknowns(about: dict[str, Any]) -> str:
     return (
-        f"{about['unknowns']} unknowns, of which the pictures determine {about['determined']:.0f}; square sum of "
-        f"the steps divided by the stated uncertainties: {about['chi2_of_steps']:.0f}. Matches scatter "
+        f"{about['unknowns']} unknowns, of which the pictures determine {about['determined']:.0f}; sum of the "
+        f""
+        f"squares of the steps, each divided by its stated uncertainty: "
+        f"{about['chi2_of_steps']:.0f}. Matches scatter "
         f"{about['noise_factor']:.1f} times as much as noise and texture alone explain, and are weighted "
         f"accordingly; {about['rejected']} were rejected. Motions that pictures cannot determine, such as a "
         f"common motion of mesh and cameras, keep their stated uncertainty."

@@ -36,7 +36,7 @@ connected."""
 _FINE_PLACES, _COARSE_PLACES = (20_000, 2_500), (8_000, 1_600)
 """Number of points of a scan's fine and coarse cloud: for few scans, and for many."""
 _PARTNERS = 6
-"""If there are more than `ALL_PAIRS` scans: greatest number of pairs of each scan in a round."""
+"""Greatest number of pairs of each scan in a round, for more than `ALL_PAIRS` scans."""
 _ODD_SIZE = 200.0
 """A scan that is larger or smaller than most by this factor has another unit."""
 _ROUNDED_CELLS = 0.01

@@ -48,7 +48,7 @@ _LISTENED_NS = 100_000_000
 
 
 class Silence:
-    """Time for which a process that beats has been silent, counted only while its listener itself runs."""
+    """Time since the last beat of another process, counted only while the listening process itself runs."""
 
     def __init__(self) -> None:
         self._beat = 0

@@ -240,7 +240,7 @@ def world_problems(document: Document, rig: Rig, settings: Mapping[str, Any]) ->
     stand_in, robot = stand_in_for(rig, dry_run=False), settings.get("robot", {})
     if isinstance(robot, dict):
         if robot.get("kind", stand_in.kind) != stand_in.kind:
-            message = f"expected {stand_in.kind}, which is at the other end of the robot's driver"
+            message = f"expected {stand_in.kind}, the controller to which the robot's driver talks"
             return [document.problem(("world", "settings", "robot", "kind"), message)]
         robot = {"kind": stand_in.kind, **robot}
     camera = settings.get("camera", {})

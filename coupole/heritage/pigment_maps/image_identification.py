@@ -1,8 +1,8 @@
 """Classes of pigments in an image cube: regions of like spectra first, then the full identification of each
 region's mean, then each pixel by itself.
 
-The map has the region's answer. Each pixel has a confidence: the probability that the pixel's own spectrum gives
-to this answer. A pixel that is like no region has no answer.
+In the map, each pixel has its region's answer. Each pixel has a confidence: the probability that the pixel's own
+spectrum gives to this answer. A pixel that is like no region has no answer.
 """
 
 from __future__ import annotations

@@ -347,7 +347,7 @@ class RsiSession:
         if 0 < advance <= _GAP_STEPS * step:
             self.fail(
                 shared_state.RESTARTED,
-                f"its IPOC steps by {apart}, by {step} before: the controller's cycle has changed",
+                f"its IPOC now steps by {apart}, before by {step}: the controller's cycle has changed",
             )
         elif advance > 0:
             self.fail(shared_state.LINK_LOST, f"{advance // step - self._astray_run} packets are missing")

@@ -151,7 +151,7 @@ def test_frames_are_discarded_when_their_samples_are_safe_and_all_commands_under
     assert "--texels: needs the frames of all LEDs" in texels.err
     other = cells.here("acquire", "--resume", run, "--result", tmp_path / "other", "--yes")
     assert other.code == 3
-    assert "no other can be made" in other.err
+    assert "no other result can be made" in other.err
     again = cells.here("reflectance", run, "--out", result)
     assert again.code == 0, again.err
     resume(run)

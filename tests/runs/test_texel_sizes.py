@@ -145,7 +145,7 @@ def test_the_same_size_again_changes_nothing(detailed: Made, coarse: Made) -> No
 def test_what_is_no_size_is_refused(detailed: Made, tmp_path: Path, size: str) -> None:
     ended = cells.here(*arguments(detailed, tmp_path / "out", size))
     assert ended.code == 2
-    assert "--texels: expected auto, each view's own pixels, or a width" in ended.err
+    assert "--texels: expected auto (each view's own pixels) or a width" in ended.err
     assert not (tmp_path / "out").exists()
 
 

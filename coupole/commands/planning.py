@@ -228,7 +228,7 @@ def _on_the_support(template: str, rig: Path, name: str) -> Path | None:
         return None
     paths = place_for(template, step.things, rig, name)
     make_console(quiet=False).print(
-        f"this cell is simulated: on the support of {paths[0]} is {step.stands}"
+        f"this cell is simulated: the support of {paths[0]} carries {step.stands}"
         + "".join(f"; {description} describes it" for description in paths[1:]),
         markup=False,
     )

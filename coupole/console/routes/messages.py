@@ -99,7 +99,7 @@ class Permitted(BaseModel):
     in_control: str
     """The person in control; empty if nobody is."""
     may_act: bool
-    """True unless another person is in control, or was since the first question."""
+    """True unless another person is in control, or has been in control since the first question."""
     taken_count: int
     """Number of times that somebody came into control. Send it with the next question."""
 

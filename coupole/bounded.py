@@ -254,7 +254,8 @@ def on_disk(label: str, do: Callable[[], T], work_s: float = 0.0, *, stop: threa
 
 
 class Workers:
-    """Threads that take work in turn. They do not keep a process alive, unlike those of concurrent.futures."""
+    """Threads that take work in turn. They do not keep a process alive, unlike the threads of
+    concurrent.futures."""
 
     def __init__(self, count: int, name: str) -> None:
         self._queue: queue.SimpleQueue[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]] | None]

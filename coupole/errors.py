@@ -151,7 +151,7 @@ class ArmUnattended(DeviceError):
     """The arm braked on its path because nobody watched its motion. No fault is latched, and the arm may move
     again.
 
-    `silent_s` is the time for which nobody looked, on the machine's clock.
+    `silent_s` is the time for which the arm was not checked, on the machine's clock.
     """
 
     def __init__(self, silent_s: float) -> None:
@@ -159,7 +159,8 @@ class ArmUnattended(DeviceError):
         super().__init__(
             "robot",
             expected="a check of the arm every 0.1 s while it moves",
-            happened=f"nobody looked for {silent_s:.2f} s (the program stood still, or waited for something), so "
+            happened=f"the arm was not checked for {silent_s:.2f} s (the program stood still, or "
+            f"waited for something), so "
             "the arm braked on its path",
             remedy="Check that the cell is clear, then continue.",
         )

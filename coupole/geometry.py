@@ -98,8 +98,8 @@ def look_at(
 
 def farthest_first(points: ArrayLike, first: int) -> Iterator[tuple[int, float]]:
     """Yield the indices of points [n, d] with a distance. The first index is `first`, with an infinite distance.
-    Each further point is the one that is farthest from all points before it, and its distance is that from them.
-    Among equal points the lowest index comes first.
+    Each further point is the one that is farthest from all points before it, and its distance is the distance from
+    these points. Among equal points the lowest index comes first.
     """
     points_array = np.asarray(points, dtype=np.float64)
     index, distance = first, np.inf

@@ -234,7 +234,8 @@ def _raw_branches(wrist: SphericalWrist, base_from_opw: Transform) -> Floats:
 
 
 def _branches_of_spherical_wrist(wrist: SphericalWrist, base_from_flange: Transform) -> list[Floats]:
-    """Return the existing branches [6], and those that py-opw-kinematics misses when the wrist is stretched."""
+    """Return the existing branches [6], and the branches that py-opw-kinematics misses when the wrist is
+    stretched."""
     base_from_opw = base_from_flange @ _solver(wrist)[1]
     raw = _raw_branches(wrist, base_from_opw)
     branches_deg = [branch for branch in raw if not np.isnan(branch).any()]

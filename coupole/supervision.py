@@ -3,7 +3,8 @@
 A moving arm or a lit lamp never depends on a single process that may simply *stop*, such as a frozen process, a
 hung call or a cut cable. So each moving or shining part receives beats from its supervisor, and makes itself safe
 when the beats end. The supervising thread itself gives a beat, each time it has checked the arm. A helper thread
-never gives the beat, because it would live on beside a hung thread. The chain, from the arm backwards:
+never gives the beat, because it would continue even if the supervising thread hung. The chain, from the arm
+backwards:
 
 ======================  =====================================  ======================  ==========================
 part                    gets its beats from                    silent for at most      then
@@ -47,7 +48,7 @@ _LISTENED_NS = 100_000_000
 
 
 class Silence:
-    """Time for which a process that beats has been silent, counted only while its listener itself runs."""
+    """Time since the last beat of another process, counted only while the listening process itself runs."""
 
     def __init__(self) -> None:
         self._beat = 0

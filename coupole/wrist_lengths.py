@@ -8,7 +8,7 @@ from typing import NamedTuple
 class WristLengths(NamedTuple):
     """Ortho-parallel basis and spherical wrist (OPW): axes 2 and 3 are parallel, axes 4, 5 and 6 meet in a point.
 
-    The lengths are those of Brandstoetter, Angerer, Hofbaur: "An Analytical Solution of the Inverse Kinematics
+    The lengths are defined by Brandstoetter, Angerer, Hofbaur: "An Analytical Solution of the Inverse Kinematics
     Problem of Industrial Serial Manipulators with an Ortho-parallel Basis and a Spherical Wrist" (2014), fig. 2.
     The angles there are the joints' angles, negated where `flip_axes` is True, minus `offsets_deg`.
     """

@@ -87,8 +87,8 @@ class ArmSupervisor:
         return itinerary
 
     def way_to(self, view: ViewPose) -> Visit:
-        """Return the visit of a view of the plan from where the next leg begins, if the order of the views is not
-        known beforehand. Raises PreflightRefused if there is no path."""
+        """Return the visit of a view of the plan, from the place at which the next leg begins. It is used if the
+        order of the views is not known beforehand. Raises PreflightRefused if there is no path."""
         leg, visit = self._paths.ways.leg(self._from_deg, view), self._paths.ways.visit(view)
         if leg.contact is not None:
             raise PreflightRefused(

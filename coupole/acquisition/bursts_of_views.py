@@ -1,4 +1,5 @@
-"""The bursts of each view: those of the plan, or those that are chosen in the run (`coupole.plan.choices`)."""
+"""The bursts of each view: the bursts of the plan, or the bursts that are chosen in the run
+(`coupole.plan.choices`)."""
 
 from __future__ import annotations
 

@@ -21,6 +21,8 @@ def tell_changes(files: InputFiles, recorder: Recorder, console: Console) -> Non
     looking.start()
     looking.join(_LONGEST_S)  # a disk that does not answer must not hold up a session's end
     for sentence in changes:
-        console.print(f"{sentence} since it was read; the run uses and keeps what was read", markup=False)
+        console.print(
+            f"{sentence} since it was read; the run uses and keeps the content that was read", markup=False
+        )
     if changes:
         recorder.note(InputsChanged(files=tuple(changes)))

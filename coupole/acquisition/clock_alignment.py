@@ -1,4 +1,5 @@
-"""Alignments of the camera's clock with the light box's clock: which step each frame falls on under each of them.
+"""Alignments of the camera's clock with the light box's clock: the step on which each frame falls, by each
+alignment.
 
 The compiled kernels of `coupole.acquisition.frame_matching`, whose docstring has the fault model, the terms and
 the proof. Times are int64 nanoseconds. Frames are counted from the first frame, steps from the first step that
@@ -18,7 +19,7 @@ PENDING = -2
 UNDECIDABLE = -3
 """Two steps lie within the tolerance of one frame."""
 DOUBTFUL = -4
-"""The frames fit one line only if this frame is left out, or if it may be this frame that is left out."""
+"""The frames fit one line only without one of them, which is, or may be, this frame."""
 
 
 @kernel

@@ -8,7 +8,10 @@ from coupole.acquisition.opened_cell import told_if_slow
 from coupole.acquisition.watching import frame_look
 from coupole.motion import occlusion
 
-_WORDS = "compiling what the run will call, once on a machine: a minute or less, longer on a busy one ..."
+_WORDS = (
+    "compiling the functions that the run will call, once on each machine: a minute or less, "
+    "longer on a busy machine ..."
+)
 
 
 def compile_ahead() -> None:

@@ -54,7 +54,7 @@ class _Planned:
 
 
 class LightOnObject:
-    """Light on one object in one session. The dose is that of the point which has received most.
+    """Light on one object in one session. The dose is the dose of the point that has received most.
 
     In a simulated cell nothing is entered in the ledger, but the budget is checked as in a real cell. Without an
     object there is no budget.

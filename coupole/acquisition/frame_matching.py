@@ -109,7 +109,7 @@ def match(
     ----------
     log : STEP_RECORD_DTYPE [steps], in the order of the burst; read to its end after the last frame was taken.
     frame_ids, timestamps_ns : [frames], in the order of arrival, on the camera's counter and clock.
-    id_modulus : first and last frame id; after the last comes the first.
+    id_modulus : first and last frame id; the first id follows the last id.
     complete : the burst is over and no frame is still in transfer.
 
     Within the fault model of the module's docstring a label is never wrong. If a label could be wrong, it is not

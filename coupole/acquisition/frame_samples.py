@@ -1,4 +1,4 @@
-"""Samples of frames for a chooser. They are taken while frames are stored; those of an earlier session are read
+"""Samples of frames for a chooser. They are taken while frames are stored; samples of an earlier session are read
 back."""
 
 from __future__ import annotations

@@ -99,7 +99,8 @@ class Control:
 
     def let_go_on(self) -> None:
         """End a pause when a person asks for it. This does not end a hold before all is safe and the session
-        stands. Before that, the session has not said what happened, and it needs the pause in order to stand."""
+        stands. Before that, the session has not reported what happened, and it needs the pause in order to come to
+        a stand."""
         if not self.coming_to_stand:
             self.pause.clear()
 

@@ -34,7 +34,7 @@ _LONGEST_WATCHDOG_S = 60.0
 _WORLD_STARTS_S, _OPENS_S = 900.0, 30.0
 _SLOW_START_S = 15.0
 _WORLD_COMPILES = (
-    "the simulated cell compiles its code, once on a machine: a minute or two, longer on a busy one ..."
+    "the simulated cell compiles its code, once on each machine: a minute or two, longer on a busy machine ..."
 )
 
 

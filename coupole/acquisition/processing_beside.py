@@ -237,8 +237,8 @@ class ProcessingBeside:
 
     @property
     def _reason(self) -> str:
-        """Return why the process has ended. Its own word counts; a limit of memory is named as the cause only if
-        it could say nothing."""
+        """Return why the process has ended. The reason that the process itself gives counts; a limit of memory is
+        named as the cause only if the process gave none."""
         if why := self._why or self._progress.why:
             return why
         words = self._last_words
@@ -321,8 +321,8 @@ class ProcessingBeside:
         )
 
     def _shortage_now(self) -> str:
-        """Return how little memory the process, which has not been waited for, may have; empty if it may have
-        enough."""
+        """Return a sentence on the limit of the process's memory, before the process is waited for; empty if the
+        limit is high enough."""
         return little_address_space(self._process.pid)
 
     def _leave_word(self) -> None:

@@ -1,4 +1,5 @@
-"""Recorders for a run's frames and events: the one that the sequencer needs, and that of a run folder."""
+"""Recorders for a run's frames and events: the recorder that the sequencer needs, and the recorder of a run
+folder."""
 
 from __future__ import annotations
 
@@ -99,8 +100,9 @@ class Recorder(Protocol):
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None: ...
 
     def see_mark(self, slot: int, burst: Burst, step: int) -> None:
-        """See the frame of a mark that has no label; the frame is freed afterwards. A burst has these marks if it
-        is taken again or if a resumed run completes it, because the frames of its first marks are kept already."""
+        """Receive the frame of a mark that has no label; the frame is freed afterwards. A burst has these marks if
+        it is taken again or if a resumed run completes it, because the frames of its first marks are kept
+        already."""
         ...
 
     def free(self, slot: int) -> None: ...

@@ -157,7 +157,8 @@ _WHEN_GIVEN_UP = {
 
 def ask(run: Path, command: Command, say: Callable[[str], object] = lambda _: None) -> State:
     """Send a command to the process that acquires into `run`; return its state afterwards. `say` gets a message
-    within 2 s if the process does not answer, and another if this gives up: it says what becomes of the command.
+    within 2 s if the process does not answer, and another if this function stops waiting: it says what happens to
+    the command.
 
     Raises NoRun if no process of this user on this machine acquires into `run`, and NoAnswer.
     """

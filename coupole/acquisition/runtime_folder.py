@@ -17,9 +17,9 @@ _MOST_TAKEN = 10
 
 
 def runtime_folder() -> Path:
-    """Return the folder; make it if it is missing. If another user has taken its name, it is the next one that is
-    this user's or free, so that all processes of a user find the same. Raises InputError if others may enter it,
-    or if all names are taken; OSError."""
+    """Return the folder; make it if it is missing. If another user has taken its name, the folder is the next one
+    that is this user's or free, so that all processes of a user find the same. Raises InputError if others may
+    enter it, or if all names are taken; OSError."""
     names = [f"coupole-{os.getuid()}", *(f"coupole-{os.getuid()}-{number}" for number in range(1, _MOST_TAKEN))]
     folders = [_BASE / name for name in names]
     for folder in folders:

@@ -78,7 +78,7 @@ _ASKED_BOARDS = 12
 
 @dataclass(frozen=True)
 class SessionRequest:
-    """A session that is asked for, besides its plan."""
+    """A request for a session, in addition to the session's plan."""
 
     parent: Path | None
     """Folder for the run's folder; None: the rig's."""

@@ -120,8 +120,8 @@ class SessionWithoutRun:
 
 
 def sessions_without_run(patience_s: float) -> Iterator[tuple[Path, State]]:
-    """Yield sockets and states of all other sessions of this user on this machine that can be stopped, or that
-    are stopping. One that does not answer within `patience_s` is `silent`: its run and plan are not known."""
+    """Yield sockets and states of all other sessions of this user on this machine that can be stopped, or that are
+    stopping. A session that does not answer within `patience_s` is `silent`: its run and plan are not known."""
     for path in sorted(runtime_folder().glob(f"*{_SUFFIX}")):
         if path == socket_of(os.getpid()):
             continue

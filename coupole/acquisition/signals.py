@@ -44,8 +44,9 @@ _raised_number = deque([0], maxlen=1)
 """Number of the first signal that was raised outside sessions; 0 for none. A session that begins afterwards obeys
 it: other people's code has caught the exception (a bare `except` around an import, say)."""
 _SAME_S = 1.0
-"""Signals outside sessions within this time after another one are the same wish: a terminal that closes may send
-two. They are dropped, because an exception within the handling of the first would hide it."""
+"""Outside a session, two signals within this time count as one request, because a terminal that closes may send
+two. The later signal is dropped, because an exception within the handling of the first signal would hide the
+first."""
 
 _PULSE_S, _TOLD_WITHIN_S = 0.25, 0.1
 _AGAIN_AFTER_S = 0.02
@@ -57,8 +58,8 @@ compile."""
 _LEAVES_WITHIN_S = 300.0
 """The closing of hanging devices and the writing of a report take less time."""
 _STOPS_WITHIN_S = 0.1
-"""A process that stops itself may run on for a moment. This allows for it, so that the time of the stop does not
-count as a freeze."""
+"""A process that stops itself may run on for a moment. This allowance keeps the time of the stop from counting as
+a freeze."""
 _SAFE_WITHIN_S = 4.0
 """Ctrl-Z stops the process after this time even if the cell is perhaps not safe; a message says so."""
 
@@ -182,7 +183,7 @@ def _end_unheard(read_fd: int) -> None:
         if _heard_s[-1] > since_s - ASKS_FROM_S:  # the handler may have been faster than this thread
             heard_s, since_s = min(heard_s, since_s), math.inf
         if time.monotonic() > heard_s + _LEAVES_WITHIN_S or time.monotonic() > since_s + bounded.STOPPED_S:
-            _tell("the program waits in a call that does not return (of a disk?), and was ended\n")
+            _tell("the program waited in a call that does not return (perhaps to a disk), and was ended\n")
             os._exit(128 + number)
 
 

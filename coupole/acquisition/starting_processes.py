@@ -12,8 +12,8 @@ from pathlib import Path
 from coupole.acquisition.sessions_without_run import socket_of
 
 YOUNG_S = 20.0
-"""A process that is older than this, s, and has no socket is not starting: it needs none. A busy machine loads the
-modules in 5 s."""
+"""A process without a socket that is older than this, s, is not starting: it needs no socket. A busy machine loads
+the modules in 5 s."""
 _HOLD = {"acquire", "demo", "commission", "meter", "live", "bench", "arm", "devices"}
 _MODULE = "coupole.commands.cli"
 

@@ -27,7 +27,8 @@ LONGEST_REQUEST_BYTES = 65536
 PATIENCE_S = 10.0
 _SAID_AFTER_S = 1.5
 _MOST_WAITING = 256
-"""Connections that a process may leave waiting, as one that is stopped does with each `coupole status`."""
+"""Number of connections that may wait for a process; a stopped process leaves one waiting for each `coupole
+status`."""
 _CONNECTS_AGAIN_S = 0.05
 _LONGEST_ANSWER_BYTES = 16 * 1024**2
 
@@ -40,7 +41,7 @@ class Caller:
         self.pid = peer_pid(connection)
 
     def is_gone(self) -> bool:
-        """Tell whether the other end is closed. An open end that only sends nothing more does not count."""
+        """Tell whether the other end is closed. An end that is open but sends nothing more does not count."""
         poll = select.poll()
         poll.register(self._connection, 0)
         return any(events & (select.POLLHUP | select.POLLERR) for _, events in poll.poll(0))
@@ -106,7 +107,7 @@ def peer_pid(connection: socket.socket) -> int:
 
 
 def _peer(connection: socket.socket) -> tuple[int, int, int]:
-    """Return process, user and group at the other end; for a server, those of the process that listens."""
+    """Return process, user and group at the other end; for a server, of the process that listens."""
     credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     pid, uid, gid = struct.unpack("3i", credentials)
     return pid, uid, gid
@@ -153,8 +154,8 @@ def _connect(connection: socket.socket, path: Path, patience_s: float) -> None:
             if time.monotonic() - begun_s > patience_s:
                 raise TimeoutError(
                     f"the process behind {path.name} accepts no connection, and {_MOST_WAITING} wait already. It "
-                    "is stopped (Ctrl-Z, SIGSTOP) or hangs: `ps -eo pid,stat,args` shows stopped ones by T, and "
-                    "`kill -CONT PID` lets one run again"
+                    "is stopped (Ctrl-Z, SIGSTOP) or hangs: `ps -eo pid,stat,args` shows stopped processes by T, "
+                    "and `kill -CONT PID` lets a process run again"
                 ) from error
             time.sleep(_CONNECTS_AGAIN_S)
         else:
@@ -163,8 +164,8 @@ def _connect(connection: socket.socket, path: Path, patience_s: float) -> None:
 
 @contextmanager
 def told_if_given_up(words: str, say: Callable[[str], object]) -> Iterator[None]:
-    """Give `words` to `say`, if there are any, when a request ends without an answer from a process that is
-    there."""
+    """Pass `words` to `say` when a request ends without an answer from a process that exists; without `words`, do
+    nothing."""
     try:
         yield
     except (FileNotFoundError, ConnectionRefusedError):

@@ -29,7 +29,8 @@ NOT_TRACEABLE = "not traceable: no certificate"
 RUN_U_K = 2.0
 """Standard uncertainty of an artefact's temperature, if it is taken from a run's coolest LED board."""
 UNKNOWN_U_K = 5.0
-"""Standard uncertainty of an artefact's temperature if nothing is known: it is within 9 K of the certificate's."""
+"""Standard uncertainty of an artefact's temperature if nothing is known: it is within 9 K of the certificate's
+temperature."""
 _BANDS_NM: dict[Literal["R", "G", "B"], tuple[float, float]] = {
     "R": (580.0, 680.0),
     "G": (490.0, 580.0),
@@ -239,8 +240,8 @@ def used_as(
 
 
 def temperature_of(celsius: float | None, u_k: float, of_run_c: tuple[float, float] | None) -> Temperature:
-    """Return the temperature that was entered. Without it, return that of a run's coolest LED board (`of_run_c`,
-    from and to), which is nearest to the room temperature."""
+    """Return the temperature that was entered. Without it, return the temperature of a run's coolest LED board
+    (`of_run_c`, from and to), which is nearest to the room temperature."""
     if celsius is not None:
         return Temperature(celsius, u_k, "entered by hand")
     if of_run_c is not None:

@@ -31,7 +31,7 @@ class Step:
 
 
 STEPS = (
-    Step("darks", "nothing; close the dome, no light of the room", (), ("dark",)),
+    Step("darks", "nothing; close the dome, and switch off the light of the room", (), ("dark",)),
     Step("response", "a grey card", ({"kind": "grey_card"},), ("response",)),
     Step("flat-field", "nothing", (), ("flat-field",)),
     Step(

@@ -1,4 +1,4 @@
-"""Earlier records that a calibration uses. They must be accepted, and must hold for its images."""
+"""Earlier records that a calibration uses. They must be accepted, and must be valid for its images."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def refuse_same_images(path: Path, record: Record, inputs: Sequence[tuple[str, s
 
 
 def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, int]) -> None:
-    """Raise InputError unless a record holds for these images: their time, camera, lens, focus, frame size and
+    """Raise InputError unless a record is valid for these images: their time, camera, lens, focus, frame size and
     temperature."""
     holds = record.validity
     if about.begun is not None and record.simulated != about.is_simulated:
@@ -110,7 +110,7 @@ def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, 
         off_mm = abs(holds.focus_distance_mm - about.focus_distance_mm)
         if off_mm > holds.focus_tolerance_mm:
             raise InputError(
-                f"{path}: holds for a focus of {holds.focus_distance_mm:g} mm, within "
+                f"{path}: is valid for a focus of {holds.focus_distance_mm:g} mm, within "
                 f"{holds.focus_tolerance_mm:g} mm; the images were taken at {about.focus_distance_mm:g} mm. "
                 "Name a record that was made at this focus"
             )
@@ -119,19 +119,19 @@ def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, 
         ("f-number", holds.f_number, about.f_number),
     ):
         if valid is not None and figure is not None and abs(valid - figure) > _SAME_FIGURE * valid:
-            raise InputError(f"{path}: holds for {label} {valid:g}; the images were taken with {figure:g}")
+            raise InputError(f"{path}: is valid for {label} {valid:g}; the images were taken with {figure:g}")
     if holds.size_px is not None and holds.size_px != size_px:
         raise InputError(
-            f"{path}: holds for frames of {holds.size_px[0]} x {holds.size_px[1]} pixels; these have "
+            f"{path}: is valid for frames of {holds.size_px[0]} x {holds.size_px[1]} pixels; these have "
             f"{size_px[0]} x {size_px[1]}"
         )
     if holds.temperature_c is not None and about.temperature_c is not None:
         low, high = holds.temperature_c
-        room = about.temperature_c[0]  # of the coolest LED board, which is nearest to that of room and camera
+        room = about.temperature_c[0]  # the coolest LED board is nearest to the room's temperature
         if not low <= room <= high:
             raise InputError(
-                f"{path}: holds from {low:g} to {high:g} C; the coolest LED board of these images had {room:g} C. "
-                "Let room, camera and boards come back to that temperature, or calibrate at this one"
+                f"{path}: is valid from {low:g} to {high:g} C; the coolest LED board of these images had "
+                f"{room:g} C. Let room, camera and boards come back to that temperature, or calibrate at this one"
             )
     if holds.camera is not None and about.camera is not None and holds.camera != about.camera:
-        raise InputError(f"{path}: holds for the camera {holds.camera}; the images are of {about.camera}")
+        raise InputError(f"{path}: is valid for the camera {holds.camera}; the images are of {about.camera}")

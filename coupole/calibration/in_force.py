@@ -65,7 +65,8 @@ def read_in_force(paths: Sequence[Path], files: InputFiles | None = None) -> tup
 
 
 def refusals(plan_records: Sequence[InForce], here: Situation, needed_kinds: Sequence[str] = NEEDED) -> list[str]:
-    """Return the reasons why a plan that names these records must not be acquired here; empty if it may."""
+    """Return the reasons why a plan that names these records must not be acquired here; empty if the plan may be
+    acquired."""
     counts = Counter[str](item.record.kind for item in plan_records)
     reasons = [
         f"calibrations: no record of the kind `{kind}` is named" for kind in needed_kinds if not counts[kind]
@@ -97,27 +98,28 @@ def _record_refusals(record: Record, here: Situation) -> list[str]:
         off_mm = abs(holds.focus_distance_mm - here.focus_distance_mm)
         if off_mm > holds.focus_tolerance_mm:
             reasons.append(
-                f"holds for a focus of {holds.focus_distance_mm:g} mm (within {holds.focus_tolerance_mm:g}); the "
-                f"rig is focused at {here.focus_distance_mm:g} mm. Calibrate at this focus, or turn the ring back"
+                f"is valid for a focus of {holds.focus_distance_mm:g} mm (within {holds.focus_tolerance_mm:g}); "
+                f"the rig is focused at {here.focus_distance_mm:g} mm. "
+                "Calibrate at this focus, or turn the ring back"
             )
     for label, unit, valid, rig_figure in (
         ("focal length", " mm", holds.focal_length_mm, here.focal_length_mm),
         ("aperture", "", holds.f_number, here.f_number),
     ):
         if valid is not None and abs(valid - rig_figure) > _SAME * valid:
-            reasons.append(f"holds for {label} {valid:g}{unit}; the rig has {rig_figure:g}{unit}")
+            reasons.append(f"is valid for {label} {valid:g}{unit}; the rig has {rig_figure:g}{unit}")
     if holds.size_px is not None and holds.size_px != here.size_px:
         reasons.append(
-            f"holds for frames of {holds.size_px[0]} x {holds.size_px[1]} pixels; the camera gives "
+            f"is valid for frames of {holds.size_px[0]} x {holds.size_px[1]} pixels; the camera gives "
             f"{here.size_px[0]} x {here.size_px[1]}"
         )
     if holds.camera is not None and here.camera is not None and holds.camera != here.camera:
-        reasons.append(f"holds for the camera {holds.camera}; this one is {here.camera}")
+        reasons.append(f"is valid for the camera {holds.camera}; this one is {here.camera}")
     if holds.temperature_c is not None and here.temperature_c is not None:
         low, high = holds.temperature_c
         if not low <= here.temperature_c <= high:
             reasons.append(
-                f"holds from {low:g} to {high:g} C; the cell's coolest LED board has {here.temperature_c:g} C. "
+                f"is valid from {low:g} to {high:g} C; the cell's coolest LED board has {here.temperature_c:g} C. "
                 "Wait for that temperature, or calibrate at this one"
             )
     return reasons

@@ -173,7 +173,7 @@ def _best_points(
     tolerance_px: float,
     least_views: int,
 ) -> list[SeenPoint]:
-    """Return candidates by number of views, then by residual. Each has only detections that no earlier one
+    """Return candidates by number of views, then by residual. Each point has only detections that no earlier point
     uses."""
     agreeing = off_px <= tolerance_px
     rms_px = np.sqrt(np.where(agreeing, off_px, 0.0) ** 2).mean(axis=1)

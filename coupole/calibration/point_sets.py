@@ -1,9 +1,9 @@
 """Assigns found points to known points, even if some are missing and some are false.
 
 Three neighbouring points form a triangle whose sides a rigid motion does not change. Triangles of the found points
-are looked up among those of the known points. Each matching pair gives a motion. The result is the motion that
-brings most found points onto known ones. If another motion is nearly as good, the layout is ambiguous, which is an
-error.
+are looked up among the distances of the known points. Each matching pair gives a motion. The result is the motion
+that brings most found points onto known ones. If another motion is nearly as good, the layout is ambiguous, which
+is an error.
 """
 
 from __future__ import annotations
@@ -79,7 +79,8 @@ def match_points(found_mm: Floats, known_mm: Floats, tolerance_mm: float) -> Mat
             best.append((len(pairs[0]), _rms(motion, found_mm, known_mm, pairs), motion))
     if not best:
         raise InputError(
-            f"targets: no motion brings {least} of the {len(found_mm)} targets found onto those of the table "
+            f"targets: no motion brings {least} of the {len(found_mm)} targets found onto "
+            f"the targets of the table "
             f"({len(known_mm)}) within {tolerance_mm:g} mm. Is it another object, is the unit wrong, or did "
             "targets move?"
         )

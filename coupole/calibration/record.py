@@ -1,9 +1,9 @@
 """The record of a calibration: result, uncertainty, inputs and validity.
 
 It is a YAML file with a SHA-256 of its own content, so that a record which was edited by hand is refused. Values
-of a rigid transform are given in mm and KUKA's A B C. Their uncertainty is that of a small step: `x_mm y_mm z_mm`
-along the axes of the frame on the left of the transform's name, and `rx_deg ry_deg rz_deg` about the axes of the
-frame on the right.
+of a rigid transform are given in mm and KUKA's A B C. Their uncertainty is the uncertainty of a small step: `x_mm
+y_mm z_mm` along the axes of the frame on the left of the transform's name, and `rx_deg ry_deg rz_deg` about the
+axes of the frame on the right.
 """
 
 from __future__ import annotations
@@ -211,8 +211,8 @@ class Record(Model):
     faults: tuple[LedFault, ...] = Field(default=(), exclude_if=_none_found)
     """Faults of LEDs; their texts are among the remarks."""
     artefacts: tuple[UsedArtefact, ...] = Field(default=(), exclude_if=_none_found)
-    """Boards, tiles and charts that it was made from, with their certificates. There are none in a record that is
-    not traceable, or that rests on other records."""
+    """Boards, tiles and charts from which the record was made, with their certificates. A record that is not
+    traceable, or that rests on other records, has none."""
     comparisons: tuple[Comparison, ...] = Field(default=(), exclude_if=_none_found)
     """Values of a check with an independent artefact."""
     inputs: Annotated[tuple[Input, ...], Field(min_length=1)]

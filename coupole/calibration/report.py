@@ -33,7 +33,7 @@ class Outcome:
     files: Mapping[str, bytes] = field(default_factory=dict)
     """Files by name, as `record.files` lists them: tables and maps that are too large for YAML."""
     sections: Sequence[Section] = ()
-    """Parts of the page in addition to those of all records."""
+    """Parts of the page in addition to the parts that all records have."""
 
 
 def write_outcome(record_path: Path, outcome: Outcome) -> tuple[Path, Path]:
@@ -132,7 +132,7 @@ def _next_step(record: Record) -> Inline:
         return [
             "Keep ",
             record_file,
-            f" with the cell's records: it holds until {record.validity.expires:%Y-%m-%d}.",
+            f" with the cell's records: it is valid until {record.validity.expires:%Y-%m-%d}.",
         ]
     return [
         "Remove the cause and calibrate again",

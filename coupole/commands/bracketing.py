@@ -178,7 +178,10 @@ def _lines(document: dict[str, Any]) -> list[str]:
     lines.append(f"{document['response_picture']}: the response found from the photographs")
     off = document["departure_from_straight"]
     if document["used_response"] == "linear":
-        lines.append(f"taken as linear; from 10 to 90 % of values the response found is straight within {off:.1%}")
+        lines.append(
+            f"the pictures were taken as linear; between 10 and 90 % of the values, the response found "
+            f"is straight within {off:.1%}"
+        )
         if off > 0.1:
             lines.append(
                 "this departure is large: processed pictures are not linear; leave out --linear, or give raw files"

@@ -60,7 +60,8 @@ class Warmth:
             "--board-c",
             min=-50.0,
             max=100.0,
-            help="Temperature of a board with a certificate, C; by default that of the run's coolest LED board.",
+            help="Temperature of a board with a certificate, C; by default the temperature of the "
+            "run's coolest LED board.",
             show_default=False,
         ),
     ] = None
@@ -151,7 +152,8 @@ def hand_eye(
     rig: Annotated[
         Path | None,
         typer.Option(
-            "--rig", help="The arm's rig. With it, the zero errors of the arm's axes are estimated too (for runs)."
+            "--rig",
+            help="The arm's rig. With the rig, the zero errors of the arm's axes are estimated too (for runs).",
         ),
     ] = None,
     *,

@@ -105,7 +105,7 @@ def flat_field(
     hand_eye: HandEyeOption = None,
     rig: RigOption = None,
 ) -> Work:
-    """Fall-off of the lens, per channel, from views of a luminous panel, shifted and turned."""
+    """Find the lens's fall-off, per channel, from views of a luminous panel that is shifted and turned."""
     from coupole.calibration.light.flat_field_records import flat_field_outcome
     from coupole.calibration.light.frames import open_light_frames
 
@@ -129,9 +129,10 @@ def glare(
     dark_record: DarkOption = None,
     response_record: ResponseOption = None,
 ) -> Work:
-    """Veiling glare of lens and camera, per channel, from views of black traps in a white card.
+    """Find the veiling glare of lens and camera, per channel, from views of black traps in a white card.
 
-    With this record, extraction subtracts the glare; each sample's uncertainty then includes that of the glare.
+    With this record, extraction subtracts the glare; each sample's uncertainty then includes the glare's
+    uncertainty.
     """
     from coupole.calibration.light.frames import open_light_frames
     from coupole.calibration.light.glare_records import glare_outcome
@@ -172,7 +173,7 @@ def drift(
     tile: TileOption,
     known: TargetCalibrations,
 ) -> Work:
-    """Drift of LED power from its calibration to a run, by temperature and age, from views of a tile.
+    """Find how LED power has drifted from its calibration to a run, by temperature and age, from views of a tile.
 
     Give the same records and the same tile as for `led-power`.
     """

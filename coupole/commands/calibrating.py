@@ -149,7 +149,7 @@ class _CommonOptions:
     valid_days: int
     as_json: bool
     lens: str | None = None
-    """Description of the lens; None also where records are not of one lens."""
+    """Description of the lens; None also if the records are of different lenses."""
     limit: Sequence[str] | None = None
     """Settings of the calibration's limits, as NAME=VALUE."""
 

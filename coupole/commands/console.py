@@ -81,7 +81,7 @@ def serve(
 
 
 def _plans_beside(rig: Path) -> Path:
-    """Return the folder `plans` beside that of the rig, or the rig's own folder. For a rig in an installed
+    """Return the folder `plans` beside the rig's folder, or the rig's own folder. For a rig in an installed
     package, return the working folder."""
     from coupole.plan.shipped_files import place_to_write
 

@@ -44,7 +44,7 @@ def dose(
 ) -> None:
     """All light that an object has received, run by run, and its budget; light given elsewhere is entered by hand.
 
-    The budget holds under every rig and plan from the next burst on. A plan's own budget can only be stricter.
+    The budget applies to every rig and plan from the next burst on. A plan's own budget can only be stricter.
     """
     from coupole.plan.cell import read_cell, users_ledger_folder
     from coupole.storage.ledger import Ledger, ledger_of, similar_ids

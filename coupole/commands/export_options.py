@@ -67,7 +67,8 @@ AdaptiveOption = Annotated[
         "--adaptive",
         metavar="ERROR",
         help="For bsdf: largest error of the table against the fit, as a share such as 0.003. It holds for 95 % "
-        "of all directions, and for 95 % of those in the lobe. The smallest such table is written; by default a "
+        "of all directions, and for 95 % of the directions in the lobe. The smallest such table "
+        "is written; by default a "
         "table of 17 MB.",
         min=1e-5,
         max=0.5,

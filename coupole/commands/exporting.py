@@ -95,9 +95,9 @@ def export(
     console = make_console(quiet=as_json)
     try:
         if out is None and source.name == so_far.LINK:
-            raise InputError(f"{source}: give --out; its folder is removed when the result is complete")
+            raise InputError(f"{source}: give --out, because this folder is removed when the result is complete")
         if options.in_place and out is not None:
-            raise InputError("--in-place writes into SOURCE: give it, or --out, not both")
+            raise InputError("--in-place writes into SOURCE: give either --in-place or --out")
         with so_far.reading(source) as read:
             summary = _write_export(Asked(read, to, folder, overwrite, options.given_options()), console)
     except CoupoleError as error:

@@ -1,4 +1,4 @@
-"""Optional libraries: `pip install 'coupole[EXTRA]'` adds those of one purpose."""
+"""Optional libraries: `pip install 'coupole[EXTRA]'` adds the libraries of one purpose."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def identify(
     report: ReportOptions,
     as_json: JsonOption = False,
 ) -> None:
-    """Which class of pigments each spectrum shows, or that the library has none for it.
+    """Find which class of pigments each spectrum shows, or that the library has no class for it.
 
     A verdict is match, mixture, ambiguous or unknown. The class and its probability are printed beside every
     verdict. The last lines are the error rates with which the library identifies its own spectra. For an image
@@ -108,7 +108,10 @@ def identify(
             raise InputError("expected spectra, or a spot of a result (--result, --at); found both or neither")
         if spot_of_result is not None:
             if report.report is not None:
-                raise InputError("--report: three channels of a camera identify nothing that could be signed")
+                raise InputError(
+                    "--report: expected spectra; three channels of a camera do not identify a "
+                    "pigment well enough for a signed report"
+                )
             document = identify_spot(spot_of_result, references_of(library, classes))
             console.print(f"{document['name']}: {document['verdict']}; {document['reason']}", markup=False)
             if as_json:

@@ -28,7 +28,7 @@ AreaOption = Annotated[
 ]
 ScaleOption = Annotated[
     float | None,
-    typer.Option("--scale", help="Number in the cube that is a reflectance of 1.", rich_help_panel=_IMAGE),
+    typer.Option("--scale", help="Number in the cube that stands for a reflectance of 1.", rich_help_panel=_IMAGE),
 ]
 WavelengthOption = Annotated[
     Literal["nm", "um"] | None,
@@ -54,7 +54,8 @@ PageOption = Annotated[
     Path | None,
     typer.Option(
         "--report",
-        help="Folder for a report to sign: page, record, and the maps of an image or a line, which need it.",
+        help="Folder for a report to sign: page, record, and maps of an image or a line. Images and "
+        "lines need this option.",
         rich_help_panel=_REPORT,
     ),
 ]

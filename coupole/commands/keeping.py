@@ -64,7 +64,7 @@ def report(
 def verify(
     run: RunPath,
     with_manifest: Annotated[
-        bool, typer.Option("--manifest", help="Add the files that manifest.sha256 does not list yet to it.")
+        bool, typer.Option("--manifest", help="Add to manifest.sha256 the files that it does not list yet.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -191,8 +191,7 @@ def _show_discarded(console: Console, verification: Verification) -> None:
         markup=False,
     )
     samples = (
-        ": its samples are unchanged since they were read back before frames were discarded, or since they were "
-        "replaced later"
+        ": its samples are unchanged since they were read back (before frames were discarded) or replaced later"
         if not verification.bad
         else " (the faults are listed above)"
     )

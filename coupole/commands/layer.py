@@ -362,7 +362,7 @@ def _say(document: dict[str, Any], console: Console) -> None:
     _say_films(document, console)
     if grains := document.get("grains"):
         console.print(
-            f"its grains are {grains['ratio']:.2f} +- {2 * grains['u_ratio']:.2f} times as large as those of "
+            f"its grains are {grains['ratio']:.2f} +- {2 * grains['u_ratio']:.2f} times as large as the grains of "
             f"{grains['than']}, if the grains are larger than the wavelength (S proportional to 1/size)",
             markup=False,
         )

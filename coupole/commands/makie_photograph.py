@@ -66,7 +66,7 @@ def makie(
     ] = False,
     inside: Annotated[
         bool,
-        typer.Option("--inside", help="Pixels hold metal and lacquer only, no shadow: exact for three colours."),
+        typer.Option("--inside", help="Assume only metal and lacquer, without shadow; exact for three colours."),
     ] = False,
     known_shares: Annotated[
         list[str] | None,
@@ -78,7 +78,7 @@ def makie(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Separate a photograph of makie: alpha is the share of metal, and the colours are those of the lacquers.
+    """Separate a photograph of makie: alpha is the share of metal, and the colours are the lacquers' colours.
 
     Photograph in diffuse light, so that all of the metal is equally bright. X counts columns from the left, Y rows
     from the top, both from 0.

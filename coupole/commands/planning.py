@@ -178,8 +178,9 @@ def plan_new(
 ) -> None:
     """Write a plan to start from. Choosing the views of `leds` for the rig's dome takes a minute or two.
 
-    For a calibration in a simulated cell it also writes NAME-rig.yaml, the rig with the board, card or tile on its
-    support, and NAME-board.yaml or NAME-tile.yaml, its description for `coupole calibrate`.
+    For a calibration in a simulated cell, the command also writes NAME-rig.yaml, the rig with the board, card or
+    tile on its support, and NAME-board.yaml or NAME-tile.yaml, the description of board or tile for `coupole
+    calibrate`.
     """
     from coupole.plan.base_model import NAME_PATTERN
     from coupole.plan.templates import LEDS, TEMPLATES
@@ -227,7 +228,7 @@ def _on_the_support(template: str, rig: Path, name: str) -> Path | None:
         return None
     paths = place_for(template, step.things, rig, name)
     make_console(quiet=False).print(
-        f"this cell is simulated: on the support of {paths[0]} is {step.stands}"
+        f"this cell is simulated: the support of {paths[0]} carries {step.stands}"
         + "".join(f"; {description} describes it" for description in paths[1:]),
         markup=False,
     )

@@ -26,7 +26,7 @@ SupportOption = Annotated[
         "--support-reflectance",
         min=0.0,
         max=0.95,
-        help="Albedo of the disk under the object, which reflects light to it.",
+        help="Albedo of the disk under the object; the disk reflects light onto the object.",
     ),
 ]
 KeepOption = Annotated[
@@ -46,8 +46,7 @@ PosesOption = Annotated[
         "--poses",
         help="Folder of COLMAP for one run, with images and camera of `coupole export RUN --to "
         "colmap`. Its poses are used: aligned to the records' poses by a similarity (three "
-        "views or more), or as they are. Their uncertainty is that of the records, because "
-        "COLMAP states none.",
+        "views or more), or as they are. They have the uncertainty of the records, because COLMAP states none.",
         show_default=False,
     ),
 ]
@@ -115,8 +114,9 @@ TexelsOption = Annotated[
         "--texels",
         metavar="auto|MM",
         help="Add materials of texels, for detail that is finer than the mesh's triangles: normal, kd, ks and "
-        "roughness of each, with uncertainty. auto: of single pixels of each view; a number: of texels of that "
-        "width on the surface, in mm, such as 0.2. Memory, disk and time are told before the work begins.",
+        "roughness of each, with uncertainty. auto: one for each pixel of each view; a number such as 0.2: one "
+        "for each texel of this width on the surface, in mm. Memory, disk and time are told "
+        "before the work begins.",
         show_default=False,
     ),
 ]

@@ -68,8 +68,8 @@ EnvironmentOption = Annotated[
     list[Path] | None,
     _option(
         "--environment",
-        "Light from everywhere: .exr or .hdr, latitude and longitude. Its top is z for runs, y for pictures; "
-        "its middle is x for runs, z for pictures.",
+        "Light from everywhere: .exr or .hdr, latitude and longitude. The map's top is z for runs, y for "
+        "pictures; its middle is x for runs, z for pictures.",
     ),
 ]
 LightsOption = Annotated[Path | None, _option("--lights", "A file (YAML) of lights with strengths.")]
@@ -78,13 +78,17 @@ SamplesOption = Annotated[
 ]
 ViewOption = Annotated[str | None, typer.Option("--view", help="View of a result of runs; by default the first.")]
 FromOption = Annotated[str | None, _option("--from", "Place X,Y,Z of a camera, mm, instead of --view.")]
-LookAtOption = Annotated[str | None, _option("--look-at", "Place X,Y,Z that it looks at; by default the object.")]
-SizeOption = Annotated[str | None, _option("--size", "Size of its picture, WIDTHxHEIGHT; by default 1024x768.")]
+LookAtOption = Annotated[
+    str | None, _option("--look-at", "Place X,Y,Z that the camera of --from looks at; by default the object.")
+]
+SizeOption = Annotated[
+    str | None, _option("--size", "Size of the picture of --from, WIDTHxHEIGHT; by default 1024x768.")
+]
 FieldOption = Annotated[
     float | None,
     _option(
         "--field-of-view",
-        "Width of its field, degrees; by default just wide enough for the object.",
+        "Width of the field of --from, degrees; by default just wide enough for the object.",
         min=0.01,
         max=170.0,
     ),

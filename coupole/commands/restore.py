@@ -71,7 +71,7 @@ def restore(
         typer.Option("--samples", min=1, help="Number of light paths through each pixel.", show_default=False),
     ] = None,
     width: Annotated[
-        int | None, typer.Option("--width", min=4, help="Width of the pictures, if smaller.", show_default=False)
+        int | None, typer.Option("--width", min=4, help="Smaller width of the pictures.", show_default=False)
     ] = None,
     step: Annotated[
         int | None,

@@ -31,8 +31,9 @@ RunningRun = Annotated[
 _LOOK_EVERY_S = 0.2
 _PLAIN_LINE_EVERY_S = 5.0
 SESSION_PATIENCE_S = (0.5, 5.0, 0.5)
-"""Longest waits for the answer of a session without a run. A frozen one must not delay the stop of another one; a
-session that loads its modules on a busy machine answers late. After each wait the run may have begun."""
+"""Longest waits for the answer of a session without a run. A frozen session must not delay the stop of another
+session; a session that loads its modules on a busy machine answers late. After each wait the run may have
+begun."""
 
 
 def pause(run: RunningRun = None, as_json: JsonOption = False) -> None:
@@ -98,8 +99,8 @@ def running_run(run: Path | None) -> State:
 
 
 def _state_after(run: Path | None, command: Command, *, until: str = "") -> State:
-    """Send a command; return the state after it, or the state in which it is `until`. Raises InputError if the run
-    is not being acquired, or has ended."""
+    """Send a command; return the state after it, or, with `until`, the first state of this name. Raises InputError
+    if the run is not being acquired, or has ended."""
     from coupole.acquisition.run_control import ask
 
     state = _answer_to(run, command)
@@ -155,7 +156,8 @@ def _run_of(named: Path | None) -> Path:
 
 
 def sessions(patience_s: float) -> tuple[dict[Path, State], dict[Path, State]]:
-    """Return sockets and states of the sessions without a run: those that answer, and those that do not."""
+    """Return sockets and states of the sessions without a run: the sessions that answer, and the sessions that do
+    not."""
     from coupole.acquisition.sessions_without_run import sessions_without_run
 
     answering_sessions: dict[Path, State] = {}
@@ -168,8 +170,8 @@ def sessions(patience_s: float) -> tuple[dict[Path, State], dict[Path, State]]:
 def _answer_of_session(
     run: Path | None, sessions: Mapping[Path, State], command: Command, alarm: Callable[[str], None]
 ) -> State | None:
-    """Send a command to the session of these that is meant; return its state afterwards. None if there is no such
-    session, or if it has just ended: its run may have begun. Raises InputError."""
+    """Send a command to the one of these sessions that is meant; return its state afterwards. None if there is no
+    such session, or if it has just ended: its run may have begun. Raises InputError."""
     from coupole.acquisition.sessions_without_run import SessionEnded, ask_session
 
     session = _session_of(run, sessions)

@@ -47,7 +47,10 @@ ReflectanceOption = Annotated[
 ]
 ResultOption = Annotated[
     Path | None,
-    typer.Option("--result", help="Folder of that result; by default the run's name followed by -reflectance."),
+    typer.Option(
+        "--result",
+        help="Folder of the result of --reflectance; by default the run's name followed by -reflectance.",
+    ),
 ]
 
 
@@ -271,7 +274,7 @@ def live(
     """Live view of the camera, or of a run in progress: figures here, pictures on a page for this machine.
 
     For a run, only its folder is read, so the run is not slowed. For a rig or a plan, the camera is opened, and
-    the arm is not moved. A plan names an object: the light on it is entered in its ledger.
+    the arm is not moved. With a plan, the light on the plan's object is entered in the object's ledger.
     """
     from coupole.acquisition.looking import watch_cell, watch_run
     from coupole.console.command_line.client import borrowed_cell

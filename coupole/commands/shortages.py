@@ -16,7 +16,8 @@ _NO_THREAD = "can't start new thread"
 
 
 def shortage_behind(error: BaseException) -> ResourceShortage | StorageError | None:
-    """Return in words what ran short, if a shortage caused an error; None if it is not known to be the cause."""
+    """Return in words what ran short, if a shortage caused an error; None if no shortage is known to be the
+    cause."""
     for link in _chain(error):
         words = _shortage(link)
         if words is not None:

@@ -76,7 +76,8 @@ BesideOption = Annotated[
     typer.Option(
         "--beside",
         metavar="RESULT",
-        help="For a result of runs: a result of another state of the same object, to compare with by a slider. "
+        help="For a result of runs: a result of another state of the same object; the page "
+        "compares the two by a slider. "
         "It is aligned to the first by the surfaces that did not change.",
         show_default=False,
     ),

@@ -1,4 +1,4 @@
-"""Stop of what other processes of this user do with a cell: an acquisition, or a session without a run."""
+"""Stops the work of this user's other processes at a cell: an acquisition, or a session without a run."""
 
 from __future__ import annotations
 
@@ -76,11 +76,12 @@ class _Stopping:
     replies: dict[int, State] = field(default_factory=dict)
     """Answers of what was stopped, by process."""
     other_names: list[str] = field(default_factory=list)
-    """Names of what was found and not stopped, because only one can be meant without a name."""
+    """Names of sessions that were found and not stopped: without a name, a session is stopped only if it is the
+    only one."""
     _unclear: dict[int, str] = field(default_factory=dict)
     """Names of sessions whose rig is not known yet, by process."""
     _told_pids: set[int] = field(default_factory=set)
-    """Processes of which it was said that they are waited for."""
+    """Processes for which the command has said that it waits for them."""
     _no_run: InputError | None = None
     """Reason why no run was stopped."""
 
@@ -156,8 +157,8 @@ class _Stopping:
         )
 
     def _only(self, meant: Mapping[Path, State]) -> Mapping[Path, State]:
-        """Return the only session; if there is none that works, those that are stopping. Raises InputError if
-        there are several."""
+        """Return the only session; if no session works, return the sessions that are stopping. Raises InputError
+        if there are several."""
         from coupole.acquisition.sessions_without_run import name_of
 
         working_sessions = {path: state for path, state in meant.items() if state["state"] != "stopping"}
@@ -168,8 +169,8 @@ class _Stopping:
 
     def _ask_session(self, path: Path, state: State) -> None:
         """Stop a session, or its run if that has begun meanwhile. If the run has its last frame, the process is
-        interrupted as by Ctrl-C, so that nothing follows. One that is being stopped already is only noted. Raises
-        InputError if it does not answer."""
+        interrupted as by Ctrl-C, so that nothing follows. A session that is being stopped already is only noted.
+        Raises InputError if it does not answer."""
         import os
         import signal
 
@@ -203,7 +204,7 @@ class _Stopping:
         return processes | (self._unclear if may_be_rig else {})
 
     def _tell(self, starting: Mapping[int, str], waited_s: float) -> None:
-        """Say for what this waits, if it takes a while; wait a moment."""
+        """If the wait takes a while, say what is awaited; wait a moment."""
         for pid, name in starting.items():
             if waited_s > _SAID_AFTER_S and pid not in self._told_pids:
                 self._told_pids.add(pid)
@@ -289,7 +290,7 @@ def _unsafe(run: Run) -> list[str]:
     from coupole.storage import journal
     from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
 
-    reasons = ["the session has no end in its journal: its process was killed, or could not write it"]
+    reasons = ["the session has no end in its journal: its process was killed, or could not write the end"]
     has_end = False
     for event in journal.read_events(run.journal_path):
         if isinstance(event, SessionStarted | SessionResumed):

@@ -34,7 +34,7 @@ def lines_of(forecast: TexelForecast, machine_bytes: int) -> Iterator[str]:
     memory, disk = bytes_text(forecast.memory_bytes), bytes_text(forecast.disk_bytes)
     duration = duration_text(forecast.time_s)
     yield (
-        f"they need some {memory} of memory and {disk} of disk; after the fits of triangles they take "
+        f"they need about {memory} of memory and {disk} of disk; after the fits of triangles they take "
         f"{duration} on this machine"
     )
     if forecast.memory_bytes > machine_bytes:

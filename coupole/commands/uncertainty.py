@@ -86,8 +86,8 @@ def budget(
     out: Annotated[Path | None, typer.Option("--out", help="Write this PNG, and HTML and JSON beside it.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute the uncertainty of a reflectance and its dominant sources, and compare the accuracies with those of
-    the paper.
+    """Compute the uncertainty of a reflectance and its dominant sources, and compare the accuracies with the
+    paper's.
 
     The intervals are by Monte Carlo (JCGM 101); the linear formula checks them.
     """
@@ -136,7 +136,7 @@ class _Result:
     dome_spread: Spread
     """Spread over the dome by our own records."""
     cases: list[Case]
-    """Our own records, then those of `--beside`."""
+    """Our own records, then the records of `--beside`."""
     table: tuple[Accuracy, ...]
     doubts: tuple[str, ...]
     traces: tuple[str, ...]
@@ -167,7 +167,8 @@ def _propagate(
     emission: str,
     coverages: Sequence[float],
 ) -> _Result:
-    """Compute the budget from our own records, and a table that compares these records with those of `beside`."""
+    """Compute the budget from our own records, and a table that compares these records with the records of
+    `beside`."""
     from coupole.calibration.budget.accuracy import Case, accuracies
     from coupole.calibration.budget.budget import budget_of
     from coupole.calibration.budget.records import doubts, known_from, read_records, traces
@@ -302,7 +303,7 @@ def _show_accuracies(console: Console, result: _Result) -> None:
         table.add_row(line.quantity, line.paper, *(line.cell(number) for number in range(len(cases))))
     console.print()
     console.print(table)
-    console.print("standard uncertainties, all directions together; samples over a dome: their 68 % intervals")
+    console.print("standard uncertainties, all directions together; for samples over a dome, their 68 % intervals")
     for trace in result.traces:
         console.print(f"traceability: {trace}")
     for doubt in result.doubts:

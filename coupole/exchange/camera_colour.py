@@ -1,11 +1,11 @@
 """Colours of frames for the eye, in CIE XYZ: from a chart's record, or from the sensor's sensitivities and the
 LEDs' spectrum.
 
-The transform by spectra is the linear one with the smallest mean error over smooth reflectances. The error is the
-difference from the colour of the same surface under daylight (D65) for the 1931 observer; the perfect white is
-exact. Reflectances are modelled as a random process over wavelength with a Gaussian covariance (Wiener estimation:
-Pratt and Mancill, Spectral estimation techniques for the spectral calibration of a color image scanner, Applied
-Optics 15, 1976).
+The transform by spectra is the linear transform with the smallest mean error over smooth reflectances. The error
+is the difference from the colour of the same surface under daylight (D65) for the 1931 observer; the perfect white
+is exact. Reflectances are modelled as a random process over wavelength with a Gaussian covariance (Wiener
+estimation: Pratt and Mancill, Spectral estimation techniques for the spectral calibration of a color image
+scanner, Applied Optics 15, 1976).
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None
     white_balance = signals / white[:, None]
     if np.linalg.cond(white_balance @ covariance @ white_balance.T) > _LARGEST_CONDITION:
         raise InputError(
-            f"{sensor}: its channels are too similar under the light of {leds} to tell colours apart; expected "
+            f"{sensor}: its channels are too similar under the light of {leds} to distinguish colours; expected "
             "sensitivities of red, green and blue that have different shapes"
         )
     matrix = _least_missing(white_balance, towards, covariance)

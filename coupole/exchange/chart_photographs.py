@@ -70,7 +70,8 @@ def _plain(path: Path, *, srgb: bool) -> PlainPicture:
     if path.suffix.lower() in _JPEG and not srgb:
         raise InputError(
             f"{path}: a JPEG is encoded for displays, not linear. Give RAW, a linear TIFF of 16 bit or OpenEXR, "
-            "merge several exposures with `coupole bracket`, or say --srgb if it has sRGB's curve and no other"
+            "merge several exposures with `coupole bracket`, or give --srgb if the JPEG has "
+            "sRGB's curve and no other"
         )
     try:
         content = np.frombuffer(path.read_bytes(), np.uint8)

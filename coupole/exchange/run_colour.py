@@ -25,7 +25,7 @@ class ColourWanted:
     sensor: Path
     """Table with the columns nm, red, green, blue."""
     leds: Path | None
-    """Table with the columns nm, power; None for that of the rig."""
+    """Table with the columns nm, power; None for the rig's table."""
     records: tuple[Path, ...] = ()
     """Records that replace those that the run names."""
     is_linear: bool = False

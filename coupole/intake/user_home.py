@@ -11,8 +11,8 @@ from coupole.errors import InputError
 
 
 def user_home() -> Path:
-    """Return the folder that HOME names. If HOME is missing, empty or relative, return the one of the user's entry
-    in passwd. Raises InputError if that names none either."""
+    """Return the folder that HOME names. If HOME is missing, empty or relative, return the home folder of the
+    user's entry in passwd. Raises InputError if that names none either."""
     for home in (os.environ.get("HOME", ""), _home_in_passwd()):
         if Path(home).is_absolute():
             return Path(home)

@@ -49,8 +49,8 @@ _COMMENT = re.compile(r"#[^\n]*")
 def kernel(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
     """Decorate a kernel: numba compiles it, without Python's lock, and its code is kept.
 
-    `options` are those of `numba.njit`, such as `parallel=True`. Constants of modules are compiled into the code.
-    They must not depend on anything but modules that are imported: no files, environment or time.
+    `options` are the options of `numba.njit`, such as `parallel=True`. Constants of modules are compiled into the
+    code. They must not depend on anything but modules that are imported: no files, environment or time.
     """
     if function is None:
         return functools.partial(kernel, **options)

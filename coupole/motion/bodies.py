@@ -148,7 +148,7 @@ def part_apart(
 def _are_apart(
     arm: Arm, body: Body, other_body: Body, postures_deg: Sequence[Sequence[float]], by_mm: float
 ) -> NDArray[np.bool_]:
-    """Return [spheres of the body], True for those that are apart."""
+    """Return [spheres of the body], True for spheres that are apart."""
     apart = np.ones(len(body.spheres.radii_mm), dtype=bool)
     for joints_deg in postures_deg:
         frames = link_frames(arm, joints_deg)

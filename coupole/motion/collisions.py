@@ -3,7 +3,7 @@
 The arm is a set of capsules that enclose its links, or meshes of the links themselves; the camera and the space
 for its cables are capsules too. Obstacles are the object (its scanned mesh), the support disk, the dome seen from
 inside, and keep-out volumes. All distances are conservative. Bodies are unions of spheres (`motion.sphere_tree`)
-that enclose the real ones. No contact between two checked postures of a motion is missed.
+that enclose the real bodies. No contact between two checked postures of a motion is missed.
 """
 
 from __future__ import annotations

@@ -136,13 +136,13 @@ class DomeCell(StandardReadable, Flyable, Stoppable, WritesStreamAssets):
             self.view = soft_signal_rw(str, self.views()[0].name)
             """Name of the view that the next flight takes; setting it moves nothing yet."""
             self.leds = soft_signal_rw(Array1D[np.int64])
-            """Numbers of the LEDs that light it, in this order; empty: the lights of the plan."""
+            """Numbers of the LEDs that light the view, in this order; if empty, the lights of the plan."""
             self.exposure_us = soft_signal_rw(int, self.plan.exposure.exposures_us[0], units="us")
-            """Exposure time of each frame; of a bracket only the shortest, unless it is given here."""
+            """Exposure time of each frame; for a bracket only the shortest time, unless a time is given here."""
             self.run_folder, self._set_run_folder = soft_signal_r_and_setter(str)
             """Folder of the last flight's run."""
             self.proof, self._set_proof = soft_signal_r_and_setter(str)
-            """How the identity of its frames was proven, in the words of run.json."""
+            """How the identity of this run's frames was proven, in the words of run.json."""
         self.proven, self._set_proven = soft_signal_r_and_setter(int)
         """Number of frames that the present flight has proven."""
         self.frames = ProvenFrames()

@@ -233,7 +233,7 @@ class Page:
         return [section for section in self.sections if section.has_content]
 
     def maps(self) -> list[Map]:
-        """All maps of the page, with those in sections of its sections."""
+        """All maps of the page, with the maps in sections of its sections."""
         maps = [figure for figure in self.pictures if isinstance(figure, Map)]
         waiting = list(self.sections)
         while waiting:

@@ -215,8 +215,8 @@ def bound_of(whole: Sequence[Burst], frames_of_light: int, again: Collection[int
 
 
 def bound_of_lights(whole: Burst, sizes: Iterable[int]) -> tuple[Burst, ...]:
-    """Return the bound of a view whose LEDs are chosen among those of the burst `whole`. It has the first LEDs of
-    `whole`, in bursts of these sizes."""
+    """Return the bound of a view whose LEDs are chosen among the LEDs of the burst `whole`. It has the first LEDs
+    of `whole`, in bursts of these sizes."""
     labels = [label for label in whole.labels if label and label.is_shot]
     darks = {label for label in whole.labels if label and label.is_dark}
     bursts, begin = [], 0

@@ -88,7 +88,7 @@ class AutoExposure(Model):
 
     @property
     def exposures_us(self) -> tuple[int, ...]:
-        """Possible times, four to the stop. Their places in this list are those of shot ids."""
+        """Possible times, four to the stop. Shot ids contain their places in this list."""
         stops = math.log2(self.longest_us / self.shortest_us)
         count = math.ceil(STEPS_PER_STOP * stops - 1e-9)
         times_us = {round(self.shortest_us * 2.0 ** (step / STEPS_PER_STOP)) for step in range(count)}

@@ -104,7 +104,7 @@ def sentinels_among(lit: Sequence[Sequence[Led] | Panel], leds: LedTable) -> tup
 
 
 def spread_rows(positions_mm: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Return the rows of `count` positions [n, 3], each as far as possible from those before it."""
+    """Return the rows of `count` positions [n, 3], each as far as possible from the positions before it."""
     return np.array(sorted(row for row, _ in islice(farthest_first(positions_mm, 0), count)))
 
 

@@ -76,8 +76,8 @@ _Candidates = Annotated[tuple[View, ...], Field(min_length=1)]
 
 
 class EnoughViews(Model):
-    """Limits that end the choice of views. The first one that is reached ends it. Time, light and frames are those
-    of the plan: frames that are taken again are not counted."""
+    """Limits that end the choice of views. The first one that is reached ends it. Time, light and frames are the
+    plan's: frames that are taken again are not counted."""
 
     views: Annotated[int, Field(ge=1, le=400)]
     """Greatest number of views."""
@@ -263,7 +263,8 @@ class Plan(Model):
             return self
         if self.object is None or self.object.mesh is None:
             raise ValueError(
-                "an object with a `mesh` with `views: {kind: adaptive}`: views are chosen by what they show of it"
+                "an object with a `mesh` with `views: {kind: adaptive}`: a view is chosen by the part of "
+                "the object that it shows"
             )
         if self.lights.kind in ("none", "panels"):
             raise ValueError("LEDs with `views: {kind: adaptive}`; panels and darks alone cannot be judged")

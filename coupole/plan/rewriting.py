@@ -100,7 +100,7 @@ def _edited_text(document: Document, text: str, changes: Mapping[KeyPath, str]) 
             node = _node(root, at)
             spans.append((node.start_mark.index, node.end_mark.index, json.dumps(value, ensure_ascii=False)))
         elif isinstance(root, MappingNode) and root.flow_style:
-            raise LookupError(f"a file in braces lacks {at[-1]}")
+            raise LookupError(f"a file written in braces has no key {at[-1]}")
         else:
             added_text += f"{at[-1]}: {json.dumps(value, ensure_ascii=False)}\n"
     for begin, end, value in sorted(spans, reverse=True):

@@ -140,7 +140,7 @@ def in_world(rig: Rig, *, dry_run: bool) -> bool:
 
 
 def device_for(rig: Rig, kind: str, *, dry_run: bool) -> tuple[DriverName, dict[str, Any]]:
-    """Return the driver and settings to open for a device: those of its twin in a dry run, its own otherwise."""
+    """Return the driver and settings to open for a device: its twin's in a dry run, otherwise its own."""
     device: Device = getattr(rig, kind)
     settings = dict(device.settings)
     driver = device.driver
@@ -219,8 +219,8 @@ def driver_problems(document: Document, rig: Rig) -> list[Problem]:
 
 def _unlike_stand_in(document: Document, rig: Rig) -> list[Problem]:
     """Refuse, in a rig of stand-ins, an arm other than the one that the stand-in moves. Otherwise the poses would
-    be those of the arm, but the pictures those of the stand-in. (A UR's stand-in moves the driver's `model`, or
-    its settings are refused.)
+    come from the arm, but the pictures from the stand-in. (A UR's stand-in moves the driver's `model`, or its
+    settings are refused.)
     """
     moved_arm, arm = ARMS_OF_DRIVERS.get(rig.robot.driver), described_arm(rig)
     if moved_arm is None or arm is None or not in_world(rig, dry_run=False):
@@ -229,8 +229,8 @@ def _unlike_stand_in(document: Document, rig: Rig) -> list[Problem]:
     if arm.arm.chain == stand_in.arm.chain:
         return []
     message = (
-        f"expected the chain of a {stand_in.name}, the only one that the stand-in of `{rig.robot.driver}` moves, "
-        f"found that of `{arm.name}`. Name your devices and leave `world:` out; `check` and `view` open none"
+        f"expected the chain of a {stand_in.name}, the only arm that the stand-in of `{rig.robot.driver}` moves, "
+        f"found the chain of `{arm.name}`. Name your devices and leave `world:` out; `check` and `view` open none"
     )
     return [document.problem(("arm",), message)]
 
@@ -240,7 +240,7 @@ def world_problems(document: Document, rig: Rig, settings: Mapping[str, Any]) ->
     stand_in, robot = stand_in_for(rig, dry_run=False), settings.get("robot", {})
     if isinstance(robot, dict):
         if robot.get("kind", stand_in.kind) != stand_in.kind:
-            message = f"expected {stand_in.kind}, which is at the other end of the robot's driver"
+            message = f"expected {stand_in.kind}, the controller to which the robot's driver talks"
             return [document.problem(("world", "settings", "robot", "kind"), message)]
         robot = {"kind": stand_in.kind, **robot}
     camera = settings.get("camera", {})

@@ -47,7 +47,7 @@ class Schedule:
     """Labels of all frames that each view can have, in the order of its bursts. Frames that were left out are
     included."""
     choosable: tuple[tuple[Burst, ...], ...] = ()
-    """Bursts from which those of each view are chosen in the run; empty if the plan gives all bursts."""
+    """Bursts from which the bursts of each view are chosen in the run; empty if the plan gives all bursts."""
     burst_sizes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     """Number of LEDs of the bursts in a view's bound, by the view's name, for views whose LEDs are chosen."""
     most_views: int | None = None

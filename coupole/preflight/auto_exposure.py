@@ -295,9 +295,9 @@ def _in_words(purpose: str, bursts: Iterable[ChosenBurst]) -> str:
 
 def _conclusion(leds: int, clipped_count: int, noisy_count: int) -> str:
     if not clipped_count and not noisy_count:
-        return f"all {leds} LEDs are exposed as asked for"
+        return f"all {leds} LEDs are exposed as requested"
     parts = [f"{clipped_count} of {leds} LEDs clip more than allowed"] if clipped_count else []
-    parts += [f"{noisy_count} of {leds} LEDs are noisier than asked for"] if noisy_count else []
+    parts += [f"{noisy_count} of {leds} LEDs are noisier than requested"] if noisy_count else []
     return f"{' and '.join(parts)}; the plan allows no more exposures"
 
 

@@ -61,7 +61,7 @@ def preflight_of(
     job, report = check_job(job, storage, paths=paths, proven=proven)
     if measure and not storage.write_bytes_s and not storage.trouble:
         report.warnings.append(
-            f"storage {folder}: too little room to measure the disk's speed; it is not considered"
+            f"storage {folder}: too little room to measure the disk's speed, so this speed is not considered"
         )
     report.warnings += trusted_by_name(job.cell.rig)
     report.refusals += commissioning_refusals(job.cell)
@@ -153,7 +153,8 @@ def _check_discarding(job: Job, report: Report, storage: StorageFacts, proven: C
         needed, reserve, free = (n / 1e9 for n in (report.peak_bytes, room.reserve_bytes, storage.free_bytes))
         report.refusals.append(
             f"storage {folder}: though frames are discarded, the run needs up to {needed:.2f} GB at a time "
-            f"(frames of one view, what is kept of all, samples and fits), and {reserve:.2f} GB must stay free; "
+            f"(frames of one view, kept frames of all views, samples and fits), and "
+            f"{reserve:.2f} GB must stay free; "
             f"{free:.2f} GB are free"
         )
 
@@ -187,8 +188,8 @@ def ledger_warnings(job: Job, history: History, more_lux_h: float) -> list[str]:
         )
     if allowed_lux_h(job, history) is None and not in_world(job.cell.rig, dry_run=False):
         warnings.append(
-            f"object {name}: nobody has set how much light it may receive: `coupole dose {name} --budget LUX_H "
-            "--name NAME` does"
+            f"object {name}: nobody has set how much light it may receive: set it by `coupole dose {name} "
+            f"--budget LUX_H --name NAME`"
         )
     if ids := similar_ids(job.cell.ledger_folder, name):
         warnings.append(

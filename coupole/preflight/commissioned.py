@@ -189,7 +189,7 @@ def devices_of(step: Step, identities: Mapping[str, Identity]) -> dict[str, str]
 
 def why_outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identity] | None = None) -> str:
     """Return why a step's result does not fit the rig (and the opened devices) any more; empty if it still
-    does."""
+    fits."""
     before, now = result.settings, settings_of(cell, result.step)
     lacking = []
     if result.covers is None:
@@ -205,8 +205,8 @@ def why_outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identi
 
 def commissioning_refusals(cell: Cell, identities: Mapping[str, Identity] | None = None) -> list[str]:
     """Return why a cell that is not simulated must not be used. Either a step of its commissioning is missing, has
-    failed or does not fit the rig any more, or the opened devices are others. The list is empty for a simulated
-    cell."""
+    failed or does not fit the rig any more, or the opened devices are different ones. The list is empty for a
+    simulated cell."""
     if in_world(cell.rig, dry_run=False):
         return []
     command = f"coupole commission {cell.document.path} --name NAME"

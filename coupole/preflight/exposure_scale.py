@@ -2,7 +2,7 @@
 
 The simulated world scales its light to the plan (unless `world.settings.white_at_us` is set), so its frames say
 nothing about a cell's exposure. The scale is known from a record of the LEDs' power that is in force, or from the
-rig's `white_response`. Without both it is not known, and nothing is assumed.
+rig's `white_response`. Without both the scale is not known, and nothing is assumed.
 """
 
 from __future__ import annotations

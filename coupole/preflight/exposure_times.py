@@ -17,7 +17,8 @@ _TIMES_OF_A_VIEW = 3
 _CLIPPED_STEP_S = 4.0
 """Penalty, as a time, for each step by which an LED's shortest exposure is above its longest allowed one."""
 _NOISY_S, _NOISY_SHARE_S = 0.3, 5.0
-"""Penalties, as times: for an LED that is noisier than required, and for a lack of all of its share of pixels."""
+"""Penalties, as times: for an LED that is noisier than required, and for an LED whose whole share of pixels is
+missing."""
 _SUBSETS_AT_ONCE = 256
 
 

@@ -112,9 +112,9 @@ def at_pace(job: Job, pace: Pace) -> Job:
 def with_choices(
     job: Job, choices: Mapping[str, Sequence[Choice]], chosen_views: Sequence[ChosenView] = ()
 ) -> Job:
-    """Return the same job for a run that has made these choices of bursts and views. If it needs no more views,
-    the others are left out. Raises StorageError for a choice that the plan does not allow: such a choice shows
-    that the journal was changed.
+    """Return the same job for a run that has made these choices of bursts and views. If the run needs no more
+    views, all other views are left out. Raises StorageError for a choice that the plan does not allow: such a
+    choice shows that the journal was changed.
     """
     try:
         if job.schedule.is_open:

@@ -33,7 +33,8 @@ def refuse_little_address_space() -> None:
 
 def little_address_space(pid: int = 0) -> str:
     """Return why a process of this user (0: this one) has too little memory: it is limited to less than
-    LEAST_ADDRESS_SPACE_BYTES (`ulimit -v`, `prlimit --as`). Empty if it is not, or if there is no such process."""
+    LEAST_ADDRESS_SPACE_BYTES (`ulimit -v`, `prlimit --as`). Empty if its limit is not lower, or if there is no
+    such process."""
     try:
         limit_bytes, _ = resource.prlimit(pid, resource.RLIMIT_AS)
     except OSError:

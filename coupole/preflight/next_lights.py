@@ -54,7 +54,7 @@ class NextLights:
 
 def spread_lights(directions: Floats, allowed_lights: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     """Return indices of the first `count` lights among `allowed_lights`. The first is nearest to their middle;
-    each further light is as far as possible from those before it. `directions` [n, 3] are unit vectors."""
+    each further light is as far as possible from the positions before it. `directions` [n, 3] are unit vectors."""
     candidates = directions[allowed_lights]
     middle = int(np.argmax(candidates @ candidates.mean(axis=0)))
     return allowed_lights[[row for row, _ in islice(farthest_first(candidates, middle), count)]]
@@ -127,7 +127,7 @@ class _Errors:
     covariance, of which only the columns of these lights are made."""
 
     def __init__(self, covariance: Floats) -> None:
-        """`covariance` [n, n] is that of the errors before any light is taken."""
+        """`covariance` [n, n] is the covariance of the errors before any light is taken."""
         self._covariance = covariance
         self._columns: list[Floats] = []
         self.variances: Floats = np.diag(covariance).copy()

@@ -174,7 +174,7 @@ def check(
     object_light: ObjectLight,
     whole: Whole | None = None,
 ) -> Report:
-    """Check the course of a whole plan, or that of the rest of the run `whole`."""
+    """Check the course of a whole plan, or the course of the rest of the run `whole`."""
     schedule, itinerary = course.schedule, course.itinerary
     report = Report(
         is_bound=schedule.is_open or plan.chooses_views,
@@ -293,7 +293,7 @@ def _too_strict(until: EnoughViews, least: Mapping[str, float]) -> list[str]:
 
 
 def _limit(report: Report, until: EnoughViews) -> None:
-    """Limit the figures to those that the plan asks for: no view is begun that would exceed them. The time of the
+    """Limit the figures to the limits that the plan sets: no view that would exceed them is begun. The time of the
     choices comes on top."""
     if until.frames is not None:
         report.frames = min(report.frames, until.frames)

@@ -1,4 +1,4 @@
-"""Conditions for which a rig's calibration records must hold."""
+"""Conditions for which a rig's calibration records must be valid."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from coupole.plan.rig_devices import in_world
 
 
 def situation_of(rig: Rig, *, camera: str | None = None, temperature_c: float | None = None) -> Situation:
-    """Return the present conditions for which this rig's records must hold."""
+    """Return the present conditions for which this rig's records must be valid."""
     return Situation(
         now=datetime.now(UTC),
         is_simulated=in_world(rig, dry_run=False),

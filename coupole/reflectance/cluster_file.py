@@ -15,13 +15,13 @@ from coupole.reflectance.triangle_fit import TriangleMaterials
 
 CLUSTERS = "fits/clusters.h5"
 _TOLD = {
-    "cluster": "of the triangles of the fits; -1 for none",
+    "cluster": "cluster of each triangle of the fits; -1 for none",
     "borrowed": "whether a triangle borrows its cluster's material, because it has too few samples",
-    "kd": "of the clusters, 1/sr, by channel",
-    "ks": "of the clusters, by channel; f = kd + ks D V",
-    "alpha": "of the clusters, GGX's roughness",
-    "residual": "of the clusters: weighted rms residual of the square roots, as a share of sqrt(kd)",
-    "harmonics": "[clusters, functions, channels] of pairs of directions, 1/sr",
+    "kd": "kd of the clusters, 1/sr, by channel",
+    "ks": "ks of the clusters, by channel; f = kd + ks D V",
+    "alpha": "alpha of the clusters (GGX's roughness)",
+    "residual": "weighted rms residual of the square roots, as a share of sqrt(kd)",
+    "harmonics": "[clusters, functions, channels] coefficients of harmonics of pairs of directions, 1/sr",
     "members": "number of triangles from which a cluster was formed",
 }
 

@@ -84,7 +84,7 @@ def centres_of_points(points: Floats, count: int, random: np.random.Generator) -
 
 def nearest_of(points: Floats, centres: Floats) -> NDArray[np.int64]:
     """[b] number of the nearest centre of each of the points [b, n]."""
-    step = max(1, _DISTANCES // len(centres))  # vq keeps those of all points to all centres
+    step = max(1, _DISTANCES // len(centres))  # vq keeps the distances of all points to all centres
     parts = [vq(points[first : first + step], centres)[0] for first in range(0, len(points), step)]
     return np.concatenate(parts).astype(np.int64)
 

@@ -87,7 +87,7 @@ def contradiction_mask(
 
 @kernel(error_model="numpy")
 def _mark(values, whole, u_noise, led_mm, centres_mm, normals, kd, places_beside, dark):  # type: ignore[no-untyped-def]
-    """Mark the samples of LEDs that contradict those of the LEDs beside them."""
+    """Mark the samples of LEDs that contradict the samples of the LEDs beside them."""
     count, leds, _ = values.shape
     mean, way, ratios_beside = np.empty(leds), np.empty(3), np.empty(places_beside.shape[1])
     for triangle in range(count):

@@ -54,7 +54,8 @@ def refuse_texels(run: Run, out: Path) -> None:
     result: texels need the frames of all LEDs."""
     if discarded_views(run) or is_for_discarding(run, out):
         raise FrameDiscarded(
-            f"--texels: needs the frames of all LEDs, and those of {run.folder} are discarded, or will be, as its "
+            f"--texels: needs the frames of all LEDs, and the frames of {run.folder} are "
+            f"discarded, or will be, as its "
             "plan says (`discard: after_fit`). Nothing was changed. Give the command without --texels, or acquire "
             "the object by a plan without `discard`"
         )

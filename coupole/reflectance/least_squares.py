@@ -131,11 +131,12 @@ def solve_by_samples(rows, penalty, values, memory, factor, right):  # type: ign
 def left_out(rows, values, coefficients, factor, step, off):  # type: ignore[no-untyped-def]
     """Fill `off` [m, ...] with the error of the fit to all other samples, for each `step`-th sample.
 
-    `rows` [n, samples], `coefficients` [m, n] and `factor` belong to a solution. With fewer samples than rows,
-    `values` [m, samples] are those that `solve_by_samples` left, else the samples. The amount is the residual of
-    the fit to all samples, divided by 1 - h, where h is the diagonal of the matrix from samples to fitted values
-    (Golub, Heath, Wahba, Technometrics 21, 1979). In the form with a matrix of the size of the samples, both the
-    residual and 1 - h contain the diagonal of its inverse as a factor, which cancels.
+    `rows` [n, samples], `coefficients` [m, n] and `factor` belong to a solution. If there are fewer samples than
+    rows, `values` [m, samples] are the values that `solve_by_samples` has left there; otherwise they are the
+    samples. The amount is the residual of the fit to all samples, divided by 1 - h, where h is the diagonal of the
+    matrix from samples to fitted values (Golub, Heath, Wahba, Technometrics 21, 1979). In the form with a matrix
+    of the size of the samples, both the residual and 1 - h contain the diagonal of its inverse as a factor, which
+    cancels.
     """
     (count, samples), size = rows.shape, len(factor)
     columns = np.zeros((off.shape[1], size))

@@ -60,7 +60,7 @@ NOTHING_AHEAD = _NothingAhead()
 
 @dataclass(frozen=True)
 class Scene:
-    """The object's triangles, and those of the support under it if the support reflects."""
+    """The object's triangles, and the triangles of the support under it if the support reflects."""
 
     rays: Any
     centres_mm: Floats

@@ -89,7 +89,8 @@ def _with_new(
     say: Callable[[int, int], None],
     most: int,
 ) -> Floats:
-    """[chosen, sites] grey values, in full scales; `values` has those of the lights that were chosen before."""
+    """[chosen, sites] grey values, in full scales; `values` has the grey values of the lights that were chosen
+    before."""
     rows = list(values)
     step = max(1, pictures.pixels // _SITES)
     for light in chosen_lights[len(rows) :].tolist():

@@ -86,7 +86,7 @@ def read_pictures(
     directions = light_file.directions
     names = light_file.names or _names_in(folder, {path.resolve() for path in (mask,) if path is not None})
     if len(names) != len(directions):
-        refuse(lights, f"has {len(directions)} lights, {folder} has {len(names)} pictures; expected as many")
+        refuse(lights, f"has {len(directions)} lights, {folder} has {len(names)} pictures; expected equal numbers")
     if len(names) < FEWEST_LIGHTS:
         refuse(lights, f"has {len(names)} lights; at least {FEWEST_LIGHTS} are needed")
     files = tuple(folder / name for name in names)

@@ -33,7 +33,7 @@ Floats = NDArray[np.float64]
 Say = Callable[[int, int], None]
 
 LEVELS = {"95": 0.95, "68": 0.6827}
-"""Shares of the pixels for which intervals hold, by their names in the file."""
+"""Shares of the pixels that intervals contain, by their names in the file."""
 FEWEST_LIGHTS = 12
 """Least number of lights from which intervals can be calibrated."""
 FOLDS = 3
@@ -192,7 +192,7 @@ def _fit_level(residuals: Residuals, coefficients: Floats, level: float) -> Stra
 
 
 def _needed_widening(residuals: Residuals, fold: NDArray[np.int64], peak: float, level: float) -> float:
-    """Return the factor by which intervals that were fitted without a fold must be widened to hold in this
+    """Return the factor by which intervals that were fitted without a fold must be widened to be valid in this
     fold."""
     ratios = np.empty(len(residuals.sizes))
     for number in range(FOLDS):

@@ -116,8 +116,8 @@ def _uncertain_texels(scene: RelitScene) -> Uncertain:
 
 def _stepped_materials(materials: TriangleMaterials, wider: Floats, step: Floats) -> TriangleMaterials:
     """Return materials whose tilts and logarithms have moved by a small step [n, 5]. Channels move together; the
-    step of each is multiplied by `wider` [n, 2, channels] (of kd, of ks), the ratio of its uncertainty to that of
-    the channels' mean."""
+    step of each is multiplied by `wider` [n, 2, channels] (of kd, of ks), the ratio of its uncertainty to the
+    uncertainty of the channels' mean."""
     return dataclasses.replace(
         materials,
         normals=turned_normals(materials.normals, step[:, :2]),

@@ -198,8 +198,8 @@ def _interval_percent(uncertainty: dict[str, Any] | None) -> dict[str, float] | 
 
 def _typical(result: RunResult, name: str) -> dict[str, float | None]:
     """Return the medians of standard uncertainties of a material. The uncertainties of kd and ks include two
-    errors: those that all samples of a triangle share, and those that all triangles share. None for an unknown
-    uncertainty.
+    errors: the errors that all samples of a triangle share, and the errors that all triangles share. None for an
+    unknown uncertainty.
     """
     variances = np.einsum("nii->ni", result.material_covariances(name)).copy()
     variances[:, 2:4] += (result.u_triangles(slice(None)) ** 2 + result.u_shared**2)[:, None]

@@ -36,7 +36,7 @@ FEWEST_TO_BORROW = 4
 """Least number of samples that determine the cluster of a triangle."""
 USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS = 400, 16, 1000
 """Usual number of members of a cluster, and bounds on the number of clusters. They are used if the number of
-clusters is not given. The numbers are those of the paper, but small objects have at least `FEWEST_CLUSTERS`
+clusters is not given. The numbers are the paper's, but small objects have at least `FEWEST_CLUSTERS`
 clusters.
 """
 _FROM = GGX_NORMAL.name

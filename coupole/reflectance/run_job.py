@@ -71,8 +71,8 @@ class RunRequest:
     keep_inter_reflection: bool = False
     """True if inter-reflection is not subtracted from the samples."""
     refined_folder: Path | None = None
-    """Folder of `coupole reflectance refine`. Its poses, lens and mesh are used instead of those of records and
-    scan."""
+    """Folder of `coupole reflectance refine`. Its poses, lens and mesh are used instead of the values in records
+    and scan."""
     poses: Path | None = None
     """COLMAP folder of one run. Its poses are used instead of the records' poses."""
 
@@ -114,7 +114,7 @@ def reflectance_of(
     of `result.json`. `ahead` has values that were computed before for the same object.
 
     Raises InputError for runs without calibrations, for runs of different objects or cameras, and for records that
-    do not belong to the runs. Raises it also for a folder with another result, for a scheduler that does not
+    do not belong to the runs. It is also raised for a folder with another result, for a scheduler that does not
     answer, and for workers that do not see the folder. Raises StorageError if a frame is damaged or the disk
     cannot be written.
     """

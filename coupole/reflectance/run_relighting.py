@@ -268,7 +268,7 @@ def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) ->
 
 
 def best_with_texels(result: RunResult, among: Collection[str] = FITS) -> str:
-    """Return the name of texels if their error is smaller than that of the best fit of triangles, in the same
+    """Return the name of texels if their error is smaller than the error of the best fit of triangles, in the same
     pixels; else the best fit `among` those named."""
     texel_errors = read_texel_errors(result.folder)
     known_mae = {name: mae for name, mae in texel_errors.items() if mae is not None}

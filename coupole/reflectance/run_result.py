@@ -62,7 +62,8 @@ FIELDS = {
     "residual": "weighted rms of the residuals of the values' square roots, as a share of sqrt(kd)",
 }
 UNCERTAIN = {
-    "covariance": "lower half, row by row, of tilts (rad) along two tangents of the normal and of the logarithms "
+    "covariance": "lower half, row by row, of the covariance of tilts (rad) along two tangents of the "
+    "normal and of the logarithms "
     "of kd, ks (the channels' mean) and alpha; without u_triangle and u_shared",
     "u_kd": "relative standard uncertainty by channel, without u_triangle and u_shared",
     "u_ks": "the same of ks",
@@ -159,13 +160,13 @@ class RunResult:
         for name in settings["view_names"]:
             if not (self.folder / "samples" / f"{name}.json").exists():
                 raise InputError(
-                    f"{self.folder}: the samples of the view {name} are not there; `coupole reflectance extract`, "
-                    "as it was begun, makes them"
+                    f"{self.folder}: the samples of the view {name} are not there; to make them, give the same "
+                    f"`coupole reflectance extract` again"
                 )
         if settings["subtracted"] and any(view.inter_reflection is None for view in self.views):
             raise InputError(
-                f"{self.folder}: inter-reflection is still in its samples; `coupole reflectance extract`, as it "
-                "was begun, subtracts it"
+                f"{self.folder}: inter-reflection is still in its samples; to subtract it, give the same "
+                f"`coupole reflectance extract` again"
             )
         paths = [self.materials_path(name) for name in MATERIALS]
         paths += [self.slices_path(name, view) for name in SLICES for view in self.views]

@@ -64,7 +64,7 @@ def begin_slices(file: h5py.File, fit: ViewFit, view: ViewSamples, channels: int
     data.attrs["basis"] = (
         "real spherical harmonics, orthonormal, degrees 0 to 9, order by order"
         if fit.basis.harmonic
-        else "-r to each of `centres`, then 1, x, y, z"
+        else "the negative distance to each of `centres`, then 1, x, y, z"
     )
     data.attrs["frame"] = "z the mesh's normal, x towards the camera along the surface"
     data.attrs["added_to"] = fit.over.name if fit.over else ""

@@ -1,4 +1,5 @@
-"""Half widths of intervals that hold in each stratum: quantiles of residuals over a predicted scale, by strata.
+"""Half widths of intervals that are valid in each stratum: quantiles of residuals over a predicted scale, by
+strata.
 
 Samples are divided into strata in several ways, and each stratum has a factor. The factors are adjusted in turn
 until the interval contains the wanted share in all strata at once (multivalid conformal prediction: Jung et al.

@@ -1,8 +1,8 @@
 """GGX materials of triangles from the samples of all views, with the mesh's normal and with a fitted one.
 
 The normal of the mesh is the prior of the fitted normal. Its variance comes from noise of the scanner's vertices.
-For a triangle of area A this variance is about that of an equilateral triangle: 2 s^2 / a^2 with a^2 = 4 A / sqrt
-3 (a plane through three points, each with an error s). The fit is that of `coupole.reflectance.normal_fit`,
+For a triangle of area A this variance is about the variance of an equilateral triangle: 2 s^2 / a^2 with a^2 = 4 A
+/ sqrt 3 (a plane through three points, each with an error s). The fit is that of `coupole.reflectance.normal_fit`,
 computed by `coupole.reflectance.ggx_fit`.
 """
 
@@ -29,7 +29,8 @@ FEWEST = 24
 """Least number of samples of a triangle: about five times the number of unknowns."""
 USUAL = 0.1
 """Weight of the usual roughness and ks; a sample can have a weight of about 6. This prior decides where no sample
-is near a highlight. Without it, one triangle in thousands was five times as bright as white between the LEDs."""
+is near a highlight. Without this prior, one triangle in thousands was five times as bright as white between the
+LEDs."""
 _USUAL_MATERIAL = (USUAL_KS, USUAL_ALPHA, USUAL / SPREAD_KS**2, USUAL)
 """The usual material in the form of `ggx_fit.fit_packs`."""
 MOST_KS = 1.0

@@ -1,7 +1,7 @@
 """Pictures of one view of a run without calibrations, to be used as pictures under known lights.
 
 Only nominal places of rig and LED table are used. The directions to the LEDs, and their light by the table, are
-those at the point in focus. Values are relative, and each pixel is treated alone.
+computed for the point in focus. Values are relative, and each pixel is treated alone.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def _refuse_others(path: Path, text: str) -> None:
 
 
 def frames_of_leds(folder: Path, frames: LightFrames, view: str | None) -> dict[int, LightFrame]:
-    """Return, for each LED, the frame of the longest exposure that is hardly clipped, otherwise that of the
+    """Return, for each LED, the frame of the longest exposure that is hardly clipped, otherwise the frame of the
     shortest exposure."""
     frame_of_led: dict[int, LightFrame] = {}
     for led, exposures in _exposures_of_leds(folder, frames, view).items():

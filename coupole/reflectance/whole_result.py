@@ -1,4 +1,4 @@
-"""A result of runs with all that is asked for: the materials of triangles, and those of texels."""
+"""A result of runs with everything that is requested: the materials of triangles, and the materials of texels."""
 
 from __future__ import annotations
 

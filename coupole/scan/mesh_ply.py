@@ -106,7 +106,7 @@ def _with(element: _Element, property_words: tuple[str, ...]) -> _Element:
 def _plain_record(path: Path, element: _Element, order: str) -> np.dtype[np.void]:
     """Return the layout of an element without lists."""
     if any(len(field) == 3 for field in element.properties):
-        raise InputError(f"{path}: element `{element.name}` holds lists; only faces may")
+        raise InputError(f"{path}: element `{element.name}` has lists; only faces may have lists")
     return np.dtype([(name, order + _PLY_TYPES[kind]) for name, kind in element.properties])
 
 

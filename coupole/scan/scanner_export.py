@@ -51,9 +51,10 @@ def read_scan(
 ) -> Scan:
     """Read mesh and targets and check them.
 
-    `unit` is the unit of the mesh (mm, cm, m, um, in). `targets_unit` is that of the table; by default it is the
-    unit named in the table, or that of the mesh. With `accept_defects`, a mesh is accepted although some edges
-    have more than two triangles or opposite orientations; these are counted, not repaired. Raises InputError.
+    `unit` is the unit of the mesh (mm, cm, m, um, in). `targets_unit` is the unit of the table; by default it is
+    the unit named in the table, or the unit of the mesh. With `accept_defects`, a mesh is accepted although some
+    edges have more than two triangles or opposite orientations; these are counted, not repaired. Raises
+    InputError.
     """
     progress("reading the mesh")
     raw = mesh_files.read_mesh(mesh_path)
@@ -111,7 +112,9 @@ def _refuse(path: Path, mesh: Mesh, defects: Defects, *, accept_defects: bool) -
 
 def _targets_unit(path: Path, table: Targets, stated_unit: str | None, mesh_unit: str) -> str:
     if stated_unit and table.unit and stated_unit != table.unit:
-        raise InputError(f"{path}: the unit in the table is {table.unit}, that of --targets-unit {stated_unit}")
+        raise InputError(
+            f"{path}: the unit in the table is {table.unit}, the unit of --targets-unit is {stated_unit}"
+        )
     return stated_unit or table.unit or mesh_unit
 
 

@@ -1,7 +1,7 @@
 """Tables of positioning targets (retro-reflective stickers) as text, from VXelements or spreadsheets.
 
 No file of the real scanner was available, so many variants are read: comments; tabs, commas, semicolons or blanks
-between columns; decimal commas; a line of headings; a name in the first column; normals in the last ones. An
+between columns; decimal commas; a line of headings; a name in the first column; normals in the last columns. An
 ambiguous line is refused with its number.
 """
 
@@ -42,7 +42,7 @@ def read_targets(path: Path) -> Targets:
     except FileNotFoundError:
         raise InputError(f"{path}: expected a table of targets; there is no such file") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected text (UTF-8); byte {error.start} is not") from None
+        raise InputError(f"{path}: expected text (UTF-8); byte {error.start} is not UTF-8") from None
     rows: list[tuple[int, list[str]]] = []
     units: dict[str, int] = {}
     for number, line in enumerate(lines, start=1):

@@ -45,9 +45,9 @@ def fit_reflectance(
 ) -> Result:
     """Fit the materials of an object to proven frames of its runs, like `coupole reflectance RUN --out OUT`.
 
-    `mesh` and `calibrations` (records, or folders of them) replace those of the runs' plans. `left_out` are LEDs
-    that are kept for the check (by default every twelfth). `texels` adds materials of single pixels, or of texels
-    of a width in mm on the surface. A job that was stopped continues when it is called again.
+    `mesh` and `calibrations` (records, or folders of them) replace the mesh and records of the runs' plans.
+    `left_out` are LEDs that are kept for the check (by default every twelfth). `texels` adds materials of single
+    pixels, or of texels of a width in mm on the surface. A job that was stopped continues when it is called again.
 
     Raises InputError if there are no runs, or if the records do not belong to them; StorageError,
     ChecksumMismatch.
@@ -188,7 +188,7 @@ def compare(
     """Find significant changes of shape and colour between two states of an object, like `coupole compare`.
 
     Both are meshes or clouds (PLY, STL, OBJ) in `unit`, or folders of a result of reflectance. `noise_mm` is the
-    standard deviation of a point (by default estimated from the scatter); with `is_aligned` both states are
+    standard deviation of a point (by default it is estimated from the scatter); with `is_aligned` both states are
     already in one frame. Raises InputError, ExtraMissing.
     """
     from coupole.heritage.comparison import state_comparison

@@ -130,7 +130,7 @@ class Result:
         fit: str | None = None,
         samples: int = SAMPLES,
     ) -> NDArray[np.float32]:
-        """[height, width, 3] linear picture under the sum of the lights, like that of `coupole reflectance
+        """[height, width, 3] linear picture under the sum of the lights, like the picture of `coupole reflectance
         relight`. 1 is a white diffuser in full light; for LEDs, 1 is the full range of the camera.
 
         `direction` (to a distant light, support frame, z up) and `led` (number of an LED of the run) are short

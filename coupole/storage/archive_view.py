@@ -132,7 +132,7 @@ def _check_records(path: Path, table: NDArray[np.void], frames: list[FrameProven
         claims = (frame_file.PROVEN, str(frame.shot).encode(), int(frame.xxh3, 16))
         if frame.index >= len(table) or table[frame.index][["state", "shot", "xxh3"]].item() != claims:
             raise ChecksumMismatch(
-                f"{path}: slot {frame.index} is not recorded as {frame.shot}, as the journal says. "
+                f"{path}: slot {frame.index} should be recorded as {frame.shot}, as the journal says. "
                 "`coupole verify` lists all that is wrong; nothing was changed."
             )
 
@@ -268,7 +268,7 @@ class _Source:
             pixels = frame_file.pixels_of(memory, self._layout)
             if read_bytes != self._layout.frame_bytes or f"{frame_file.checksum(pixels):016x}" != frame.xxh3:
                 raise ChecksumMismatch(
-                    f"{self._path}: {frame.shot} is not what was proven. `coupole verify` lists all that is "
+                    f"{self._path}: {frame.shot} differs from what was proven. `coupole verify` lists all that is "
                     "wrong; nothing was changed."
                 )
             yield pixels

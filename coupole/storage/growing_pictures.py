@@ -155,7 +155,7 @@ def new_picture_name(kind: str) -> str:
 
 
 def read_growing(result: Path) -> Growing:
-    """Return what can be looked at; empty if there is nothing, or if the index is not valid."""
+    """Return the pictures and pages that exist so far; empty if there are none, or if the index is not valid."""
     try:
         return Growing.model_validate(read_json(result / PICTURES / _INDEX))
     except (OSError, InputError, ValidationError):

@@ -64,7 +64,7 @@ class SessionBegun(JournalEvent):
 
     event: str
     simulated: bool = False
-    """True if the devices are those of a simulated cell."""
+    """True if the devices belong to a simulated cell."""
     room_c: float | None = None
     """Temperature of the coolest LED board, C; None if the box knows none."""
     acknowledged: str = ""

@@ -111,7 +111,7 @@ class Ledger:
                 f"{self.path}: counts light for a plan whose own line is not there, so earlier lines are "
                 "missing: the ledger was moved or replaced while light was given, and it is not known what the "
                 "object may still receive. Put the whole ledger back; if it is lost, give `coupole dose "
-                f"{self.object_id} --add LUX_H --note WHY` with what it had, or with 0"
+                f"{self.object_id} --add LUX_H --note WHY` with the light that it had received, or with 0"
             )
 
     def ask_again(self, budget_request: Asked, plan_id: str) -> None:

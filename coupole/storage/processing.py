@@ -78,8 +78,8 @@ class Processing:
     views: int = 0
     """Views of the plan."""
     fitted_views: int = 0
-    """Views of the result so far, `RESULT/so-far`. It is 0 while there is no such result, and when the result is
-    complete."""
+    """Number of views of the result so far, `RESULT/so-far`; 0 while there is no such result, and when the result
+    is complete."""
     detail: str = ""
     """The present fit or other step, with the share of it that is done."""
     why: str = ""

@@ -134,7 +134,7 @@ class Run:
 
     @property
     def most_views(self) -> int | None:
-        """Greatest number of its views, if they are chosen while it runs; None if the plan gives them."""
+        """Greatest number of the run's views, if views are chosen during the run; None if the plan gives them."""
         most_views: int | None = self.about.get("most_views")
         return most_views
 
@@ -150,8 +150,8 @@ class Run:
 
     @property
     def views(self) -> list[str]:
-        """Names of its views, in the plan's order. If they are chosen while it runs, these are the views chosen so
-        far, in the order of the choices."""
+        """Names of the run's views, in the plan's order. If views are chosen during the run, these are the views
+        chosen so far, in the order of the choices."""
         if self.most_views is None:
             return list(self.about["views"])
         return [choice.view for choice in self.chosen_views() if choice.view]
@@ -163,7 +163,7 @@ class Run:
 
     @property
     def expected_views(self) -> int:
-        """Number of its views; while more may be chosen, the greatest number."""
+        """Number of the run's views; while more views may be chosen, the greatest possible number."""
         return self.most_views if self.most_views is not None and self.wants_views else len(self.views)
 
     @property

@@ -311,8 +311,8 @@ def _difference_s(begin_time: str, end_time: str) -> float:
 
 
 def newest_run(parent: Path, name: str, plan: Path, say: Callable[[str], object]) -> Path | None:
-    """Return the newest run in `parent` of the plan with this name. None if there is none, or if the plan's file
-    has changed since the run began; `say` is told this."""
+    """Return the newest run in `parent` of the plan with this name. None if there is no such run, or if the plan's
+    file has changed since the run began; this is then passed to `say`."""
     folders = [folder for folder in sorted(parent.glob(f"*-{name}")) if (folder / RUN_JSON).is_file()]
     if not folders:
         return None

@@ -81,7 +81,7 @@ def problem_of(result: Path, view: str, first: str) -> str:
     if not proofs or proofs[0] != first:
         return f"{result / NAME}: does not have the proof of the view {view} that the run's journal names"
     if present_digest not in proofs:
-        return f"{path}: is not what was proven: it was changed, or the disk failed. Put it back from a copy"
+        return f"{path}: differs from what was proven: it was changed, or the disk failed. Put it back from a copy"
     return ""
 
 

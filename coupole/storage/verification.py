@@ -116,8 +116,8 @@ def _check_discarded(run: Run, result: Verification, proven: Mapping[ShotId, Fra
 
 
 def _unchosen(run: Run) -> list[str]:
-    """Find frames that come before their choice, or before that of their view, in the journal, if these are
-    chosen."""
+    """If frames or views are chosen in the run: find frames that the journal has before their choice, or before
+    the choice of their view."""
     chosen_shots: set[ShotId] = set()
     chosen_views: set[str] = set()
     problems = []

@@ -65,7 +65,9 @@ class View:
 
     def _proven(self, frame: FrameProven, pixels: NDArray[np.uint16]) -> NDArray[np.uint16]:
         if f"{frame_file.checksum(pixels):016x}" != frame.xxh3:
-            raise ChecksumMismatch(f"{self.path}: {frame.shot} is not what was proven. See `coupole verify`.")
+            raise ChecksumMismatch(
+                f"{self.path}: {frame.shot} differs from what was proven. See `coupole verify`."
+            )
         return pixels
 
     def number(self, name: str) -> float | None:

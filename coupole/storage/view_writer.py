@@ -40,7 +40,7 @@ WRITERS = 3
 
 class ViewWriter:
     """Writes one view's file. Several threads may call `store`. One thread calls all other methods; `sync` may be
-    called from another one."""
+    called from another thread."""
 
     def __init__(self, path: Path, proven_slots: dict[str, int]) -> None:
         """Open a file that `create` made. `proven_slots` (shot id to slot) are kept; all other slots are free.

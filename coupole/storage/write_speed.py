@@ -22,8 +22,8 @@ def measure_write_speed(folder: Path, *, frame_bytes: int = 0, room_bytes: int) 
     """Measure the write speed of a folder's disk, bytes per second, in the way frames are written: with O_DIRECT
     if possible, several at a time, into allocated space, synced.
 
-    It writes 64 MiB, or 128 MiB for large frames, into a file without a name, which disappears with this process.
-    Returns 0 if there is not enough room. Raises StorageError if nothing can be written.
+    The measurement writes 64 MiB, or 128 MiB for large frames, into a file without a name, which disappears with
+    this process. Returns 0 if there is not enough room. Raises StorageError if nothing can be written.
     """
     blocks = min(max(_LEAST_BLOCKS, _FRAMES * frame_bytes // _BLOCK_BYTES), _MOST_BLOCKS)
     total_bytes = blocks * _BLOCK_BYTES

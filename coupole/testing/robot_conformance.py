@@ -255,10 +255,10 @@ class RobotConformance:
             give_up = time.monotonic() + 30.0
             while cell.is_moving:
                 thread.submit(robot.measured).result()
-                assert time.monotonic() < give_up, "it moves on although nobody watches it"
+                assert time.monotonic() < give_up, "the arm moves on although nobody watches it"
                 time.sleep(0.02)
         stood_deg = cell.joints_deg()
-        assert np.abs(stood_deg - self.away_deg).max() > 1.0, "it was there before it could be stopped"
+        assert np.abs(stood_deg - self.away_deg).max() > 1.0, "the arm arrived before it was stopped"
         way = (stood_deg - self.home_deg) / (self.away_deg - self.home_deg)
         assert np.ptp(way) < 0.01, "it left its line"
         with pytest.raises(ArmUnattended):

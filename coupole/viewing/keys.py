@@ -68,7 +68,7 @@ def _read_keys(terminal: int, end_fd: int, actions: Mapping[str, Callable[[], ob
 
 
 def _is_ours() -> bool:
-    """Tell whether standard input is a terminal with this process in its foreground."""
+    """Tell whether standard input is a terminal that has this process in its foreground."""
     try:
         terminal = sys.stdin.fileno()
         return os.isatty(terminal) and os.tcgetpgrp(terminal) == os.getpgrp()

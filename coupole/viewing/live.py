@@ -30,8 +30,8 @@ from coupole.viewing.raw_preview import Coding, Figures, figures
 
 _POLL_S = 0.2
 _STATUS_S, _STATUS_REST = 1.0, 20.0
-"""Least time between two readings of a run's status; and the pause after a reading, as a multiple of the time that
-it took."""
+"""Least time between two readings of a run's status; and the pause after a reading, as a multiple of the reading's
+time."""
 UNWATCHED_S = 5.0
 """A source of light stops when no page has asked for this time. An open page asks five times a second; a page in
 the background asks once a second."""
@@ -92,7 +92,7 @@ class Studio:
         return time.monotonic() - self._asked_s < UNWATCHED_S
 
     def note_request(self) -> None:
-        """Note that a page asks, so that somebody may be watching."""
+        """Note that a page asks, which means that somebody may be watching."""
         self._asked_s = time.monotonic()
 
     @property

@@ -19,8 +19,8 @@ _ON_THE_DISK_MM = 0.05
 
 
 def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> None:
-    """Print the summary of a preflight. For a resumed run the figures are for the rest of the run, beside those
-    for the whole run.
+    """Print the summary of a preflight. For a resumed run the figures are for the rest of the run, beside the
+    figures for the whole run.
     """
     whole = report.whole
     table = Table(title=f"{name} on {rig}", title_justify="left", box=None, show_header=False)
@@ -38,7 +38,7 @@ def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> 
     table.add_row(f"{size_name}{at_most}", size + (_speeds(report) if report.frames else ""))
     if report.peak_bytes is not None and report.staying_bytes is not None:
         beside = "" if whole is None else " beside what is there"
-        at_a_time = "frames of one view, what is kept of all, samples and fits"
+        at_a_time = "frames of one view, kept frames of all views, samples and fits"
         table.add_row(f"on disk at a time{beside}, at most", f"{bytes_text(report.peak_bytes)}: {at_a_time}")
         stays = "frames that are not discarded, samples and fits"
         table.add_row("stays on disk, at most", f"{bytes_text(report.staying_bytes)}: {stays}")

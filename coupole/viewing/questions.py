@@ -62,7 +62,7 @@ def _line_typed(is_over: Callable[[], bool]) -> str:
 
     Raises Interrupted (exit code 129) if the terminal is gone: this is not an answer, and a read may show it
     before SIGHUP comes. A signal does not end a read in Python, so this waits in short steps. It takes byte after
-    byte, so that the lines that follow are left to whoever asks next.
+    byte, so that the lines that follow are left for the next question.
     """
     try:
         input_fd = sys.stdin.fileno()

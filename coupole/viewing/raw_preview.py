@@ -140,8 +140,8 @@ def white_point(raw: NDArray[np.uint16], coding: Coding) -> tuple[float, float, 
 
 
 def loupe(raw: NDArray[np.uint16], coding: Coding, gains: Sequence[float] = (1.0, 1.0, 1.0)) -> bytes:
-    """Return a region of a RAW frame as PNG, with one pixel for each of the sensor's. The region begins on a Bayer
-    cell. Each pixel has its own value; its two other colours are those of its cell."""
+    """Return a region of a RAW frame as PNG, with one pixel for each pixel of the sensor. The region begins on a
+    Bayer cell. Each pixel has its own value; its two other colours are the colours of its cell."""
     cells = develop(raw, pattern=coding.pattern, black_dn=coding.black_dn, white_dn=coding.white_dn, gains=gains)
     picture = np.repeat(np.repeat(cells, 2, axis=0), 2, axis=1)
     letters = coding.pattern if coding.pattern != "MONO" else "GGGG"

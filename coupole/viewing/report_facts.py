@@ -115,8 +115,8 @@ def sessions(run_status: Status) -> Section:
         rows.append((Moment(session.begun), duration_text(session.duration_s), pause_text, outcome, reason))
     head = ("begun (UTC)", "duration", "pauses", "ended", "why")
     notes = [
-        f"In the session of {session.begun} the machine's clock was set by {session.clock_set_s:+.0f} s. Times of "
-        "day and pauses in this report are those of that clock; the duration is not."
+        f"In the session of {session.begun} the machine's clock was set by {session.clock_set_s:+.0f} s. Times "
+        f"of day and pauses in this report are by that clock; the duration is not."
         for session in run_status.sessions
         if abs(session.clock_set_s) > _CLOCK_SET_S
     ]

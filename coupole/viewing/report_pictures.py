@@ -140,8 +140,8 @@ def coverages(coverage: Coverage) -> Section:
         },
         tables=[Table("How much of the object each view shows", _FRAMED, list(_framings(coverage)))],
         notes=[
-            "By the mesh, the measured poses and the rig's lens. It does not consider whether the arm hides a "
-            "point, nor which lights reach it."
+            "Computed from the mesh, the measured poses and the rig's lens. The computation does not consider "
+            "whether the arm hides a point, nor which lights reach the point."
         ],
     )
 

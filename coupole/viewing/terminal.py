@@ -48,7 +48,7 @@ def make_console(*, quiet: bool) -> Console:
 
 class _Console(Console):
     """Console as wide as the terminal that reads it, even if there is a queue between them. Of rich's markup it
-    knows only `[red]words[/]` and the other names in `_MARKUP`. All other brackets, such as those of paths, are
+    knows only `[red]words[/]` and the other names in `_MARKUP`. All other brackets, such as brackets in paths, are
     printed as they are."""
 
     def render_str(self, text: str, *, markup: bool | None = None, **options: Any) -> Text:
@@ -76,8 +76,8 @@ class _Console(Console):
 
 
 class _Terminal:
-    """A stream that may go away (a closed window, a broken pipe). Text that it does not take is dropped, so that
-    the session ends normally."""
+    """A stream that may go away (a closed window, a broken pipe). Text that the stream does not take is dropped,
+    so that the session ends normally."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -146,7 +146,7 @@ class RunObserver:
     """Watches a run: bars on a terminal, a line every few seconds elsewhere."""
 
     def __init__(self, console: Console, frame_bytes: int, proven_before: int, *, speed: float = 1.0) -> None:
-        """`speed` is that of the cell's clock, in its seconds per second."""
+        """`speed` is the speed of the cell's clock, in its seconds per second of real time."""
         self._console, self._frame_bytes, self._speed = console, frame_bytes, speed
         self._started_s = time.monotonic()
         self._printed_s = 0.0

@@ -174,7 +174,7 @@ def install() -> None:
 
 
 def full_stdout() -> str:
-    """Return why standard output does not take text; empty if it takes text, or if its reader has gone. Text that
+    """Return why standard output takes no text; empty if it takes text, or if its reader has gone. Text that
     it did not take is dropped.
     """
     try:
@@ -190,8 +190,8 @@ def full_stdout() -> str:
 
 
 def unread() -> Unread | None:
-    """Return the text of standard error that was not taken so far. None if all was taken, or if its reader is only
-    a little late."""
+    """Return the text of standard error that was not taken so far. None if all text was taken, or if its reader is
+    only a little late."""
     outlet = _outlets.get("stderr")
     text = outlet.queue.unread() if outlet else None
     return text if text and (text.lost_bytes or text.stalled_s >= PATIENCE_S) else None

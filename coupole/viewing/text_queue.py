@@ -26,7 +26,7 @@ class Unread:
 
 class TextQueue:
     """Bytes in the order in which they were put in. When the queue is full the oldest bytes are dropped, and the
-    next text that is taken says how many lines were lost. Any thread may use it."""
+    next text that the reader takes says how many lines were lost. Any thread may use it."""
 
     def __init__(self, most_bytes: int = MOST_BYTES, *, tells: bool = True) -> None:
         """Make an empty queue. With `tells`, a message takes the place of dropped text. For a document, `tells` is

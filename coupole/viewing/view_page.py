@@ -251,7 +251,7 @@ def _mesh(solid: Solid, colour: Colour, opacity: float = 1.0, words: str = "") -
 
 
 def _line(lines_mm: Sequence[Points], colour: Colour, width: int, words: str) -> Any:
-    """Several lines [n, 3] as one trace, with gaps between them."""
+    """Return several lines [n, 3] as one trace, with gaps between them."""
     gap = np.full((1, 3), np.nan)
     points = np.concatenate([part for line in lines_mm for part in (line, gap)])
     trace = _points(points, None, words)

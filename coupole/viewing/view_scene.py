@@ -65,7 +65,7 @@ class Stop:
     leg_s: float | None
     """Duration of the leg; None if there is none."""
     camera_way_mm: Points
-    """[n, 3] path of the projection centre on the leg. Without a leg, it is that of the straight motion to the
+    """[n, 3] path of the projection centre on the leg. Without a leg, it is the path of the straight motion to the
     collision."""
     flange_way_mm: Points
     vias_mm: Points

@@ -81,7 +81,7 @@ for finding in findings:
 # ## Probabilities, and how often the library misleads
 #
 # Each finding has the probability of each class, and the probability that the library has none for
-# the spot. `rates` count what happened when each spectrum of the library was left out and asked for.
+# the spot. `rates` count what happened when each spectrum of the library was left out and then identified.
 
 # %%
 for finding in findings:

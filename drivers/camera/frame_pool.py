@@ -58,5 +58,5 @@ class Slot:
         """[slot_bytes], page-aligned."""
 
     def release(self) -> None:
-        """Return it to the pool; a second call does nothing."""
+        """Return the slot to the pool; a second call does nothing."""
         self._pool.give_back(self._index, self._acquisition)

@@ -2,10 +2,10 @@
 drivers.
 
 A camera keeps the settings of the last program, and some cameras keep them over power-off. So each feature that
-affects the exposure of a frame or its pixels is set and read back when the camera is opened. Names and entries are
-those of the GenICam Standard Features Naming Convention (SFNC) 2.7. A feature that the camera lacks is left out.
-If the camera has a feature that does not take the value, this is an error. Features named in the rig (`features`,
-or `leave`) belong to the rig, and their lines of the table are not used.
+affects the exposure of a frame or its pixels is set and read back when the camera is opened. Names and entries
+follow the GenICam Standard Features Naming Convention (SFNC) 2.7. A feature that the camera lacks is left out. If
+the camera has a feature that does not take the value, this is an error. Features named in the rig (`features`, or
+`leave`) belong to the rig, and their lines of the table are not used.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ FRAME_TRIGGER = (
     _line("TriggerDivider", 1),
     _line("TriggerMultiplier", 1),
 )
-"""Features of the trigger that starts frames. They are set after the trigger is on, because some cameras lock them
-before."""
+"""Features of the trigger that starts frames. They are set after the trigger is on, because some cameras do not
+allow them before."""
 TRIGGER_LINE = (
     Line(("LineMode",), ("Input",)),
     _line("LineInverter", False),

@@ -98,8 +98,8 @@ def _widen_10p(out, data):  # type: ignore[no-untyped-def]
 
 @kernel
 def _widen_10_packed(out, data):  # type: ignore[no-untyped-def]
-    """Two pixels in three bytes: the middle byte holds the lower two bits of each; those of the second pixel begin
-    at bit 4."""
+    """Two pixels in three bytes: the middle byte holds the lower two bits of each; the bits of the second pixel
+    begin at bit 4."""
     for pair in range(len(out) // 2):
         first, middle, last = data[3 * pair], data[3 * pair + 1], data[3 * pair + 2]
         out[2 * pair] = np.uint16(first) << np.uint16(2) | np.uint16(middle & 3)

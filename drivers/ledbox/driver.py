@@ -1,8 +1,8 @@
 """The LED control box, by SCPI over a serial line or USBTMC (docs/reference/ledbox-protocol.md).
 
 Every message ends in `SYSTem:ERRor?`, so every command is confirmed and costs one round trip. The box's two table
-banks are used alternately. While one runs, the next table is uploaded into the other, in blocks; other messages
-pass between the blocks. `lights_off` waits for no message, because it begins with a device clear.
+banks are used alternately. While one table runs, the next table is uploaded into the other bank, in blocks; other
+messages pass between the blocks. `lights_off` waits for no message, because it begins with a device clear.
 """
 
 from __future__ import annotations

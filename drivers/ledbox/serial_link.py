@@ -1,6 +1,6 @@
 """Carries bytes to and from a device on a serial line, with any URL that pyserial accepts.
 
-Time-outs are counted on the rig's clock, so that they hold in a simulated world that runs faster or slower.
+Time-outs are counted on the rig's clock, so that they are right in a simulated world that runs faster or slower.
 pyserial's own time-outs, in machine time, determine only how often the rig's clock is read.
 
 A device clear is a BREAK on a serial line, and RFC 2217's BREAK on an `rfc2217://` port. On a `socket://`, which

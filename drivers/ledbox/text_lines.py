@@ -250,7 +250,9 @@ class TextLineBox:
         self.lights_off()
 
     def panel(self, panel: int, on: bool) -> None:
-        self._refuse("a panel that the box has", f"panel {panel} was asked for, it has none", "Leave panels out.")
+        self._refuse(
+            "a panel that the box has", f"panel {panel} was requested, but the box has none", "Leave out panels."
+        )
 
     def board_temperature_c(self, board: int) -> float | None:
         return None

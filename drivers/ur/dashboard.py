@@ -83,7 +83,7 @@ def ready_controller(config: Config) -> tuple[str, str, str]:
 
 
 def why_ended(host: str) -> str:
-    """Return the name of the fault for a program that ended although the driver did not stop it."""
+    """Return the name of the fault of a program that ended although the driver did not stop it."""
     with contextlib.suppress(OSError), contextlib.closing(Dashboard(host)) as dashboard:
         if dashboard.ask("is in remote control") == "false":
             return "not in remote control: the program was stopped at the pendant"

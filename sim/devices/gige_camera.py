@@ -316,7 +316,7 @@ class GigeCamera:
         return self._frames[slot]
 
     def send(self, shot: Shot) -> bool:
-        """Encode a frame, and pass it to the camera's process as soon as that has room for an image."""
+        """Encode a frame, and pass it to the camera's process as soon as this process has room for an image."""
         patience_end_s = time.monotonic() + _PATIENCE_S
         while not self._free_on_wire:
             self._look()

@@ -117,7 +117,8 @@ class KukaController:
         return self._delay
 
     def true_base_from_flange(self) -> Transform:
-        """True pose of the flange: the controller's, with the arm's constant error and that of the last stop."""
+        """True pose of the flange: the controller's, with the arm's constant error and the error of the last
+        stop."""
         return self.errors.true_flange_pose(self.joints_deg, self._axes.stops, self._axes.came_from_deg)
 
     def estop(self) -> None:
@@ -220,7 +221,7 @@ class KukaController:
                 self._refusals.note_refusal(*answer)
             elif answer.ipoc != expected_ipoc:
                 self._refusals.note_refusal(
-                    "an answer with another IPOC than that of the last packet is ignored",
+                    "an answer whose IPOC differs from the IPOC of the last packet is ignored",
                     f"{answer.ipoc}, expected {expected_ipoc}",
                 )
             else:

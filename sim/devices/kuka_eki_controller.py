@@ -124,7 +124,8 @@ class KukaEkiController:
         return self.settled_since_ns is None
 
     def true_base_from_flange(self) -> Transform:
-        """True pose of the flange: the controller's, with the arm's constant error and that of the last stop."""
+        """True pose of the flange: the controller's, with the arm's constant error and the error of the last
+        stop."""
         return self.errors.true_flange_pose(self.joints_deg, self._stops, self._came_from_deg)
 
     def estop(self) -> None:

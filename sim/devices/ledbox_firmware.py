@@ -50,7 +50,7 @@ class Settings(BaseModel):
     """Board of an LED: led // leds_per_board."""
     serial_number: str = "SIM-0001"
     enabling_switch: Literal["none", "released", "held"] = "none"
-    """State of the enabling switch at power-on, on the box's input for one; `none`: the box has no such input."""
+    """State of the enabling switch at power-on, on the box's input for it; `none`: the box has no such input."""
     clock_offset_ns: int = Field(default=5_000_000_000, ge=0)
     """Reading of the box's clock at world time 0."""
     clock_ppm: float = Field(default=12.0, ge=-1000, le=1000)
@@ -120,7 +120,7 @@ class LedBoxFirmware:
         self._dropped_edges: set[int] = set()
         self._doubled_edges: dict[int, int] = {}
         self.dead_leds: set[int] = set()
-        """LEDs that from their next step on draw no current and give no light."""
+        """LEDs that draw no current and give no light from their next step on."""
         self._panels = dict.fromkeys(_PANELS, False)
         self.enabling_switch = settings.enabling_switch
         self._burst: Burst | None = None

@@ -29,8 +29,8 @@ REST_PER_ON = 2
 
 
 def read_table(before: NDArray[np.void], payload: bytes, led_count: int, edge_width_us: int) -> NDArray[np.void]:
-    """Return the records `before` (STEP [n]) and those of an uploaded block. Raises ScpiError for a record out of
-    limits."""
+    """Return the records `before` (STEP [n]) and the records of an uploaded block. Raises ScpiError for a record
+    out of limits."""
     if len(payload) % STEP.itemsize:
         raise ScpiError(-161, f"{len(payload)} bytes are not a multiple of {STEP.itemsize}")
     table = np.concatenate([before, np.frombuffer(payload, STEP)])

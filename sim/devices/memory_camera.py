@@ -1,6 +1,6 @@
 """Driver of the simulated camera without a network: frames are in memory shared with the world.
 
-It is for machines without libaravis, and for rates above those of loopback. The other end is
+It is for machines without libaravis, and for rates above the rates of loopback. The other end is
 `sim.devices.camera_server`.
 """
 

@@ -47,7 +47,7 @@ def export_scan(
     try:
         sample: Thing = TypeAdapter(Thing).validate_python(dict(thing))
     except ValidationError as error:
-        raise InputError(f"scanner: not a thing of the simulated world: {error}") from error
+        raise InputError(f"scanner: expected a thing of the simulated world: {error}") from error
     if not isinstance(sample, Sample) or sample.stickers is None:
         raise InputError(f"scanner: expected a thing with `stickers`, found {thing}; it has nothing to hold on to")
     random = np.random.default_rng([seed, 2])

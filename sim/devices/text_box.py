@@ -56,7 +56,7 @@ class TextBox:
         self._lit: dict[int, Timer | None] = {}
         """LEDs that are lit, with the timer that will end them."""
         self.dead_leds: set[int] = set()
-        """LEDs that from their next flash on give no light."""
+        """LEDs that give no light from their next flash on."""
         self._deaf_until_ns = 0
         self._stuck_leds: set[int] = set()
         self._line = bytearray()

@@ -108,11 +108,11 @@ def _hair() -> list[Form]:
 
 
 def _curl(x: float, y: float, z: float, radius: float) -> Form:
-    """Return a ball with a spiral groove; the groove's hand is that of the ball's side."""
+    """Return a ball with a spiral groove; the direction of the groove depends on the ball's side."""
     return ball((x, y, z), radius, 0.02, groove=(0.32 * radius, 2.2, 1.0 if x > 0.0 else -1.0))
 
 
 def _on_skull(x: float, y: float) -> float:
-    """Height z of the skull's front at a place; outside the skull, that of its rim."""
+    """Height z of the skull's front at a place; outside the skull, the height of its rim."""
     across = ((x - _SKULL[0]) / _SKULL_RADII[0]) ** 2 + ((y - _SKULL[1]) / _SKULL_RADII[1]) ** 2
     return float(_SKULL[2] + _SKULL_RADII[2] * np.sqrt(max(0.0, 1.0 - across)))

@@ -66,7 +66,8 @@ def mirror_pair(form: Form) -> list[Form]:
 def height_above_plane(solid: Sequence[Form], x: Array, y: Array, turn: Array, top: float, bottom: float) -> Array:
     """Height [...] of the solid's highest point above places `x`, `y` [...]; `bottom` where there is none.
 
-    `turn` [3, 3] is the rotation from the solid's axes to those of the plane, z away from it. Rays start at `top`.
+    `turn` [3, 3] is the rotation from the solid's axes to the plane's axes, z away from the plane. Rays start at
+    `top`.
     """
     table = np.array([form.row() for form in solid])
     places = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)

@@ -1,8 +1,8 @@
 """Materials from files, measured or exported, in MERL's, RGL's and ALTA's formats.
 
-Red, green and blue of a file are used as those of the simulated camera. Spectra are converted to the camera's
-channels under its LEDs. The renderer's materials are isotropic; an anisotropic material is replaced by its mean
-over turns of the surface.
+Red, green and blue of a file are used as the simulated camera's red, green and blue. Spectra are converted to the
+camera's channels under its LEDs. The renderer's materials are isotropic; an anisotropic material is replaced by
+its mean over turns of the surface.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def materials() -> tuple[Material, ...]:
 def plaque(step_mm: float = STEP_MM) -> Surface:
     """The closed plaque in its own frame (`sim.objects.plaque_relief`), of triangles with legs of `step_mm`.
 
-    Each cell has one material, one tint, and one normal for shading: that of the heights at its corners.
+    Each cell has one material, one tint, and one normal for shading: the normal of the heights at its corners.
     """
     width, depth = relief.PLAQUE_MM
     columns, rows = round(width / step_mm), round(depth / step_mm)

@@ -14,7 +14,7 @@ from sim.scene.surface import Material, Surface
 
 _SEGMENTS = 48
 _BORDER = 10.0 / 6.0
-"""Ratio of a sticker's diameter to that of its bright disk."""
+"""Ratio of a sticker's diameter to the diameter of its bright disk."""
 _THICKNESS_MM = 0.05
 _CELL_MM = 2.0
 _TRAPS_MM = tuple(

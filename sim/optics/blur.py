@@ -43,13 +43,13 @@ def through(
 
 def defocus_blur_px(objective: Objective, depth_mm: Image, pixel_pitch_um: float) -> Image:
     """Return the standard deviation per axis, pixels, of the blur by defocus at depths along the optical axis. It
-    is a quarter of the disk's diameter. At an infinite depth, where nothing is seen, it is that of 1 km."""
+    is a quarter of the disk's diameter. At an infinite depth, where nothing is seen, it is the blur of 1 km."""
     return np.asarray(0.25 * defocus_px(objective, np.minimum(depth_mm, 1e6), pixel_pitch_um), np.float32)
 
 
 def _blur(image: Image, sigma_px: Image, more_px: float, cell_mask: NDArray[np.bool_], out: Image) -> None:
     """Fill the pixels of `out` at the places `cell_mask` [2, 2] of the Bayer cell. The blur's variance is the sum
-    of those of `sigma_px` [h, w] and `more_px`."""
+    of the variances of `sigma_px` [h, w] and `more_px`."""
     low, high = (float(np.hypot(edge, more_px)) for edge in (sigma_px.min(), sigma_px.max()))
     layers = _layers(max(low, _SHARP_PX), high) if high > _SHARP_PX else []
     if low <= _SHARP_PX:

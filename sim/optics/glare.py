@@ -81,7 +81,7 @@ class Glare(BaseModel):
         return np.asarray(large[:height, :width], np.float32)
 
     def _of_cells(self, cells: Floats, width: float) -> Floats:
-        """Scattered light of cells [rows, columns]; `width` is that of the picture, in cells."""
+        """Scattered light of cells [rows, columns]; `width` is the picture's width, in cells."""
         lobe, blur = _spectra(cells.shape, self.core * width, self.falls_by, self.ghost_blur * width)
         veil = self.haze * np.full(cells.shape, cells.mean())
         veil += (1.0 - self.haze - self.ghost) * _convolve(cells, lobe)

@@ -28,7 +28,7 @@ class Objective:
     """Distance from the lens's principal plane to the plane in focus."""
     f_number: float = 8.0
     rim_radius: float = 3.0
-    """Radius of the front rim, relative to that of the pupil; stopped down to f/8 the rim is far outside
+    """Radius of the front rim, relative to the pupil's radius; stopped down to f/8 the rim is far outside
     (assumed)."""
     rim_shift: float = 4.0
     """Shift of the rim across the pupil, in radii of the pupil, for a tangent of 1 (assumed)."""

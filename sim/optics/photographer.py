@@ -164,7 +164,7 @@ class Photographer:
         glow(_AHEAD, "lambertian", self._sight, np.eye(4), look.empty, None)
 
     def _relative_illuminance(self) -> NDArray[np.float32]:
-        """[h, w] illuminance of each pixel relative to that of the centre."""
+        """[h, w] illuminance of each pixel relative to the illuminance of the centre."""
         x, y = slopes(self._sight)
         tangent = np.hypot(x, y)
         shift_x, shift_y = self._strangers.lens.stop_shift_mm

@@ -223,8 +223,8 @@ def _develop(  # type: ignore[no-untyped-def]
     small_means,
     small_starts,
 ):
-    """Apply shot noise, full well, readout and ADC. The loops over a row are separate, so that all but that of the
-    dim pixels are vectorised. Arrays in tuples would halve the speed."""
+    """Apply shot noise, full well, readout and ADC. The loops over a row are separate, so that all but the loop of
+    the dim pixels are vectorised. Arrays in tuples would halve the speed."""
     height, width = out.shape
     dark_s, full_well, read_e, row_e, dn_per_e, black, white = readout
     for row in numba.prange(height):

@@ -69,7 +69,7 @@ class Lens:
 
     @property
     def terms(self) -> NDArray[np.float64]:
-        """Terms for `bend` and `distorted_points`: those of the distortion. A lens with more terms than Brown's
+        """Terms of the distortion, for `bend` and `distorted_points`. A lens with more terms than Brown's
         model also has the centre of distortion.
         """
         if len(self.distortion) == 5 and not any(self.off_axis):

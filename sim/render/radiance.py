@@ -178,7 +178,7 @@ def _mean_lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha, led, shares):  # type:
 
 @kernel
 def _lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha):  # type: ignore[no-untyped-def]
-    """D G / (4 n.l n.v) towards a light at (tx, ty, tz), and that times Schlick's (1 - h.v)^5."""
+    """D G / (4 n.l n.v) towards a light at (tx, ty, tz), and the same times Schlick's (1 - h.v)^5."""
     distance = np.sqrt(tx * tx + ty * ty + tz * tz)
     lx, ly, lz = tx / distance, ty / distance, tz / distance
     hx, hy, hz = lx + vx, ly + vy, lz + vz

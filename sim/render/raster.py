@@ -1,9 +1,9 @@
 """The triangle that each pixel sees: a z-buffer over all triangles of the scene, once per camera pose.
 
-A pixel's ray d = (x, y, 1) meets the triangle of camera coordinates v0 v1 v2 where d (v1 x v2), d (v2 x v0) and
-d (v0 x v1) have the sign of v0 (v1 x v2), and then 1/z is their sum over that volume (Olano and Greer 1997). So
-triangles that extend behind the camera need no clipping, and two triangles with a common edge leave no crack: the
-edge's products are the same numbers with opposite signs.
+A pixel's ray d = (x, y, 1) meets the triangle of camera coordinates v0 v1 v2 where d (v1 x v2), d (v2 x v0) and d
+(v0 x v1) have the sign of v0 (v1 x v2). Then 1/z is the sum of these three products, divided by v0 (v1 x v2)
+(Olano and Greer 1997). So triangles that extend behind the camera need no clipping, and two triangles with a
+common edge leave no crack: the edge's products are the same numbers with opposite signs.
 
 The image is divided into bands of rows. Each band processes the triangles that reach it in order, and keeps the
 nearest, or the first of equally near ones. So the result does not depend on the number of threads. Nearness and
@@ -306,7 +306,7 @@ def _fill_triangle(v, box, member, lens, shift, rooks, top, nearest):  # type: i
 
 @kernel
 def _span(row, start, stop, edges, lens, shift):  # type: ignore[no-untyped-def]
-    """Reduce a row's columns, `start` to before `stop`, to those between a triangle's edges."""
+    """Reduce a row's columns, `start` to before `stop`, to the columns between a triangle's edges."""
     a0, b0, c0, a1, b1, c1, a2, b2, c2 = edges
     focal, centre_x, centre_y = lens[0], lens[1], lens[2]
     y, shift_x, spare = (row - centre_y) / focal, 0.0, lens[8] / focal

@@ -79,7 +79,7 @@ class Stickers(BaseModel):
     gap_mm: _Length = 0.8
     """Gap as in `sim.objects.standards.sticker_poses`, which gives the stickers' poses."""
     new: Annotated[int, Field(ge=0)] = 0
-    """Number of those that were attached after the scan and are not in its table."""
+    """Number of stickers that were attached after the scan and are not in its table."""
     fallen: Annotated[int, Field(ge=0)] = 0
     """Number of stickers in the scan that have come off since."""
 

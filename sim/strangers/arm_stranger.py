@@ -39,8 +39,8 @@ class ArmStranger(BaseModel):
     def errors_deg(
         self, joints_deg: Sequence[float], came_from_deg: Sequence[float], origins_mm: Floats, axes: Floats
     ) -> Floats:
-        """[6] true less reported angles. `came_from_deg` are the angles at the stop before, `origins_mm`
-        [7, 3] and `axes` [6, 3] the joints' (the flange last) in the base."""
+        """[6] true less reported angles. `came_from_deg` are the angles at the stop before; `origins_mm` [7, 3]
+        and `axes` [6, 3] are the origins and axes of the joints in the base, with the flange's origin last."""
         joints = np.asarray(joints_deg, dtype=np.float64)
         short = -0.5 * np.array(self.backlash_deg) * np.sign(joints - np.asarray(came_from_deg))
         turn = np.radians(np.array(self.ripple_periods) * joints + np.array(self.ripple_phase_deg))

@@ -67,7 +67,7 @@ class LightStranger(BaseModel):
         return bool(self.lobe or self.exponent_spread)
 
     def exponent(self, led: int) -> float:
-        """Exponent by which an LED's lobe departs from that of all LEDs."""
+        """Exponent by which an LED's lobe departs from the lobe of all LEDs."""
         return float(self.exponent_spread * np.random.default_rng((self.seed, _EXPONENT, led)).standard_normal())
 
     def warmth(self, frame: int) -> float:

@@ -68,7 +68,7 @@ class MeasuredConfig(_Model):
     merl: Path | None = None
     bsdf: Path | None = None
     alta: Path | tuple[Path, Path, Path] | None = None
-    """One file, or those of red, green and blue."""
+    """One file, or one file each for red, green and blue."""
 
     @property
     def alta_files(self) -> tuple[Path, ...]:

@@ -36,7 +36,7 @@ class BoxAlone(Protocol):
     """A stand-in for an LED box. All methods are called on the world's thread."""
 
     dead_leds: set[int]
-    """LEDs that from their next flash on give no light."""
+    """LEDs that give no light from their next flash on."""
 
     def mute(self, seconds: float | None = None) -> None:
         """The box neither receives nor answers, for ever or for `seconds`."""

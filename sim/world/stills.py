@@ -16,7 +16,7 @@ from sim.world.config import Config
 
 
 class Stills:
-    """A camera at any pose; `config` is that of the world (`sim.world.config.Config`)."""
+    """A camera at any pose; `config` is the configuration of the world (`sim.world.config.Config`)."""
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         valid_config = Config.model_validate(config)

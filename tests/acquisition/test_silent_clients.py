@@ -46,7 +46,7 @@ def full_queue(path: Path) -> Iterator[socket.socket]:
 def test_a_process_that_accepts_nobody_is_told_as_such(tmp_path: Path) -> None:
     """As one that is stopped, and that many have asked already."""
     path = tmp_path / "socket"
-    message = r"accepts no connection.*`kill -CONT PID` lets one run again"
+    message = r"accepts no connection.*`kill -CONT PID` lets a process run again"
     with full_queue(path), pytest.raises(TimeoutError, match=message):
         exchange(path, {"ask": "state"}, patience_s=0.2)
 

@@ -150,8 +150,8 @@ def test_a_record_of_another_camera_is_refused(
     content = dict(record)
     del content["sha256"], content["schema_version"]
     for name, validity, why in (
-        ("larger", {"size_px": (1024, 768)}, "holds for frames of 1024 x 768 pixels"),
-        ("other", {"camera": "Other 7"}, "holds for the camera Other 7"),
+        ("larger", {"size_px": (1024, 768)}, "is valid for frames of 1024 x 768 pixels"),
+        ("other", {"camera": "Other 7"}, "is valid for the camera Other 7"),
         ("old", {"expires": datetime(2020, 1, 1, tzinfo=UTC)}, "expired on 2020-01-01"),
     ):
         other = seal_record(**content | {"validity": record.validity.model_copy(update=validity)})

@@ -123,7 +123,7 @@ def test_a_lens_of_another_focus_is_not_taken_for_an_observation(sound: Path, tm
     write_record(tmp_path / "far.yaml", resealed(lens, focus_distance_mm=400.0))
     ended = of_board("hand-eye", sound, tmp_path, "--camera", tmp_path / "far.yaml")
     assert ended.code == 2
-    assert "far.yaml: holds for a focus of 400 mm" in ended.err
+    assert "far.yaml: is valid for a focus of 400 mm" in ended.err
 
 
 # -- LEDs -----------------------------------------------------------------------------------------------------
@@ -181,14 +181,14 @@ def test_a_camera_warmer_than_its_record_holds_for_is_named(lit: Path, tmp_path:
     )
     ended = leds(lit, tmp_path, record)
     assert ended.code == 2
-    assert "cool.yaml: holds from 15 to 20 C; the coolest LED board of these images had 25 C" in ended.err
+    assert "cool.yaml: is valid from 15 to 20 C; the coolest LED board of these images had 25 C" in ended.err
 
 
 def test_a_focus_ring_that_was_turned_is_named(lit: Path, tmp_path: Path) -> None:
     record = write_hand_eye(tmp_path / "far.yaml", scene(1, stickers=1, views=1).prior, focus_distance_mm=400.0)
     ended = leds(lit, tmp_path, record)
     assert ended.code == 2
-    assert "far.yaml: holds for a focus of 400 mm" in ended.err
+    assert "far.yaml: is valid for a focus of 400 mm" in ended.err
 
 
 def test_an_expired_record_stops_an_acquisition_before_it_begins(cell: CellFolder) -> None:

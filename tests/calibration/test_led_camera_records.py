@@ -52,14 +52,14 @@ def test_a_record_of_another_focus_is_refused(recorded: tuple[Path, Sources]) ->
     path, sources = recorded
     about = replace(sources.about, focus_distance_mm=500.0)
     with pytest.raises(
-        InputError, match="holds for a focus of 335 mm, within 2 mm; the images were taken at 500 mm"
+        InputError, match="is valid for a focus of 335 mm, within 2 mm; the images were taken at 500 mm"
     ):
         read_posed_camera(path, None, about, SIZE_PX)
 
 
 def test_a_record_of_other_frames_is_refused(recorded: tuple[Path, Sources]) -> None:
     path, sources = recorded
-    with pytest.raises(InputError, match="holds for frames of 480 x 360 pixels"):
+    with pytest.raises(InputError, match="is valid for frames of 480 x 360 pixels"):
         read_posed_camera(path, None, sources.about, (4096, 3072))
 
 

@@ -136,12 +136,12 @@ def test_a_kind_that_is_missing_or_named_twice_is_refused() -> None:
     [
         ({"now": NOW + timedelta(days=181)}, "expired on 2026-08-28"),
         ({"now": NOW - timedelta(days=1)}, "in the future"),
-        ({"focus_distance_mm": 420.0}, "holds for a focus of 335 mm"),
-        ({"f_number": 11.0}, "holds for aperture 8; the rig has 11"),
-        ({"focal_length_mm": 50.0}, "holds for focal length 35 mm"),
-        ({"size_px": (2048, 1536)}, "holds for frames of 4096 x 3072"),
-        ({"camera": "CB120CG-CM 99"}, "holds for the camera CB120CG-CM 1234"),
-        ({"temperature_c": 31.0}, "holds from 18 to 26 C"),
+        ({"focus_distance_mm": 420.0}, "is valid for a focus of 335 mm"),
+        ({"f_number": 11.0}, "is valid for aperture 8; the rig has 11"),
+        ({"focal_length_mm": 50.0}, "is valid for focal length 35 mm"),
+        ({"size_px": (2048, 1536)}, "is valid for frames of 4096 x 3072"),
+        ({"camera": "CB120CG-CM 99"}, "is valid for the camera CB120CG-CM 1234"),
+        ({"temperature_c": 31.0}, "is valid from 18 to 26 C"),
         ({"is_simulated": True}, "made in a real cell"),
     ],
 )

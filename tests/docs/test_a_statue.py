@@ -103,7 +103,7 @@ def test_gold_and_the_paints_are_identified_and_what_the_library_lacks_is_not(wa
     (told,) = [text for command, text in walked.printed.items() if " identify " in command]
     assert re.search(r"hair: gold leaf with 9\d%", told)
     assert re.search(r"mantle: blue with 9\d%", told)
-    assert "repair: the probability that the library has its class is 0%" in told
+    assert "repair: the probability that the library has the spectrum's class is 0%" in told
 
 
 def test_hypotheses_differ_where_they_should_by_day_and_by_candles(walked: Walked) -> None:

@@ -296,7 +296,7 @@ def test_a_frame_that_changed_on_the_disk_is_not_exported(made: MadeRun, out: Pa
     with path.open("r+b") as file:
         file.seek(layout.data_offset + frame.index * layout.frame_bytes)
         file.write(b"\xff\xff")
-    with pytest.raises(ChecksumMismatch, match="top/led0001/e0 is not what was proven"):
+    with pytest.raises(ChecksumMismatch, match="top/led0001/e0 differs from what was proven"):
         export(made, "dng", out)
     assert not (out / "top_led0001_e0.dng").exists()
 

@@ -209,7 +209,7 @@ def test_lines_with_mistakes_are_refused_with_their_line(library: dict[str, Path
 
     with pytest.raises(InputError, match=r"line.csv:4:1: x_cm: expected a number, found 'left'"):
         identify([line(tmp_path, shapes, **{"p1,1.5": "p1,left"})], **library, **out)
-    with pytest.raises(InputError, match=r"line.csv:4:1: expected another place than that of p0"):
+    with pytest.raises(InputError, match=r"line.csv:4:1: expected another place than the place of p0"):
         identify([line(tmp_path, shapes, **{"p1,1.5,2": "p1,0,0"})], **library, **out)
     with pytest.raises(InputError, match=r"line.csv:2:1: expected position_mm, or x_mm, y_mm and z_mm"):
         identify([line(tmp_path, shapes, **{"x_cm,y_cm": "x_cm,x_mm"})], **library, **out)

@@ -246,5 +246,5 @@ def test_other_lights_are_taken_by_their_name(tmp_path: Path) -> None:
     document = restoration(tmp_path, text).document
     asked = chosen_file(document, document.validate(RestorationFile), Choice(lights="candles"))
     assert [light.luminance_cd_m2 for light in asked.lights if light.kind == "environment"] == [5.0]
-    with pytest.raises(InputError, match=r"--lights sun: expected one of those of .*: candles"):
+    with pytest.raises(InputError, match=r"--lights sun: expected one of the lights of .*: candles"):
         chosen_file(document, document.validate(RestorationFile), Choice(lights="sun"))

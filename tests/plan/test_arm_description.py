@@ -162,7 +162,7 @@ def test_an_arm_that_the_stand_in_does_not_move_is_planned_with_but_not_simulate
     data["joints"][2]["origin_mm"] = [455, 0, 0]
     (tmp_path / "mine.yaml").write_text(json.dumps(data))
     with pytest.raises(
-        InputError, match=r"rig\.yaml:1:\d+: arm: expected the chain of a KR10 .*found that of `mine`"
+        InputError, match=r"rig\.yaml:1:\d+: arm: expected the chain of a KR10 .*found the chain of `mine`"
     ):
         rig_with(tmp_path, arm="mine.yaml")
     real = (REPO / "configs/rigs/la-coupole.yaml").read_text().replace("../", f"{REPO}/configs/")

@@ -93,7 +93,7 @@ def test_highlights_and_dark_pixels_are_exposed_as_asked_for() -> None:
     case = case_of(shortest_us=250, longest_us=128000, snr=15, most_exposures=4)
     scene = Scene(case.view, brightest=6.0, dimmest=0.004, seed=3)
     choices, samples = chosen_by(case, scene)
-    assert choices[-1].reason == f"all {len(case.view.leds)} LEDs are exposed as asked for"
+    assert choices[-1].reason == f"all {len(case.view.leds)} LEDs are exposed as requested"
     for led, times_us in times_of(case, samples).items():
         rate = scene.rates[led]
         assert np.mean(rate * times_us[0] >= FULL_DN) <= 2e-3
@@ -113,7 +113,7 @@ def test_one_exposure_is_enough_where_all_is_alike() -> None:
 def test_what_cannot_be_reached_is_said() -> None:
     case = case_of(shortest_us=250, longest_us=2000, snr=100)
     choices, _ = chosen_by(case, Scene(case.view, brightest=0.0, dimmest=0.01, seed=1))
-    assert "LEDs are noisier than asked for" in choices[-1].reason
+    assert "LEDs are noisier than requested" in choices[-1].reason
     assert "the plan allows no more" in choices[-1].reason
 
 

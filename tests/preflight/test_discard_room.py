@@ -51,7 +51,7 @@ def test_what_stays_is_what_is_kept_of_all_views_with_samples_and_fits() -> None
 def test_each_size_says_what_it_includes() -> None:
     words = shown(Report(bytes=9_000_000, peak_bytes=5_000_000, staying_bytes=2_000_000))
     assert re.search(r"all frames, added up +9.0 MB", words), words
-    at_a_time = "5.0 MB: frames of one view, what is kept of all, samples and fits"
+    at_a_time = "5.0 MB: frames of one view, kept frames of all views, samples and fits"
     assert re.search(rf"on disk at a time, at most +{at_a_time}", words), words
     assert re.search(r"stays on disk, at most +2.0 MB: frames that are not discarded, samples and fits", words)
     assert re.search(r"on disk +9.0 MB", shown(Report(bytes=9_000_000)))

@@ -71,7 +71,7 @@ def test_texels_are_the_nearest_whole_number_of_pixels_wide(mm: float | None, si
 
 @pytest.mark.parametrize("mm", [0.0, -0.2, 101.0, float("nan"), float("inf")])
 def test_what_is_no_width_is_refused_also_in_python(mm: float) -> None:
-    with pytest.raises(InputError, match="expected auto, each view's own pixels, or a width"):
+    with pytest.raises(InputError, match=r"expected auto \(each view's own pixels\) or a width"):
         TexelSize(mm)
 
 

@@ -64,7 +64,7 @@ def test_a_run_is_never_shorter_than_its_ideal_and_efficiency_is_their_ratio(cle
 
 def test_json_leaves_standard_error_to_errors(clean: Clean) -> None:
     """And to what whoever waits is told: on a cold or busy machine cell and run compile for seconds."""
-    compiles = ("the simulated cell compiles its code", "compiling what the run will call")
+    compiles = ("the simulated cell compiles its code", "compiling the functions that the run will call")
     assert [line for line in clean.ended.err.splitlines() if not line.startswith(compiles)] == []
 
 

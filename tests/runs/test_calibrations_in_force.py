@@ -82,7 +82,7 @@ def test_a_run_is_not_resumed_with_another_calibration(calibrated: CellFolder) -
 
 def test_a_record_of_another_focus_is_refused(calibrated: CellFolder) -> None:
     write_record(calibrated.folder / "camera.yaml", record("camera", focus_distance_mm=400.0))
-    assert "holds for a focus of 400 mm" in refused(calibrated)
+    assert "is valid for a focus of 400 mm" in refused(calibrated)
 
 
 def test_an_expired_record_is_refused(calibrated: CellFolder) -> None:
@@ -107,7 +107,7 @@ def test_a_record_of_another_camera_is_refused_once_the_camera_is_open(calibrate
     write_record(calibrated.folder / "camera.yaml", record("camera", camera="Other 12"))
     ended = calibrated.acquire()
     assert ended.code == 3
-    assert "camera.yaml: holds for the camera Other 12; this one is" in ended.err
+    assert "camera.yaml: is valid for the camera Other 12; this one is" in ended.err
     assert not list((calibrated.folder / "storage").glob("2*"))
 
 
@@ -115,7 +115,7 @@ def test_a_cell_that_is_warmer_than_its_calibration_is_refused(calibrated: CellF
     write_record(calibrated.folder / "camera.yaml", record("camera", temperature_c=(10.0, 15.0)))
     ended = calibrated.acquire()
     assert ended.code == 3
-    assert "camera.yaml: holds from 10 to 15 C; the cell's coolest LED board has" in ended.err
+    assert "camera.yaml: is valid from 10 to 15 C; the cell's coolest LED board has" in ended.err
 
 
 def test_the_temperature_of_the_room_stands_in_the_journal(calibrated: CellFolder) -> None:

@@ -151,7 +151,7 @@ def test_frames_are_discarded_when_their_samples_are_safe_and_all_commands_under
     assert "--texels: needs the frames of all LEDs" in texels.err
     other = cells.here("acquire", "--resume", run, "--result", tmp_path / "other", "--yes")
     assert other.code == 3
-    assert "no other can be made" in other.err
+    assert "no other result can be made" in other.err
     again = cells.here("reflectance", run, "--out", result)
     assert again.code == 0, again.err
     resume(run)
@@ -334,7 +334,7 @@ def test_a_view_whose_samples_are_damaged_or_gone_is_told_and_nothing_is_made_of
     path = result / "samples/top.h5"
     whole = path.read_bytes()
     spoil(path)
-    for words in ("is not what was proven", "is missing"):
+    for words in ("differs from what was proven", "is missing"):
         ended = cells.here("verify", run)
         assert ended.code == 6, ended.err
         assert words in ended.err

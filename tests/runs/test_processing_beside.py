@@ -255,7 +255,7 @@ def test_what_cannot_be_made_is_refused_before_anything_moves(tmp_path: Path) ->
     ("plan", "words"),
     [
         ({"object": {"id": "nobody"}}, "expected the object's mesh"),
-        ({"gain_db": 6.0}, "holds for a gain of"),
+        ({"gain_db": 6.0}, "is valid for a gain of"),
         ({"lights": {"kind": "panels", "panels": [1]}}, "expected single LEDs"),
     ],
 )
@@ -280,7 +280,7 @@ def test_the_result_of_another_run_is_neither_touched_nor_taken_for_this_ones(tm
     first = {name: path.read_bytes() for name, path in files(tmp_path / "first").items()}
     refused = cell.acquire("--reflectance", "--result", tmp_path / "first")
     assert refused.code == 3, refused.err
-    assert "expected a new folder, or that of this run's result" in refused.err
+    assert "expected a new folder, or the folder of this run's result" in refused.err
     assert cell.acquire().code == 0
     second = sorted((tmp_path / "storage").glob("2*/run.json"))[-1].parent
     refused = cells.here("acquire", "--resume", second, "--result", tmp_path / "first", "--yes")

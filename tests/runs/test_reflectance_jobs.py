@@ -114,5 +114,5 @@ def test_a_frame_that_is_not_the_one_that_was_proven_is_refused(made: Made, tmp_
         data[led, 100, 100] ^= 1
     ended = cells.here("reflectance", run, "--calibrations", RECORDS, "--out", tmp_path / "result")
     assert ended.code == 6
-    assert "top/led0480/e0 is not what was proven" in " ".join(ended.err.split())
+    assert "top/led0480/e0 differs from what was proven" in " ".join(ended.err.split())
     assert not list((tmp_path / "result/samples").glob("top*"))

@@ -66,7 +66,7 @@ def test_powers_for_another_gain_are_refused(tmp_path: Path) -> None:
     assert cell.acquire().code == 0
     ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", tmp_path / "result")
     assert ended.code == 2
-    assert "holds for a gain of 0 dB; the run has 6 dB" in " ".join(ended.err.split())
+    assert "is valid for a gain of 0 dB; the run has 6 dB" in " ".join(ended.err.split())
 
 
 TILE_MM = (-30.0, -40.0)

@@ -145,7 +145,7 @@ def test_the_same_size_again_changes_nothing(detailed: Made, coarse: Made) -> No
 def test_what_is_no_size_is_refused(detailed: Made, tmp_path: Path, size: str) -> None:
     ended = cells.here(*arguments(detailed, tmp_path / "out", size))
     assert ended.code == 2
-    assert "--texels: expected auto, each view's own pixels, or a width" in ended.err
+    assert "--texels: expected auto (each view's own pixels) or a width" in ended.err
     assert not (tmp_path / "out").exists()
 
 
@@ -180,7 +180,7 @@ def test_texels_larger_than_triangles_are_told() -> None:
     lines = list(lines_of(TexelForecast(TexelSize(1.6), (view,), 1.2, 500_000_000, 2_000_000, 75.0), 10**9))
     assert lines[0] == "texels: some 1,900 in 1 view, 4 x 4 pixels each, 1.6 mm on the surface"
     assert lines[1].startswith(
-        "they need some 500.0 MB of memory and 2.0 MB of disk; after the fits of triangles they take 1 min 15 s"
+        "they need about 500.0 MB of memory and 2.0 MB of disk; after the fits of triangles they take 1 min 15 s"
     )
     assert "larger than the mesh's triangles, whose edge is 1.2 mm" in lines[2]
     assert len(list(lines_of(TexelForecast(TexelSize(), (view,), 1.2, 1, 1, 1.0), 1))) == 2
@@ -201,7 +201,7 @@ def test_texels_that_the_disk_cannot_hold_are_refused_before_the_work(
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(total=0, used=0, free=1_000_000))
     ended = cells.here(*arguments(detailed, out, "auto"))
     assert ended.code == 6, ended.err
-    assert re.search(r"texels need some \d\.\d\d GB, and 0\.00 GB are free", " ".join(ended.err.split()))
+    assert re.search(r"texels need about \d\.\d\d GB, and 0\.00 GB are free", " ".join(ended.err.split()))
     assert "of disk; after the fits" in " ".join(ended.out.split()) + " ".join(ended.err.split())
     assert not out.exists()
 

@@ -222,7 +222,7 @@ def test_panels_that_the_box_does_not_have_end_the_run_with_four(tmp_path: Path)
     cell = text_cell(tmp_path, lights={"kind": "panels", "panels": [1]})
     ended = cell.acquire()
     assert ended.code == 4
-    assert "panel 1 was asked for, it has none" in ended.err
+    assert "panel 1 was requested, but the box has none" in ended.err
 
 
 def test_a_template_that_lacks_its_led_is_refused_where_it_stands(cell: CellFolder) -> None:

@@ -117,5 +117,5 @@ def test_targets_of_another_unit_or_place_than_the_mesh_are_refused(
 def test_a_unit_that_contradicts_the_tables_own_is_refused(tmp_path: Path) -> None:
     trimesh.creation.icosphere(subdivisions=2, radius=40.0).export(tmp_path / "m.ply")
     (tmp_path / "t.txt").write_text("# mm\n1 2 3\n")
-    with pytest.raises(InputError, match="the unit in the table is mm, that of --targets-unit m"):
+    with pytest.raises(InputError, match="the unit in the table is mm, the unit of --targets-unit is m"):
         read_scan(tmp_path / "m.ply", tmp_path / "t.txt", targets_unit="m")

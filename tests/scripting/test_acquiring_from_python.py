@@ -141,7 +141,7 @@ def test_a_frame_that_is_not_what_was_proven_is_refused(
     content = path.read_bytes()
     place = content.index(frame.pixels.tobytes())
     path.write_bytes(content[:place] + b"\xff" + content[place + 1 :])
-    with pytest.raises(coupole.errors.ChecksumMismatch, match="is not what was proven"):
+    with pytest.raises(coupole.errors.ChecksumMismatch, match="differs from what was proven"):
         np.asarray(frame)
     path.write_bytes(content)
 

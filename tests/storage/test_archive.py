@@ -304,13 +304,13 @@ def test_a_frame_that_changed_on_the_disk_is_not_archived(made: MadeRun) -> None
     path, slot = made.run.view_path("top"), made.run.proven()[ShotId.parse("top/led0001/e0")].index
     layout = frame_file.read_layout(path)
     flip_byte(path, layout.data_offset + slot * layout.frame_bytes + 777)
-    archive_is_refused(made, "top/led0001/e0 is not what was proven")
+    archive_is_refused(made, "top/led0001/e0 differs from what was proven")
 
 
 def test_a_record_that_contradicts_the_journal_is_not_archived(made: MadeRun) -> None:
     path, slot = made.run.view_path("top"), made.run.proven()[ShotId.parse("top/led0001/e0")].index
     flip_byte(path, frame_file.read_layout(path).table_offset + slot * frame_file.FRAME_DTYPE.itemsize + 12)
-    archive_is_refused(made, f"slot {slot} is not recorded as top/led0001/e0")
+    archive_is_refused(made, f"slot {slot} should be recorded as top/led0001/e0")
 
 
 def test_an_archive_that_does_not_read_back_does_not_replace_the_file(made: MadeRun) -> None:

@@ -127,8 +127,7 @@ class ArmPaths:
         job = self._jobs[key]
         if self._job is not None and not np.array_equal(job.shape.corners_mm, self._job.shape.corners_mm):
             raise InputError(
-                f"{plan}: its object, or the object's place, differs from that of the plan with which the bench "
-                "was begun"
+                f"{plan}: its object, or the object's place, differs from the plan with which the bench was begun"
             )
         return job
 

@@ -72,7 +72,7 @@ class DriveAsked(_Request):
 class StopAsked(_Request):
     command: Literal["stop"]
     why: Annotated[str, Field(max_length=400)] = ""
-    """The reason, in words, for whoever asked for the work that is stopped."""
+    """The reason, in words, for the process that requested the work that is stopped."""
 
 
 class JogAsked(_Request):
@@ -82,7 +82,7 @@ class JogAsked(_Request):
     share: Annotated[float, Field(ge=0.01, le=1)] = 0.4
     """Share of reduced speed, 250 mm/s."""
     hold: int | None = None
-    """The number that the first answer gave. A request without it counts as a new press of the button."""
+    """The number in the first answer. A request without it counts as a new press of the button."""
     at: Annotated[str, Field(alias="from")]
     """Origin of the request: an address in the rig's `console: at_the_cell:`."""
 

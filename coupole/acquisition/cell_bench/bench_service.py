@@ -156,7 +156,7 @@ class BenchService:
 
     def _refuse_while_metering(self) -> None:
         if (work := self.works.running) is not None and work.kind == "meter":
-            raise InputError("box and camera are metering; stop it or let it end")
+            raise InputError("box and camera are metering; stop the metering or let it end")
 
     def _begin_metering(self, asked: MeterAsked, stops: int, asking_pid: int) -> dict[str, Any]:
         small = metering_job(self._arm.job_of(Path(asked.plan)))
@@ -273,7 +273,7 @@ def serve_bench(
             if service.is_spent:
                 raise DeviceError(
                     "cell",
-                    expected="a metering that ends as it should",
+                    expected="a metering that ends normally",
                     happened=service.works.last.figures()["why"] if service.works.last else "it failed",
                     remedy="The cell was made safe; begin the bench again.",
                 )

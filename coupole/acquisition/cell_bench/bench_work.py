@@ -37,8 +37,8 @@ class Work:
         self._thread.start()
 
     def stop(self, why: str = "") -> None:
-        """Stop the work. Returns at once; nothing new is moved or lit after this. The first `why` is told to
-        whoever asked for the work."""
+        """Stop the work. Returns at once; nothing new is moved or lit after this. The first `why` is reported to
+        the process that requested the work."""
         self._lost = self._lost or why
         self.control.stop_by(signal.SIGINT)
 

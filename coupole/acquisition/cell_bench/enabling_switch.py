@@ -29,7 +29,7 @@ class EnablingSwitch:
     """The switch of one cell, if it has one."""
 
     def __init__(self, box: LedBox, *, must_exist: bool) -> None:
-        """`must_exist`: the rig says that the box has an input for one."""
+        """`must_exist`: the rig says that the box has an input for a switch."""
         self._box, self._must_exist = box, must_exist
         self.exists = box.presence() is not None
 

@@ -134,7 +134,8 @@ def stopping(bench: Bench) -> None:
             return
         bench.go_to(home_deg)
     findings.remarks.append(
-        "at the greatest speeds of this session, the arm turned until it stopped by at most the angle of "
+        "at the greatest speeds of this session, the arm turned before it stopped by at most the angle that it "
+        "covers in "
         f"{1e3 * max(delays_s):.0f} ms at full speed; stops from the speeds of plans are not measured, because "
         "these exceed 250 mm/s"
     )

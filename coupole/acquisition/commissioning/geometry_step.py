@@ -87,12 +87,13 @@ def _measure_bodies(bench: Bench) -> None:
     for name, question, rig_mm in (
         (
             "tool_reach_mm",
-            "from the flange's face to the foremost point of what it carries, along its axis",
+            "along the flange's axis, from its face to the foremost point of everything that it carries",
             reach_mm,
         ),
         (
             "tool_width_mm",
-            "from the flange's axis to the outermost point of what it carries, square to it",
+            "at right angles to the flange's axis, from this axis to the outermost point of everything that it "
+            "carries",
             width_mm,
         ),
     ):
@@ -178,7 +179,7 @@ def _sight(bench: Bench, board: Board, place_mm: Floats) -> None:
     start = sights[0].support_from_camera @ camera_from_board
     deviation = deviations(sights, intrinsics, middle_mm, place_mm, start)
     findings.remarks.append(
-        f"{len(sights)} sights; the board is seen {deviation.height_mm:+.1f} mm above where the rig has it, "
+        f"{len(sights)} sights; the board is seen {deviation.height_mm:+.1f} mm above its place in the rig, "
         f"{deviation.sideways_mm:.1f} mm aside, tilted by {deviation.tilt_deg:.1f} deg; the sights disagree by "
         f"{deviation.disagreement_mm:.1f} mm"
     )

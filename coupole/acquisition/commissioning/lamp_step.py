@@ -17,7 +17,7 @@ from coupole.plan.led_table import LedTable
 _LEAST_SPREAD = 0.05
 """Smallest singular value of the visible normals, as a share of the largest. Below it the object is too flat."""
 _LEAST_SIGNAL_SIGMA, _LEAST_SIGNAL_SHARE = 8.0, 0.01
-"""Least signal of a picture, that is, its mean minus that of its dark frame. The first limit is in standard
+"""Least signal of a picture, that is, its mean minus the mean of its dark frame. The first limit is in standard
 deviations of that mean, the second is a share of the median LED's signal."""
 _LEAST_CURRENT_SHARE = 0.5
 _MOST_PIXELS = 4000

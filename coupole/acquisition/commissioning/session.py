@@ -155,7 +155,8 @@ def _record_so_far(cell: Cell, console: Console) -> CommissioningRecord:
     if (record.rig, record.simulated) != (cell.rig.name, is_simulated):
         kind = "simulated" if record.simulated else "real"
         raise InputError(
-            f"{record_path(cell)}: is of the {kind} cell {record.rig}; expected that of {cell.rig.name}. Give "
+            f"{record_path(cell)}: is the record of the {kind} cell {record.rig}; expected the record "
+            f"of {cell.rig.name}. Give "
             "each cell its own `storage: state:`, or move the file away"
         )
     return record

@@ -278,7 +278,7 @@ class _Series:
     changes: Sequence[Change]
     first: Mapping[int, FrameLook]
     is_since_earlier: bool
-    """True if the first frames are those of an earlier session: the arm has left the view meanwhile, and come
+    """True if the first frames come from an earlier session: the arm has left the view meanwhile, and come
     back."""
 
     def finding(
@@ -319,8 +319,8 @@ def _led_of(label: ShotLabel) -> int:
 
 
 def _lasting(is_over: NDArray[np.bool_]) -> int | None:
-    """Return the first value of those at the end that are all over the limit; None if the last value is not over
-    it."""
+    """Return the first of the last values that are all above the limit; None if the last value is not above the
+    limit."""
     if not len(is_over) or not is_over[-1]:
         return None
     within = np.flatnonzero(~is_over)

@@ -1,8 +1,8 @@
-"""Compares each frame with those of the neighbouring LEDs, to find an LED that is much too dim or bright.
+"""Compares each frame with the frames of the neighbouring LEDs, to find an LED that is much too dim or bright.
 
-A picture changes steadily with the direction of its light. So the picture under each LED is predicted from those
-of its nearest neighbours. The prediction is a weighted linear fit over directions, in units of the light that the
-LED table gives each LED. The view itself shows how good the prediction is: its scatter sets the limits.
+A picture changes steadily with the direction of its light. So the picture under each LED is predicted from the
+pictures of its nearest neighbours. The prediction is a weighted linear fit over directions, in units of the light
+that the LED table gives each LED. The view itself shows how good the prediction is: its scatter sets the limits.
 """
 
 from __future__ import annotations

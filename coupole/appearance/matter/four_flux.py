@@ -25,7 +25,7 @@ from coupole.appearance.matter.kubelka_munk import decay
 from coupole.appearance.spectra.grid import Array, within
 
 _LEAST_X = 1e-5
-"""x = bSh is not smaller than this: a layer without absorption of diffuse light gets a very small one. The results
+"""Least value of x = bSh: a layer without absorption of diffuse light gets a very small absorption. The results
 depend on x^2, so the error is 1e-10. This is as large as the rounding error of the differences divided by x."""
 
 

@@ -74,7 +74,7 @@ class Face:
         if wrong.any():
             low, high = (np.broadcast_to(v, internal.shape)[wrong][0] for v in (self.gloss, self.brightest))
             raise InputError(
-                f"a paint under this face is seen with a reflectance of {low:.3g} to {high:.3g}; found "
+                f"seen through this face, a paint has a reflectance of {low:.3g} to {high:.3g}; found "
                 f"{np.asarray(measured_reflectance.values)[wrong][0]:.3g}, which would be below 0 or above 1 "
                 f"inside the binder: check whether gloss is included, and whether the sample has a glossy face"
             )

@@ -127,9 +127,9 @@ def _facets(roughness: float) -> Array:
     """[angles, angles]: row i has the share of the light from angle i that GGX facets reflect, by local angle at
     the facet.
 
-    The product of this table with a sheet's reflectances gives those of the rough sheet. Facets are weighted by
-    their visible area (Heitz, "Sampling the GGX distribution of visible normals", JCGT 7(4), 2018). They are taken
-    at Gauss points of a disk, each weighted with the shadowing G2/G1 of the reflected direction.
+    The product of this table with a sheet's reflectances gives the reflectances of the rough sheet. Facets are
+    weighted by their visible area (Heitz, "Sampling the GGX distribution of visible normals", JCGT 7(4), 2018).
+    They are taken at Gauss points of a disk, each weighted with the shadowing G2/G1 of the reflected direction.
     """
     alpha = max(roughness, brdf.LEAST_ROUGHNESS)
     radius2, weight = np.polynomial.legendre.leggauss(_FACETS)

@@ -111,8 +111,8 @@ def settle_flakes(all_flakes: Flakes, tops_mm: Array, frames: Array) -> Flakes:
     """Return the same flakes, each with its depth and tilt, under a place [n, 3] of another surface.
 
     The third columns of `frames` [n, 3, 3] are the surface's outward normals at these places. A flake stays flat
-    even where the surface is curved. So it deviates from the surface by its radius squared over twice the
-    surface's radius.
+    even where the surface is curved. So the flake deviates from the surface by its radius squared, divided by
+    twice the surface's radius.
     """
     centres = tops_mm + all_flakes.centres_mm[:, 2:] * frames[:, :, 2]
     return replace(all_flakes, centres_mm=centres, slab_from_flake=frames @ all_flakes.slab_from_flake)

@@ -10,7 +10,7 @@ The head is YAML in lines that begin with `#`. Below it are comma-separated colu
     400,3.127,21.04,0.11,0.52
 
 `unit` is `per mm`, `per layer` (the thickness was not known) or `relative` (to the scattering of a white). `u_K`
-and `u_S` are standard uncertainties. They may be left out, and so may all other columns.
+and `u_S` are standard uncertainties. These two columns, and all other columns, may be left out.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class PaintFile:
     head_lines: Mapping[str, Any] = field(default_factory=dict)
     """Other lines of the head, about the measurement."""
     other: Mapping[str, Array] = field(default_factory=dict)
-    """Further columns [n], such as those of four fluxes."""
+    """Further columns [n], such as the columns of four fluxes."""
 
     def on_grid(self) -> Pigment:
         """Return the paint as a pigment on 380 to 780 nm, linear between its wavelengths and constant beyond its
@@ -132,7 +132,7 @@ def read_paint(path: Path) -> PaintFile:
 
 
 def _head(text: str, path: Path) -> tuple[dict[str, Any], int, list[str]]:
-    """Return the head, the number of the line of names, and the lines from that one on."""
+    """Return the head, the number of the line of names, and all lines from this line on."""
     lines = text.splitlines()
     end = next((at for at, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
     head_text = "\n".join(line[1:].strip(" ") for line in lines[1:end])

@@ -74,7 +74,8 @@ class RglTable:
         return len(self.phi_i) <= _ISOTROPIC
 
     def seen_with(self, weights: Array) -> RglTable:
-        """Return the same table with other channels: sums of its own, weighted by `weights` [new, channels]."""
+        """Return the same table with other channels: sums of its own channels, weighted by `weights` [new,
+        channels]."""
         return replace(self, values=np.asarray(self.values @ weights.T, np.float32), wavelengths_nm=None)
 
     def _looked_up(self, wi: Array, wo: Array) -> Array:
@@ -101,8 +102,8 @@ class RglTable:
         return np.asarray(np.maximum(values, 0.0) / cosine)
 
     def _in_the_measured_part(self, wi: Array, wo: Array) -> tuple[Array, Array]:
-        """Return directions that are turned or mirrored into the measured range of incidence, if that is a half or
-        a quarter of all azimuths."""
+        """Return directions that are turned or mirrored into the measured range of incidence, if this range is a
+        half or a quarter of all azimuths."""
         if self.isotropic:
             return wi, wo
         parts = round(2.0 * np.pi / float(self.phi_i[-1] - self.phi_i[0]))
@@ -243,7 +244,7 @@ def _fields(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]:
 
 
 def _elevation(ways: Array) -> Array:
-    """[n] angles between unit directions [n, 3] and the normal, exact near it."""
+    """[n] angles between unit directions [n, 3] and the normal, exact near the normal."""
     chord = np.sqrt(ways[:, 0] ** 2 + ways[:, 1] ** 2 + (ways[:, 2] - 1.0) ** 2)
     return np.asarray(2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0)))
 

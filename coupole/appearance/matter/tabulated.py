@@ -42,7 +42,7 @@ class SpecularTable:
 
 
 def tabulate(source: Brdf, incidence_deg: Array, *, theta_nodes: int = 40, phi_nodes: int = 7) -> SpecularTable:
-    """The table of `source`, a BRDF or a measurement of one, at angles of incidence (increasing, below 90)."""
+    """The table of `source`, a BRDF or a measured BRDF, at angles of incidence (increasing, below 90)."""
     incidence = np.deg2rad(np.atleast_1d(np.asarray(incidence_deg, dtype=float)))
     if np.any(np.diff(incidence) <= 0.0) or incidence[0] < 0.0 or incidence[-1] >= 0.5 * np.pi:
         raise InputError(

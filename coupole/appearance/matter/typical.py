@@ -55,7 +55,7 @@ FORMER_NAMES = {
     "malachite": "green_shape",
     "green earth": "dull_green_shape",
 }
-"""Names of pigments that these shapes had formerly; scene files may still use them."""
+"""Former names of these shapes, which were names of pigments; scene files may still use them."""
 
 
 def reflectance(name: str) -> InternalReflectance:

@@ -31,7 +31,7 @@ def read_index(path: Path) -> Complex:
     """n + i k [81]; k is 0 where the file has none. Between the lines of the file, values are linear in the
     wavelength.
 
-    Raises InputError, with file and line if there is one, also if 380 to 780 nm are not covered.
+    Raises InputError with the file and, if possible, the line; also if the file does not cover 380 to 780 nm.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")

@@ -22,8 +22,8 @@ from coupole.appearance.shapes.triangles import weld_corners
 from coupole.errors import InputError
 
 Filter = float | Literal["circular"]
-"""Angle in degrees of a polariser before the lens, from the picture's horizontal towards up; or one that passes
-right-handed circular light."""
+"""Angle in degrees of a polariser before the lens, from the picture's horizontal towards up; or a polariser that
+passes right-handed circular light."""
 _BLACK = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.0))
 _BALL_PARTS = 64
 """Number of parts n into which edges of a weathered ball are divided; the ball has 20 n^2 triangles."""

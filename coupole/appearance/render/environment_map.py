@@ -114,7 +114,7 @@ def level_irradiance(radiance: Array) -> float:
 
 
 def factor(source: EnvironmentMap, folder: Path, step_nm: StepNm) -> Array:
-    """[81] factors of the map's light relative to its rendered light, which has white D65. Raises InputError."""
+    """[81] factors from the light as it is rendered, with white D65, to the map's own light. Raises InputError."""
     white = around_nodes(power(source.spectrum, folder), step_nm)
     if not np.all(white > 0.0):
         raise InputError(

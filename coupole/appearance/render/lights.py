@@ -54,8 +54,8 @@ class Distant(Model):
         height_deg = float(np.degrees(np.arcsin(-unit(self.direction)[2])))
         if isinstance(self.spectrum, LowSun) and abs(height_deg - self.spectrum.elevation_deg) > _SAME_HEIGHT_DEG:
             raise ValueError(
-                f"light comes from {height_deg:.1f} degrees high, and its spectrum is that of a sun "
-                f"{self.spectrum.elevation_deg:g} degrees high: give both the same height, or take a light "
+                f"light comes from a height of {height_deg:.1f} degrees, but its spectrum belongs to a sun at "
+                f"{self.spectrum.elevation_deg:g} degrees: give both the same height, or take a light "
                 "of kind `daylight`"
             )
         return self

@@ -105,8 +105,8 @@ class MakieTile(Pose):
 class NashijiSlab(Pose):
     """Gold flakes in clear lacquer over black (seed 002, section 5); x and y go from 0 to the slab's size.
 
-    Rays are refracted at the lacquer's face, which also reflects the lights. They are absorbed along their paths
-    through the lacquer, and hit the flakes at their positions.
+    Rays are refracted at the lacquer's face, which also reflects the lights. The rays are absorbed along their
+    paths through the lacquer, and hit the flakes at their positions.
     """
 
     kind: Literal["nashiji_slab"]

@@ -104,8 +104,9 @@ def passage(pane: Pane, folder: Path) -> Array:
     most = float(sheet(np.ones(1), _face(pane))[1][0])
     if through.min() < 0.0 or through.max() > most + 0.01:
         raise InputError(
-            f"{path}: expected transmittances from 0 to {most:.3f}, that of clear glass of index {pane.index:g}, "
-            f"found {through.min():.3g} to {through.max():.3g}; give those of the whole sheet"
+            f"{path}: expected transmittances from 0 to {most:.3f}, the transmittance of clear glass "
+            f"of index {pane.index:g}, "
+            f"found {through.min():.3g} to {through.max():.3g}; give the transmittances of the whole sheet"
         )
     return _inside(np.clip(through, 0.0, most), _face(pane))
 

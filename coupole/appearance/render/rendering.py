@@ -25,7 +25,8 @@ _LOOKS, _LEAST_LOOKS = 128, 4
 """Number of passes after which the noise of a picture with a noise limit is checked, and least number before its
 noise is known."""
 _PATHS_PER_PASS = 4_000_000
-"""Number of paths in a pass. It limits a pass to seconds, because Mitsuba cannot be interrupted within a pass."""
+"""Number of paths in a pass. This limits a pass to seconds, because Mitsuba cannot be interrupted within a
+pass."""
 
 
 @dataclass(frozen=True)

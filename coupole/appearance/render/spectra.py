@@ -162,8 +162,8 @@ def internal(spectrum: Reflectance, folder: Path, index: ArrayLike) -> InternalR
 
 
 def coefficients(paint: MeasuredPaint, folder: Path, *, needs_mm: bool) -> Pigment:
-    """Return K and S [81], constant beyond the file's ends. Raises InputError, also if they must be per mm and are
-    not."""
+    """Return K and S [81], constant beyond the file's ends. Raises InputError, also if K and S must be per mm and
+    are not."""
     paint_file = read_paint(folder / paint.path)
     if needs_mm and paint_file.unit != "per mm":
         raise InputError(

@@ -31,7 +31,8 @@ def load_scene(mi: Any, description: Any) -> Any:
 
 
 def import_extra(name: str, extra: str = "mitsuba,materials") -> Any:
-    """Import an optional module. Raises InputError, with the extra that has it, if it is not installed."""
+    """Import an optional module. If the module is not installed, raises InputError that names the extra with
+    it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:

@@ -42,7 +42,7 @@ _BLOCK_VALUES = 4_000_000
 
 @dataclass(frozen=True)
 class CubeOptions:
-    """The user's words about a cube; they precede those of its header."""
+    """The user's words about a cube; they take precedence over its header's."""
 
     scale: float | None = None
     """Number in the file that is a reflectance of 1."""
@@ -133,7 +133,7 @@ def is_cube(path: Path) -> bool:
 
 
 def open_cube(path: Path, options: CubeOptions | None = None) -> Cube:
-    """Read a cube's header, by its path or that of the binary file, and find the binary file.
+    """Read a cube's header, given its path or the binary file's, and find the binary file.
 
     Raises InputError, with file and line, for headers that do not state what is needed.
     """
@@ -253,7 +253,8 @@ class _Fields:
         raise self.wrong(name, f"expected a number, found {self.word(name)!r}")
 
     def ignore_value(self, dtype: np.dtype[Any]) -> np.generic | None:
-        """The value of pixels without data, as the file has it; None if no value of its type is it."""
+        """The value of pixels without data, as the file has it; None if the file's type of number cannot express
+        it."""
         number = self.number("data ignore value", np.nan)
         with np.errstate(over="ignore"):
             if np.isfinite(number) and (dtype.kind == "f" or (
@@ -327,8 +328,8 @@ class _Fields:
         return nm
 
     def good_bands(self, bands: int) -> NDArray[np.bool_]:
-        """[bands] True for bands that the list of bad bands does not exclude. Raises InputError if two of the same
-        wavelength remain, or fewer than three."""
+        """[bands] True for bands that the list of bad bands does not exclude. Raises InputError if two bands of
+        the same wavelength remain, or fewer than three bands."""
         words = self.values.get("bbl")
         good = np.ones(bands, bool)
         if words is not None:

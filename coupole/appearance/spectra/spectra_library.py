@@ -45,7 +45,7 @@ class LibrarySpectrum:
     negative or S is not positive.
     """
     absorption: Array | None = None
-    """K [n] in the file's unit, which S has too; None if reflectance was measured."""
+    """K [n] in the file's unit, which is also the unit of S; None if reflectance was measured."""
     scattering: Array | None = None
 
 

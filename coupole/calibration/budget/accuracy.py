@@ -1,4 +1,4 @@
-"""The accuracies of seed 003 beside those from calibration records, for one cell or several.
+"""The accuracies of seed 003 beside the accuracies from calibration records, for one cell or several.
 
 Our figures are computed from records: standard uncertainties, all directions together. The paper does not state
 the coverage of its figures.

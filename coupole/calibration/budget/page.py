@@ -1,4 +1,5 @@
-"""The uncertainty budget as a page: result, dominant sources, accuracies beside those of the paper, all inputs."""
+"""The uncertainty budget as a page: result, dominant sources, accuracies beside the paper's accuracies, all
+inputs."""
 
 from __future__ import annotations
 
@@ -42,7 +43,7 @@ def page(
                     "Accuracies beside the paper's",
                     tables=[_accuracies(cases, accuracies)],
                     notes=[
-                        "Standard uncertainties, all directions together; samples over a dome: their 68 % "
+                        "Standard uncertainties, all directions together; for samples over a dome, their 68 % "
                         "intervals."
                     ],
                 ),

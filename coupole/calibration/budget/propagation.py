@@ -296,8 +296,8 @@ def draw(
 
 
 def _sorted_values(values: Floats, *, infinite: float = 0.0) -> Floats:
-    """Return the sorted values. Raises InputError if more than the share `infinite` of them is infinite, or if one
-    is NaN."""
+    """Return the sorted values. Raises InputError if more than the share `infinite` of the values is infinite, or
+    if one value is NaN."""
     if np.isnan(values).any() or float(np.mean(np.isinf(values))) > infinite:
         raise InputError(
             f"budget: {np.mean(~np.isfinite(values)):.2%} of the trials give no finite value: an input's "

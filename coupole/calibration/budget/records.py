@@ -102,7 +102,7 @@ def known_from(items: Sequence[InForce], start: Known) -> Known:
         sources += [(group, _display_name(item.record)) for group in statement.sources]
     if {"leds", "mesh"} <= kinds:
         # No record keeps the share of the hand-eye's error in LEDs and mesh, so they count as independent. A tenth
-        # of a millimetre between LED and mesh, which is more than that share, changes an irradiance by 0.02 %.
+        # of a millimetre between LED and mesh, which is more than this share, changes an irradiance by 0.02 %.
         changes["robot_mm"] = 0.0
     return replace(start, **changes, sources=tuple(sources))
 
@@ -229,7 +229,7 @@ _KINDS = ", ".join(kind for kind in get_args(Kind) if reader_of(kind))
 
 
 def camera_reach_mm(record: Record) -> float:
-    """Return the distance from the middle of the flange to that of the camera."""
+    """Return the distance from the middle of the flange to the middle of the camera."""
     return float(np.linalg.norm(record.transforms[_SEEN_FROM_HAND_EYE].translation_mm))
 
 

@@ -60,7 +60,7 @@ def _link(digest: str, item: InForce, records_by_digest: dict[str, InForce]) -> 
 
 
 def _gaps(item: InForce, records_by_digest: dict[str, InForce]) -> list[str]:
-    """Return gaps in a record's chain: its own gaps, and those of all records that it was made from."""
+    """Return gaps in a record's chain: its own gaps, and the gaps of all records from which it was made."""
     record = item.record
     name = f"{record.kind} {record.name}"
     made_from = [records_by_digest[line.sha256] for line in record.inputs if line.sha256 in records_by_digest]

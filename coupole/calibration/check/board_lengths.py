@@ -120,9 +120,9 @@ def lengths_of(position: Position, board: Board, noise: Noise) -> Lengths:
 
 
 def _own_u_mm(board: Board, lengths_mm: Floats) -> Floats:
-    """Return the uncertainty of certified lengths without that of the scale. If a surface lies between two planes
-    at a distance f, a chord is shorter by at most 8 f^2 / (3 L). This counts as the half width of a rectangular
-    distribution."""
+    """Return the uncertainty of certified lengths without the uncertainty of the scale. If a surface lies between
+    two planes at a distance f, a chord is shorter by at most 8 f^2 / (3 L). This counts as the half width of a
+    rectangular distribution."""
     artefact = board.artefact
     u_corner = 0.0 if artefact is None or artefact.corner_um is None else 1e-3 * artefact.corner_um.u
     flat = 0.0 if artefact is None or artefact.flatness_um is None else 1e-3 * artefact.flatness_um.value

@@ -53,7 +53,7 @@ class Pictures:
 
 
 def records_in_force(paths: Sequence[Path]) -> tuple[InForce, ...]:
-    """Return all records except those of other checks."""
+    """Return all records except the records of other checks."""
     return tuple(item for item in read_in_force(paths) if item.record.kind != "artefact-check")
 
 
@@ -72,8 +72,8 @@ def records_by_kind(items: Sequence[InForce], kinds: Sequence[Kind]) -> dict[Kin
 
 
 def refuse_dependent(artefact: Artefact | None, path: Path, items: Sequence[InForce]) -> Artefact:
-    """Return the artefact of a description. Raises InputError if it has no certificate, or if it was used in a fit
-    of the records."""
+    """Return the artefact of a description. Raises InputError if the artefact has no certificate, or if it was
+    used in a fit of the records."""
     if artefact is None or artefact.certificate is None:
         raise InputError(
             f"{path}: a check needs the artefact's identity and certificate: expected a block `artefact` with "
@@ -144,7 +144,7 @@ def compare_lengths(
     together = together + u_scale**2 + np.diag(certified_own)
     names = [f"length_error_ppm.{part.position}" for part in position_lengths]
     ratios = ", ".join(f"{part.position} {part.residual_ratio:.2f}" for part in position_lengths)
-    remark = f"residuals of corners over the record's noise: {ratios}"
+    remark = f"residuals of corners divided by the record's noise: {ratios}"
     return _check_of(comparisons, names, 1e6 * errors, 1e12 * together, (remark,))
 
 
@@ -171,7 +171,7 @@ def compare_reflectances(tile: MeasuredTile) -> Checked:
     errors = np.log(tile.reflectance / tile.certified_reflectance).ravel()
     u_certified = (tile.u_certified / tile.certified_reflectance).ravel()
     names = [f"ln_reflectance_error.{place}.{channel}" for place in tile.places for channel in tile.channels]
-    remark = f"residuals of readings over their noise: {tile.residual_ratio:.2f}"
+    remark = f"residuals of readings divided by their noise: {tile.residual_ratio:.2f}"
     return _check_of(comparisons, names, errors, tile.covariance + np.outer(u_certified, u_certified), (remark,))
 
 

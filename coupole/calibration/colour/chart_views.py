@@ -108,7 +108,7 @@ class ChartReader:
         if not is_solved or camera_from_chart[2, 2] > 0.0:
             raise InputError(
                 "--corners: expected the middles of the top left, top right, bottom right and bottom left patch, "
-                "clockwise on the chart; these show its back"
+                "clockwise on the chart; these points show the chart's back"
             )
         return np.asarray(self._frames.lit[0].base_from_camera @ camera_from_chart)
 

@@ -3,9 +3,9 @@ under D50.
 
 There are two forms: a matrix [3, 3], and a root-polynomial of degree 2 (Finlayson, Mackiewicz and Hurlbert, Color
 correction using root-polynomial regression, IEEE Trans. Image Processing 24, 2015). Its terms r, g, b, sqrt(rg),
-sqrt(rb), sqrt(gb) scale with the exposure, like those of a matrix. Both forms keep white exactly. First they are
-found by least squares in XYZ, weighted by the slope of L*. Then the sum of squares of CIEDE2000 is minimised, with
-a weak prior at the first solution.
+sqrt(rb), sqrt(gb) scale with the exposure, like the terms of a matrix. Both forms keep white exactly. First they
+are found by least squares in XYZ, weighted by the slope of L*. Then the sum of squares of CIEDE2000 is minimised,
+with a weak prior at the first solution.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ def better(matrix: LeftOut, roots: LeftOut) -> Form:
 
 def covariance_of(patch_signals: Balanced, profile: Profile) -> tuple[Floats, Floats, Floats]:
     """Return covariances [3 terms, 3 terms] of the coefficients, row by row. The first is from the noise of
-    signals, the second from the patches' own uncertainty, and the third from that of the light.
+    signals, the second from the patches' own uncertainty, and the third from the uncertainty of the light.
 
     Let J and K be the derivatives of the misses with respect to the coefficients and to the data. Then dm =
     -(J'J)^-1 J'K dd (the implicit function theorem on the normal equations, with Gauss and Newton's
@@ -246,7 +246,7 @@ Parts = Callable[[Floats, Floats, Floats], Floats]
 def _by_noise(
     patch_signals: Balanced, profile: Profile, balanced_channels: Floats, parts: Parts, free: Floats, lab: Floats
 ) -> Sequence[Floats]:
-    """Return changes of the misses by one standard uncertainty of each signal. They include the change of the
+    """Return changes of the errors by one standard uncertainty of each signal. They include the change of the
     balance."""
     columns = []
     grey = list(patch_signals.neutral)

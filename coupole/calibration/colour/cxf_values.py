@@ -4,7 +4,7 @@ them.
 A patch is an object with a name. i1Profiler numbers its objects instead (`M1_Measurement12`) and gives their row
 and column: such patches are named A1, A2, ... by their place. The reflectance spectrum of a patch is preferred.
 Its wavelengths follow from the first one (of the spectrum, or of its colour specification) and from the increment
-of the specification. Without spectra, L*a*b* or XYZ is taken, under D50 for the 1931 observer alone. A file may
+of the specification. Without spectra, L*a*b* or XYZ is taken, only under D50 for the 1931 observer. A file may
 hold each patch several times, once for each condition of measurement (ISO 13655: M0, M1, M2). The type of the
 objects says which of them are used.
 """
@@ -34,7 +34,7 @@ _LEAST_BANDS = 10
 
 
 def read_cxf_values(path: Path, unit: Unit = "auto", object_type: str | None = None) -> ChartValues:
-    """Return the colours of the named objects; of only one type, if it is given.
+    """Return the colours of the named objects; if a type is given, only of objects of this type.
 
     Raises InputError if the file is not CxF3, a patch occurs twice, spectra have no wavelengths, or colours are
     missing or under another light.

@@ -58,7 +58,7 @@ def draw_colour(
     axes[1, 0].axhline(0.0, color=GREY)
     axes[1, 0].plot(known_chart.lab[grey, 0], (lab - known_chart.lab)[grey, 0], "o-", color=BLUE)
     axes[1, 0].set(
-        title="Tone: greys by the profile minus those of the chart", xlabel="L*", ylabel="difference of L*"
+        title="Tone: greys by the profile minus greys of the chart", xlabel="L*", ylabel="difference of L*"
     )
     if shown_chart is not None:
         _draw_chart(axes[1, 1], shown_chart)

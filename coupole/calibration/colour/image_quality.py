@@ -142,7 +142,8 @@ def edges_of(picture: ChartPicture, names: Sequence[str]) -> dict[str, tuple[Sla
 
 
 def edge_figures(edges: Mapping[str, Sequence[SlantedEdge]]) -> list[Figure]:
-    """Return the sharpness in green, which is that of the worst edge, and the largest shift between colours."""
+    """Return the sharpness in green, which is the sharpness of the worst edge, and the largest shift between
+    colours."""
     green = [colours[1] for colours in edges.values()]
     shifts = [abs(_shift(colours[k], colours[1])) for colours in edges.values() for k in (0, 2)]
     mtf50, mtf10 = (min(min(edge.frequency_at(share), 1.0) for edge in green) for share in (0.5, 0.1))

@@ -186,7 +186,7 @@ def _refuse_curved(view: _ChartView, known_chart: KnownChart) -> None:
 
 
 def _refuse_tints(views: Sequence[_ChartView], known_chart: KnownChart, remarks: list[str]) -> None:
-    """Raise InputError if the light's colour differs between pictures: a profile holds for one light."""
+    """Raise InputError if the light's colour differs between pictures: a profile is valid for one light."""
     grey = list(known_chart.neutral)
     tints = []
     for view in views:
@@ -195,7 +195,7 @@ def _refuse_tints(views: Sequence[_ChartView], known_chart: KnownChart, remarks:
         tints.append(white)
     apart = np.abs(np.array(tints) / tints[0] - 1.0).max(axis=1)
     worst = int(np.argmax(apart))
-    words = f"{views[worst].picture.name}: its light differs in colour from that of {views[0].picture.name}"
+    words = f"{views[worst].picture.name}: its light differs in colour from the light of {views[0].picture.name}"
     if apart[worst] > _TINT_REFUSED:
         raise InputError(
             f"{words} by {apart[worst]:.0%}; a profile is valid for one light: calibrate for each light separately"

@@ -225,8 +225,8 @@ def _solution(
     """Return the covariances from `equations`, and the noise from the residuals of the accepted spots [k] at
     `state`.
 
-    The freedom that the spots use is not summed over them: all parameters together are as many as the traces of
-    the spots' and the priors' parts, and those of the priors need the diagonal blocks alone.
+    The degrees of freedom that the spots use are not summed over the spots: the traces of the spots' and the
+    priors' parts add up to the number of parameters, and the traces of the priors need only the diagonal blocks.
     """
     shared_covariance = equations.shared_covariance
     own_covariances: list[Floats] = []

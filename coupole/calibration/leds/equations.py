@@ -32,8 +32,8 @@ class Stated:
     robot_mm: float = 0.03
     robot_deg: float = 0.003
     table_mm: float = 10.0
-    """Prior deviation of boards from their table. It is so wide that it matters only for a board that was not
-    seen."""
+    """Prior deviation of boards from their table. The deviation is so large that the prior matters only for a
+    board that was not seen."""
     table_deg: float = 2.0
     side_mm: float = 7.0
     """Side of an LED."""

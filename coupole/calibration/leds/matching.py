@@ -29,7 +29,8 @@ _RIGID_MM = 5.0
 """Points that fit a board's layout within this distance are taken for this board, with its LEDs in the right
 order."""
 _MOST_TURN_DEG = 60.0
-"""A board of 2 x 3 LEDs rotated by 180 degrees looks like one that is wired backwards, which is more likely."""
+"""A board of 2 x 3 LEDs rotated by 180 degrees looks like a board that is wired backwards; wrong wiring is more
+likely."""
 
 
 @dataclass(frozen=True)
@@ -234,7 +235,7 @@ def _places(
         rows = np.flatnonzero(here == place)
         leds = tuple(int(ids[row]) for row in rows)
         text = (
-            f"LEDs {' and '.join(map(str, leds))} light at the same place, that of LED {ids[place]}. Look at "
+            f"LEDs {' and '.join(map(str, leds))} light at the same place: the place of LED {ids[place]}. Look at "
             "the wires"
         )
         faults.append(LedFault("miswired", leds, text))

@@ -50,7 +50,7 @@ class Spot:
     """[2, 2], px^2."""
     area_px: float
     fill: float
-    """Area, divided by that of the ellipse with the same second moments."""
+    """Area, divided by the area of the ellipse with the same second moments."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,8 @@ def _spot(signal: Floats) -> Spot | str:
 
 
 def _green_place(pattern: str) -> tuple[int, int]:
-    """Return row and column of a green pixel in the 2 x 2 pattern; for `MONO` those of the first pixel."""
+    """Return row and column of a green pixel in the 2 x 2 pattern; for `MONO`, row and column of the first
+    pixel."""
     place = max(pattern.find("G"), 0) if pattern != "MONO" else 0
     return place // 2, place % 2
 

@@ -4,8 +4,8 @@ A primary lens on a die shifts its image across the die's normal, towards the vi
 the angle between both. A shift along the ray is not seen, so this is a change of height by the cosine: the part of
 it that all views share looks like another height of the LED. A lens that is not round, or a reflecting wall of the
 package, shifts the image by another linear function of the direction. Spots of LEDs are far out of the focus in
-which the camera was calibrated: their picture may be larger than by its record, all of it or more that of near
-LEDs (a pupil that is vignetted, or elsewhere).
+which the camera was calibrated: their picture may be larger than the record says, either as a whole, or more so
+for near LEDs (a pupil that is vignetted, or elsewhere).
 
 Each suspect is a set of modes, whose coefficients are first estimated freely beside all other unknowns. The
 variance under which these estimates are most likely is their prior variance in the second adjustment (empirical
@@ -31,7 +31,8 @@ PRIMARY, OVAL, FIELD = "primary lens", "lens not round", "field out of focus"
 GROWTH, NEAR_MM = 1e-4, 1000.0
 """Unit of the growth of the picture, and the distance at which the growth for near LEDs has its stated value."""
 _WIDE_MM, _WIDE_GROWTHS = 2.0, 50.0
-"""Prior standard deviations of freely estimated coefficients: much more than any lens on a die, or focus."""
+"""Prior standard deviations of freely estimated coefficients: much larger than the effect of any lens on a die, or
+of focus."""
 _LEAST, _CANDIDATES = 1e-6, 400
 _BY_CHANCE, _DOUBTFUL = 1e-4, 0.1
 """Two probabilities that noise alone explains a suspect: below the first it is named, below the second it may have

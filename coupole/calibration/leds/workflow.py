@@ -254,20 +254,22 @@ def _h5(
             dataset.attrs["units"] = unit
             dataset.attrs["long_name"] = long_name
 
-        write_dataset("centre_covariance", geometry.centre_covariance[where], "mm^2", "[leds, 3, 3] of the centre")
+        write_dataset(
+            "centre_covariance", geometry.centre_covariance[where], "mm^2", "[leds, 3, 3] covariance of the centre"
+        )
         normal = geometry.normal_covariance[boards.board_of[where]]
-        write_dataset("normal_covariance", normal, "deg^2", "[leds, 2, 2] of turns about the board's x and y")
+        write_dataset("normal_covariance", normal, "deg^2", "[leds, 2, 2] of the turns about the board's x and y")
         axes = geometry.state.base_from_board[boards.board_of[where], :3, :2]
-        write_dataset("board_axes", axes, "", "[leds, 3, 2] x and y of its board in the base")
+        write_dataset("board_axes", axes, "", "[leds, 3, 2] x and y axes of the LED's board in the base frame")
         write_dataset(
             "left_out_covariance",
             geometry.views.centre_covariance[where],
             "mm^2",
-            "[leds, 3, 3] of the centre by the jackknife over views",
+            "[leds, 3, 3] covariance of the centre by the jackknife over views",
         )
-        write_dataset("degrees_of_freedom", geometry.degrees[where], "", "[leds] effective, of the centre's u")
+        write_dataset("degrees_of_freedom", geometry.degrees[where], "", "[leds] effective, for the centre's u")
         shared_text = (
-            "[leds] share of the centre's variance from poses, lens and hand-eye, common to its neighbours"
+            "[leds] share of the centre's variance from poses, lens and hand-eye (common to neighbouring LEDs)"
         )
         write_dataset("shared_part", geometry.shared_part[where], "", shared_text)
         write_dataset(
@@ -278,7 +280,7 @@ def _h5(
         )
         write_dataset("views", views[where], "", "[leds] number of views in which the LED was found")
         write_dataset("residual_rms", np.sqrt(square / np.maximum(views, 1))[where], "px", "[leds]")
-        write_dataset("found", matching.place_of >= 0, "", "[leds] False: only its board determines its place")
+        write_dataset("found", matching.place_of >= 0, "", "[leds] False: only the board determines the place")
     return buffer.getvalue()
 
 

@@ -29,7 +29,7 @@ _SEARCHED_PX = 700
 """Least side of a reduced image in which a board is searched for."""
 _REDUCTIONS = (4, 2)
 _SAME_SIDE = 0.01
-"""Largest relative difference between the certified side of squares and that of the description."""
+"""Largest relative difference between the certified side of squares and the side in the description."""
 CLIPPED_SHARE = 0.02
 """Largest share of white pixels about the corners. An image with a larger share is left out, because clipping
 shifts edges."""

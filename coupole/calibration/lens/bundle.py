@@ -131,7 +131,8 @@ def calibrate_hand_eye(
     """
     if len(sightings) != len(poses.base_from_flange):
         raise InputError(
-            f"hand-eye: {len(sightings)} images and {len(poses.base_from_flange)} poses; one for each"
+            f"hand-eye: {len(sightings)} images and {len(poses.base_from_flange)} poses; expected "
+            f"one pose for each image"
         )
     earlier = lens if isinstance(lens, EarlierLens) else None
     intrinsics = earlier.intrinsics if earlier else lens

@@ -90,7 +90,7 @@ def chromatic_from(
 def _in_channel(
     channel: Channel, accepted_sightings: tuple[Sighting, ...], board_images: Found, sources: Sources, board: Board
 ) -> list[Sighting]:
-    """Return the sightings in a channel, from those in green."""
+    """Return the sightings in a channel, from the sightings in green."""
     if channel == "green":
         return list(accepted_sightings)
     return [

@@ -31,7 +31,7 @@ noise of a poor robot may hide a moved board."""
 _AS_GOOD = 1.5
 """Hypotheses whose scatter is within this factor of the best are ranked: the smallest change comes first."""
 _DEPTH_WORSE = 5.0
-"""Uncertainty of a board's distance, divided by that of its position across the image."""
+"""Uncertainty of a board's distance, divided by the uncertainty of its position across the image."""
 _FALSE_ALARMS = 0.01
 _RESAMPLED = 24
 

@@ -102,7 +102,7 @@ class Layout:
 
     @property
     def units(self) -> Floats:
-        """Factors [s] from the adjustment's units (mm, radians) to those of `names`."""
+        """Factors [s] from the adjustment's units (mm, radians) to the units of `names`."""
         return np.concatenate(
             [np.ones(len(self.free)), _STEP_UNITS, _STEP_UNITS, np.ones(self.shared_count - self.scale)]
         )

@@ -2,8 +2,8 @@
 
 X is `flange_from_camera`. The board and the base stand still, so base_from_flange_i X camera_from_board_i is the
 same for all poses i. So each pair of poses gives one equation A X = X B, where A is the motion of the flange and B
-that of the camera. The methods weight errors differently. If they disagree by more than noise explains, the data
-have another error (`coupole.calibration.lens.diagnosis`).
+the motion of the camera. The methods weight errors differently. If they disagree by more than noise explains, the
+data have another error (`coupole.calibration.lens.diagnosis`).
 """
 
 from __future__ import annotations

@@ -201,7 +201,7 @@ def _worst(base_from_flange: Floats, camera_from_board: Floats) -> list[int]:
 def _moved_board(
     base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str], noise_scatter: Expected
 ) -> Iterator[Hypothesis]:
-    """Yield the hypotheses that the board was in two places. Motions within each part are then valid, those
+    """Yield the hypotheses that the board was in two places. Motions within each part are then valid; motions
     between the parts are not."""
     count = len(base_from_flange)
     for change in range(_LEAST_SEGMENT, count - _LEAST_SEGMENT + 1):
@@ -228,7 +228,8 @@ def _moved_board(
 
 
 def _by_chance(before: Solution, after: Solution) -> float:
-    """Return the probability that noise alone causes a step as large as that between the boards of the two parts.
+    """Return the probability that noise alone causes a step as large as the step between the boards of the two
+    parts.
 
     It is Hotelling's T^2 of two samples with a common covariance (Anderson, An Introduction to Multivariate
     Statistical Analysis, 3rd ed., 2003, section 5.3.4), with six degrees of freedom less, because both parts share

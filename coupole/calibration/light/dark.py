@@ -64,7 +64,7 @@ class Dark:
     hot: NDArray[np.int64]
     """[hot, 2] row and column of hot pixels, the hottest first."""
     reference_c: float | None
-    """None if not all frames have a temperature; the maps then hold for the temperature of the frames."""
+    """None if not all frames have a temperature; the maps are then valid for the temperature of the frames."""
     doubling_k: float
     levels: tuple[tuple[float, float, float], ...]
     """Exposure (s), temperature (C), mean DN of each frame."""

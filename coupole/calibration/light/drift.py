@@ -42,7 +42,7 @@ class Reading:
     """Temperature of the LED's board minus its temperature when the power was calibrated; NaN if one of them is
     not known."""
     ratio: float
-    """Measured signal, relative to that expected from the LED's calibrated power."""
+    """Measured signal, relative to the signal expected from the LED's calibrated power."""
     u_ratio: float
     """Standard uncertainty of the ratio, from noise and from the LED's own calibration."""
     by_shared: tuple[float, ...] = ()

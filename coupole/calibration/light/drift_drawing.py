@@ -31,7 +31,7 @@ def draw_drift(drift: Drift, warmer_k: Floats, t_s: Floats, record: Record, figu
     if odd:
         axes[0, 0].plot(*np.transpose(odd), "x", color=RED, label="left out")
     axes[0, 0].legend(frameon=False)
-    axes[0, 0].set(title="Power divided by that of the calibration", xlabel="minutes", ylabel="%")
+    axes[0, 0].set(title="Power divided by the power of the calibration", xlabel="minutes", ylabel="%")
     axes[0, 1].plot(warm, 100 * read_factors, ".", color=GREY, ms=4)
     axes[0, 1].set(title="The same by temperature", xlabel="warmer than when calibrated (K)", ylabel="%")
     axes[1, 0].hist(100 * drift.residuals, bins=40, color=BLUE)

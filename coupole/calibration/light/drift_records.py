@@ -133,8 +133,8 @@ def drift_outcome(
             remarks=(
                 f"{len(drift.used_readings)} readings in {len(views)} views; factor {factor.min():.4f} to "
                 f"{factor.max():.4f}",
-                "ln factor = level + rate_per_h (t - start_s) / 3600 + per_k (T - board_c); T is the board's, "
-                "board_c that of the LED in the powers' table",
+                "ln factor = level + rate_per_h (t - start_s) / 3600 + per_k (T - board_c); T is the board's "
+                "temperature, board_c its temperature in the powers' table",
                 *remarks,
             ),
             more_inputs=(*record_input(led_power), *setting.inputs),

@@ -11,7 +11,7 @@ rotation separate the two. In logarithms
 The first term is cos^4 with the focal length f; the polynomial is the departure of a real lens from it. Images are
 reduced to means of blocks of pixels. Dust and dead pixels do not affect the result, because a block's mean leaves
 out outliers, and its weight decreases with its residual (Tukey). A block has the same error in all views (from its
-pixels' responses). So the covariance is that of clusters of blocks ("sandwich", Liang and Zeger 1986), with
+pixels' responses). So the covariance is computed for clusters of blocks ("sandwich", Liang and Zeger 1986), with
 leave-one-out residuals (Bell and McCaffrey 2002).
 """
 

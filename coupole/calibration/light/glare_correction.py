@@ -61,7 +61,7 @@ class GlareCorrection:
 
 
 def read_glare(path: Path, frames: LightFrames) -> GlareCorrection:
-    """Return the correction by a record that holds for these frames. Raises InputError for a record of another
+    """Return the correction by a record that is valid for these frames. Raises InputError for a record of another
     kind or camera."""
     record = read_earlier(path, "glare", frames.about, frames.size_px)
     names = [parameter.name for parameter in record.parameters]

@@ -148,7 +148,7 @@ def _parameters(fits: Mapping[str, GlareFit]) -> tuple[list[Parameter], Floats]:
             value=float(value),
             u=float(u),
             degrees_of_freedom=fit.degrees_of_freedom,
-            dominated_by="what lies nearer than the traps' rims"
+            dominated_by="light from nearer than the traps' rims"
             if part == "near"
             else "differences between views",
         )

@@ -30,8 +30,8 @@ class Trap:
 
     outer: Integers
     inner: Integers
-    """[n, 2] rows and columns of the first pixels of its cells near the rim, and of those in its middle. The rim
-    itself is left out. Less light from nearby reaches the middle."""
+    """[n, 2] rows and columns of the first pixels of its cells near the rim, and of the cells in its middle. The
+    rim itself is left out. Less light from nearby reaches the middle."""
     beside: Integers
     """[n, 2] cells of the white around it."""
 
@@ -68,7 +68,7 @@ def _cells_of_trap(
     trap_mask: NDArray[np.bool_], is_white: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]] | None:
     """Return outer and inner cells of a trap, and the cells beside it. None if something that is not white is
-    around it or in it, or if it is too small."""
+    around the trap or in it, or if the trap is too small."""
     from scipy import ndimage
 
     near = ndimage.binary_dilation(trap_mask, iterations=2)

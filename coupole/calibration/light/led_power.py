@@ -230,8 +230,8 @@ def _refuse_moved(
     design: Floats,
     redundancy: float,
 ) -> None:
-    """Raise InputError if one view fits far better with a tilt of its own, although it has the same place as
-    others."""
+    """Raise InputError if one view fits far better with a tilt of its own, although the tile has the same place in
+    other views."""
     for place in {view.place for view in views}:
         members = [v for v, view in enumerate(views) if view.place == place]
         if len(members) < 2:

@@ -86,7 +86,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
 
 
 def power_limits(powers: Mapping[str, LedPower], operator_limits: Mapping[str, float]) -> tuple[Limit, ...]:
-    """Compare the powers with their limits: those of green, and the worst channel's causes."""
+    """Compare the powers with their limits: the powers of green, and the worst channel's causes."""
     green = powers["G"]
     good = np.isfinite(green.power) & (green.power > 0)
     u = green.u_against_mean()
@@ -115,13 +115,15 @@ def _of_views(power: LedPower, limits: Sequence[Limit]) -> list[str]:
     if figures["left_out"].is_met and figures["scatter"].is_met:
         return [line]
     return [
-        f"{line}. Views contradict each other by more than noise, and what is named does not explain it. Look for "
+        f"{line}. Views contradict each other by more than noise, and the named causes do not explain it. Look "
+        f"for "
         "a tile, camera or lamp that moved between the views; then take the views anew"
     ]
 
 
 def with_equal_figures(powers: Mapping[str, LedPower]) -> dict[str, LedPower]:
-    """Return the powers with as many figures of causes in each channel; those that are added change nothing."""
+    """Return the powers with the same number of figures of causes in each channel; added figures change
+    nothing."""
     most = max(powers.values(), key=lambda power: len(power.common_names)).common_names
     equal = {}
     for channel, power in powers.items():

@@ -179,8 +179,8 @@ def _flicker(pairs: Sequence[Pair]) -> float:
 def _refuse_contradictions(pairs: Sequence[Pair], signals: Floats, flicker: float) -> None:
     if flicker > 0.01:
         raise InputError(
-            f"response: the light flickers by {flicker:.1%} from frame to frame; at most 1 % can be separated "
-            "from a bent response. Let it warm up, or take panels"
+            f"response: the light flickers by {flicker:.1%} from frame to frame; a flicker above 1 % cannot be "
+            f"separated from a bent response. Let the light warm up, or use panels"
         )
     usable = np.isfinite(signals).sum(axis=0) >= _GROUPS // 3
     exposures = np.array([pair.exposure_us for pair in pairs])

@@ -1,4 +1,4 @@
-"""Errors of LED powers: those of each LED alone, and figures that LEDs share."""
+"""Errors of LED powers: the errors of each LED alone, and the errors that LEDs share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NEGLIGIBLE, _MOST_FIGURES = 0.04, 6
 
 @dataclass(frozen=True)
 class CommonFigures:
-    """Errors of all powers: those of each LED alone, and those that LEDs share."""
+    """Errors of all powers: the errors of each LED alone, and the errors that LEDs share."""
 
     u_own: Floats
     """[leds] relative standard uncertainty."""

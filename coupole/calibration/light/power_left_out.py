@@ -1,8 +1,8 @@
 """Views of the tile left out in turn: how far each moves the LEDs' powers.
 
-The model is linear in logarithms, so each fit without a view is solved anew, with lobe and drift at the
-amplitudes found. The squares of the moves give a covariance that takes only the views for independent, and nothing
-of noise as stated or of the model's form (the jackknife by clusters, CR3: Bell and McCaffrey, Survey Methodology
+The model is linear in logarithms, so each fit without a view is solved anew, with lobe and drift at the amplitudes
+found. The squares of the moves give a covariance that assumes only that the views are independent; it uses neither
+the stated noise nor the model's form (the jackknife by clusters, CR3: Bell and McCaffrey, Survey Methodology
 28(2), 2002). Exposures of one view are one cluster.
 """
 
@@ -27,8 +27,8 @@ class ViewsLeftOut:
     """View whose removal moves the powers most; empty if no LED is in two views."""
 
     def ratio(self, u: Floats) -> float:
-        """Return the root mean square of these uncertainties over that of the stated ones [leds]; 0 if no LED is
-        in two views."""
+        """Return the root mean square of these uncertainties, divided by the root mean square of the stated ones
+        [leds]; 0 if no LED is in two views."""
         both_known = np.isfinite(self.u) & np.isfinite(u)
         if not both_known.any():
             return 0.0
@@ -36,9 +36,9 @@ class ViewsLeftOut:
 
 
 def views_left_out(y: Floats, observations: Between, names: Sequence[str]) -> ViewsLeftOut:
-    """Leave out the views, one after the other. `y` [n] are the logarithms; the design of the observations are the
-    derivatives by the shared figures and by the modes of causes, its prior their standard uncertainties. `names`
-    [n] are the views."""
+    """Leave out the views, one after the other. `y` [n] are the logarithms. The design of the observations has the
+    derivatives by the shared figures and by the modes of causes; its prior has their standard uncertainties.
+    `names` [n] are the views."""
     led, leds = observations.led, observations.leds
     whole = _log_powers(y, observations)
     squares, views_of_led, largest = np.zeros(leds), np.zeros(leds, np.int64), (0.0, "")

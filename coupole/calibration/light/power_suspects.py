@@ -4,8 +4,8 @@ words for these, for a stain and for tilted dies (`tile_parts`).
 A drift changes all powers of a time by one factor. Its modes are cosines over the session: few slow ones, and two
 bands of faster ones, each with an amplitude of its own.
 
-Amplitudes, noise and evidence are those of `model_error`. A suspect is named if leaving it out would hurt with all
-others present.
+Amplitudes, noise and evidence are those of `model_error`. A suspect is named if the fit is clearly worse without
+it, with all others present.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ UNSTEADY, RESTLESS = "unsteady light", "restless light"
 CLEAR = 15.0
 """Evidence from which a suspect is named. Noise alone exceeds it once in 20,000 fits."""
 _DOUBTFUL = 1.64
-"""Evidence below which a lobe or drift counts for nothing: noise alone gives as much in a tenth of all cells."""
+"""Evidence below which a lobe or drift is ignored: noise alone gives this much evidence in a tenth of all
+cells."""
 _SLOW, _FASTER, _FAST = 3, 9, 24
 """Number of half waves over the session: slow ones, with faster ones, all. Slow ones become smaller by their
-number, like those of a random walk."""
+number, like the steps of a random walk."""
 _LEAST, _LEAST_REDUNDANCY = 1e-9, 10.0
-"""Least amplitude, and least number of observations beyond one for each LED that tell a cause."""
+"""Least amplitude, and least number of observations beyond one for each LED, from which a cause is determined."""
 REACH_MM = 40.0
 """Distance from the tile's middle for which powers hold."""
 
@@ -44,7 +45,7 @@ _WORDS = {
     DRIFT: "gain or light drifted over the session",
     UNSTEADY: "gain or light wavered during the session",
     RESTLESS: "gain or light wavered many times during the session",
-    DIES: "dies are tilted, or their lobes differ: light falls off otherwise than by the cosine law",
+    DIES: "dies are tilted, or their lobes differ: their light does not follow the cosine law",
 }
 _REMEDIES = {
     STAIN: "Clean the tile or turn another part of it up",
@@ -61,7 +62,7 @@ _REMEDIES = {
 
 @dataclass(frozen=True)
 class CausesFound:
-    """Lobe and drift, as the differences between the views of each LED tell them."""
+    """Lobe and drift, as the differences between the views of each LED show them."""
 
     error: ModelError
     """Its step are the shared figures [c]."""

@@ -1,7 +1,7 @@
 """A lobe of a white tile beside Minnaert's law, by Ward's model (ACM SIGGRAPH 1992).
 
-It has several widths, alone and with a part that grows towards grazing light. The certificate counts the lobe:
-what it reflects, the matt part does not.
+It has several widths, alone and with a part that grows towards grazing light. The certificate includes the lobe:
+the matt part does not reflect the light that the lobe reflects.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ A stain is a pattern over the parts of the tile that all LEDs and views share. I
 powers. So its modes are those of a random field over the tile (covariance exp(-d / `_STAIN_MM`)), whose mean is
 about as large as its pattern. The flat field's error is a gradient over the tile in each view; it is no stain.
 
-The light of an LED whose die leans falls off across the tile otherwise than by the cosine law. This scatters from
-LED to LED, and is in no power at the tile's middle, but in the light beside it.
+If the die of an LED is tilted, its light does not fall off across the tile by the cosine law. This effect scatters
+from LED to LED. It changes no power at the tile's middle, but it changes the light beside the middle.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _LEAST_PARTS, _LEAST_NOISE = 4, 1e-9
 
 @dataclass(frozen=True)
 class PartsFound:
-    """A pattern of the tile, and light that falls off across it otherwise than by the cosine law."""
+    """A pattern of the tile, and light whose fall-off across the tile departs from the cosine law."""
 
     loss: float
     """Relative change of the tile's mean reflectance against its description."""
@@ -109,7 +109,7 @@ def parts_of(rows: Sequence[Row], places_mm: Sequence[Floats], tile: Tile, prior
 
 @dataclass(frozen=True)
 class _InView:
-    """Contrasts [n, m - 1] of the parts in one view, over their noise, and what causes do to them."""
+    """Contrasts [n, m - 1] of the parts in one view, divided by their noise, and the effect of causes on them."""
 
     leds: NDArray[np.int64]
     values: Floats

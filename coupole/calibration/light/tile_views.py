@@ -19,7 +19,7 @@ _SHADED = 0.03
 """Relative departure of a part of the tile, beyond noise. A larger one counts as shadow."""
 _SHADED_SIGMA = 6.0
 _FEW_LEDS = 8
-"""Least number of LEDs of a view by which a pattern of the tile is told from shadows."""
+"""Least number of LEDs of a view from which a pattern of the tile is distinguished from shadows."""
 _LOWEST_COSINE = 0.05
 """Least cosine of incidence on the tile. For LEDs within 3 degrees of its horizon, the signal depends mostly on
 the tile's tilt."""
@@ -96,7 +96,7 @@ class Angles:
     """Cosine between the light and the half vector."""
 
     def at(self, row: int) -> Angles:
-        """Return those of one LED."""
+        """Return the cosines of one LED."""
         return Angles(self.incidence[row], self.observation[row], self.half[row], self.difference[row])
 
 

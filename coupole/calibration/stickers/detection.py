@@ -32,8 +32,8 @@ _INSIDE, _OUTSIDE = 0.65, 1.35
 _LEAST_RIM = 0.8
 """Least share of the rays that find a rim on the ellipse."""
 _FAR_SIGMA, _WORST_RIM = 3.5, 0.06
-"""Bound of outliers, and greatest roughness of the rim as a share of the radius. A rougher rim is not that of a
-printed disk."""
+"""Bound of outliers, and greatest roughness of the rim as a share of the radius. A rougher rim does not belong to
+a printed disk."""
 _LEAST_SIGMA_PX = 0.02
 
 

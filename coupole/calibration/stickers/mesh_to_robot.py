@@ -50,7 +50,7 @@ class Stated:
 
 @dataclass(frozen=True)
 class MeshPose:
-    """The result. The covariance [6, 6] is that of a step of `rotations.moved_transforms`: mm, then degrees."""
+    """The result. The covariance [6, 6] belongs to a step of `rotations.moved_transforms`: mm, then degrees."""
 
     base_from_mesh: Floats
     covariance: Floats

@@ -71,7 +71,8 @@ def mesh_from(
     stated_noise: Stated,
     base_from_support: Transform | None = None,
 ) -> MeshFound:
-    """Calibrate the pose of a scanned mesh. Raises InputError if its stickers do not match those in the images."""
+    """Calibrate the pose of a scanned mesh. Raises InputError if its stickers do not match the stickers in the
+    images."""
     if sources.poses is None:
         raise InputError("mesh: the images have no poses; give runs, or a folder with poses")
     base_from_flange = sources.poses.base_from_flange

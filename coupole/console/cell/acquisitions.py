@@ -137,8 +137,8 @@ class Acquisitions:
         return "another process of this user has its devices open" if is_in_use(self._cell) else ""
 
     def _is_ours(self, state: State) -> bool:
-        """Tell whether a run belongs to this cell: it names its rig, or the queue has begun it. (A resumed run
-        names its own copy of the rig.)"""
+        """Tell whether a run belongs to this cell: the run names the cell's rig, or the queue has begun the run.
+        (A resumed run names its own copy of the rig.)"""
         entry = self._queue.running
         return state["rig"] == self._rig or (entry is not None and bool(entry.pid) and state["pid"] == entry.pid)
 

@@ -178,7 +178,9 @@ class Bench:
     def plan_path(self) -> str:
         """Return the plan's file. Raises InputError if the bench was begun without a plan."""
         if not self.plan:
-            raise InputError("no plan: close the devices, and open them with the plan whose object lies there")
+            raise InputError(
+                "no plan: close the devices, and open them with the plan whose object lies on the support"
+            )
         return str(self._plans.path(self.plan))
 
     # -- watching -----------------------------------------------------------------------------------------------
@@ -207,13 +209,14 @@ class Bench:
             if self._closing:
                 continue
             if self._task is not None and not self._task.running:
-                self.closed_because = self._task.why or "it has ended by itself"
+                self.closed_because = self._task.why or "the bench has ended by itself"
                 self._task = self.state = None
             else:
                 self._look()
 
     def _end_drive_of_another(self) -> None:
-        """Stop the arm if it is driven for a person, and another one has come into control since it began."""
+        """Stop the arm if it is driven for a person, and another person has come into control since the motion
+        began."""
         if not self._driver or not (name := self._control.taken_since(self._taken_count, self._driver)):
             return
         try:

@@ -192,8 +192,9 @@ def _told_if_given_up(rig: Path, counts_anyway: bool) -> Iterator[None]:
     except BaseException:
         if not counts_anyway:
             alarm(
-                f"{rig}: stopped waiting for an answer: the console will not carry out the request, unless it had "
-                f"begun it before it stopped answering; `coupole queue {rig}` shows what is in its queue"
+                f"{rig}: stopped waiting for an answer: the console will not carry out the request, unless the "
+                f"console had begun it before it stopped answering; `coupole queue {rig}` "
+                f"shows what is in its queue"
             )
         raise
 

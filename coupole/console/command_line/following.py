@@ -191,7 +191,7 @@ class _Followed:
                 if self._state() is None:
                     raise DeviceLost(
                         "console",
-                        expected="the console to tell how the run ends",
+                        expected="the console to report how the run ended",
                         happened=reason(error),
                         remedy=f"`coupole status {run}` shows the run's state; `coupole stop {run}` stops it.",
                     ) from error

@@ -59,7 +59,7 @@ def _watch(cell: Cell, action: str, taken_count: int, control: KeptControl, over
                 "GET",
                 f"/api/v1/bench/permission?taken_count={taken_count}",
                 given_up=over.is_set,
-                meanwhile="; the motion goes on, as nobody can take control there meanwhile",
+                meanwhile="; the motion goes on, because nobody can take control there now",
             )
             if not now["may_act"]:
                 control.lose(f"{now['in_control']} took control at the console")

@@ -27,7 +27,7 @@ _MOST_FAILURES, _MOST_FROM_ELSEWHERE, _MOST_KEPT, _FORGOTTEN_AFTER_S = 5, 30, 10
 
 
 class Role(IntEnum):
-    """Rights of a person; each role may also do all that the lower ones may."""
+    """Rights of a person; each role may also do everything that lower roles may do."""
 
     OBSERVER = 1
     """May look."""

@@ -30,7 +30,7 @@ from coupole.storage.run import Run
 
 
 class EntryRefused(InputError):
-    """The entry may not be run; `exit_code` is that of `coupole check`."""
+    """The entry may not be run; `exit_code` is the exit code of `coupole check`."""
 
     def __init__(self, problems: Sequence[Problem], exit_code: int = PreflightRefused.exit_code) -> None:
         super().__init__(problems)
@@ -93,8 +93,8 @@ class Entering:
         return self._queue.add(by, before=request.before, **fields)
 
     def move(self, number: str, before: str) -> None:
-        """Move a waiting entry. Raises InputError if it does not wait, or if the new order exceeds an object's
-        budget; StorageError."""
+        """Move a waiting entry. Raises InputError if the entry does not wait, or if the new order exceeds an
+        object's budget; StorageError."""
         reordered_entries = self._queue.order_after(number, before)
         if more := self._more_light(reordered_entries):
             raise EntryRefused(

@@ -62,8 +62,8 @@ def too_much_light(
     at_work: AtWork,
     budget_lux_h: Callable[[str], float | None] = lambda _: None,
 ) -> dict[str, str]:
-    """Return the refusals of waiting entries, by id: those that exceed their object's budget after all entries
-    before them.
+    """Return the refusals of waiting entries, by id: refusals of entries that exceed their object's budget after
+    all entries before them.
 
     `received_lux_h` returns the light that an object has received by its ledger, `budget_lux_h` the light that it
     may receive. A plan's own budget can only be stricter.

@@ -43,9 +43,9 @@ class PlanFields:
     """1 for all LEDs, 4 for every fourth LED."""
     darks_per_view: int | None = None
     own_views: bool = False
-    """True if the views are not those of the form."""
+    """True if the views differ from the form's views."""
     own_lights: bool = False
-    """True if the lights are not those of the form."""
+    """True if the lights differ from the form's lights."""
     own_exposure: bool = False
     """True if the exposure is chosen in the run; times in the form would replace it."""
 

@@ -64,7 +64,7 @@ class Entry(BaseModel):
     reflectance: bool = False
     """Process the views during the acquisition, and make the result at its end."""
     result: str = ""
-    """Folder of that result; by default the run's name followed by `-reflectance`."""
+    """Folder of the result; by default the run's name followed by `-reflectance`."""
     needs: Needs | None = None
     """Needs of the entry; None for a hold, and for an entry that began at once."""
     by: str

@@ -62,7 +62,7 @@ def add_bench_routes(app: FastAPI, service: Service) -> None:
     @app.get("/api/v1/bench/permission", responses=REFUSALS)
     def still_permitted(person: Who, taken_count: int) -> Permitted:
         """Tell a command that drives the arm whether this person may still do so. It stops the arm if not.
-        `taken_count` is that of the permission: another person who came into control since then, even for a
+        `taken_count` is the count of the permission: another person who came into control since then, even for a
         moment, ends it."""
         control, count = service.control, service.control.taken_count
         taker = control.taken_since(taken_count, person.name)

@@ -69,7 +69,7 @@ class NewEntry(Asked):
     """Process the views during the acquisition, and make the result at its end. A resumed run that began with this
     option keeps it in any case."""
     result: Text = ""
-    """Folder of that result; by default the run's name followed by `-reflectance`; for the command line."""
+    """Folder of the result; by default the run's name followed by `-reflectance`; for the command line."""
 
 
 class Move(Asked):
@@ -99,9 +99,9 @@ class Permitted(BaseModel):
     in_control: str
     """The person in control; empty if nobody is."""
     may_act: bool
-    """True unless another person is in control, or was since the permission."""
+    """True unless another person is in control, or has been in control since the permission."""
     taken_count: int
-    """Number of times that somebody came into control. Later questions send that of the permission."""
+    """Number of times that somebody came into control. Later questions send the count of the permission."""
 
 
 class Light(Asked):

@@ -72,10 +72,14 @@ class MeterPanel:
         )
 
 
-_IDLE = "It finds the exposure at which nothing is clipped and the object is above the noise, in all of its views."
+_IDLE = (
+    "Metering finds the exposure at which nothing is clipped and the object is above the noise, "
+    "in all views of the plan."
+)
 _NO_PLAN = "It needs devices that were opened with a plan."
 _ASKED = (
-    "The arm drives to each view of the plan, with light at several exposures. It counts as light on the object."
+    "The arm drives to each view of the plan, with light at several exposures. This light counts "
+    "as light on the object."
 )
 
 

@@ -104,7 +104,7 @@ class PictureSettings:
         }
 
     def set_white(self, gains: list[float] | None = None) -> None:
-        """Set the white point to that of a region; None for the sensor's own colours."""
+        """Set the white point to the colour of a region; None for the sensor's own colours."""
         self.gains = list(gains or _NEUTRAL)
         self._on_change()
 

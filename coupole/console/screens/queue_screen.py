@@ -176,4 +176,4 @@ def _sum_of(waiting: list[EntryNow]) -> str:
     seconds = sum(entry_needs.preparation_s + entry_needs.duration_s for entry_needs in needs)
     light = sum(entry_needs.dose_lux_h for entry_needs in needs)
     size = sum(entry_needs.bytes for entry_needs in needs)
-    return f"all that waits: {duration_text(seconds)}, {bytes_text(size)}, {light:.3f} lux h"
+    return f"all waiting entries: {duration_text(seconds)}, {bytes_text(size)}, {light:.3f} lux h"

@@ -135,7 +135,7 @@ class _Screen:
                     "light on the object": f"{now.dose:.3f} lux h in this run",
                     "taken again": f"{run_progress.reshot} shots",
                     "hottest LED board": hot,
-                    "reflectance": "not asked for with this run" if processing is None else processing.words,
+                    "reflectance": "not requested for this run" if processing is None else processing.words,
                 }
             )
         )

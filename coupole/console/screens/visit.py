@@ -173,7 +173,7 @@ async def enter(visit: Visit, request: NewEntry, words: str) -> bool:
 
     if request.hold:
         return await visit.act(f"queue {words}", do, done_text=f"{words} is in the queue") is not None
-    visit.say(f"{words}: preflight checks it, then it is in the queue")
+    visit.say(f"{words}: preflight checks the entry, then it is put into the queue")
     async with entering.one_at_a_time:
         return await visit.act(f"queue {words}", do, done_text=f"{words} is in the queue") is not None
 

@@ -46,13 +46,13 @@ _SECRETS = (
 _README = """\
 Coupole, support bundle of {t}.
 
-versions.json   this machine, and the versions of what Coupole uses
+versions.json   this machine, and the versions of the software that Coupole uses
 disk.json       of the runs
 rig/            the rig, its LED table, and its records of calibrations without their maps
 plans/          the folder of plans
 state/          faults of the arm, and other facts of the cell
 runs/           of the {runs} newest runs: description, journal, plan and rig; no frames
-console/        who asked for what; the queue; what commands and acquisitions printed
+console/        who requested what; the queue; the output of commands and acquisitions
 
 It contains names of people (who asked for what) and of objects. Values of keys that look like passwords or
 tokens are replaced by {left_out}; accounts and notifications are not included.
@@ -102,9 +102,9 @@ def _value_without(value: Any) -> Any:
 
 
 def _line_without(line: str) -> tuple[str, tuple[int, bool] | None]:
-    """Return a line of YAML or of text without secrets. Also return where the left-out value continues: following
-    lines belong to it if they begin beyond this column. The last value says whether items of a list may begin at
-    this column.
+    """Return a line of YAML or of text without secrets. Also return the column that shows where the left-out value
+    continues: following lines belong to it if they begin beyond this column. The last value says whether items of
+    a list may begin at this column.
     """
     words, end = line.rstrip("\r\n"), line[len(line.rstrip("\r\n")) :]
     if (entry := _ENTRY.search(words)) is None:

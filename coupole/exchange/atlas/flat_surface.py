@@ -32,9 +32,9 @@ Singles = NDArray[np.float32]
 
 MOST_SIDE_PX = 16384
 _MOST_U, _MOST_U_OF_TRIANGLE, _MOST_U_OF_WHITE = 0.4, 0.15, 0.03
-"""Limits of the standard uncertainty of kd. A material is known if it meets one of two limits. One is relative to
-its kd: the first number for texels, the second for triangles, whose error may be in one channel only. The other,
-the third number, is relative to the kd of a white diffuser."""
+"""Limits of the standard uncertainty of kd. A material is known if it meets one of two limits. One limit is
+relative to the material's kd: the first number for texels, the second for triangles, whose error may be in one
+channel only. The other limit is relative to the kd of a white diffuser: the third number."""
 _BLOCK = 1 << 20
 """Number of texels that are looked up together."""
 
@@ -99,8 +99,8 @@ class FlatSurface:
 
 
 def flatten(surface: MeasuredSurface) -> FlatSurface:
-    """Lay a surface out in maps. The width of texels is that of the options. By default, it is the width of those
-    in the finest view, or it follows from the allowed width of the map.
+    """Lay a surface out in maps. The width of texels is that of the options. By default, it is the width of the
+    texels in the finest view, or it follows from the allowed width of the map.
 
     Raises InputError if the maps would be wider than the options or `MOST_SIDE_PX` allow, or if nothing has a
     material.

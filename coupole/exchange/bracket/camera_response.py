@@ -30,8 +30,8 @@ SATURATED, DARK = 0.98, 0.01
 """A pixel gives only a bound if its value is at least the first or at most the second of these."""
 _PIXELS = 3000
 _WIDE = 2.6
-"""Smallest factor between exposure times for which waves of the response stay undetermined: 4 is such a factor, 2
-is not."""
+"""Smallest factor between exposure times that leaves waves of the response undetermined: 4 leaves them
+undetermined, 2 does not."""
 _ROUNDS, _SMOOTH_ROUNDS, _OUTLIER = 10, 6, 4.0
 """Number of rounds of the fit; number of first rounds, which have a stiff response; standard deviations above
 which a sample has less weight in the next round."""
@@ -137,7 +137,7 @@ def _samples(values: NDArray[np.float32]) -> Array:
     useful = (hat(values.astype(float)) > 0.0).sum(axis=0) >= 2
     if np.count_nonzero(useful) < 50:
         raise InputError(
-            "bracket: expected many pixels that two photographs show, neither dark nor saturated; found "
+            "bracket: expected many pixels that are neither dark nor saturated in two photographs; found "
             f"{np.count_nonzero(useful)}; take photographs in steps of 2 times the exposure"
         )
     flat = useful & (steep <= np.quantile(steep[useful], 0.6))
@@ -201,7 +201,7 @@ def _predict_values(samples: Array, weights: Array, log_t: Array, g: Array, powe
 
 
 def _with_noise(g: Array, weights: Array, off: Array, slope: Array, least_noise: float) -> _Fit:
-    """Return the fit with the noise of its residuals. `off` is the samples' ln of exposure minus that of the
+    """Return the fit with the noise of its residuals. `off` is the samples' ln of exposure minus the ln of the
     time."""
     free = 1.0 - weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
     residuals = (off - _pixel_means(weights, off)) / slope / np.sqrt(np.maximum(free, 1e-3))

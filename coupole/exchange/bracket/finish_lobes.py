@@ -1,6 +1,6 @@
 """Two lobes of facets over a diffuse body: a first model of a finish, which a table then corrects.
 
-The wider lobe has GGX's distribution. The narrower one has a tail between those of GGX and a Gaussian: D is
+The wider lobe has GGX's distribution. The narrower one has a tail between the tails of GGX and a Gaussian: D is
 proportional to (1 + tan^2(theta_h)/(alpha^2 (g - 1)))^-g / cos^4(theta_h), GGX for g = 2, Beckmann for large g
 (Student's distribution of slopes; Ribardiere and others, Computer Graphics Forum 36, 2017). Shadowing is Smith's
 for GGX. The rise towards grazing angles is Schlick's, minus the dip that metals have before it (Lazanyi and

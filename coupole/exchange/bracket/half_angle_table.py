@@ -2,9 +2,9 @@
 
 Rusinkiewicz, "A new change of variables for efficient BRDF representation" (1998). A photograph of a sphere under
 one distant light has one difference angle: half the angle between light and camera. In these coordinates its
-samples fill one layer of the table, and values between two photographs are those that are smooth along theta_d. In
-coordinates about the mirror direction, the samples of a photograph would be oblique, and a peak between two
-photographs would be lost.
+samples fill one layer of the table, and values between two photographs are chosen so that they are smooth along
+theta_d. In coordinates about the mirror direction, the samples of a photograph would be oblique, and a peak
+between two photographs would be lost.
 
 The azimuth goes only from 0 to 90 degrees. Exchange of the directions and mirror symmetry map all other
 directions to this range, so the table is always reciprocal.

@@ -18,7 +18,7 @@ _COLOURS = ("tab:red", "tab:green", "tab:blue")
 
 def write_exr(path: Path, merged_picture: Merged, comment: str) -> None:
     """Write channels R, G, B; `u.R`, `u.G`, `u.B`, relative standard uncertainties, inf for bounds; and
-    `saturated`, `dark` and `contradicting`, which are 1 where a channel or a photograph is so. Raises
+    `saturated`, `dark` and `contradicting`, which are 1 where a channel or a photograph has this property. Raises
     StorageError."""
     channels: dict[str, Any] = {}
     for number, name in enumerate("RGB"):

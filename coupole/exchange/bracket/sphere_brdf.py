@@ -244,7 +244,7 @@ def misses(samples: Samples, finish: Finish) -> tuple[float, float]:
 
 def _ways(places: Array, to_light: Array) -> tuple[Array, Array]:
     """Directions to the light and to the camera [n, 3] at places [n, 2] of the sphere, each in a frame of the
-    normal there; outside the sphere, those at its edge."""
+    normal there; outside the sphere, the directions at its edge."""
     radius = np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1.0)
     up = np.sqrt(np.maximum(1.0 - np.sum(places**2, axis=1, keepdims=True), 0.0))
     frames = _frames(np.concatenate([places / radius, up], axis=1))

@@ -73,8 +73,8 @@ def light_planes(
     """Compute the planes of frames [h, w, 3], in shares of the camera's range, under LEDs in the directions `ways`
     [n, 3].
 
-    `frame` reads a frame by its number; each frame is read twice, and passed once to `see`. The memory needed is
-    that of `planes` pictures of one channel.
+    `frame` reads a frame by its number; each frame is read twice, and passed once to `see`. It needs the memory of
+    `planes` pictures of one channel.
     """
     count = len(ways)
     places = None

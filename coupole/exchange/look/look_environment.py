@@ -1,5 +1,5 @@
-"""Light from all directions for a page: as many directions as it averages, with a density proportional to the
-light."""
+"""Light from all directions for a page: as many directions as the page averages, with a density proportional to
+the light."""
 
 from __future__ import annotations
 

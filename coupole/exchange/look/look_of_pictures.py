@@ -49,7 +49,8 @@ def look_of_pictures(folder: Path) -> Look:
         "told": {
             "Pictures": f"{len(result.directions)} of {width} x {height}",
             "Light": (
-                "distant, without the shadows that the object casts. Strength 1 is that of the pictures. "
+                "distant, without the shadows that the object casts. Strength 1 is the strength "
+                "of the pictures' lights. "
                 "`coupole reflectance relight` comes nearer to the photographs, because it interpolates between "
                 "the pictures."
             ),

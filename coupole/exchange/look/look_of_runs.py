@@ -67,7 +67,7 @@ class OtherState:
 def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice | None = None) -> Look:
     """Return the page's contents for a complete result.
 
-    Raises InputError if it is not one, if it has no material, or if a residual is asked for together with texels.
+    Raises InputError for an incomplete result, for one without material, and for a residual together with texels.
     """
     choice = choice or PageChoice()
     source_about = read_about(folder)
@@ -132,7 +132,8 @@ def _facts(result: RunResult, triangles_text: str, is_simulated: object) -> dict
         "Object": "simulated" if is_simulated else "measured",
         "Triangles": triangles_text,
         "Views": ", ".join(view.view for view in result.views),
-        "Light": "straight from lamps, with shadows; none from surface to surface. White is the radiance that is "
+        "Light": "straight from lamps, with shadows; no light from surface to surface. White "
+        "is the radiance that is "
         "shown as white; a white diffuser that faces a light of strength 1 has 1.",
     }
 
@@ -178,7 +179,7 @@ def _residuals(result: RunResult, fit: str, planes: int, about: dict[str, Any], 
     """Return blocks of the residuals of a fit; facts about them are added to `about`."""
     about["residual"], blocks = residual_blocks(result, planes, say)
     about["told"]["Residual"] = (
-        f"what {fit} leaves of each view's samples, as {planes} planes, which have "
+        f"the residual of {fit} in each view's samples, as {planes} planes, which contain "
         f"{100 * about['residual']['kept']:.4g} % of its energy. The residual belongs to one view, and fades out "
         "beside this view."
     )

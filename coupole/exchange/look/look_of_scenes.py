@@ -166,8 +166,12 @@ def _about(scene: PlainScene, folder: Path, powers: dict[str, Array], materials:
             ),
             "Light": "straight from lamps and from the upper half of the sky, with shadows of lamps; none from "
             "surface to surface, and no mirror images of other objects."
-            + (" Lamps near by are disks far away, as strong as at the camera's target." if lamps else ""),
-            "Shape": "flat triangles, also where the renderer has them smooth",
+            + (
+                " Lamps near by are replaced by distant disks that are equally strong at the camera's target."
+                if lamps
+                else ""
+            ),
+            "Shape": "flat triangles, also where the renderer smooths them",
         },
     }
 

@@ -135,7 +135,7 @@ def _early(look: Look, inside: list[Block]) -> int:
 
 
 def _shared_out(look: Look, most_bytes: int) -> tuple[list[Block], list[Block]]:
-    """Return the blocks that go into the page, and those that go beside it.
+    """Return the blocks that go into the page, and the blocks that go beside it.
 
     The blocks that a page needs to begin go into it all together, or not at all. Then the others go into it in
     their order, while there is room.

@@ -51,7 +51,7 @@ def look_texels(flat: FlatSurface, count: int, prefix: str = "") -> LookTexels:
         place = {"column": column, "row": row, "blocks": [block.name for block in tile]}
         about["tiles"].append({**place, "size_px": list(tile[1].shape[1::-1])})
     remark = (
-        f"{np.count_nonzero(flat.texel_of_place >= 0):,} of {flat.texel_mm:.3g} mm, "
+        f"{np.count_nonzero(flat.texel_of_place >= 0):,} texels of {flat.texel_mm:.3g} mm, "
         f"{100 * flat.measured_share:.0f} % from pixels of the views, the others from triangles"
     )
     return LookTexels(about, remark, _places_of_corners(flat, count), _means(flat, count), blocks)

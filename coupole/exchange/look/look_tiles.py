@@ -54,7 +54,7 @@ def tiles_of(values: NDArray[np.float32]) -> Iterator[Tile]:
 
 
 def halve_pictures(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[n, ceil(h / 2), ceil(w / 2)] means over those of 2 x 2 pixels that have a value."""
+    """[n, ceil(h / 2), ceil(w / 2)] means over the pixels of each 2 x 2 that have a value."""
     count, height, width = values.shape
     means = np.empty((count, -(-height // 2), -(-width // 2)), np.float32)
     for whole, half in zip(values, means, strict=True):

@@ -41,7 +41,8 @@ class Material:
 def materials_of(surface: MeasuredSurface) -> Iterator[Material]:
     """Return the materials of the chosen triangles or, by default, those of all clusters.
 
-    Raises InputError if a triangle has none, or if nothing is chosen and there are no clusters, or too many.
+    Raises InputError if a triangle has no material, or if no triangle is chosen and there are no clusters, or too
+    many.
     """
     chosen_triangles(surface, optional=True)
     for number in surface.options.triangles:
@@ -63,8 +64,8 @@ def materials_of(surface: MeasuredSurface) -> Iterator[Material]:
 
 
 def chosen_triangles(surface: MeasuredSurface, *, optional: bool = False) -> NDArray[np.int64]:
-    """Return the chosen triangles. Raises InputError if one does not exist or has no material, or if none is
-    named."""
+    """Return the chosen triangles. Raises InputError if a triangle does not exist or has no material, or if no
+    triangle is named."""
     if not surface.options.triangles and not optional:
         raise InputError("--triangle: expected the numbers of triangles whose samples are exported")
     for number in surface.options.triangles:

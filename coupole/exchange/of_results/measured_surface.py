@@ -45,7 +45,7 @@ class ExportChoice:
     most_error: float | None = None
     """Greatest relative error of tables that adapt to their material; None for plain tables."""
     texel_mm: float | None = None
-    """Width of a map's texels; None for that of the views."""
+    """Width of a map's texels; None for the width of the views' pixels."""
     map_px: int | None = None
     """Greatest width of maps; None for no limit."""
     uv_mesh: Path | None = None
@@ -118,9 +118,11 @@ def read_surface(
     result = RunResult(folder)
     name = fit or _best(result, takes_texels=takes_texels)
     if name not in (*MATERIALS, TEXELS):
-        raise InputError(f"--fit: expected {' or '.join(MATERIALS)}, which hold from everywhere; got {name}")
+        raise InputError(
+            f"--fit: expected {' or '.join(MATERIALS)}, which are valid from every direction; got {name}"
+        )
     if name == TEXELS and not takes_texels:
-        raise InputError("--fit texels: is for formats with maps; this one has one material for each triangle")
+        raise InputError("--fit texels: is for formats with maps; this format has one material for each triangle")
     of_triangles = best_fit(result, MATERIALS) if name == TEXELS else name
     path = result.materials_path(of_triangles)
     if not path.exists():

@@ -180,7 +180,7 @@ def _text(words: str) -> dict[str, list[str]]:
 
 
 def checked_base(base_url: str) -> str:
-    """Return the base without slashes at its end. Raises InputError if it is not an http address, or has
+    """Return the base without slashes at its end. Raises InputError if the base is not an http address, or has
     characters that an address must not have (RFC 3986, appendix A)."""
     try:
         parts = urlsplit(base_url)

@@ -159,7 +159,7 @@ def refuse_few_lights(name: str, lights: Floats) -> NDArray[np.int64]:
     above = np.flatnonzero(lights[:, 2] > 0.0)
     if len(above) < FEWEST_LIGHTS:
         raise InputError(
-            f"{name}: {len(above)} lights are before the picture's plane; at least {FEWEST_LIGHTS} are needed"
+            f"{name}: {len(above)} lights are in front of the picture's plane; at least {FEWEST_LIGHTS} are needed"
         )
     return above
 

@@ -60,7 +60,7 @@ def classes_of_channels(
     if share.min() < _COVERED:
         raise InputError(
             f"library: expected spectra wherever the channels see light; found {share.min():.0%} of one channel's "
-            "covered; use a library with a wider range"
+            "light covered; use a library with a wider range"
         )
     weights = weights[:, covered_bands] / share[:, None]
     ratio = kubelka_munk.k_over_s(np.clip(references.reflectance[np.ix_(rows, covered_bands)], 0.004, 0.999))

@@ -79,8 +79,9 @@ class ClassModel:
         return _probabilities(np.column_stack([near @ self._weights, variance]), self._scale)
 
     def quick_probabilities(self, reflectance: Array) -> Array:
-        """The same in a third of the time, for many pixels; probabilities differ by less than 0.001. Distances are
-        of single precision, and directions in which the references hardly differ count as noise."""
+        """Return nearly the same probabilities in a third of the time, for many pixels; they differ by less than
+        0.001. Distances are of single precision, and directions in which the references hardly differ count as
+        noise."""
         rows, directions, factors = self._main_directions
         near = self._kernel(_squared_distances(features(reflectance).astype(np.float32), rows)).astype(np.float64)
         quadratic = (near**2).sum(axis=1) / _NOISE - ((near @ directions) ** 2) @ factors
@@ -121,9 +122,9 @@ class ClassModel:
 
     @cached_property
     def threshold(self) -> float:
-        """A spectrum counts as known from this probability on that its class is in the library. If the class of a
-        reference is left out of the library, only a share of 0.05 of the references reach this probability.
-        References that a family (`pigment_classes`) excludes count as not reaching it.
+        """Probability that the class of a spectrum is in the library, from which the spectrum counts as known. If
+        the class of a reference is left out of the library, only a share of 0.05 of the references reach this
+        probability. References that a family (`pigment_classes`) excludes count as not reaching it.
         """
         probabilities = self.held_out.without_class
         known_probability = 1.0 - probabilities[:, -1]

@@ -66,7 +66,7 @@ class Evidence:
     runner_up: Array
     """[n] reflectance of the nearest reference of the second class, scaled in the same way."""
     fit: Array
-    """[n] reflectance of the answer: that of the nearest reference, or of the mixture's two references
+    """[n] reflectance of the answer: of the nearest reference, or of the mixture's two references
     together."""
     log_odds: Array
     """[n] for the first class against the second: positive where the spectrum is nearer to the first, in units of
@@ -156,12 +156,14 @@ def _judge(
     flat = "; the spectrum has no bands, so its level decides" if log_k_over_s(reflectance).std() < _FLAT else ""
     if mixture is not None and mixture.is_settled and not _lacks_siblings(of_bands, mixture):
         return "mixture", (
-            f"two references leave {mixture.residual:.1%} of K/S; one alone is worse by {mixture.gain:.0f} and "
-            f"two of other classes by {mixture.lead:.0f} in Schwarz's criterion"
+            f"two references leave a residual of {mixture.residual:.1%} of K/S; a single reference is worse by "
+            f"{mixture.gain:.0f} and "
+            f"two references of other classes by {mixture.lead:.0f} in Schwarz's criterion"
         )
     if not model.is_known(probabilities)[0]:
         return "unknown", (
-            f"the probability that the library has its class is {1.0 - probabilities[0, -1]:.0%}, and at least "
+            f"the probability that the library has the spectrum's class is "
+            f"{1.0 - probabilities[0, -1]:.0%}, and at least "
             f"{model.threshold:.0%} is needed; {best.class_name} comes nearest{flat}"
         )
     missing = lacking(best.class_name, model.class_names)

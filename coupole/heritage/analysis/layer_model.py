@@ -39,7 +39,7 @@ class Deserved:
 
 @dataclass(frozen=True)
 class GrainRatio:
-    """Mean grain size of one grinding, relative to that of another."""
+    """Mean grain size of one grinding, relative to the mean grain size of another."""
 
     ratio: float
     u_ratio: float
@@ -84,7 +84,10 @@ def deserved_by_measurement(
     chi2, count = float(np.sum(differences**2) / (2.0 * noise**2)), differences.size
     largest, direct_share = float(np.abs(differences).max()), float(transmittance.max())
     if chi2 <= count + 3.0 * np.sqrt(2.0 * count):
-        because = f"spectra under directional light are those under diffuse light within the noise of {noise:g}"
+        because = (
+            f"spectra under directional light agree with the spectra under diffuse light "
+            f"within the noise of {noise:g}"
+        )
         return Deserved("two fluxes", because, largest, direct_share)
     because = (
         f"spectra under directional light differ by up to {largest:.3f} from those under diffuse light, "

@@ -60,8 +60,8 @@ def read_palette(sources: Sequence[Path]) -> tuple[Paint, ...]:
             )
     if "per layer" in {paint.unit for paint in paints} and len(paints) > 1:
         raise InputError(
-            f"{paints[0].source}: K and S are of a layer of unknown thickness, so it cannot be mixed with "
-            "others; measure it with its thickness"
+            f"{paints[0].source}: K and S are of a layer of unknown thickness, so this paint cannot be mixed "
+            f"with others; measure it with its thickness"
         )
     if not paints:
         raise InputError(f"{', '.join(map(str, sources))}: expected paints ({ENDING}, or a library); found none")

@@ -1,6 +1,6 @@
 """The recipe of a colour: shares of paints with an opaque mixture that matches a target (Duncan 1949).
 
-K and S of a mixture are the sums of those of its paints, weighted by the shares. Subsets of the palette are
+K and S of a mixture are the sums of its paints' K and S, weighted by the shares. Subsets of the palette are
 compared by the linear problem sum c_i (K_i - Q S_i) = 0, where Q is the target's K/S; it is weighted so that its
 residuals are those of measured reflectance. The best few subsets are refined by least squares on the measured
 reflectance itself, with shares that are not negative. If there are at most `_EXHAUSTIVE` subsets of a size, all
@@ -61,7 +61,7 @@ class Recipe:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Recipes of 1, 2, ... paints, and the one that is worth its number of paints."""
+    """Recipes of 1, 2, ... paints, and the recipe that justifies its number of paints."""
 
     recipes: tuple[Recipe, ...]
     chosen_index: int
@@ -202,7 +202,8 @@ class _Problem:
             )
         inside = np.maximum(self.face.inside(MeasuredReflectance(clipped_target)).values, _DARKEST)
         q = kubelka_munk.k_over_s(inside)
-        # dR/dQ inside, then d(seen)/dR: residuals of the linear problem are about those of what is seen.
+        # dR/dQ inside, then d(seen)/dR: residuals of the linear problem are about the residuals of the seen
+        # reflectance.
         slope = inside / np.sqrt(np.maximum(q * (q + 2.0), 1e-9))
         slope = slope * self.face.passing / (1.0 - self.face.inner * inside) ** 2
         self.system = slope[:, None] * (self.k - q[:, None] * self.s)

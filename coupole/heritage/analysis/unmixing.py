@@ -27,7 +27,7 @@ _MODEL, _NOISE = 0.01, 0.001
 _CORRELATED_BANDS = 3.0
 """Length, in bands, over which the model's error is correlated."""
 _RATIOS = (0.0, 0.05, 0.25)
-"""Ratios of the variance of the model's error to that of noise, relative to `_MODEL` and `_NOISE`."""
+"""Ratios of the variance of the model's error to the variance of noise, relative to `_MODEL` and `_NOISE`."""
 _LEAST_NOISE = 0.02
 """Variance of noise where the model limits the accuracy; with it, no band is without noise."""
 _LEAST_RESIDUAL = 1e-8
@@ -48,10 +48,10 @@ class Unmixed:
     residual: float
     """Relative residual of K/S, rms."""
     gain: float
-    """Schwarz's criterion of the best single reference minus that of the pair; more than 10 is very strong
+    """Schwarz's criterion of the best single reference minus the pair's criterion; more than 10 is very strong
     evidence (Kass and Raftery 1995)."""
     lead: float
-    """Schwarz's criterion of the best pair of other classes minus that of this pair."""
+    """Schwarz's criterion of the best pair of other classes minus this pair's criterion."""
 
     @property
     def is_settled(self) -> bool:

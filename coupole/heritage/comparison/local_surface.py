@@ -119,7 +119,7 @@ def _fit_batch(
     normals: Floats,
     reach_mm: float,
 ) -> LocalFits:
-    """Fit near places [n, 3] alone; the scatter is that of each place by itself."""
+    """Fit near places [n, 3] alone; the scatter is found for each place by itself."""
     away, near = tree.query(places, NEIGHBOURS)
     offsets = np.asarray(tree.data)[near] - places[:, None]
     tangent, bitangent = _tangents(normals)

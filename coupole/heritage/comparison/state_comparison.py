@@ -198,8 +198,8 @@ def _fits(
 
 
 def _of_result(points_mm: Floats, colours: Colours, places_mm: Floats) -> Floats:
-    """[n, 3, 3] covariance of a result's colour at places, from the nearest point that has one. It is not divided
-    by the number of points around, because these points share most of it."""
+    """[n, 3, 3] covariance of a result's colour at places, from the nearest point that has one. The covariance is
+    not divided by the number of points around, because these points share most of it."""
     if colours.covariance is None:
         return np.zeros((len(places_mm), 3, 3))
     there = np.isfinite(colours.lab).all(axis=1)

@@ -1,8 +1,8 @@
 """Classes of pigments in an image cube: regions of like spectra first, then the full identification of each
 region's mean, then each pixel by itself.
 
-The map has the region's answer. Each pixel has a confidence: the probability that the pixel's own spectrum gives
-to this answer. A pixel that is like no region has no answer.
+In the map, each pixel has its region's answer. Each pixel has a confidence: the probability that the pixel's own
+spectrum gives to this answer. A pixel that is like no region has no answer.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class ImageFinding:
     region_numbers: NDArray[np.uint8]
     """0: like no region, or not looked at."""
     confidence: NDArray[np.float32]
-    """Probability that the pixel's own spectrum gives to the answer of the map; NaN where there is none."""
+    """Probability, by the pixel's own spectrum, of the map's answer; NaN where there is no answer."""
     picture: NDArray[np.uint8]
     """[rows, columns, 3] three bands as red, green and blue, for the eye."""
     names: tuple[str, ...]
@@ -146,7 +146,7 @@ class _Mean:
 
     @property
     def label(self) -> str:
-        """The name of its class in the map; empty if it has none."""
+        """The name of the region's class in the map; empty if it has none."""
         if self.finding.verdict == "mixture":
             return " + ".join(sorted({part.class_name for part in self.finding.parts}))
         return self.finding.class_name if self.finding.verdict == "match" else ""

@@ -91,7 +91,7 @@ def read_line(path: Path, *, unit: Unit = "auto") -> LinePoints:
     if np.any(steps <= 0.0):
         row = int(np.flatnonzero(steps <= 0.0)[0])
         raise _wrong(path, spectra[row + 1].line - 1,
-                     f"expected another place than that of {spectra[row].name}, found the same")  # fmt: skip
+                     f"expected another place than the place of {spectra[row].name}, found the same")  # fmt: skip
     return LinePoints(spectra, np.concatenate([[0.0], np.cumsum(steps)]), places_mm, axes)
 
 

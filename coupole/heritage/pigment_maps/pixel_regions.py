@@ -1,9 +1,10 @@
 """Regions of like spectra in an image: pixels that differ by little more than the image's own noise.
 
 Noise is estimated from differences of neighbours. Spectra are divided by it, and reduced to the components whose
-variance exceeds that of noise (Green et al., IEEE Trans. Geosci. Remote Sens. 26, 65, 1988). Groups are split in
-two along their widest direction until none is wider than noise, or there are enough; then Lloyd's iteration
-(IEEE Trans. Inf. Theory 28, 129, 1982) settles all of them together. The result does not depend on chance.
+variance exceeds the variance of noise (Green et al., IEEE Trans. Geosci. Remote Sens. 26, 65, 1988). Groups are
+split in two along their widest direction until none is wider than noise, or there are enough; then Lloyd's
+iteration (IEEE Trans. Inf. Theory 28, 129, 1982) settles all of them together. The result does not depend on
+chance.
 """
 
 from __future__ import annotations

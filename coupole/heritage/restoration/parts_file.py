@@ -59,7 +59,9 @@ class Box(Model):
     @model_validator(mode="after")
     def _has_room(self) -> Box:
         if any(low >= high for low, high in zip(self.low_mm, self.high_mm, strict=True)):
-            raise ValueError("the box is empty: each of `low_mm` must be less than that of `high_mm`")
+            raise ValueError(
+                "the box is empty: each number of `low_mm` must be less than the same number of `high_mm`"
+            )
         return self
 
 

@@ -188,7 +188,9 @@ def chosen_file(document: Document, restoration_file: RestorationFile, choice: C
         by_name = {light_set.name: light_set.lights for light_set in restoration_file.other_lights}
         if choice.lights not in by_name:
             known_names = ", ".join(by_name) or "none; name some as `other_lights`"
-            raise InputError(f"--lights {choice.lights}: expected one of those of {document.path}: {known_names}")
+            raise InputError(
+                f"--lights {choice.lights}: expected one of the lights of {document.path}: {known_names}"
+            )
         changes["lights"] = by_name[choice.lights]
     if choice.samples:
         changes["samples"] = choice.samples

@@ -2,8 +2,8 @@
 
 `content_sha256` is the SHA-256 of the canonical content: JSON with sorted keys, without blanks, without the keys
 `files`, `content_sha256` and `sha256`. The page prints it. `files` has the checksum of each file beside the
-record, `sha256` that of the whole record without this key. Checksums tell that something was changed. They do
-not prove who signed: whoever changes a file can compute them again.
+record, `sha256` the checksum of the whole record without this key. Checksums tell that something was changed.
+Checksums do not prove who signed: a person who changes a file can compute them again.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class LibraryFacts:
     table: str
     """Table with the classes of its spectra."""
     licence: str
-    """Words of its licence; empty if it is not stated."""
+    """Words of the library's licence; empty if no licence is stated."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,8 @@ def signature_of(name: str, role: str) -> Signature:
 
 
 def new_record(origin: Origin, findings: Sequence[PigmentFinding], results: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record without checksums of files. `results` are other results by name, such as those of a map."""
+    """Return a record without checksums of files. `results` are other results by name, such as the results of a
+    map."""
     library = origin.library
     signature = origin.signature
     record: dict[str, Any] = {

@@ -180,7 +180,7 @@ def _steadiness(finding: ImageFinding) -> str:
     """Return a sentence about the effect of the means' noise on the answers."""
     words = (
         "The mean of each region was drawn 200 times with its standard error, which follows from the scatter of "
-        "the pixels. Errors that all pixels share, such as those of the white, are not included. The first "
+        "the pixels. Errors that all pixels share, such as errors of the white, are not included. The first "
         "class, or the verdict unknown, stayed in "
     )
     unsteady_regions = [region for region in finding.regions if region.draws_alike < _STEADY]

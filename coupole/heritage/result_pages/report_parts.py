@@ -29,7 +29,8 @@ LIMITS = (
     "With Kremer's library of historical pigments, paints of other makers were matched in 27 of 74 tested cases "
     "and matched wrongly in 3. The first class was right in 57 of them. Other libraries were not tested "
     "in this way.",
-    "Probabilities hold among the classes of this library and for spectra like those in it. Confirm the finding "
+    "Probabilities apply to the classes of this library, and to spectra like the spectra in "
+    "it. Confirm the finding "
     "by another method (such as X-ray fluorescence or Raman spectroscopy) before a treatment depends on it.",
 )
 

@@ -129,7 +129,7 @@ def _of_views(model: ColmapModel, measured_run: MeasuredRun) -> Floats:
 
 
 def _refuse_other_lens(path: Path, number: int, camera: ColmapCamera, measured_run: MeasuredRun) -> None:
-    """Raise InputError for another lens: poses hold only for the lens with which they were found."""
+    """Raise InputError for another lens: poses are valid only for the lens with which they were found."""
     where = f"{path.with_stem('cameras')}: camera {number}"
     if camera.size_px != measured_run.frames.size_px:
         raise InputError(f"{where}: expected pictures of {measured_run.frames.size_px} px; found {camera.size_px}")

@@ -29,14 +29,14 @@ TOLD = {
     "lens": "fx, fy, cx, cy (px), k1, k2, p1, p2, k3",
     "views": "run and view",
     "base_from_camera": "[views, 4, 4] mm",
-    "vertices_mm": "[n, 3] of the mesh, those that triangles use, in its order, base frame",
+    "vertices_mm": "[n, 3] vertices that triangles use, in the mesh's order, base frame",
     "vertex_u_mm": "[n] standard uncertainty along the normal",
-    "names": "of the unknowns, with units; cameras by their places in `views`",
-    "steps": "of the unknowns, from the initial values of records and scan",
-    "covariance": "of the steps",
-    "stated_covariance": "of the unknowns without the pictures, from records and scan",
-    "controls_mm": "[controls, 3] where `shape` is, base frame",
-    "middle_mm": "[3] about which `mesh` turns, base frame",
+    "names": "names of the unknowns, with units; cameras by their places in `views`",
+    "steps": "steps of the unknowns from the initial values of records and scan",
+    "covariance": "covariance of the steps",
+    "stated_covariance": "covariance of the unknowns without the pictures, from records and scan",
+    "controls_mm": "[controls, 3] points at which `shape` is given, base frame",
+    "middle_mm": "[3] point about which `mesh` turns, base frame",
 }
 MATCH_FIELDS = {
     "reference": "place in `views` of the view that sees the spot in the greatest detail",
@@ -72,8 +72,8 @@ class RefinedGeometry:
         run = measured_run.run.folder.name
         if absent := [view.name for view in measured_run.views if (run, view.name) not in self.base_from_camera]:
             raise InputError(
-                f"{self.path}: holds no pose of the view {absent[0]} of {run}; `coupole reflectance refine` "
-                "with all runs that you name makes them"
+                f"{self.path}: holds no pose of the view {absent[0]} of {run}; give all runs that you name to "
+                f"`coupole reflectance refine`"
             )
         if self.inputs.get(run) != dict(measured_run.frames.inputs):
             raise InputError(

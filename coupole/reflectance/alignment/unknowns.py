@@ -5,9 +5,10 @@ The vector holds, in this order: the lens's estimated parameters; six steps for 
 base's axes, rad about the camera's, as `rotations.moved`); six of the whole mesh (mm along the base's axes, rad
 about axes through its middle); and the displacement of the surface along its normals at control points, mm.
 
-Hand-eye and axis zeros move all cameras together: the covariance of the cameras' steps contains theirs, and the
-arm's own scatter in each view. The displacement is a Gaussian process over space: control points are correlated by
-exp(-r^2 / 2 scale^2), and they predict the values between them (Rasmussen and Williams 2006, Eq. 2.25).
+Hand-eye and axis zeros move all cameras together: the covariance of the cameras' steps contains their covariance,
+and the arm's own scatter in each view. The displacement is a Gaussian process over space: control points are
+correlated by exp(-r^2 / 2 scale^2), and they predict the values between them (Rasmussen and Williams 2006, Eq.
+2.25).
 """
 
 from __future__ import annotations

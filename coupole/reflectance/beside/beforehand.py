@@ -49,7 +49,9 @@ def reasons_against(plan: Path, rig: Path | None, result: Path | None, run: Path
 
 def _of_folder(result: Path | None, run: Path | None) -> Iterator[str]:
     if run is not None and (other := _other_result(Run(run), result)):
-        yield f"--result: frames of this run were discarded for the samples in {other}; no other can be made"
+        yield (
+            f"--result: frames of this run were discarded for the samples in {other}; no other result can be made"
+        )
     if result is None:
         return
     if not result.exists():
@@ -61,7 +63,7 @@ def _of_folder(result: Path | None, run: Path | None) -> Iterator[str]:
         return
     is_own = run is not None and is_of_run(result, run.name)
     if not result.is_dir() or (not is_own and any(result.iterdir())):
-        yield f"--result {result}: expected a new folder, or that of this run's result; found other content"
+        yield f"--result {result}: expected a new folder, or the folder of this run's result; found other content"
 
 
 def _other_result(run: Run, result: Path | None) -> Path | None:

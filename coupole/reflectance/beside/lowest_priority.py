@@ -23,7 +23,7 @@ _NICE_OF_THE_END = 10
 class ThreadForTheEnd:
     """A thread for the work after the last frame, for which a person waits. Only a privileged process can take
     back a low priority (setpriority(2), sched(7)). So this thread is begun before `yield_to_all_others`, and keeps
-    its own."""
+    its own priority."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, "after the last frame")
@@ -35,7 +35,7 @@ class ThreadForTheEnd:
         self._pool.submit(self._run, work).result()
 
     def _run(self, work: Callable[[], None]) -> None:
-        if sys.platform == "linux":  # elsewhere, the priority is that of the whole process
+        if sys.platform == "linux":  # elsewhere, a priority applies to the whole process
             with contextlib.suppress(OSError):
                 nice = max(_NICE_OF_THE_END, os.getpriority(os.PRIO_PROCESS, self.number))
                 os.setpriority(os.PRIO_PROCESS, self.number, nice)
@@ -44,8 +44,8 @@ class ThreadForTheEnd:
 
 def yield_to_all_others(but: ThreadForTheEnd) -> None:
     """Use processors and disk only while no other process wants them, and be the first to be ended if memory is
-    short. Threads that begin later inherit this, except those of one thread. Each of the four measures is taken if
-    the system supports it."""
+    short. Threads that begin later inherit these measures, except threads that `but` begins. Each of the four
+    measures is taken if the system supports it."""
     if sys.platform != "linux":
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, 0, 19)
@@ -65,7 +65,7 @@ def yield_to_all_others(but: ThreadForTheEnd) -> None:
 
 def end_with(parent: int) -> None:
     """Let the system end this process by SIGKILL when the thread that began it ends, even while it is stopped
-    (prctl(2)). On systems without this call, the process learns it from the end of its input."""
+    (prctl(2)). On systems without this call, the process learns of this from the end of its input."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:  # it has died before

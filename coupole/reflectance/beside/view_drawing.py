@@ -1,7 +1,7 @@
 """Draws normals and materials, with their uncertainty, while a run goes on.
 
 A view whose samples have just been taken gets a first look: a quick fit to some of its triangles and LEDs. While
-its frames arrive, it gets earlier ones, from some of the frames that are there. First looks are not part of the
+its frames arrive, it gets earlier looks, from some of the frames that are there. First looks are not part of the
 result. They use one view alone, and its samples still contain light that was reflected by other surfaces. When the
 result of the views so far is complete, its maps replace the first looks.
 """

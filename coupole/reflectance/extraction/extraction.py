@@ -34,7 +34,7 @@ from coupole.storage.array_digest import ArrayDigest
 Floats = NDArray[np.float64]
 
 _PATCHES_BESIDE = 9
-"""Number of patches: a patch and those around it."""
+"""Number of patches: a patch and the patches around it."""
 MOST_BLUR_PX = 2.0
 """Largest diameter of the circle of confusion of a pixel that is used, px."""
 Say = Callable[[str, int, int], None]
@@ -250,13 +250,15 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface, digest: A
     file.attrs["lateral_u_mm"] = u_lateral_mm  # of where pixels look, across the line of sight
     digest.add("seen", surface.places)
     file.create_dataset("seen", data=surface.places, compression="gzip", compression_opts=1, track_times=False)
-    file["seen"].attrs["told"] = "[h, w] place in `triangles` of what a pixel sees, -1 where it is not used"
+    file["seen"].attrs["told"] = (
+        "[h, w] place in `triangles` of the triangle that a pixel sees, -1 where the pixel is not used"
+    )
     _dataset(file, "triangles", surface.triangles, "numbers of the mesh's triangles, from 0", digest)
     _dataset(file, "pixels", work.reader.pixels, "pixels of each channel on each triangle", digest)
     description = "relative standard uncertainty from the pixels' own responses, shared by a triangle's samples"
     _dataset(file, "u_response", work.reader.u_response, description, digest)
-    _dataset(file, "centres_mm", work.facets.centres_mm, "of the triangles, mm, base frame", digest)
-    _dataset(file, "normals", work.facets.normals, "of the triangles, unit, base frame", digest)
+    _dataset(file, "centres_mm", work.facets.centres_mm, "centres of the triangles, mm, base frame", digest)
+    _dataset(file, "normals", work.facets.normals, "normals of the triangles, unit length, base frame", digest)
     _dataset(file, "camera_mm", view.base_from_camera[:3, 3], "projection centre, mm, base frame", digest)
     _dataset(file, "leds", leds, "numbers of the LEDs", digest)
     centres_mm, normals = measured_run.leds.of(leds)
@@ -280,7 +282,11 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface, digest: A
     )
     scales = np.stack([_dn_share(measured_run, view, int(led)) for led in leds])
     _dataset(
-        file, "full_scales", scales, "of the camera that f cos_i E/Phi of 1 gives in the longest exposure", digest
+        file,
+        "full_scales",
+        scales,
+        "share of the camera's range for f cos_i E/Phi = 1 in the longest exposure",
+        digest,
     )
 
 
@@ -304,7 +310,7 @@ def _begin_samples(file: h5py.File, work: ViewPass) -> dict[str, h5py.Dataset]:
     codes = ", ".join(f"{code} {name}" for name, code in CODES.items())
     kinds: dict[str, tuple[Any, tuple[int, ...], str]] = {
         "f": (np.float16, (count, leds, channels), "reflectance, 1/sr; NaN where there is no sample"),
-        "u_own": (np.float16, (count, leds, channels), "relative standard uncertainty, of noise"),
+        "u_own": (np.float16, (count, leds, channels), "relative standard uncertainty from noise"),
         "codes": (np.uint8, (count, leds), f"of a triangle and an LED: {codes}"),
     }
     if "glare" in work.measured_run.records:

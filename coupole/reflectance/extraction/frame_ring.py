@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from coupole.calibration.light.frames import LightFrame
 
 READERS = 2
-"""Number of threads that read; also the number of slots in addition to those of the frames that are worked on."""
+"""Number of threads that read; also the number of slots in addition to the slots of the frames that are worked
+on."""
 _SECTOR = 512
 """Bytes. Memory for a direct read begins at a multiple of this."""
 

@@ -57,7 +57,7 @@ class CodesAhead:
         self._codes: dict[bytes, NDArray[np.uint8]] = {}
 
     def begin(self, sight: str) -> None:
-        """Keep the codes of this view; those of another view are forgotten. `sight` identifies what the view
+        """Keep the codes of this view; the codes of another view are forgotten. `sight` identifies what the view
         sees."""
         if sight != self._sight:
             self._sight, self._codes = sight, {}
@@ -81,7 +81,7 @@ def _keys_of(leds: Positions) -> Sequence[bytes]:
 
 
 def lamp_codes(mesh: PacketMesh, facets: Facets, leds: Positions, pool: Executor) -> NDArray[np.uint8]:
-    """[leds, triangles] codes, computed LED by LED in the threads of a pool; `mesh` throws the shadows."""
+    """[leds, triangles] codes, computed LED by LED in the threads of a pool; `mesh` casts the shadows."""
     facets.ray_starts_mm  # noqa: B018  made once, before threads want it
     rows = pool.map(first_alone(lambda led: _codes_of_led(mesh, facets, leds, led)), range(len(leds.ids)))
     return np.stack(list(rows))

@@ -266,7 +266,8 @@ def refuse_other_gain(path: Path, record: Record, gain_db: float) -> None:
     record_db = record.fixed.get("gain_db", 0.0)
     if abs(record_db - gain_db) > SAME_GAIN_DB:
         raise InputError(
-            f"{path}: holds for a gain of {record_db:g} dB; the run has {gain_db:g} dB. Name a record of this gain"
+            f"{path}: is valid for a gain of {record_db:g} dB; the run has {gain_db:g} dB. "
+            "Name a record of this gain"
         )
 
 

@@ -16,5 +16,5 @@ CODES = {
     "shaded": SHADED,
     "penumbra": PENUMBRA,
     "hidden by the cell": BY_CELL,
-    "shaded by what is not known": BY_UNKNOWN,
+    "shaded by something unknown": BY_UNKNOWN,
 }

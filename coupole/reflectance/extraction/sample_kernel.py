@@ -221,8 +221,8 @@ def _veil(begin, end, channel, lists, veils):  # type: ignore[no-untyped-def]
 
 @kernel(error_model="numpy")
 def _mean(begin, end, channel, lists, response, darks, shots, number):  # type: ignore[no-untyped-def]
-    """Return the mean of one pass, and its variance. They are NaN without pixels, with a pixel at the top of the
-    range, or with a mean at its bottom."""
+    """Return the mean of one pass, and its variance. They are NaN if there are no pixels, if a pixel is at the top
+    of the range, or if the mean is at its bottom."""
     none, unity = np.float32(0.0), np.float32(1.0)
     square, cube = response.curve[channel, 0], response.curve[channel, 1]
     in_dark, gain = response.noise[channel, 0], response.noise[channel, 1]

@@ -27,7 +27,7 @@ def add_mirrored(
     emitter: Emitter,
     lobe_rays: int,
 ) -> None:
-    """Draw rays from the materials' lobes, and add the light of an emitter that these rays meet; `mesh` throws the
+    """Draw rays from the materials' lobes, and add the light of an emitter that these rays meet; `mesh` casts the
     shadows."""
     of_emitter = (
         emitter.near, emitter.axes, emitter.centre_mm, emitter.halves_mm, emitter.radiance, emitter.density

@@ -31,7 +31,7 @@ _PACKET = 4
 
 
 def trace_beam(mesh: PacketMesh, surface: Surface, beam: Beam, codes: Codes) -> None:
-    """Fill `codes` [h, w], which say whether the beam reaches each pixel; `mesh` throws the shadows."""
+    """Fill `codes` [h, w], which say whether the beam reaches each pixel; `mesh` casts the shadows."""
     by = _facing(surface, beam), beam.place, beam.axis, beam.exponent
     in_strips(
         len(codes), lambda rows: _begin(surface.triangle_of_pixel[rows], surface.places_mm[rows], *by, codes[rows])

@@ -78,7 +78,7 @@ def quality(mae: dict[str, Any], fits: Sequence[Fit]) -> str:
     titles = {fit.name: fit.title for fit in fits}
     best = min(known_errors, key=lambda name: known_errors[name])
     return (
-        f"With the most ({setting} {value:g}) the smallest error is that of {titles[best]}: "
+        f"With the most data ({setting} {value:g}) {titles[best]} has the smallest error: "
         f"{100 * known_errors[best]:.3f} % of range."
     )
 

@@ -80,9 +80,8 @@ def _notes(document: dict[str, Any]) -> list[str]:
         kinds = ((words, document["mae_of_view"][name]) for name, words in _TOLD.items())
         errors = ", ".join(f"{words} {100 * mae:.3f} %" for words, mae in kinds if mae is not None)
         notes.append(
-            f"From the view {document['without_view']}, whose samples the clusters did not use: {errors} (their "
-            "own "
-            "materials had them)."
+            f"From the view {document['without_view']}, whose samples the clusters did not use: {errors} (the "
+            f"triangles' own materials used these samples)."
         )
     if document["mae_ratio"] is not None:
         notes.append(f"Ratio {document['mae_ratio']:.2f}; published: 1.7 (seed 003, figure 6, harmonics).")

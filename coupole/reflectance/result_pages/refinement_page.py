@@ -49,7 +49,7 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
         )
     if surprising(about):
         yield (
-            "poses, lens and mesh were moved farther than records, scan and options state: square sum "
+            "poses, lens and mesh were moved farther than records, scan and options state: the sum of squares is "
             f"{about['chi2_of_steps']:.0f}, where about {about['determined']:.0f} is expected. State larger "
             "uncertainties, or look for a record that does not belong to these runs"
         )
@@ -101,7 +101,7 @@ _ARROWS = (
     f"with the greatest detail; they are {LONGER:g} times as long as the true distance. The first two are at the "
     "top."
 )
-_STEPS = "Steps along the base's axes and about the camera's, with standard uncertainties."
+_STEPS = "Steps along the base's axes and about the camera's axes, with standard uncertainties."
 
 
 def _next_step(name: str, about: dict[str, Any]) -> Inline:
@@ -112,11 +112,13 @@ def _next_step(name: str, about: dict[str, Any]) -> Inline:
 
 def _unknowns(about: dict[str, Any]) -> str:
     return (
-        f"{about['unknowns']} unknowns, of which the pictures determine {about['determined']:.0f}; square sum of "
-        f"the steps divided by the stated uncertainties: {about['chi2_of_steps']:.0f}. Matches scatter "
+        f"{about['unknowns']} unknowns, of which the pictures determine {about['determined']:.0f}; sum of the "
+        f""
+        f"squares of the steps, each divided by its stated uncertainty: "
+        f"{about['chi2_of_steps']:.0f}. Matches scatter "
         f"{about['noise_factor']:.1f} times as much as noise and texture alone explain, and are weighted "
-        f"accordingly; {about['rejected']} were rejected. Motions that pictures cannot determine, such as that "
-        "of mesh and cameras together, keep their stated uncertainty."
+        f"accordingly; {about['rejected']} were rejected. Motions that pictures cannot determine, such as a "
+        f"common motion of mesh and cameras, keep their stated uncertainty."
     )
 
 
@@ -153,7 +155,7 @@ def _cameras(about: dict[str, Any]) -> Table:
 def _mesh(about: dict[str, Any]) -> Section:
     mesh = about["mesh"]
     note = (
-        f"Along its normals it was moved by {mesh['shape_rms_mm']:.3f} mm (root mean square of points "
+        f"Along its normals the mesh was moved by {mesh['shape_rms_mm']:.3f} mm (root mean square of points "
         f"{mesh['scale_mm']:g} mm apart); their median standard uncertainty is {mesh['shape_median_u_mm']:.3f} "
         "mm, "
         f"{mesh['shape_stated_u_mm']:g} mm was stated."

@@ -55,8 +55,8 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
     if poses := about.get("poses"):
         yield (
             f"cameras have the poses of COLMAP, {poses['median_moved_mm']:.3g} mm and "
-            f"{poses['median_turned_deg']:.2g} degrees (median) from those of the records; their uncertainty is "
-            "assumed to be that of the records"
+            f"{poses['median_turned_deg']:.2g} degrees (median) from the records' poses; their uncertainty is "
+            "assumed to be the records' uncertainty"
         )
     if about["not_fitted"]:
         yield f"{about['not_fitted']} triangles have fewer than {FEWEST} samples and no material"
@@ -155,7 +155,7 @@ def _first(checks: Sequence[Figure], about: dict[str, Any], views: Sequence[Sect
 def _quality(about: dict[str, Any]) -> str:
     best = _best_fit(about)
     if best is None:
-        return "It is not known: no LEDs were kept for the check."
+        return "The error is not known: no LEDs were kept for the check."
     error, psnr_db = 100 * about["mae"][best], about["held_out_psnr_db"][best]
     return f"Under LEDs kept for the check, {FITS[best].title} is off by {error:.2f} % of range, {psnr_db:.1f} dB."
 
@@ -222,7 +222,7 @@ def _uncertain(about: dict[str, Any]) -> Section:
     note = (
         f"By Monte Carlo through the measurement equation ({trial['samples']} samples, {trial['draws']} draws "
         "of each), "
-        "and with one source removed at a time; last, what was published of La Coupole (seed 003, 6.1 and 7)."
+        "and with one source removed at a time; last, the figures published for La Coupole (seed 003, 6.1 and 7)."
     )
     head = ("sources", "median sample", "95th percentile", "narrower by")
     return Section(section, heading, tables=[Table(caption, head, lines)], notes=[note])

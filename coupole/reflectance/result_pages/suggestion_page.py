@@ -82,7 +82,8 @@ def _page(name: str, suggestion: Suggestion) -> Page:
 
 
 _LIMITS = (
-    "The figures are those of the fits themselves, made of drawn samples: the frames' noise, each LED's own power "
+    "The figures come from the fits themselves, applied to drawn samples that include the frames' "
+    "noise, each LED's own power "
     "and place, the noise of the arm's poses, and a highlight with Fresnel's term.",
     "The figures do not include: light from surface to surface, edges of shadows, translucency, errors of the "
     "mesh, the light of two triangles in one pixel, and materials that are no sum of a matt part and a highlight. "

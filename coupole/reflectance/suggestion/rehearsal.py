@@ -2,9 +2,9 @@
 
 Triangles of the mesh are drawn. Their samples have the frames' noise, and errors of each LED's power and place.
 The pose of each view has the robot's noise, so pixels near a triangle's edge see its neighbour. The highlight
-grows towards grazing angles by Schlick's Fresnel term, which the fitted model lacks. So the uncertainty is that of
-the fit itself, including the misfit of the model. Inter-reflection, edges of shadows, errors of the mesh, and the
-width of a pixel are not included.
+grows towards grazing angles by Schlick's Fresnel term, which the fitted model lacks. So the uncertainty is the
+uncertainty of the fit itself, including the misfit of the model. Inter-reflection, edges of shadows, errors of the
+mesh, and the width of a pixel are not included.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ Floats = NDArray[np.float64]
 _MOST_VALUES = 20_000_000
 """Largest number of drawn samples, of all channels. If there are more, fewer triangles are fitted."""
 _MOST_DRAWN, _MOST_FITTED = 100_000, 3000
-"""Largest numbers of triangles whose pixels are drawn, and of those that are then fitted."""
+"""Largest number of triangles whose pixels are drawn, and largest number of triangles that are then fitted."""
 
 
 NORMAL_DEG = "normal_deg"
 ExpectedUncertainty = dict[str, Floats]
-"""Standard uncertainties [n] of triangles, by the names in the report of a result: `normal_deg`,
-`kd_percent`, `ks_percent`, `alpha_percent`. Those of kd and ks include the part that all LEDs share. NaN for a
+"""Standard uncertainties [n] of triangles, by the names in the report of a result: `normal_deg`, `kd_percent`,
+`ks_percent`, `alpha_percent`. The uncertainties of kd and ks include the part that all LEDs share. NaN for a
 triangle with too few samples for a material."""
 
 

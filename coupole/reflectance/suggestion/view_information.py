@@ -1,9 +1,9 @@
 """Expected information of views about an object's materials, to compare views before anything is measured.
 
 A fit's covariance is H^-1 M H^-1 (`coupole.reflectance.material_uncertainty`). H and M are sums over samples, so
-each view adds its own samples. Here the derivatives are those of a supposed material. M contains the errors that
-are known beforehand: the frames' noise, each LED's own power, and the priors. The uncertainty stated with a plan
-comes from `rehearsal`.
+each view adds its own samples. Here the derivatives are computed for a supposed material. M contains the errors
+that are known beforehand: the frames' noise, each LED's own power, and the priors. The uncertainty stated with a
+plan comes from `rehearsal`.
 """
 
 from __future__ import annotations

@@ -87,9 +87,9 @@ def texels_of_grid(
 
 
 def _wider(colours: Singles) -> Singles:
-    """[n] factors of kd's variance for colours [n, channels]: those of the darkest channel, because all channels
-    have one uncertainty. If the lobe has another form, the error of kd is as large in a dark channel as in a light
-    one."""
+    """[n] factors of kd's variance for colours [n, channels]: the factors of the darkest channel, because all
+    channels have one uncertainty. If the lobe has another form, the error of kd is as large in a dark channel as
+    in a light one."""
     factors: Singles = np.clip(np.exp(-2.0 * colours).max(axis=1), 1.0, _MOST_WIDER)
     return factors
 
@@ -99,7 +99,7 @@ def without_slopes(
 ) -> Singles:
     """Return colours of texels [h, w, channels] without what only looks like a colour: paint gets lighter across a
     texel, and the channels' pixels are at different places (`TexelSquares`). `lightness` [h, w] is
-    the logarithm of kd; its slope is that between the texels on both sides."""
+    the logarithm of kd; its slope is found from the texels on both sides."""
     known_lightness = np.where(is_fitted, lightness, np.float32(np.nan))
     framed_lightness = np.pad(known_lightness, 1, constant_values=np.nan)
     slopes = np.stack(
@@ -116,7 +116,7 @@ def without_slopes(
 
 
 def of_all_pixels(colours: Singles, whole_colours: Singles, shares: Floats) -> Floats:
-    """[n] logarithms of the mean paint of texels over that which the mean of their channels shows.
+    """[n] logarithms of the mean paint of texels, divided by the paint that the mean of their channels shows.
 
     A channel shows the paint at its own pixels: its colour without the colour around. The mean of the channels
     gives each channel the same weight, but channels have different shares [channels] of the pixels: in a Bayer
@@ -132,9 +132,9 @@ def colours_around(
     uncertainty [h, w]. A colour is the logarithm of kd over the channels' mean.
 
     A texel's red and blue pixels are at different places, so a change of the paint between them looks like a
-    colour. So the difference of a texel's colour from its triangle's is averaged with those of the texels around,
-    within some pixels. The spread that the mean removes gives its uncertainty. The mean of the logarithms over the
-    channels is 0, so kd's mean over the channels stays as it was fitted.
+    colour. So the difference of a texel's colour from its triangle's is averaged with the differences of the
+    texels around, within some pixels. The spread that the mean removes gives its uncertainty. The mean of the
+    logarithms over the channels is 0, so kd's mean over the channels stays as it was fitted.
     """
     width = max(_SPREAD_PX / side_px, _LEAST_SPREAD)
     weight = is_fitted.astype(np.float32)

@@ -1,5 +1,5 @@
-"""Shrinkage of materials, as far as neighbours agree: a pixel's material moves towards that of its triangle, and a
-triangle's material towards those of the triangles around it.
+"""Shrinkage of materials, as far as neighbours agree: a pixel's material moves towards its triangle's material,
+and a triangle's material towards the materials of the triangles around it.
 
 In a window the spread of materials comes from the surface and from the fits. The part that the fits' covariances
 do not explain is the surface's (empirical Bayes: Morris, Parametric empirical Bayes inference, 1983). Where the
@@ -56,9 +56,9 @@ def settle(
     bend: Singles | None = None,
 ) -> None:
     """Shrink, in place, the deviations [h, w, 5] of a view's pixels from their triangles (tilts, logarithms)
-    towards 0, as far as their neighbours agree. Replace their covariances [h, w, 15, lower half row by row] by
-    those after the shrinkage. Only pixels with `is_fitted` [h, w] are used and changed. `centre_covariance` [h, w,
-    15] is the covariance of the triangles' materials. `bend` [h, w] is the variance of the triangles' tilts
+    towards 0, as far as their neighbours agree. Replace their covariances [h, w, 15, lower half row by row] by the
+    covariances after the shrinkage. Only pixels with `is_fitted` [h, w] are used and changed. `centre_covariance`
+    [h, w, 15] is the covariance of the triangles' materials. `bend` [h, w] is the variance of the triangles' tilts
     around a pixel (`bend_around`): where the mesh turns, a pixel sees more than its own triangle.
     """
     covariance[...] = mean_around(covariance, is_fitted, _ALIKE_PX)
@@ -80,7 +80,7 @@ def bend_around(normals: Singles, is_used: NDArray[np.bool_]) -> Singles:
 def settle_triangles(logs: Singles, covariance: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:
     """Shrink ks and roughness of triangles (`logs` [h, w, 2], seen pixel by pixel) towards their means in a
     window, as far as the neighbours agree. Return the steps [h, w, 5] by which the materials change. Replace the
-    covariances [h, w, 15], in place, by those after the shrinkage.
+    covariances [h, w, 15], in place, by the covariances after the shrinkage.
     """
     weight = (1.0 / np.maximum(covariance[..., VARIANCES[3:]], _LEAST)).astype(np.float32)
     middle = mean_around(weight * logs, is_fitted, side_px) / np.maximum(

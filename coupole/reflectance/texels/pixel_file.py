@@ -27,13 +27,15 @@ _TOLD = {
     "kd": "1/sr, by channel; the pixel's own channel was fitted, the other channels are from pixels around it",
     "ks": "by channel; f = kd + ks D V",
     "alpha": "GGX's roughness",
-    "covariance": "lower half, row by row, of tilts (rad) along two tangents of the normal and of the logarithms "
+    "covariance": "lower half, row by row, of the covariance of tilts (rad) along two tangents of the "
+    "normal and of the logarithms "
     "of kd, ks (of the pixel's own channel) and alpha; without u_pixel and u_shared",
 }
 _TOLD_OF_SEVERAL = _TOLD | {
     "pixels": "places in the picture, row by row, of each texel's first pixel",
-    "kd": "1/sr, by channel; all were measured",
-    "covariance": "lower half, row by row, of tilts (rad) along two tangents of the normal and of the logarithms "
+    "kd": "1/sr, by channel; all channels were measured",
+    "covariance": "lower half, row by row, of the covariance of tilts (rad) along two tangents of the "
+    "normal and of the logarithms "
     "of kd, ks (the channels' mean) and alpha; without u_pixel and u_shared",
 }
 _ASKED, _SIDE, _PIXEL = "texel_mm", "side_px", "pixel_mm"
@@ -107,10 +109,10 @@ def write_view_texels(path: Path, texels: ViewTexels, head: TexelFileHead) -> No
                 _OF_PIXEL, data=texels.texel_of_pixel, compression="gzip", shuffle=True, track_times=False
             )
             numbers.attrs["told"] = "[h, w] number of the texel that a pixel belongs to, -1 for none"
-        of_pixel = "relative standard uncertainty of kd and ks, of a pixel's own response"
-        of_several = "relative standard uncertainty of kd and ks, of the responses of a texel's pixels"
+        of_pixel = "relative standard uncertainty of kd and ks, from a pixel's own response"
+        of_several = "relative standard uncertainty of kd and ks, from the responses of a texel's pixels"
         _dataset(file, "u_pixel", head.u_pixel, of_several if is_of_several else of_pixel)
-        _dataset(file, "u_shared", head.u_shared, "the same, of the power of all LEDs")
+        _dataset(file, "u_shared", head.u_shared, "the same, from the power of all LEDs")
 
 
 def _dataset(file: h5py.File, name: str, values: Any, description: str) -> None:

@@ -1,8 +1,8 @@
 """Materials of single pixels: normal, kd, ks and alpha of each, with the material of its triangle as prior.
 
-The fit is that of triangles (`coupole.reflectance.ggx_fit`), with one view and one channel, and begins at the
-triangle's material. The prior is weak here. The influence of neighbours on a pixel is found afterwards, from all
-of them (`coupole.reflectance.texels.neighbours`).
+The fit is the same as for triangles (`coupole.reflectance.ggx_fit`), with one view and one channel, and begins at
+the triangle's material. The prior is weak here. The influence of neighbours on a pixel is found afterwards, from
+all of them (`coupole.reflectance.texels.neighbours`).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from coupole.reflectance.triangle_fit import between, towards
 Floats = NDArray[np.float64]
 
 TILT, LOG_KS, LOG_ALPHA = math.radians(20.0), 1.5, 0.7
-"""Standard deviations of a pixel's normal (each of two tilts) and of the logarithms of ks and alpha from those of
-its triangle. They are larger than all spreads that were seen, so that they have an effect only where the samples
-give no information.
+"""Standard deviations of a pixel's normal (each of two tilts) and of the logarithms of ks and alpha from the
+values of its triangle. They are larger than all spreads that were seen, so that they have an effect only where the
+samples give no information.
 """
 FEWEST_OF_PIXEL = 8
 """Least number of samples of a pixel. Its triangle's material adds the missing information, and its uncertainty

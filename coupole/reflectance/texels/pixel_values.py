@@ -138,8 +138,8 @@ def fill_rows(
     pixels: LitPixels,
     root_share: np.float32,
 ) -> None:
-    """Fill the values of pixels from the frames of their LEDs. Noise lowers the mean of square roots; `root_share`
-    of this loss is added, which is 1 if each pixel is fitted alone."""
+    """Fill the values of pixels from the frames of their LEDs. Noise lowers the mean of square roots; the share
+    `root_share` of this loss is added; this share is 1 if each pixel is fitted alone."""
     lists, (codes, direct), rows = reader.lists, pixels.light, pixels.rows
     channels = reader.pixels.shape[1]
     first = int(lists.starts[rows.start * channels])

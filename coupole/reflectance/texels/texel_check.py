@@ -1,4 +1,4 @@
-"""Errors of texels, compared with those of triangles, in pictures of LEDs that were kept for the check.
+"""Errors of texels, compared with the errors of triangles, in pictures of LEDs that were kept for the check.
 
 Pictures are made as by `coupole reflectance relight --led`. They are compared with the frames pixel by pixel,
 where both have a value. Inter-reflection is subtracted from the frames, as from the samples.
@@ -119,7 +119,7 @@ def _add_errors(samples: WideningSamples, result: RunResult, view: ViewSamples) 
 def held_out_pictures(
     result: RunResult, view: ViewSamples, makers: Mapping[str, Callable[[int], Singles]], *, every: int = 1
 ) -> Iterator[tuple[Singles, dict[str, Singles]]]:
-    """Yield pictures of each LED that was kept for the check, or of one in so many: the measured picture [h / 2, w
+    """Yield pictures of each LED that was kept for the check, or of every n-th LED: the measured picture [h / 2, w
     / 2, channels] in shares of the camera's range, and the pictures of the `makers`, by their names. A maker
     returns [h, w, channels] for an LED."""
     frames = read_check_frames(result, view)

@@ -150,7 +150,7 @@ class _Sums:
 
 def _mae(result: RunResult, say: Said) -> dict[str, float | None]:
     """Return mean absolute errors, in shares of the camera's range, of pictures of left-out LEDs: by the texels'
-    own materials, and by those of their clusters, in the pixels where both have a value."""
+    own materials, and by the materials of their clusters, in the pixels where both have a value."""
     sums, values = {"own": 0.0, "clustered": 0.0}, 0
     for number, view in enumerate(result.views, start=1):
         fits = {"own": TEXELS, "clustered": TEXEL_CLUSTERS}

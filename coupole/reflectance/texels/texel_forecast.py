@@ -143,7 +143,8 @@ def refuse_full_disk(forecast: TexelForecast, out: Path) -> None:
     free_bytes = shutil.disk_usage(folder).free
     if forecast.disk_bytes > free_bytes:
         raise DiskFull(
-            f"{out}: texels need some {forecast.disk_bytes / 1e9:.2f} GB, and {free_bytes / 1e9:.2f} GB are free. "
+            f"{out}: texels need about {forecast.disk_bytes / 1e9:.2f} GB, and "
+            f"{free_bytes / 1e9:.2f} GB are free. "
             "Free space, name another --out, or make larger texels (--texels MM)"
         )
 

@@ -150,7 +150,8 @@ def _gather(triangle, seen_mm, centre_mm, normal, most_mm, texel, place_mm, texe
 
 @kernel
 def _most_frequent(numbers):  # type: ignore[no-untyped-def]
-    """Return the most frequent number; the lowest of several. `numbers` [n] are sorted in place."""
+    """Return the most frequent number; the lowest one, if several are equally frequent. `numbers` [n] are sorted
+    in place."""
     numbers.sort()
     best, best_count, count = numbers[0], 0, 0
     for place in range(len(numbers)):

@@ -38,6 +38,6 @@ class TexelSize:
 def size_refused(text: str) -> InputError:
     """Return the error for a text that does not state a size of texels."""
     return InputError(
-        f"--texels: expected auto, each view's own pixels, or a width on the surface in mm up to {_MOST_MM:g}, "
+        f"--texels: expected auto (each view's own pixels) or a width on the surface in mm up to {_MOST_MM:g}, "
         f"such as 0.2; got {text!r}"
     )

@@ -37,10 +37,10 @@ Singles = NDArray[np.float32]
 KD, KS, ALPHA = 2, 3, 4
 """Places of the logarithms among the unknowns."""
 MOST_KD = 1.0
-"""Largest kd, 1/sr: three times that of white, to allow for strong light from other surfaces. A fit with more has
-failed."""
+"""Largest kd, 1/sr: three times the kd of white, to allow for strong light from other surfaces. A fit with more
+has failed."""
 MOST_VARIANCE = np.square([TILT, TILT, 1.0, LOG_KS, LOG_ALPHA]) * 4.0
-"""Largest variances of a useful fit; they are larger than those of the prior."""
+"""Largest variances of a useful fit; they are larger than the prior's variances."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Centres:
     logs: Singles
     """[h, w, 2 channels + 1] logarithms of kd, ks and alpha; NaN where nothing is known."""
     colours: Singles
-    """[h, w, channels] logarithms of kd without their mean, shrunk towards those around them."""
+    """[h, w, channels] logarithms of kd without their mean, shrunk towards the values around them."""
     covariance: Singles
     """[h, w, 15]"""
 

@@ -1,7 +1,7 @@
 """Errors of overlaps, summed over cells of space, because errors that the points of a cell share do not average
 out.
 
-The covariance of a fit is that of sums over cells (a sandwich estimator, clustered: Liang, Zeger, Biometrika
+The covariance of a fit is computed from sums over cells (a sandwich estimator, clustered: Liang, Zeger, Biometrika
 73(1), 1986). If there are about as many parameters as cells, the fit absorbs much of their errors. Therefore each
 sum is computed as if the fit had not seen its cell (CR3, the jackknife by clusters: Bell, McCaffrey, Survey
 Methodology 28(2), 2002).

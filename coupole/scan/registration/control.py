@@ -159,8 +159,8 @@ def motions_by_targets(sightings: Sightings) -> list[PairMotion]:
         if off_mm[worst] > _SIGMAS * u_mm[worst] * np.sqrt(3):
             raise InputError(
                 f"targets: `{shared_names[worst]}` is {off_mm[worst]:.3g} mm away from the place where the other "
-                f"{len(shared_names) - 1} targets of two scans put it, which state {u_mm[worst]:.2g} mm: another "
-                "target of that name, another unit, or an uncertainty that is too small"
+                f"{len(shared_names) - 1} targets of two scans put it; the scans state {u_mm[worst]:.2g} mm: "
+                f"another target of that name, another unit, or an uncertainty that is too small"
             )
         fit = Fit(1.0, 0.0, float(np.sqrt(np.mean(off_mm**2))), 1_000_000)
         motions.append(PairMotion(first, second, motion, fit, "targets"))

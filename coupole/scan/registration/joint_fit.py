@@ -60,7 +60,7 @@ class JointFit:
     median_nearest_mm: float
     """Median distance from points to the nearest points of other scans, over all overlaps."""
     inflation: float
-    """Standard uncertainties, relative to those that independent errors of all points would give."""
+    """Standard uncertainties, relative to the uncertainties that independent errors of all points would give."""
     sightings: tuple[Sighting, ...]
     """Targets, with their residuals."""
 
@@ -138,7 +138,7 @@ class _State:
         return max(1.0, float(np.sqrt(np.median(np.diag(honest)[self.free] / np.diag(bread)[self.free]))))
 
     def covariances(self) -> tuple[Floats, Floats]:
-        """[6 n, 6 n] covariances from errors of overlaps, and from those of targets and prior knowledge."""
+        """[6 n, 6 n] covariances from errors of overlaps, and from errors of targets and prior knowledge."""
         bread = self._inverse(self.normal)
         meat = self._meat(bread, self.inflation_used)
         return bread @ meat @ bread, bread @ (self.targets_normal + np.diag(self.prior)) @ bread

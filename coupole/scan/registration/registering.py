@@ -36,7 +36,7 @@ connected."""
 _FINE_PLACES, _COARSE_PLACES = (20_000, 2_500), (8_000, 1_600)
 """Number of points of a scan's fine and coarse cloud: for few scans, and for many."""
 _PARTNERS = 6
-"""Greatest number of pairs of each scan in a round, if there are more than `ALL_PAIRS` scans."""
+"""Greatest number of pairs of each scan in a round, for more than `ALL_PAIRS` scans."""
 _ODD_SIZE = 200.0
 """A scan that is larger or smaller than most by this factor has another unit."""
 _ROUNDED_CELLS = 0.01
@@ -80,7 +80,7 @@ class Registration:
     """The joint adjustment of all poses."""
 
     def is_merged_on_site(self, cell_mm: float) -> bool:
-        """True if mesh and clouds are in the control points' frame. They are in it if there are control points,
+        """True if mesh and clouds are in the control points' frame. This is so if there are control points,
         and if numbers of 32 bits resolve the coordinates there to a hundredth of a cell."""
         if self.site_from_first is None:
             return False
@@ -224,7 +224,7 @@ def _groups_by_search(
 def _some(
     untried_pairs: Sequence[tuple[int, int]], groups: Groups, round_number: int
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Return pairs for a round, a few for each scan, drawn from those of different groups; and the remaining
+    """Return pairs for a round, a few for each scan, drawn from the pairs of different groups; and the remaining
     pairs."""
     order = np.random.default_rng(round_number).permutation(len(untried_pairs))
     partner_counts: dict[int, int] = {}

@@ -35,7 +35,7 @@ class ScanContent:
     mesh: Mesh
     """Mesh of the scan; without triangles if it is a cloud."""
     srgba: NDArray[np.uint8] | None = None
-    """[n, 4] sRGB colours, 8 bits, and 255 for a point with a colour, 0 for one without; None if no point has a
-    colour."""
+    """[n, 4] sRGB colours, 8 bits, and 255 for a point with a colour, 0 for a point without a colour; None if no
+    point has a colour."""
     stated_pose: NDArray[np.float64] | None = None
     """4x4 transform of the scan to the frame that its file states; it is not proven."""

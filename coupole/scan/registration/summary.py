@@ -128,7 +128,7 @@ def _sliding(registration: Registration) -> str:
     some = ", ".join(f"{names[a]} on {names[b]}" for a, b in registration.sliding_pairs[:3])
     pairs_do = "1 pair does" if count == 1 else f"{count} pairs do"
     more = ", ..." if count > 3 else ""
-    return f"{pairs_do} not hold by overlap alone ({some}{more}): the other pairs place these scans"
+    return f"{pairs_do} not determine a pose by overlap alone ({some}{more}): the other pairs place these scans"
 
 
 def remarks(registration: Registration) -> Iterator[str]:
@@ -179,6 +179,5 @@ def remarks(registration: Registration) -> Iterator[str]:
         if sighting.left_mm > _CONSPICUOUS * np.sqrt(3) * sighting.u_mm:
             yield (
                 f"target {sighting.name} of {names[registration.placed_numbers[sighting.scan]]} is "
-                f"{sighting.left_mm:.3g} mm "
-                f"off, stated are {sighting.u_mm:.2g} mm"
+                f"{sighting.left_mm:.3g} mm off, with a stated uncertainty of {sighting.u_mm:.2g} mm"
             )

@@ -145,9 +145,9 @@ def folds(points_mm: Floats, normals: Floats | None, spacing_mm: float) -> dict[
 
 
 def choose_viewpoints(folded_shares: Sequence[dict[Stand, float]]) -> list[Viewpoint]:
-    """Return one viewpoint for each scan. All scans come from one scanner; so the viewpoint is the one with the
-    smallest share of folded rays over all scans, or the origin if it is as good. A scan that does not fit it,
-    because it was merged or moved, gets `none`."""
+    """Return one viewpoint for each scan. All scans come from one scanner; so the viewpoint with the smallest
+    share of folded rays over all scans is used, or the origin if it is as good. A scan that does not fit this
+    viewpoint, because it was merged or moved, gets `none`."""
     common_stands = set.intersection(*(set(of_scan) for of_scan in folded_shares))
     total = {stand: float(np.median([of_scan[stand] for of_scan in folded_shares])) for stand in common_stands}
     best: Stand = min(total, key=lambda stand: (total[stand], stand)) if total else "none"

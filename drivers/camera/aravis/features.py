@@ -36,7 +36,7 @@ class Features:
         return next((name for name in names if self.has(name)), None)
 
     def read_value(self, name: str) -> Value:
-        """Raises DeviceRefused if the camera has no such feature, or the feature holds no value."""
+        """Raises DeviceRefused if the camera has no such feature, or the feature has no value."""
         with self._lock:
             match self._kind(name):
                 case "enumeration" | "string":

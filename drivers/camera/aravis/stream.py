@@ -54,7 +54,7 @@ class Pool:
         """Number of slots with frames that are not released yet."""
 
     def fits(self, slots: int, payload_bytes: int) -> bool:
-        """True if it has this many slots of this size, and none is in use."""
+        """True if the pool has this many slots of this size, and none is in use."""
         return self.out == 0 and self.slots >= slots and self.payload_bytes == payload_bytes
 
     def slot(self, index: int) -> NDArray[np.uint8]:
@@ -85,7 +85,7 @@ class StreamStatistics:
     incomplete_images: int = 0
     """Images that arrived with missing packets."""
     skipped_ids: int = 0
-    """Frame ids without a complete image, including those of `incomplete_images`."""
+    """Frame ids without a complete image, including the ids of `incomplete_images`."""
     underruns: int = 0
     """Number of times that libaravis found no free buffer; several of them may concern one frame."""
 
@@ -172,7 +172,7 @@ class Stream:
                 self._library.arv_stream_push_buffer(self._handle, buffer)
 
     def statistics(self) -> StreamStatistics:
-        """Counts since the stream was made. After `close` they are those at its end."""
+        """Counts since the stream was made. After `close` they are the counts at the end of the acquisition."""
         with self._lock:
             return self._final or self._count()
 

@@ -31,7 +31,7 @@ from drivers.fair_lock import FairLock
 from drivers.opening import closed_on_failure
 
 _A_LOOK_S = 1e-4
-"""Shortest time-out that harvesters accepts. With a shorter one it may not poll at all, because its clock has
+"""Shortest time-out that harvesters accepts. With a shorter time-out it may not poll at all, because its clock has
 steps of 0.2 us."""
 _NAP_S = 1e-3
 """Pause between polls for a frame: a blocking wait of genicam 1.6 would hold the GIL."""
@@ -202,7 +202,7 @@ class GenTLCamera:
             self._features.write("TriggerSoftware", True)
 
     def statistics(self) -> CameraStatistics:
-        """Counts of the present acquisition; while disarmed, those of the last one."""
+        """Counts of the present acquisition; while disarmed, the counts of the last acquisition."""
         if self._armed.is_set():
             with self._lock, reporting(self._name, "the camera's counters"):
                 self._last = self._statistics()

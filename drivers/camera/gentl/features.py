@@ -138,7 +138,7 @@ class Features:
         if kind in {"IInteger", "IFloat"}:
             self._check_range(name, node, float(value))
         if not self._genapi.is_writable(node.node):
-            self._refuse(f"`{name}` to be writable now", "the camera says that it is not")
+            self._refuse(f"`{name}` to be writable now", "the camera says that it cannot be set")
 
     def _check_range(self, name: str, node: Any, value: float) -> None:
         if not node.min <= value <= node.max:

@@ -204,7 +204,7 @@ class RawFiles:
             time.sleep(min(_LOOK_S, left_s))
 
     def _frame(self, path: Path, timeout_s: float) -> Frame | None:
-        """Return the next frame. None if no memory became free in time; the file then remains the next one."""
+        """Return the next frame. None if no memory became free in time; the file then remains the next file."""
         slot = self._pool.take(timeout_s)
         if slot is None:
             return None
@@ -246,7 +246,9 @@ class RawFiles:
         if before is not None and exif.iso != before.iso:
             raise self._bad_picture(path, f"ISO {before.iso} as before", f"it was ISO {exif.iso}")
         if before is not None and exif.taken_ns <= before.taken_ns:
-            raise self._bad_picture(path, "a capture time after that of the picture before", "it is not later")
+            raise self._bad_picture(
+                path, "a capture time after the capture time of the picture before", "it is not later"
+            )
 
     def trigger(self) -> None:
         if self._exposure is None or self._exposure.hardware_trigger:

@@ -5,8 +5,8 @@ docs/how-to/cb120-camera.md lists what must be checked on the real one.
 
 *Buffers.* The transport carries 12-bit packed pixels; xiAPI unpacks them, in one pass over the image, into
 page-aligned memory of the driver (XI_RAW16, XI_BP_SAFE, XI_IMG.bp). The driver copies nothing, and pixels are
-valid until `release()`. The policy XI_BP_UNSAFE would avoid this pass. It is not used, because it gives access to
-xiAPI's own ring, which "may be overwritten by device" (xiApi.h) while it is read.
+valid until `release()`. The policy XI_BP_UNSAFE would avoid this pass. This mode is not used, because it gives
+access to xiAPI's own ring, which "may be overwritten by device" (xiApi.h) while it is read.
 
 *Queue.* Images wait in xiAPI's queue, oldest first, until a buffer of the driver is free. When the queue is full,
 xiAPI drops images and counts them. Each dropped image leaves a gap in `acq_nframe`, the frame id.
@@ -323,8 +323,8 @@ class XiCamera:
         self._device.set("trigger_software", 1)
 
     def statistics(self) -> CameraStatistics:
-        """Return statistics from xiAPI's counters, as described in xiApi.h; while disarmed, those of the last
-        acquisition."""
+        """Return statistics from xiAPI's counters, as described in xiApi.h; while disarmed, the statistics of the
+        last acquisition."""
         if self._armed.is_set():
             self._last = self._statistics()
         return self._last

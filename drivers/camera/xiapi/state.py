@@ -139,7 +139,7 @@ class State:
                 self.set(size, int(self._device.bounds(size)[1]))
 
     def free_other_inputs(self, trigger_input: int) -> None:
-        """Let inputs other than that of the box trigger nothing."""
+        """Let no input trigger frames but the box's input."""
         if {"gpi_selector", "gpi_mode"} & self._rigs:
             return
         low, high = self._device.bounds("gpi_selector")

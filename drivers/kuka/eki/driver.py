@@ -225,7 +225,8 @@ class KukaEki:
                 expected=f"an answer from the program at {self.settings.address}",
                 happened=f"{watch.statuses} statuses answered, {watch.foreign} belonged to another session, "
                 f"{self._link.reader.malformed} were malformed",
-                remedy="Restart the controller's programs, and check that they are those of configs/kuka/eki",
+                remedy="Restart the controller's programs, and check that they are the "
+                "programs of configs/kuka/eki",
             )
 
     def _percent(self, speed: float) -> int:

@@ -6,8 +6,8 @@ cycle squared. The only other allowed change is to no step at all.
 
 A place is the axes, or the flange's pose. The trajectory obeys this invariant by construction. This module checks
 the invariant again on the answer that is about to be sent, from the sent numbers alone. So no earlier mistake can
-reach the arm. Limits of the pose follow from those of the axes: no point of the arm moves faster than its reach
-times the sum of all axis speeds.
+reach the arm. Limits of the pose follow from the limits of the axes: no point of the arm moves faster than its
+reach times the sum of all axis speeds.
 """
 
 from __future__ import annotations

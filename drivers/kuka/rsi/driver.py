@@ -317,7 +317,7 @@ def _refuse_normal_priority(settings: Settings) -> None:
         f"in every {settings.cycle_ms} ms",
         happened="this user does not have this right; without it, 16 % of the answers were late beside other work",
         remedy=f"{how_to_give_the_right()}. Or a person writes `without_realtime_by: NAME` among the robot's "
-        "`settings:` in the rig's file; `coupole doctor` measures what this machine can",
+        "`settings:` in the rig's file; `coupole doctor` measures whether this machine answers in time",
     )
 
 

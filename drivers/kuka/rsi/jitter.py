@@ -46,8 +46,8 @@ class Jitter(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """True if no answer was late, because the controller's counter of late answers allows only few in a whole
-        session."""
+        """True if no answer was late. No answer may be late, because the controller's counter allows only few late
+        answers in a whole session."""
         return self.late_share == 0.0
 
 
@@ -100,8 +100,8 @@ class StandInController:
 @contextmanager
 def answering_session(settings: Settings) -> Iterator[tuple[StandInController, bool]]:
     """Begin a session of the driver's process with a controller in this process. Yield the controller, and True if
-    the driver's process runs under SCHED_FIFO. Address, controller and limits of lateness replace those of the
-    settings for this session.
+    the driver's process runs under SCHED_FIFO. Address, controller and limits of lateness replace the values in
+    the settings for this session.
     """
     port = free_port()
     here = {"listen": f"127.0.0.1:{port}", "controller": "", "delay_limit": 10**9, "link_timeout_s": 1e6}

@@ -1,4 +1,5 @@
-"""The flange's pose in plain Python. It is fast enough for every cycle, in a process that does not import numpy.
+"""The flange's pose in plain Python. The computation is fast enough for every cycle, in a process that does not
+import numpy.
 
 Millimetres and degrees, in the base frame. A correction of the pose is six numbers X, Y, Z, A, B, C. The
 translation is added in base coordinates. The rotation Rz(A) Ry(B) Rx(C) is applied from the left, in base axes:

@@ -116,7 +116,7 @@ class RsiSession:
         self._velocity_deg_s: tuple[float, ...] = (0.0,) * 6
         self._ipoc = self._ipoc_step = self._astray_ipoc = self._astray_run = 0
         self._packet_ns = opened_ns
-        """Time of the last packet, including those of a session that another program began."""
+        """Time of the last packet, including the packets of a session that another program began."""
         self._session_over = self._leaves = False
         self._last_words = _LAST_WORDS
         self._last_answer: bytes | None = None
@@ -229,9 +229,9 @@ class RsiSession:
         return (self._stop_template if ends else self._template) % (*values, packet.ipoc)
 
     def _silent(self) -> bool:
-        """Tell whether the driver has stopped answering. After a fault it ends the session in this way, so that no
-        old correction reaches a new session. It is silent at once if a new session may have begun, otherwise when
-        the commanded axes, and so the arm, are at rest."""
+        """Tell whether the driver has stopped answering. After a fault the driver ends the session in this way, so
+        that no old correction reaches a new session. The driver is silent at once if a new session may have begun,
+        otherwise when the commanded axes, and so the arm, are at rest."""
         if self.fault != shared_state.NO_FAULT and self.motion.phase == shared_state.STANDING:
             self._last_words -= 1
         return self._session_over or self._last_words < 0
@@ -347,7 +347,7 @@ class RsiSession:
         if 0 < advance <= _GAP_STEPS * step:
             self.fail(
                 shared_state.RESTARTED,
-                f"its IPOC steps by {apart}, by {step} before: the controller's cycle has changed",
+                f"its IPOC now steps by {apart}, before by {step}: the controller's cycle has changed",
             )
         elif advance > 0:
             self.fail(shared_state.LINK_LOST, f"{advance // step - self._astray_run} packets are missing")
@@ -355,7 +355,7 @@ class RsiSession:
             self.fail(shared_state.RESTARTED, "RSI was restarted: its packets have begun to count anew")
 
     def _watch(self, packet: Packet, *, strays: bool) -> None:
-        """Compare the measured axes with those commanded in the last answer."""
+        """Compare the measured axes with the axes commanded in the last answer."""
         config, motion = self._config, self.motion
         if packet.joints_deg == self._measured_deg:
             self._velocity_deg_s = (0.0,) * 6

@@ -80,7 +80,7 @@ class Settings(BaseModel):
     (100 as shipped)."""
     delay_counts: Literal["cumulative", "consecutive"] = "cumulative"
     """Way in which the controller counts late answers. `cumulative`: all of a session, so that a decrease means
-    that RSI was restarted. `consecutive`: those in a row; an answer in time sets the counter to 0."""
+    that RSI was restarted. `consecutive`: late answers in a row; an answer in time sets the counter to 0."""
     unaccounted_s: float = Field(default=0.1, ge=0)
     """The session ends if the controller is silent for this time and its IPOC does not count the silence. 0: no
     silence ends it."""
@@ -114,7 +114,8 @@ class Settings(BaseModel):
         standard = np.allclose(self.wrist.opw_from_flange, np.eye(4), rtol=0.0, atol=1e-9)
         if self.corrects == "pose" and not standard:
             raise ValueError(
-                f"corrections of the pose need KUKA's flange, its z axis along axis 6, not that of "
+                f"corrections of the pose need a flange like KUKA's, with its z axis along "
+                f"axis 6, not the flange of "
                 f"{self.arm_model.name}; set `corrects: axes`"
             )
         return self

@@ -10,7 +10,7 @@ from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.shared_state import Six
 
 _LEAST_MOTION_DEG = 1e-6
-"""Motions shorter than this, which is below the resolution of the wire, are not made. The speed limits along such
+"""Shorter motions, which are below the resolution of the wire, are not made. The speed limits along such
 a short line would be infinite.
 """
 

@@ -13,7 +13,7 @@ The reason is a restart of RSI: the controller needs some cycles for it, counts 
 its counter at 0. The old corrections would then be wrong by as much as the arm had moved before.
 
 *Lag.* The arm must be between the places to which the answers of the last `follow_lag_s` led, with a tolerance of
-`follow_deg`. If it is not there, no answer leads farther away from it.
+`follow_deg`. If the arm is elsewhere, no answer leads farther away from it.
 
 The witness uses no count of `rsi_session`. It stores the last answered packet and the places of the answers
 itself.

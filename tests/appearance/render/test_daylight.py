@@ -88,7 +88,7 @@ def test_a_sun_whose_direction_and_spectrum_differ_in_height_is_refused() -> Non
     low = {"kind": "low_sun", "elevation_deg": 8}
     slanted = {"kind": "distant", "direction": [-0.62, -0.35, -0.36], "illuminance_lux": 9000, "spectrum": low}
     with pytest.raises(
-        ValueError, match=r"comes from 26\.8 degrees high, and its spectrum is that of a sun 8 degrees"
+        ValueError, match=r"a height of 26\.8 degrees, but its spectrum belongs to a sun at 8 degrees"
     ):
         scene([plane(GREY)], [slanted])
 

@@ -196,7 +196,7 @@ def test_a_run_without_it_says_so(house: House) -> None:
     ada = house.ada
     assert house.operator.post("/api/v1/queue", {"plan": "plan.yaml"}).status == 200
     ada.goes_to("/run")
-    ada.sees("dd", "not asked for with this run")
+    ada.sees("dd", "not requested for this run")
     assert not ada.at("[data-name=growing]").is_displayed()
     time.sleep(0.6)
     assert not ada.at("[data-name=growing]").is_displayed()

@@ -125,7 +125,7 @@ def test_a_start_that_is_interrupted_leaves_no_world(cell: CellFolder) -> None:
 def test_who_waits_for_a_slow_start_hears_what_for(cell: CellFolder) -> None:
     with mock.patch.object(opened_cell, "_SLOW_START_S", 0.0):
         ended = cells.here("acquire", cell.plan, "--yes")
-    assert "compiles its code, once on a machine" in ended.err
+    assert "compiles its code, once on each machine" in ended.err
     assert ended.code == 0
 
 

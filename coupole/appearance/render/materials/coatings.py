@@ -62,7 +62,8 @@ class FourFlux(Model):
     coefficients: FourFluxes
     thickness_mm: Positive
     ground: Reflectance = _BLACK
-    """Reflectance of the ground inside the binder; a measured one was measured under a face of the same index."""
+    """Reflectance of the ground inside the binder; a measured reflectance was measured under a face of the same
+    index."""
     ground_mirror: Share = 0.0
     """Reflectance of a glossy ground for directed light, in addition to `ground`."""
     ground_roughness: Roughness = 0.1
@@ -113,7 +114,8 @@ class Layers(Model):
     kind: Literal["layers"]
     layers: Annotated[tuple[Layer, ...], Field(min_length=1, max_length=20)]
     ground: Reflectance = _BLACK
-    """Reflectance of the ground inside the binder; a measured one was measured under a face of the same index."""
+    """Reflectance of the ground inside the binder; a measured reflectance was measured under a face of the same
+    index."""
     index: Refraction = indices.BINDER
     roughness: Roughness = 0.05
     """Roughness of the face; a leaf on top has its own roughness."""
@@ -122,7 +124,9 @@ class Layers(Model):
     def _check_top_leaf(self) -> Layers:
         first = self.layers[0]
         if isinstance(first, Leaf) and first.uncovered:
-            raise ValueError("a leaf on top has no face where it is `uncovered`: take `kind: worn`, or varnish it")
+            raise ValueError(
+                "a leaf on top needs a varnish if parts of it are `uncovered`: take `kind: worn`, or varnish it"
+            )
         return self
 
 

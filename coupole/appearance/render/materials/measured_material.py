@@ -78,7 +78,7 @@ def measured_brdf(material: MeasuredMaterial, folder: Path) -> Brdf:
     if path.is_dir():
         return read_result(path, material.fit, cluster=material.cluster, triangles=material.triangles)
     if material.cluster is not None or material.triangles is not None:
-        raise InputError(f"{path}: `cluster` and `triangles` are of a result's folder; leave them out")
+        raise InputError(f"{path}: `cluster` and `triangles` belong to the folder of a result; leave them out")
     match path.suffix.lower():
         case ".binary":
             return read_merl(path)

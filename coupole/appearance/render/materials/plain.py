@@ -61,12 +61,12 @@ class Paint(Model):
 
     kind: Literal["paint"]
     pigment: Colouring
-    """Reflectance of an opaque layer, or K and S. A measured reflectance is that under the face; others are inside
-    the binder."""
+    """Reflectance of an opaque layer, or K and S. A measured reflectance is valid under the face; others are
+    inside the binder."""
     thickness_mm: Positive | None = None
     ground: Reflectance = Constant(kind="constant", value=0.0)
-    """Reflectance of the ground. A measured reflectance is that of the ground under a face of the same index;
-    other reflectances are inside the binder.
+    """Reflectance of the ground. A measured reflectance is the reflectance of the ground under a face of the same
+    index; other reflectances are inside the binder.
     """
     scattering_per_mm: Positive = 30.0
     """Scattering of a pigment that is given by its reflectance; a paint file has its own."""

@@ -100,10 +100,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 @pytest.fixture(autouse=True)
 def _leaves_signals_as_they_were() -> Generator[None]:
     """A command ignores signals when it exits. If that stays so in a worker, each process that a later test starts
-    ignores Ctrl-C too."""
+    ignores Ctrl-C too. (Other people's libraries set handlers of their own.)"""
     before = signal.getsignal(signal.SIGINT)
     yield
-    assert signal.getsignal(signal.SIGINT) is before, "the test leaves another handler of SIGINT: use `cells.here`"
+    left = signal.signal(signal.SIGINT, before)
+    assert left is not signal.SIG_IGN or before is signal.SIG_IGN, (
+        "the test leaves Ctrl-C ignored: use `cells.here`"
+    )
 
 
 def pytest_collection_finish() -> None:

@@ -291,4 +291,4 @@ def test_a_signal_ends_a_process_that_waits_for_what_never_returns(what: str) ->
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 128 + signal.SIGTERM
         assert process.stderr is not None
-        assert "waits in a call that does not return" in process.stderr.read()
+        assert "waited in a call that does not return" in process.stderr.read()

@@ -92,7 +92,7 @@ def ignore_from_now() -> None:
 
 def signal_behind(error: BaseException) -> SignalReceived | None:
     """Return the SignalReceived that caused an error, if there is one. Compiled code that is interrupted raises a
-    SystemError in its place."""
+    SystemError in its place; other people's code may raise an error of its own."""
     causes: list[BaseException] = []
     cause: BaseException | None = error
     while cause is not None and cause not in causes:
@@ -100,7 +100,7 @@ def signal_behind(error: BaseException) -> SignalReceived | None:
             return cause
         causes.append(cause)
         cause = cause.__cause__ or cause.__context__
-    return None
+    return SignalReceived(_raised_number[0]) if _raised_number[0] else None
 
 
 def _stays_ignored(number: int) -> bool:

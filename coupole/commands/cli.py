@@ -28,7 +28,7 @@ from coupole.bounded import leave
 from coupole.commands.common import fail
 from coupole.commands.examples import add_examples
 from coupole.commands.extras import lacking_extras, missing_extra
-from coupole.errors import CoupoleError, Interrupted, StorageError
+from coupole.errors import CoupoleError, InputError, Interrupted, StorageError
 from coupole.viewing import text_outlet
 
 AT_A_CELL = {
@@ -229,8 +229,11 @@ def _exit_code_of_command() -> int:
     try:
         code = app(standalone_mode=False)
     except CoupoleError as error:
-        _say(error)
-        code = error.exit_code
+        if isinstance(error, InputError) and (cause := signal_behind(error)):
+            code = _code_of_signal(cause)
+        else:
+            _say(error)
+            code = error.exit_code
     except SignalReceived as signal_error:
         code = _code_of_signal(signal_error)
     except typer.Abort:
@@ -268,6 +271,8 @@ def _code_of_signal(error: SignalReceived) -> int:
 def _code_of_missing(error: ImportError) -> int:
     """Print which extra provides the missing library; return the exit code."""
     missing = missing_extra(error)
+    if cause := signal_behind(error):
+        return _code_of_signal(cause)
     if missing is None:
         return _code_of_defect(error)
     fail(missing, as_json="--json" in sys.argv)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.reflectance.triangle_fit import TriangleMaterials
+from coupole.storage.hdf5_file import hdf5_file
 
 CLUSTERS = "fits/clusters.h5"
 _TOLD = {
@@ -71,7 +72,7 @@ def read_clusters(folder: Path) -> Clusters:
 
 def write_clusters(path: Path, clusters: Clusters, members: NDArray[np.int64]) -> None:
     """Write the file; `members` [clusters] is the number of triangles by which each cluster was found."""
-    with h5py.File(path, "w") as file:
+    with hdf5_file(path, "w") as file:
         for name, description in _TOLD.items():
             values = members if name == "members" else getattr(clusters, name)
             stored_values = values.astype(np.float32) if name in Clusters.OF_CLUSTERS else values

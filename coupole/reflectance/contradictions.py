@@ -26,6 +26,7 @@ from coupole.reflectance.fits import GGX_NORMAL
 from coupole.reflectance.parts_in_threads import in_threads
 from coupole.reflectance.run_result import CONTRADICTED, SAMPLES, RunResult, ViewSamples
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values, towards
+from coupole.storage.hdf5_file import hdf5_file
 
 Floats = NDArray[np.float64]
 
@@ -168,7 +169,7 @@ def leave_out(view: ViewSamples, found_contradictions: Iterable[Found]) -> None:
     def write(part: Path) -> None:
         count = total = 0
         shutil.copyfile(view.path, part)
-        with h5py.File(part, "r+") as file:
+        with hdf5_file(part, "r+") as file:
             for contradictions in found_contradictions:
                 count, total = count + contradictions.values, total + contradictions.all_values
                 if contradictions.places.size:

@@ -30,6 +30,7 @@ from coupole.reflectance.parts_in_threads import in_threads
 from coupole.reflectance.result_folder import complete
 from coupole.reflectance.run_result import AS_MEASURED, INTER_REFLECTION, SAMPLES, RunResult, ViewSamples
 from coupole.reflectance.triangle_fit import TriangleSamples
+from coupole.storage.hdf5_file import hdf5_file
 
 Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]
@@ -112,7 +113,7 @@ def _as_measured(
         patch_reflectance = _apparent_reflectance(result, diffuse, paths.scene, count, support_reflectance)
 
         def write(part: Path) -> None:
-            with h5py.File(part, "w") as file:
+            with hdf5_file(part, "w") as file:
                 file["shown"] = patch_reflectance
                 for name, values in diffuse.items():
                     file[f"diffuse/{name}"] = values
@@ -218,7 +219,7 @@ def _subtract_view(
     def write(part: Path) -> None:
         shutil.copyfile(view.path, part)
         shares, sample_count = [], 0
-        with h5py.File(part, "r+") as file:
+        with hdf5_file(part, "r+") as file:
             description = "share of f that was inter-reflection, and was subtracted"
             share_dataset = file.create_dataset(
                 INTER_REFLECTION, file["f"].shape, np.float16, chunks=file["f"].chunks, fillvalue=np.nan
@@ -233,6 +234,7 @@ def _subtract_view(
                 for name, of_rows in new_values.items():
                     file[name][rows] = of_rows
                 share_dataset[rows] = share.astype(np.float16)
+                file.raise_error()
                 sample_count += int(np.count_nonzero(np.isfinite(share)))
                 say(f"inter-reflection of {view.view}", rows.stop, len(view.triangles))
             every = np.concatenate(shares)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import resource
 import sys
 import time
@@ -43,6 +42,7 @@ from coupole.reflectance.relighting import Interpolation, learn, read_interpolat
 from coupole.reflectance.result_folder import begin, complete
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sha256
+from coupole.storage.hdf5_file import hdf5_file
 
 VIEW = np.array([0.0, 0.0, 1.0])
 BLOCK = 20_000
@@ -130,7 +130,7 @@ def _inputs(pictures: PictureSet) -> dict[str, Any]:
 
 def _store(pictures: PictureSet, path: Path, say: Said) -> None:
     def write(part: Path) -> None:
-        with h5py.File(part, "w") as file:
+        with hdf5_file(part, "w") as file:
             file.attrs.update(full_scale=pictures.full_scale, axes=AXES)
             file["mask"], file["directions"] = pictures.mask, pictures.directions
             file["intensities"] = pictures.intensities
@@ -167,7 +167,7 @@ def _fit(result: PictureResult, lights: NDArray[np.int64], path: Path, step: str
         begun.unlink()
     pixels = int(np.count_nonzero(result.mask))
     directions = result.directions[lights]
-    with h5py.File(begun, "a") as file:
+    with hdf5_file(begun, "r+" if begun.exists() else "w") as file:
         for name, width in _FIELDS.items():
             file.require_dataset(name, (pixels, width)[: 1 + (width > 1)], np.float32, fillvalue=np.nan)
         file["normal"].attrs["axes"], file.attrs["lights"] = AXES, lights
@@ -180,8 +180,7 @@ def _fit(result: PictureResult, lights: NDArray[np.int64], path: Path, step: str
             contents = (materials.normals, kd, ks, materials.alpha, materials.residual, materials.kd, materials.ks)
             for name, content in zip(_FIELDS, contents, strict=True):
                 file[name][block] = content
-            file.flush()
-            os.fsync(file.id.get_vfd_handle())  # the block is on the disk before it counts as fitted
+            file.sync()  # the block is on the disk before it counts as fitted
             file.attrs["fitted"] = block.stop
             file.flush()
     begun.replace(path)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +18,7 @@ from coupole.reflectance.light_interpolation import KERNELS, left_without
 from coupole.reflectance.new_light.environment import OF_PICTURES, read_environment
 from coupole.reflectance.new_light.light_kinds import AnyLight, DistantLight, EnvironmentLight
 from coupole.reflectance.picture_result import INTERPOLATION, PictureResult, open_result_file
+from coupole.storage.hdf5_file import hdf5_file
 
 Floats = NDArray[np.float32]
 Beams = Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -50,7 +50,7 @@ class Interpolation:
     network: Network | None
 
     def write(self, path: Path) -> None:
-        with h5py.File(path, "w") as file:
+        with hdf5_file(path, "w") as file:
             file.attrs.update(kernel=self.kernel, peak=self.peak)
             file["lights"], file["gains"] = self.lights, self.gains
             for kernel, rms in self.left_out_rms.items():

@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +27,7 @@ from coupole.reflectance.light_interpolation import nearest
 from coupole.reflectance.picture_result import INTERVALS, MATERIALS, PictureResult, open_result_file
 from coupole.reflectance.relighting import Beams, Interpolation, strip_between, strips
 from coupole.reflectance.strata import StratumFactors, fit_strata
+from coupole.storage.hdf5_file import hdf5_file
 
 Floats = NDArray[np.float64]
 Say = Callable[[int, int], None]
@@ -73,7 +73,7 @@ class RelitIntervals:
 
     def write(self, path: Path) -> None:
         """Write the file of a result."""
-        with h5py.File(path, "w") as file:
+        with hdf5_file(path, "w") as file:
             file.attrs["spacing"] = self.spacing
             file["coefficients"] = self.coefficients
             for level, factors in self.factors.items():

@@ -10,7 +10,6 @@ from itertools import groupby
 from pathlib import Path
 from uuid import uuid4
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,6 +39,7 @@ from coupole.reflectance.triangle_fit import (
 )
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import make_folder
+from coupole.storage.hdf5_file import hdf5_file
 
 Floats = NDArray[np.float64]
 
@@ -201,16 +201,18 @@ def _write_slices(
     say: Said,
 ) -> None:
     with ExitStack() as files:
-        coefficients = []
+        slice_files, coefficients = [], []
         for fit in fits:
             path = result.slices_path(fit.name, view)
             make_folder(path.parent)
             part = files.enter_context(in_the_making(path))
-            file = files.enter_context(h5py.File(part, "w"))
-            coefficients.append(begin_slices(file, fit, view, result.channels))
+            slice_files.append(files.enter_context(hdf5_file(part, "w")))
+            coefficients.append(begin_slices(slice_files[-1], fit, view, result.channels))
         for rows, of_rows in of_fits:
             for data, block_coefficients in zip(coefficients, of_rows, strict=True):
                 data[rows] = block_coefficients
+            for file in slice_files:
+                file.raise_error()
             say(f"fit {', '.join(fit.name for fit in fits)} of {view.view}", rows.stop, len(view.triangles))
 
 

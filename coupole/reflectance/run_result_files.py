@@ -15,11 +15,12 @@ from coupole.reflectance.material_uncertainty import MaterialUncertainty
 from coupole.reflectance.run_result import FIELDS, LOWER, UNCERTAIN, ViewSamples
 from coupole.reflectance.slice_basis import centres
 from coupole.reflectance.triangle_fit import TriangleMaterials
+from coupole.storage.hdf5_file import hdf5_file
 
 
 def write_object(path: Path, corners_mm: NDArray[np.float64], base_from_support: NDArray[np.float64]) -> None:
     """Write the mesh as it was placed in the cell."""
-    with h5py.File(path, "w") as file:
+    with hdf5_file(path, "w") as file:
         data = file.create_dataset("corners_mm", data=corners_mm.astype(np.float32), track_times=False)
         data.attrs["told"] = "[triangles, corners, 3] mm, base frame"
         file.create_dataset("base_from_support", data=base_from_support, track_times=False)
@@ -35,7 +36,7 @@ def write_materials(
 ) -> None:
     """Write a fit of all triangles, joined from blocks. `u_triangle` [n] and `u_shared` are relative standard
     uncertainties of kd and ks: `u_triangle` belongs to each triangle alone, `u_shared` to all together."""
-    with h5py.File(path, "w") as file:
+    with hdf5_file(path, "w") as file:
         file.create_dataset("triangles", data=triangles, track_times=False).attrs["told"] = "numbers in the mesh"
         for field, description in FIELDS.items():
             values = np.concatenate([getattr(part, field) for part in parts]).astype(np.float32)

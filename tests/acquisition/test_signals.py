@@ -205,7 +205,17 @@ def test_a_signal_within_compiled_code_is_known_behind_its_error() -> None:
     behind = signal_behind(error)
     assert behind is not None
     assert behind.number == signal.SIGTERM
+    raise_outside_sessions()
     assert signal_behind(ValueError("a defect")) is None
+
+
+def test_a_signal_that_other_code_answers_with_an_error_of_its_own_is_known_behind_it() -> None:
+    raise_outside_sessions()
+    with contextlib.suppress(SignalReceived):
+        signal.raise_signal(signal.SIGTERM)
+    behind = signal_behind(ImportError("cannot import a library"))
+    assert behind is not None
+    assert behind.number == signal.SIGTERM
 
 
 def test_a_hang_up_that_is_ignored_stays_ignored() -> None:

@@ -19,6 +19,7 @@ from coupole.reflectance.alignment.unknowns import renumbered_triangles
 from coupole.reflectance.extraction.measured_run import MeasuredRun
 from coupole.reflectance.extraction.pointing import Pointing
 from coupole.storage.durable import sha256
+from coupole.storage.hdf5_file import hdf5_file
 
 Floats = NDArray[np.float64]
 REFINED, ABOUT = "refined.h5", "refined.json"
@@ -142,7 +143,7 @@ def write_refined(
         "controls_mm": unknowns.controls_mm,
         "middle_mm": unknowns.middle_mm,
     }
-    with h5py.File(path, "w") as file:
+    with hdf5_file(path, "w") as file:
         file.attrs.update(schema=SCHEMA, mesh_sha256=mesh_sha256, simulated=is_simulated)
         for name, data in values.items():
             file.create_dataset(name, data=data, track_times=False).attrs["told"] = TOLD[name]

@@ -30,6 +30,7 @@ from coupole.reflectance.extraction.seen_surface import SeenSurface, seen_surfac
 from coupole.reflectance.extraction.view_samples import BLOCK, Samples, ViewPass
 from coupole.reflectance.result_folder import complete
 from coupole.storage.array_digest import ArrayDigest
+from coupole.storage.hdf5_file import hdf5_file
 
 Floats = NDArray[np.float64]
 
@@ -88,7 +89,7 @@ def extract_view(
 
     def write(part: Path) -> None:
         nonlocal sample_count
-        with h5py.File(part, "w") as file:
+        with hdf5_file(part, "w") as file:
             _write_head(file, work, surface, digest)
             file.attrs["view"] = path.stem
             data = _begin_samples(file, work)
@@ -103,6 +104,7 @@ def extract_view(
                     if name in data:
                         _write_chunk(data[name], some, values)
                         digest.add(name, values, (some.rows.start, some.leds.start, 0)[: values.ndim])
+                file.raise_error()
                 sample_count += int(np.count_nonzero(np.isfinite(some.f)))
                 of_code[:] += np.bincount(some.codes.ravel(), minlength=len(CODES))
                 if some.rows.stop == len(surface.triangles):

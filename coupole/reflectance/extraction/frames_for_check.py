@@ -22,6 +22,7 @@ from coupole.reflectance.extraction.frame_veils import FrameVeils
 from coupole.reflectance.extraction.measured_run import MeasuredView
 from coupole.reflectance.extraction.radiance import RANGE_LEFT_OUT, Radiometry
 from coupole.reflectance.extraction.sample_codes import REACHED
+from coupole.storage.hdf5_file import hdf5_file
 
 MOST_FRAMES = 12
 """Largest number of frames of a view; if more LEDs are kept, they are thinned out evenly."""
@@ -56,7 +57,7 @@ def write_frames(
             share -= _veil_picture(radiometry, veils, view.by_led[led], frame.exposure_us, offsets)
         return share.astype(np.float16), noise
 
-    with h5py.File(to, "w") as file, ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+    with hdf5_file(to, "w") as file, ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         shape = (len(leds), height // 2, width // 2, radiometry.channels)
         data = file.create_dataset("share", shape, np.float16, track_times=False)
         data.attrs["told"] = (
@@ -65,6 +66,7 @@ def write_frames(
         noise = np.full(len(leds), np.nan)
         for number, (values, noise_picture) in enumerate(pool.map(picture, leds)):
             data[number], noise[number] = values, noise_picture
+            file.raise_error()
         file.create_dataset("leds", data=np.array(leds, np.int64), track_times=False)
         file.create_dataset("noise", data=noise, track_times=False)
         file["noise"].attrs["told"] = (

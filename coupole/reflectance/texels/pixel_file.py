@@ -17,6 +17,7 @@ from coupole.intake.plain_data import read_json
 from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples
 from coupole.reflectance.texels.texel_size import TexelSize
 from coupole.reflectance.triangle_fit import TriangleMaterials
+from coupole.storage.hdf5_file import hdf5_file
 
 FOLDER, ABOUT = "texels", "texels.json"
 Singles = NDArray[np.float32]
@@ -96,7 +97,7 @@ def texels_path(result: RunResult, view: ViewSamples) -> Path:
 def write_view_texels(path: Path, texels: ViewTexels, head: TexelFileHead) -> None:
     """Write the texels of a view."""
     is_of_several = texels.texel_of_pixel is not None
-    with h5py.File(path, "w") as file:
+    with hdf5_file(path, "w") as file:
         file.attrs["view"], file.attrs["size_px"] = head.view, head.size_px
         file.attrs["frame"], file.attrs["simulated"] = "base of the robot", head.is_simulated
         if head.asked_size.mm is not None:

@@ -13,6 +13,7 @@ from coupole.errors import InputError
 from coupole.reflectance.fits import TEXEL_CLUSTERS
 from coupole.reflectance.run_result import RunResult, ViewSamples
 from coupole.reflectance.texels.pixel_file import ViewTexels, read_view_texels
+from coupole.storage.hdf5_file import hdf5_file
 
 PATH = f"fits/{TEXEL_CLUSTERS}.h5"
 _TOLD = {
@@ -40,7 +41,7 @@ class TexelClusters:
 
 def write_texel_clusters(path: Path, clusters: TexelClusters) -> None:
     """Write the file."""
-    with h5py.File(path, "w") as file:
+    with hdf5_file(path, "w") as file:
         for name, description in _TOLD.items():
             values = getattr(clusters, name)
             stored_values = values if name == "members" else values.astype(np.float32)

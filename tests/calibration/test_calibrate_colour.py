@@ -181,7 +181,7 @@ def test_corners_in_the_picture_place_the_chart(made: Path, tmp_path: Path) -> N
     assert "--corners" in str(refused.exception)
     backwards = " ".join(reversed(words.split()))
     refused = calibrate(tmp_path / "r", run_of(made), "--chart", moved, "--corners", backwards)
-    assert "show its back" in str(refused.exception)
+    assert "show the chart's back" in str(refused.exception)
 
 
 def test_saturated_patches_are_refused_by_name(made: Path, tmp_path: Path) -> None:

@@ -136,7 +136,7 @@ def test_what_is_no_measured_material_is_refused(tmp_path: Path) -> None:
     h5py.File(tmp_path / "of-pictures/fits/materials.h5", "w").close()
     for wanted, words in (
         ({"path": tmp_path / "short.binary"}, "expected a material of the MERL database"),
-        ({"path": tmp_path / "short.binary", "cluster": 1}, "of a result's folder"),
+        ({"path": tmp_path / "short.binary", "cluster": 1}, "the folder of a result"),
         ({"path": tmp_path / "none"}, "ggx.h5: is not there"),
         ({"path": tmp_path / "of-pictures"}, "ggx.h5: is not there"),
         ({"path": result(tmp_path), "triangles": [3]}, "expected triangles with a material"),

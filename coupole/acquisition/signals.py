@@ -84,10 +84,19 @@ def raise_outside_sessions() -> None:
 
 
 def ignore_from_now() -> None:
-    """Ignore signals from now on, because the process is about to exit with its code."""
+    """Ignore signals from now on, because the process is about to exit with the code of a failure or of an earlier
+    signal."""
     _raised_number.append(0)
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
+
+
+def exit_from_now() -> None:
+    """Have each signal end the process at once with its code from now on. All is done, but a script must not go on
+    after the signal."""
+    for number in ENDING:
+        if not _stays_ignored(number):
+            signal.signal(number, lambda number, _: os._exit(128 + number))
 
 
 def signal_behind(error: BaseException) -> SignalReceived | None:

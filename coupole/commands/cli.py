@@ -19,6 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 import coupole
 from coupole.acquisition.signals import (
     SignalReceived,
+    exit_from_now,
     ignore_from_now,
     raise_outside_sessions,
     signal_behind,
@@ -220,7 +221,10 @@ def main() -> None:
     raise_outside_sessions()
     with unheard_end():
         code = _exit_code_of_command()
-        ignore_from_now()
+        if code:
+            ignore_from_now()
+        else:
+            exit_from_now()
     leave(code)
 
 

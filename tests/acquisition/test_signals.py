@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -216,6 +217,22 @@ def test_a_signal_that_other_code_answers_with_an_error_of_its_own_is_known_behi
     behind = signal_behind(ImportError("cannot import a library"))
     assert behind is not None
     assert behind.number == signal.SIGTERM
+
+
+LEAVES = """
+import os, signal, sys
+from coupole.acquisition.signals import exit_from_now, ignore_from_now, raise_outside_sessions
+raise_outside_sessions()
+exit_from_now() if sys.argv[1] == "0" else ignore_from_now()
+os.kill(os.getpid(), signal.SIGTERM)
+sys.exit(int(sys.argv[1]))
+"""
+
+
+@pytest.mark.parametrize(("code", "ends_with"), [(0, 143), (4, 4), (129, 129)])
+def test_a_signal_in_the_last_moment_stops_a_script_and_hides_no_failure(code: int, ends_with: int) -> None:
+    ended = subprocess.run([sys.executable, "-c", LEAVES, str(code)], check=False)
+    assert ended.returncode == ends_with
 
 
 def test_a_hang_up_that_is_ignored_stays_ignored() -> None:

@@ -30,7 +30,6 @@ from coupole.commands.reflectance_options import (
     bytes_of,
 )
 from coupole.commands.relight import relight
-from coupole.commands.texel_steps import ablate_texels_of, cluster_texels_of
 from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -289,6 +288,8 @@ def ablate(
 
     def step(say: Said) -> dict[str, Any]:
         if texels:
+            from coupole.commands.texel_steps import ablate_texels_of
+
             return ablate_texels_of(result, runs or [], sources, bytes_of(memory), say)
         if runs or sources.has_any:
             raise InputError("RUNS, --mesh, --calibrations, --refined, --poses: are for --texels")
@@ -338,6 +339,8 @@ def cluster(
 
     def step(say: Said) -> dict[str, Any]:
         if texels:
+            from coupole.commands.texel_steps import cluster_texels_of
+
             return cluster_texels_of(result, clusters, bytes_of(memory), degrees, without_view, say)
         from coupole.reflectance.result_pages import cluster_page
         from coupole.reflectance.run_clusters import cluster_result

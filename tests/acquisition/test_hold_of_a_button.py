@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import pytest
-from benches import HERE
 
 from coupole.acquisition.cell_bench import bench_arm
 from coupole.acquisition.cell_bench.bench_arm import HoldLostError
 from coupole.acquisition.cell_bench.bench_requests import JogAsked
 from coupole.clock import SystemClock
+
+HERE = "127.0.0.1"
 
 
 class ClockByHand(SystemClock):

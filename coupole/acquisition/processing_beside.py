@@ -23,7 +23,8 @@ from rich.console import Console
 
 from coupole.acquisition.discarder import Discarder
 from coupole.acquisition.signals import SignalReceived
-from coupole.errors import InputError
+from coupole.bounded import run_bounded
+from coupole.errors import CoupoleError, InputError
 from coupole.intake.plain_data import json_of
 from coupole.preflight.discard_room import DiscardRoom
 from coupole.preflight.machine import little_address_space
@@ -249,7 +250,7 @@ class ProcessingBeside:
 
     def _say_stopped(self, run: Path) -> None:
         """Say what is kept after a stop, and what goes on with it."""
-        if is_complete(run):
+        if _is_known_to_be_complete(run):
             self._why = "stopped while it was made"
             self._say_unfinished()
             return
@@ -351,3 +352,11 @@ class ProcessingBeside:
         self._process.kill()  # every file of a result is whole or not there
         self._has_ended.wait(_ENDS_WITHIN_S)
         return True
+
+
+def _is_known_to_be_complete(run: Path) -> bool:
+    """Tell whether all frames of a run are there. False if its disk gives no answer: this must hide no other
+    error."""
+    with contextlib.suppress(CoupoleError, OSError):
+        return run_bounded(lambda: is_complete(run))
+    return False

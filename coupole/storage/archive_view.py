@@ -32,11 +32,9 @@ from coupole.errors import ChecksumMismatch, DiskFull, StorageError
 from coupole.storage import bitshuffle, frame_file
 from coupole.storage.bitshuffle import Codec
 from coupole.storage.durable import sync_folder
+from coupole.storage.hdf5_file import hdf5_file
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.line_file import utc_now
-
-_METADATA_BYTES = 2**20
-"""Space that HDF5 may need for metadata in addition to the frames of one step."""
 
 Progress = Callable[[str, int, int], None]
 """Takes the current work (`top: compress`), the number of frames done, and their total."""
@@ -151,11 +149,9 @@ def _write(path: Path, partial: Path, frames: list[FrameProven], codec: Codec, p
     with (
         _Source(path, layout, workers) as source,
         h5py.File(path, "r") as before,
-        h5py.File(partial, "w", libver=("v108", "v110")) as after,
-        partial.open("r+b") as on_disk,
+        hdf5_file(partial, "w", libver=("v108", "v110")) as after,
         ThreadPoolExecutor(workers, "archive") as pool,
     ):
-        _reserve(on_disk.fileno(), after, path.stat().st_size - layout.frames * layout.frame_bytes)
         shape = (layout.frames, layout.height_px, layout.width_px)
         try:
             data = _copy_all_but_frames(before, after, shape, tile, codec, {frame.index for frame in frames})
@@ -168,22 +164,14 @@ def _write(path: Path, partial: Path, frames: list[FrameProven], codec: Codec, p
 
         compressed_frames = _in_order(pool, compress, frames, ahead=2 * workers)
         for count, (frame, tiles) in enumerate(compressed_frames, start=1):
-            _reserve(on_disk.fileno(), after, sum(len(tile_bytes) for _, tile_bytes in tiles))
             for (row, column), tile_bytes in tiles:
                 data.id.write_direct_chunk((frame.index, row, column), tile_bytes)
+            after.raise_error()
             progress(f"{path.stem}: compress", count, len(frames))
         stored_bytes = int(data.id.get_storage_size())
-        after.flush()
-        size = after.id.get_filesize()
-    os.truncate(partial, min(size, partial.stat().st_size))
     with partial.open("r+b") as on_disk:
         os.fsync(on_disk.fileno())
     return stored_bytes
-
-
-def _reserve(fd: int, file: h5py.File, more_bytes: int) -> None:
-    """Allocate space beyond the file's end, because HDF5 can neither continue nor close a file on a full disk."""
-    os.posix_fallocate(fd, file.id.get_filesize(), more_bytes + _METADATA_BYTES)
 
 
 def _copy_all_but_frames(

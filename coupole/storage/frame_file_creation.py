@@ -16,8 +16,8 @@ from coupole.devices import FrameFormat
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sync_folder
 from coupole.storage.frame_file import DATA, FRAME_DTYPE, MAX_POSES, PAGE, POSE_DTYPE
+from coupole.storage.hdf5_file import hdf5_file
 from coupole.storage.line_file import utc_now
-from coupole.storage.unwritten_file import UnwrittenFile
 
 
 @dataclass(frozen=True)
@@ -73,19 +73,18 @@ def create(
     `metadata`: `title`, `sample`, `simulated`, `pixel_pitch_um` and any further attributes of the entry. Raises
     DiskFull if the disk has not enough space.
     """
-    unwritten_file = UnwrittenFile()
-    with h5py.File(
-        unwritten_file, "w", alignment_threshold=PAGE, alignment_interval=PAGE, libver=("v108", "v110")
-    ) as file:
-        _describe(file, slots, frame_format, metadata, is_packed=is_packed)
-        for name, arrays in (collections or {}).items():
-            collection = _group(file["entry"], name, "NXcollection")
-            for key, values in arrays.items():
-                _store(collection, key, values)
     partial = path.with_suffix(".part")
     try:
-        with partial.open("wb") as file_on_disk:
-            unwritten_file.write_to(file_on_disk.fileno())
+        with hdf5_file(
+            partial, "w", alignment_threshold=PAGE, alignment_interval=PAGE, libver=("v108", "v110")
+        ) as file:
+            _describe(file, slots, frame_format, metadata, is_packed=is_packed)
+            for name, arrays in (collections or {}).items():
+                collection = _group(file["entry"], name, "NXcollection")
+                for key, values in arrays.items():
+                    _store(collection, key, values)
+        with partial.open("r+b") as file_on_disk:
+            os.posix_fallocate(file_on_disk.fileno(), 0, partial.stat().st_size)
             os.fsync(file_on_disk.fileno())
         partial.rename(path)
         sync_folder(path.parent)

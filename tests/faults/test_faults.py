@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ import pytest
 from cells import SIDE, TOP, CellFolder, Ended
 from expected_pictures import mislabelled
 from failures import MORE_LIGHTS, assert_complete_once_mended, assert_told, fail_in_a_burst
+from small_disks import small_disk_at
 
 FRAMES = 66
 """Of one view: 54 lights, two dark frames, ten marks."""
@@ -290,18 +290,8 @@ def test_a_fault_at_a_time_of_the_world_is_met_whatever_the_run_does_then(joinin
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 12 MB, where this machine lets one be mounted."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=12m", "none", str(folder)], capture_output=True, check=False
-    )
-    if mounted.returncode:
-        pytest.skip("a small disk cannot be mounted here")
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", str(folder)], check=True)
+    with small_disk_at(tmp_path / "disk", kib=12 * 1024) as disk:
+        yield disk
 
 
 def _fill(path: Path) -> None:

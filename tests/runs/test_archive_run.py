@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 import shutil
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +13,7 @@ import cells
 import pytest
 from archives import MadeRun, make_run
 from cells import SIDE, TOP, CellFolder
+from small_disks import small_disk_at
 
 from coupole.devices import FrameFormat
 from coupole.plan.shot_id import ShotId
@@ -143,16 +143,8 @@ def kill_archive(run: Path, moments: random.Random) -> int:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 24 MB, where this machine lets one be mounted."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=24m", "none", str(folder)], capture_output=True, check=False
-    )
-    if mounted.returncode:
-        pytest.skip("a small disk cannot be mounted here")
-    yield folder
-    subprocess.run(["umount", str(folder)], check=True)
+    with small_disk_at(tmp_path / "disk", kib=24 * 1024) as disk:
+        yield disk
 
 
 @pytest.mark.parametrize("left_bytes", [0, 2**20, 2**21, 3 * 2**20])

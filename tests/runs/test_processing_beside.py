@@ -162,6 +162,19 @@ def test_a_stop_during_the_fits_ends_the_command_and_the_run_stays_complete(tmp_
     assert cells.events(cell.run_folder, "stop")[-1]["outcome"] == "done"
 
 
+def test_a_disk_that_fails_at_the_end_hides_no_other_error(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path)
+    beside = ProcessingBeside(cell.plan, cell.rig, None, make_console(quiet=True))
+    beside._run = tmp_path / "a run whose files are gone"
+
+    def session() -> None:
+        with beside:
+            raise ValueError("what ended the run")
+
+    with pytest.raises(ValueError, match="what ended the run"):
+        session()
+
+
 def test_a_processing_that_gets_no_more_memory_says_so_and_is_no_defect(tmp_path: Path) -> None:
     cell = cell_of_three_views(tmp_path)
     process, worker = begun(cell)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +13,7 @@ import cells
 import pytest
 from beside_runs import begun, result_of
 from discarded_runs import all_discarded, discarding_cell, everything_is_there, resume
+from small_disks import small_disk_at
 
 from coupole.storage.given_back import why_not
 
@@ -29,14 +29,8 @@ pytestmark = [
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of its own, with room for less than three views and their samples."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    words = ["mount", "-t", "tmpfs", "-o", "size=140m", "tmpfs", str(disk)]
-    mounted = subprocess.run(words, check=False, capture_output=True, text=True)
-    if mounted.returncode != 0:
-        pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
+    with small_disk_at(tmp_path / "disk", kib=140 * 1024) as disk:
+        yield disk
 
 
 @pytest.mark.parametrize(

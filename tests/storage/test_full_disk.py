@@ -13,6 +13,7 @@ from pathlib import Path
 import cells
 import pytest
 from cells import SIDE, TOP, CellFolder
+from small_disks import small_disk_at
 from view_files import FORMAT, METADATA, SLOTS, frame
 
 from coupole.errors import DiskFull, StorageError
@@ -30,14 +31,8 @@ from coupole.storage.view_writer import ViewWriter
 @pytest.fixture
 def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
     """A disk of its own, of 1 MiB or so many as are asked for."""
-    disk, mib = tmp_path / "disk", getattr(request, "param", 1)
-    disk.mkdir()
-    words = ["mount", "-t", "tmpfs", "-o", f"size={mib}m", "tmpfs", str(disk)]
-    mounted = subprocess.run(words, check=False, capture_output=True, text=True)
-    if mounted.returncode != 0:
-        pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
+    with small_disk_at(tmp_path / "disk", kib=1024 * getattr(request, "param", 1)) as disk:
+        yield disk
 
 
 def fill(disk: Path, leave_bytes: int) -> None:

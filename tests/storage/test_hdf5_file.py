@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import cells
 import h5py
 import numpy as np
 import pytest
+from small_disks import small_disk_at
 
 from coupole.storage.hdf5_file import hdf5_file
 
@@ -35,14 +38,8 @@ else:
 @pytest.fixture
 def disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
     """A disk with so many kibibytes as are asked for."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    words = ["mount", "-t", "tmpfs", "-o", f"size={request.param}k", "tmpfs", str(folder)]
-    mounted = subprocess.run(words, check=False, capture_output=True, text=True)
-    if mounted.returncode != 0:
-        pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
-    yield folder
-    subprocess.run(["umount", str(folder)], check=True)
+    with small_disk_at(tmp_path / "disk", kib=request.param) as disk:
+        yield disk
 
 
 @pytest.mark.parametrize("disk", [4, 8, 16, 40, 100, 160, 200], indirect=True)
@@ -96,3 +93,10 @@ def test_the_error_is_told_and_not_what_follows_from_it(tmp_path: Path) -> None:
 
     with pytest.raises(OSError, match="Input/output error"):
         work()
+
+
+def test_no_module_lets_hdf5_write_to_a_disk_by_itself() -> None:
+    """Files in memory (`buffer`) cannot be full."""
+    opened = re.compile(r"h5py\.File\((?!buffer)[^)]*\"(w|r\+|a)\"")
+    writers = [path for path in (cells.REPO / "coupole").rglob("*.py") if opened.search(path.read_text())]
+    assert writers == []

@@ -26,9 +26,8 @@ _ARRIVED_DEG = 0.1
 _TOLD_WITHIN_S = 3.0
 """Time within which the fault of an arm that stopped on its way is reported."""
 _SPEED_OVER_S, _MOMENT_S = 0.3, 0.08
-"""Times over which speeds are measured: the time of the motion, and a time in which the arm has begun to brake. "
-    "Reports
-come unevenly, so speeds over shorter times are noise."""
+"""Times over which speeds are measured: the time of the motion, and a time in which the arm has begun to brake.
+Reports come unevenly, so speeds over shorter times are noise."""
 _FAST_SHARE = 0.5
 """Share of an axis's greatest speed in this session; the axis must have been this fast."""
 _STEADY_SHARE = 0.8

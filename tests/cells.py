@@ -258,7 +258,7 @@ def start(*arguments: str | Path, anew: bool = False, **popen: Any) -> subproces
     words = [*map(str, arguments)]
     if not anew and popen.keys() <= {"stdin", "stdout", "stderr"}:
         return NURSERY.command(words, **options)
-    return subprocess.Popen([sys.executable, "-m", "coupole.commands.cli", *words], **options)
+    return subprocess.Popen([sys.executable, "-m", "coupole", *words], **options)
 
 
 def finish(process: subprocess.Popen[str]) -> Ended:

@@ -53,7 +53,7 @@ def bench_check(options: Asked) -> None:
     command = [
         sys.executable,
         "-m",
-        "coupole.commands.cli",
+        "coupole",
         "check",
         str(ROOT / "configs/plans/large.yaml"),
         "--no-paths",

@@ -190,7 +190,7 @@ def _cell(root: Path, folder: Path, entries: dict[str, Any]) -> tuple[Path, Path
 
 
 def _serve(root: Path, rig: Path, folder: Path) -> Console:
-    command = [sys.executable, "-m", "coupole.commands.cli", "serve", str(rig), "--port", "0", "--json"]
+    command = [sys.executable, "-m", "coupole", "serve", str(rig), "--port", "0", "--json"]
     process = subprocess.Popen(
         [*command, "--plans", str(folder)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=root
     )

@@ -102,7 +102,7 @@ def _live_run(root: Path, size: Size, *options: str) -> LiveRun:
         command = [
             sys.executable,
             "-m",
-            "coupole.commands.cli",
+            "coupole",
             "acquire",
             "plan.yaml",
             "--yes",

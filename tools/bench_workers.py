@@ -71,9 +71,7 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
 
 
 def _coupole(root: Path, *arguments: str) -> None:
-    subprocess.run(
-        [sys.executable, "-m", "coupole.commands.cli", *arguments], check=True, cwd=root, capture_output=True
-    )
+    subprocess.run([sys.executable, "-m", "coupole", *arguments], check=True, cwd=root, capture_output=True)
 
 
 def _fit(root: Path, folder: Path, workers: int, number: int) -> Fitted:
@@ -86,7 +84,7 @@ def _fit(root: Path, folder: Path, workers: int, number: int) -> Fitted:
     with cluster(dask, workers) as (address, processes):
         used_s = [_cpu_s(process.pid) for process in processes]
         begun_s = time.perf_counter()
-        command = [sys.executable, "-m", "coupole.commands.cli", "reflectance", "fit", str(out)]
+        command = [sys.executable, "-m", "coupole", "reflectance", "fit", str(out)]
         with (dask / "client.log").open("wb") as log:
             client = subprocess.Popen([*command, "--scheduler", address], cwd=root, stdout=log, stderr=log)
         _, status, usage = os.wait4(client.pid, 0)

@@ -58,7 +58,7 @@ def write_cell(folder: Path, mesh: str, material: str, most_triangles: int | Non
 
 def coupole(folder: Path, *arguments: str) -> dict[str, Any]:
     """Return a function that runs a command in the folder and returns its JSON."""
-    command = [sys.executable, "-m", "coupole.commands.cli", *arguments, "--json"]
+    command = [sys.executable, "-m", "coupole", *arguments, "--json"]
     process = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     if process.returncode:
         words = process.stderr[-2000:] or process.stdout[-2000:]

@@ -15,7 +15,7 @@ YOUNG_S = 20.0
 """A process without a socket that is older than this, s, is not starting: it needs no socket. A busy machine loads
 the modules in 5 s."""
 _HOLD = {"acquire", "demo", "commission", "meter", "live", "bench", "arm", "devices"}
-_MODULE = "coupole.commands.cli"
+_MODULE = "coupole"
 
 
 @dataclass(frozen=True)

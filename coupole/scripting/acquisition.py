@@ -63,7 +63,7 @@ class Acquisition(Iterator[Event]):
         self._process = self._begin(arguments)
 
     def _begin(self, arguments: list[str]) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "coupole.commands.cli", "acquire", *arguments, "--json"]
+        command = [sys.executable, "-m", "coupole", "acquire", *arguments, "--json"]
         with self._output_path("errors").open("wb") as errors, self._output_path("figures").open("wb") as figures:
             return subprocess.Popen(
                 [sys.executable, bound_process.__file__, str(os.getpid()), *command],

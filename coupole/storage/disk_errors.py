@@ -1,4 +1,4 @@
-"""Errors of the operating system on a run's disk, in words for the operator."""
+"""Errors of the operating system on a disk with runs or results, in words for the operator."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from coupole.errors import DiskFull, StorageError
 
 
 def disk_error(path: Path, error: OSError) -> StorageError:
-    """Return the error to raise when a run's file cannot be written. It is DiskFull if there is no space or quota
+    """Return the error to raise when a file cannot be written. It is DiskFull if there is no space or quota
     left."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return DiskFull(f"{path}: the disk is full. Free space on it, then resume the run.")
+        return DiskFull(
+            f"{path}: the disk is full. Free space on it, then resume the run, or run the command again."
+        )
     if error.errno == errno.EFBIG:
         return StorageError(
             f"{path}: a file would be longer than this process or its file system allows. Raise the limit "
@@ -20,6 +22,9 @@ def disk_error(path: Path, error: OSError) -> StorageError:
         )
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return StorageError(
-            f"{path}: no more files may be open at once. Raise the limit (`ulimit -n 1024`), then resume the run."
+            f"{path}: no more files may be open at once. Raise the limit (`ulimit -n 1024`), then resume the run, "
+            "or run the command again."
         )
-    return StorageError(f"{path}: {error.strerror or error}. Check the disk, then resume the run.")
+    return StorageError(
+        f"{path}: {error.strerror or error}. Check the disk, then resume the run, or run the command again."
+    )

@@ -169,7 +169,8 @@ def test_an_arm_that_is_not_confirmed_to_be_at_rest_counts_as_a_fault_of_the_cel
 
 
 def test_an_arm_pushed_in_a_burst_that_springs_back_has_just_that_burst_taken_again(joining: CellFolder) -> None:
-    """The views before and after stay as they were taken."""
+    """The other view stays as it was taken. So do the frames that were proven before the push; on a busy machine
+    there may be none."""
     joining.write(views=[TOP, SIDE], lights=MORE_LIGHTS, order="as_written")
     first_edge = 270 + 12  # of the second view
     edge = first_edge + 100
@@ -180,12 +181,12 @@ def test_an_arm_pushed_in_a_burst_that_springs_back_has_just_that_burst_taken_ag
     (moved,) = cells.events(run, "fault")
     assert moved["kind"] == "ArmMoved"
     assert moved["message"].startswith("side")
-    assert "side" in {shot.split("/")[0] for shot in cells.reshot(run)}
+    assert {shot.split("/")[0] for shot in cells.reshot(run)} == {"side"}
     cells.assert_each_shot_proven_once(run)
     assert mislabelled(joining, run) == []
     side = [frame.record for shot, frame in cells.stored(run).items() if shot.startswith("side/")]
-    assert max(record["step"] for record in side if record["pose"] == 0) < edge - first_edge
-    assert {int(record["pose"]) for record in side} == {0, 1}
+    assert all(record["step"] < edge - first_edge for record in side if record["pose"] == 0)
+    assert 1 in {int(record["pose"]) for record in side} <= {0, 1}
 
 
 def test_an_arm_that_stays_pushed_is_never_driven_back_unasked(joining: CellFolder) -> None:

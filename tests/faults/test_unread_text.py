@@ -168,7 +168,7 @@ def test_a_run_on_a_terminal_of_twenty_columns_that_nobody_reads_is_done(tmp_pat
 
 def test_a_run_without_any_standard_stream_is_done(tmp_path: Path) -> None:
     cell = CellFolder(tmp_path)
-    words = [sys.executable, "-m", "coupole.commands.cli", "acquire", str(cell.plan), "--yes"]
+    words = [sys.executable, "-m", "coupole", "acquire", str(cell.plan), "--yes"]
     ended = subprocess.run(
         ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *words], cwd=REPO, timeout=cells.PATIENCE_S, check=False
     )
@@ -240,7 +240,7 @@ def test_a_last_word_waits_for_no_reader_where_no_queue_lies_between() -> None:
 
 @pytest.mark.parametrize("kind", ["full pipe", "stopped terminal"])
 def test_a_command_without_a_cell_that_nobody_reads_is_ended_by_ctrl_c(kind: str) -> None:
-    command = [sys.executable, "-m", "coupole.commands.cli", "schema", "plan"]
+    command = [sys.executable, "-m", "coupole", "schema", "plan"]
     with (
         READERS[kind]() as nobody,
         subprocess.Popen(command, stdout=nobody, stderr=nobody, cwd=REPO) as process,

@@ -15,7 +15,7 @@ import pytest
 def dose(data: Path, *words: str, streams: str = "") -> cells.Ended:
     """The command, its ledgers in `data`; `streams` are redirections of a shell."""
     ended = subprocess.run(
-        ["sh", "-c", f'exec "$@" {streams}', "sh", sys.executable, "-m", "coupole.commands.cli", "dose", *words],
+        ["sh", "-c", f'exec "$@" {streams}', "sh", sys.executable, "-m", "coupole", "dose", *words],
         cwd=cells.REPO,
         env={**os.environ, "XDG_DATA_HOME": str(data)},
         capture_output=True,

@@ -91,7 +91,7 @@ def test_a_run_that_has_begun_is_stopped_by_its_plan_or_rig_too(tmp_path: Path, 
 
 def test_a_metering_is_stopped_by_its_plan(tmp_path: Path) -> None:
     cell = CellFolder(tmp_path)
-    cell.write(lights={"kind": "all"})
+    cell.write(lights={"kind": "all"}, exposure={"kind": "fixed", "exposure_us": 60_000})  # more than a minute
     process = cells.start("meter", cell.plan, "--yes")
     _until(process, "simulated")
     stopped = cells.here("stop", cell.plan)

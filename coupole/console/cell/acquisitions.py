@@ -187,7 +187,7 @@ class Acquisitions:
         # recorded first, because an entry must never begin twice
         self._queue.change(entry.id, state="running", begun=utc_now())
         output_path, figures = self._files(entry)
-        command = [sys.executable, "-m", "coupole.commands.cli", "acquire", *self._arguments(entry)]
+        command = [sys.executable, "-m", "coupole", "acquire", *self._arguments(entry)]
         try:
             with output_path.open("wb") as errors, figures.open("wb") as figures_file:
                 self._process = subprocess.Popen(

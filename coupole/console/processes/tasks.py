@@ -27,7 +27,7 @@ from coupole.storage.line_file import utc_now
 MOST_AT_ONCE, _MOST_KEPT, _MOST_SAID = 4, 100, 20_000
 _PATIENCE_S = 20.0
 """Longest wait for the end of a process, s; it includes making a cell safe."""
-_COUPOLE = (sys.executable, "-m", "coupole.commands.cli")
+_COUPOLE = (sys.executable, "-m", "coupole")
 _BOUND = Path(__file__).with_name("bound_process.py")
 _FORMER_KEPT = 50
 

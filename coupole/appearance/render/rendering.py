@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from coupole.appearance.render import bands, description, lights, variant
 from coupole.appearance.render.bands import Description
+from coupole.appearance.render.control_variates import FIRST_PATHS, Guide, batch_sizes
 from coupole.appearance.render.pieces import Piece
 from coupole.appearance.render.scene_file import Camera, PlainScene, Scene, with_plain_lights
 from coupole.errors import CoupoleError
@@ -21,9 +22,6 @@ from coupole.errors import CoupoleError
 Progress = Callable[[int, int], None]
 """Function that takes the number of finished passes, and of all passes."""
 FILTERS: tuple[description.Filter, ...] = (0.0, 90.0, 45.0, "circular")
-_LOOKS, _LEAST_LOOKS = 128, 4
-"""Number of passes after which the noise of a picture with a noise limit is checked, and least number before its
-noise is known."""
 _PATHS_PER_PASS = 4_000_000
 """Number of paths in a pass. This limits a pass to seconds, because Mitsuba cannot be interrupted within a
 pass."""
@@ -38,9 +36,10 @@ class Spectral:
     stokes: NDArray[np.float32]
     """[4 or 1, h, w, bands]: S0, and with polarisation S1 (horizontal), S2 (45 degrees), S3 (right circular)."""
     samples: int
-    """Number of paths through each pixel."""
+    """Number of paths through each pixel; with a noise limit, that of the guide (`control_variates`)."""
     noise: float | None = None
-    """Median over the pixels of the relative standard error, if the scene has a noise limit."""
+    """Median over the pixels of the relative standard error, if the scene has a noise limit: of the guide, with
+    the largest part that the guide does not explain in another group of bands."""
 
     @property
     def radiance(self) -> NDArray[np.float32]:
@@ -68,56 +67,100 @@ class Renderer:
     def render(self, camera: Camera, progress: Progress = lambda done, total: None) -> Spectral:
         """Return the camera's picture; the same scene and seed give the same bits in the same variant."""
         filters = FILTERS if self.scene.polarisation else (None,)
-        samples, noise = self.scene.samples, None
-        if self.scene.noise is not None:
-            samples, noise = self._enough(camera, self.scene.noise)
-        counts = _counts(samples, _most(camera))
-        pass_number, total = 0, len(bands.groups(self.scene.bands.step_nm)) * len(filters) * len(counts)
-        behind = []
-        for through in filters:
-            whole = description.scene_description(self.scene, camera, self._parts, self._mi, through)
-            groups = []
-            for group in bands.groups(self.scene.bands.step_nm):
+        wholes = [
+            description.scene_description(self.scene, camera, self._parts, self._mi, through)
+            for through in filters
+        ]
+        if self.scene.noise is None:
+            behind = self._with_all_paths(camera, wholes, progress)
+            samples, noise = self.scene.samples, None
+        else:
+            behind, samples, noise = self._with_guides(camera, wholes, self.scene.noise, progress)
+        stokes = _stokes(behind) if self.scene.polarisation else np.stack(behind)
+        return Spectral(bands.wavelengths(self.scene.bands.step_nm), stokes, samples, noise)
+
+    def _with_all_paths(
+        self, camera: Camera, wholes: Sequence[Description], progress: Progress
+    ) -> list[NDArray[np.float32]]:
+        """Return the picture [h, w, bands] of each description, with all paths in each band."""
+        counts = _counts(self.scene.samples, _most(camera))
+        groups = bands.groups(self.scene.bands.step_nm)
+        pass_number, total = 0, len(groups) * len(wholes) * len(counts)
+        pictures = []
+        for whole in wholes:
+            of_groups = []
+            for group in groups:
                 sums = np.zeros((camera.height_px, camera.width_px, bands.QUARTERS))
-                group_scene = bands.for_group(whole, group, self.scene.bands.step_nm, self._files)
-                mitsuba_scene = variant.load_scene(self._mi, group_scene)
+                mitsuba_scene = self._load(whole, group)
                 for part, count in enumerate(counts):
                     progress(pass_number, total)
                     sums += count * self._picture(mitsuba_scene, count, part, camera)
                     pass_number += 1
-                groups.append((sums / samples * self._radiance_unit[group]).astype(np.float32))
-            count = len(bands.rendered_bands(self.scene.bands.step_nm))
-            behind.append(np.concatenate(groups, axis=2)[..., :count])
+                of_groups.append(self._radiance(sums / self.scene.samples, group))
+            pictures.append(self._whole(of_groups))
         progress(total, total)
-        stokes = _stokes(behind) if self.scene.polarisation else np.stack(behind)
-        wavelengths_nm = bands.wavelengths(self.scene.bands.step_nm)
-        return Spectral(wavelengths_nm, stokes, samples, noise)
+        return pictures
 
-    def _enough(self, camera: Camera, noise_limit: float) -> tuple[int, float]:
-        """Return the number of samples for a relative noise of `noise_limit` (at most the scene's number), and
-        their noise.
-
-        The noise is found in the middle group of bands, because all groups have the same random numbers.
-        """
+    def _with_guides(
+        self, camera: Camera, wholes: Sequence[Description], noise_limit: float, progress: Progress
+    ) -> tuple[list[NDArray[np.float32]], int, float]:
+        """Return the picture [h, w, bands] of each description, the number of paths of their guides, and the noise
+        of the first one (`control_variates`). All guides have as many paths as the first one needs."""
         groups = bands.groups(self.scene.bands.step_nm)
-        whole = description.scene_description(self.scene, camera, self._parts, self._mi)
         middle = groups[len(groups) // 2]
-        mitsuba_scene = variant.load_scene(
-            self._mi, bands.for_group(whole, middle, self.scene.bands.step_nm, self._files)
-        )
-        count = min(_most(camera), max(1, self.scene.samples // _LOOKS))
-        sums = squares = np.zeros((camera.height_px, camera.width_px))
-        for passes in range(1, max(2, self.scene.samples // count) + 1):
-            picture = self._picture(mitsuba_scene, count, passes - 1, camera).mean(axis=2, dtype=float)
-            sums, squares = sums + picture, squares + picture**2
-            if passes < _LEAST_LOOKS:
-                continue
-            variance = np.maximum(squares / passes - (sums / passes) ** 2, 0.0) / (passes - 1)
-            lit = sums > 0.0
-            noise = float(np.median(np.sqrt(variance[lit]) / (sums[lit] / passes))) if lit.any() else 0.0
-            if noise <= noise_limit:
-                break
-        return passes * count, noise
+        sizes = list(batch_sizes(FIRST_PATHS, self.scene.samples))
+        pictures, noises = [], []
+        for number, whole in enumerate(wholes):
+            guide = Guide(self._files / f"guide-{number}", camera.height_px, camera.width_px)
+            guide_picture, residuals = 0.0, [0.0]
+            for size, picture in self._batches(whole, middle, sizes, camera):
+                progress(
+                    number * len(groups) * len(sizes) + len(guide.sizes), len(wholes) * len(groups) * len(sizes)
+                )
+                guide.add(size, picture)
+                guide_picture += size * picture
+                if number == 0 and guide.is_enough(noise_limit):
+                    break
+            sizes = guide.sizes
+            of_groups = []
+            for place, group in enumerate(groups):
+                progress(number * len(groups) + place, len(wholes) * len(groups))
+                if group == middle:
+                    of_groups.append(self._radiance(guide_picture / guide.moments.paths, group))
+                    continue
+                follower = guide.correct(self._batches(whole, group, sizes, camera), noise_limit)
+                of_groups.append(self._radiance(follower.picture, group))
+                residuals.append(follower.residual_noise)
+            noises.append(float(np.hypot(guide.moments.noise(), max(residuals))))
+            pictures.append(self._whole(of_groups))
+            guide.path.unlink()
+        progress(1, 1)
+        return pictures, sum(sizes), noises[0]
+
+    def _batches(
+        self, whole: Description, group: list[int], sizes: Sequence[int], camera: Camera
+    ) -> Iterator[tuple[int, NDArray[np.floating[Any]]]]:
+        """Yield the number of paths of each batch and its mean picture [h, w, 4]; in all groups the same paths."""
+        mitsuba_scene, part = self._load(whole, group), 0
+        for size in sizes:
+            sums = np.zeros((camera.height_px, camera.width_px, bands.QUARTERS))
+            for count in _counts(size, _most(camera)):
+                sums += count * self._picture(mitsuba_scene, count, part, camera)
+                part += 1
+            yield size, sums / size
+
+    def _load(self, whole: Description, group: list[int]) -> Any:
+        """Return Mitsuba's scene for a group of bands."""
+        return variant.load_scene(self._mi, bands.for_group(whole, group, self.scene.bands.step_nm, self._files))
+
+    def _radiance(self, picture: NDArray[np.floating[Any]], group: list[int]) -> NDArray[np.float32]:
+        """Return a group's picture [h, w, 4] in W/(m^2 sr nm)."""
+        return (picture * self._radiance_unit[group]).astype(np.float32)
+
+    def _whole(self, of_groups: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+        """Return the picture [h, w, bands] of all groups."""
+        count = len(bands.rendered_bands(self.scene.bands.step_nm))
+        return np.concatenate(of_groups, axis=2)[..., :count]
 
     def _picture(self, mitsuba_scene: Any, count: int, part: int, camera: Camera) -> NDArray[np.float32]:
         image = np.array(self._mi.render(mitsuba_scene, spp=count, seed=self.scene.seed + part), np.float32)

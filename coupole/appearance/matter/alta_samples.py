@@ -68,7 +68,7 @@ def read_alta(path: Path) -> AltaSamples:
     except OSError as error:
         raise InputError(f"{path}: cannot read the samples: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected ALTA's text; found bytes that are no text") from error
+        raise InputError(f"{path}: expected ALTA's text; found bytes that are not text") from error
     head, first = _head(path, lines)
     inputs, outputs = _dim(path, head)
     (given_in, line), given_out = head.get("PARAM_IN", ("", 0)), head.get("PARAM_OUT")

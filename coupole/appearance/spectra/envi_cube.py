@@ -276,8 +276,8 @@ class _Fields:
         """Type of the values, with their byte order."""
         word = self.word("data type")
         if word not in _TYPES:
-            raise self.wrong("data type", f"expected one of {', '.join(_TYPES)}, found {word!r}; complex values "
-                                          "are no reflectances")  # fmt: skip
+            raise self.wrong("data type", f"expected one of {', '.join(_TYPES)}, found {word!r}; complex "
+                                          "values are not reflectances")  # fmt: skip
         dtype = np.dtype(_TYPES[word])
         order = self.word("byte order") if dtype.itemsize > 1 else "0"
         if order not in ("0", "1"):

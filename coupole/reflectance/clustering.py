@@ -1,5 +1,5 @@
-"""Clusters of triangles that look alike, and one material for each cluster from all its samples (seed 003, section
-7: 1,000 materials for 400,000 triangles).
+"""Clusters of triangles that look alike, and one material for each cluster from all its samples (Lucat et al.
+2025, section 7: 1,000 materials for 400,000 triangles).
 
 Each sample is turned into the frame of its own triangle, in which z is the fitted normal. Without this, normals
 that are wrong by degrees would blur the pooled samples.

@@ -1,7 +1,7 @@
 """Dependence of each fit on the number of LEDs, on grazing samples and on the number of coefficients.
 
 Some triangles of a result, spread over it, are fitted again with fewer samples or coefficients. The fits are
-compared under LEDs that were left out of all fits (seed 003, 6.3 and 6.4).
+compared under LEDs that were left out of all fits (Lucat et al. 2025, 6.3 and 6.4).
 """
 
 from __future__ import annotations

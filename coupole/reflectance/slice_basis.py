@@ -17,10 +17,10 @@ from coupole.kernels import kernel
 Floats = NDArray[np.float64]
 
 COUNT = 100
-"""Number of coefficients of each basis, as in seed 003, 6.3."""
+"""Number of coefficients of each basis, as in Lucat et al. 2025, 6.3."""
 _DEGREES = 10
 TIKHONOV = 0.1
-"""Penalty of the highest degree of the harmonics (seed 003, 5.2)."""
+"""Penalty of the highest degree of the harmonics (Lucat et al. 2025, 5.2)."""
 _TAIL = 4
 _RADIAL, _RESIDUAL = 1e-3, 0.1
 """Ridge of the radial functions: for reflectance, and for the residual of a material, which is mostly noise. Both

@@ -1,4 +1,4 @@
-"""Two directional and two diffuse fluxes in a scattering layer (seed 000, section 3.4).
+"""Two directional and two diffuse fluxes in a scattering layer (Dumazet et al. 2008, section 3.4).
 
 With z downward, l the directional and L the diffuse fluxes, mu = k + s_i + s_j::
 

@@ -51,7 +51,8 @@ class Shape(Model):
 
 
 class Bole(Model):
-    """The papers' bole, half red lead, half red ochre (seed 001, section 5), of assumed shapes, in its binder."""
+    """The papers' bole, half red lead, half red ochre (Callet et al. 2010, section 5), of assumed shapes, in its
+    binder."""
 
     kind: Literal["bole"]
 

@@ -14,5 +14,5 @@ LEDS = (
     Allowed("image_away", "shift of the dies' images away from the camera, in standard uncertainties", 4.0),
     Allowed("left_out", "ratio of the uncertainty found by leaving out views to the stated uncertainty", 2.0),
 )
-"""`centre_mm`, `normal_deg`: standard uncertainties (seed 003: 700 um, 0.21 deg). `left_out` is for the centres,
-the median over the LEDs."""
+"""`centre_mm`, `normal_deg`: standard uncertainties (Lucat et al. 2025: 700 um, 0.21 deg). `left_out` is for the
+centres, the median over the LEDs."""

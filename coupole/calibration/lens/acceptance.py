@@ -27,7 +27,7 @@ HAND_EYE = (
     Allowed("turn_deg", "camera's turn", 0.05, "deg"),
     Allowed("robot_ratio", "ratio of the robot's estimated noise to its stated noise", 3.0),
 )
-"""`centre_mm` is a standard uncertainty, all directions together (seed 003: 300 um)."""
+"""`centre_mm` is a standard uncertainty, all directions together (Lucat et al. 2025: 300 um)."""
 CHROMATIC = (
     *IMAGES,
     Allowed("shift_px", "uncertainty of the shift between colours", 0.1, "px"),

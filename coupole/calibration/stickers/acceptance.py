@@ -10,5 +10,5 @@ MESH = (
     Allowed("residual_px", "residual of stickers", 0.5, "px"),
     Allowed("robot_ratio", "ratio of the robot's estimated noise to its stated noise", 3.0),
 )
-"""`place_mm` is the standard uncertainty of the place of the worst sticker in the base frame (seed 003: 100
-um)."""
+"""`place_mm` is the standard uncertainty of the place of the worst sticker in the base frame (Lucat et al. 2025:
+100 um)."""

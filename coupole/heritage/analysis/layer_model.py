@@ -1,4 +1,5 @@
-"""Choice of the model that a paint layer needs, and the size of its grains (seed 000, sections 3.4 and 3.5).
+"""Choice of the model that a paint layer needs, and the size of its grains (Dumazet et al. 2008, sections 3.4 and
+3.5).
 
 Two fluxes are valid for light that is diffuse inside the layer: under diffuse illumination, or where the layer
 scatters so much that nothing reaches its ground unscattered. A thin or clear layer under directional light (a

@@ -43,7 +43,7 @@ class CameraColour:
     it is not known."""
     neutral: Neutral
     origin: str
-    """Origin of this knowledge, in words."""
+    """Where these colours come from, in words."""
 
 
 def unknown_colour() -> CameraColour:

@@ -98,8 +98,8 @@ def pool_samples(
     members: NDArray[np.int64],
     random: np.random.Generator,
 ) -> None:
-    """Add samples of triangles with fitted `normals` [b, 3] to the pools of their clusters [b] (-1 for none). All
-    triangles of a cluster, `members` [k] in number, contribute equally."""
+    """Add samples of triangles with fitted `normals` [b, 3] to the pools of their clusters [b] (-1 for none). The
+    triangles of a cluster, whose number is `members` [k], contribute equally."""
     most_each = np.maximum(_LEAST_EACH, MOST_POOLED // np.maximum(members, 1))
     order = random.permutation(np.flatnonzero(sample_mask))
     _pool(

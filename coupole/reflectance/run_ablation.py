@@ -37,7 +37,7 @@ LED_STEPS = (1, 2, 4, 8)
 MOST_INCIDENCES_DEG = (89, 80, 70, 60)
 COEFFICIENTS = (100, 64, 36, 16)
 _BLOCKS, _TRIANGLES = 16, 48
-"""Number of places in the result, and of neighbouring triangles at each place."""
+"""Number of places that are taken from the result, and number of neighbouring triangles at each place."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Variant:
 
 
 Variants = dict[str, list[tuple[float, Variant]]]
-"""Values of settings and their variants, by the settings' names."""
+"""Values of each setting with the variant of the data for each value, by the setting's name."""
 FEWER_SAMPLES: Variants = {
     "share of the LEDs": [(1.0 / step, Variant(led_step=step)) for step in LED_STEPS],
     "most incidence, degrees": [(deg, Variant(most_incidence_deg=deg)) for deg in MOST_INCIDENCES_DEG],

@@ -30,7 +30,7 @@ SOURCES = {
     "led_mm": "places of the LEDs",
     "u_glare": "veiling glare taken off",
 }
-"""Fields of `Sources`, and their meaning."""
+"""Names of the fields of `Sources`, with what each of them means."""
 
 
 @dataclass(frozen=True)

@@ -88,9 +88,9 @@ def four_flux_varnish() -> Brdf:
 
 def woven_cloth() -> Brdf:
     """Return linen whose threads are finer than a pixel. It is the mean over the threads' normals
-    (`fabric.weave`), each rough and with some gloss. Threads that face away from light or eye are dark. The others
-    hide each other by the excess of their area (Ashikhmin, Premoze and Shirley, A microfacet-based BRDF generator,
-    2000). The result is the mean over all turns of the cloth."""
+    (`fabric.weave`), each rough and with some gloss. Threads that face away from light or eye are dark. The other
+    facets hide each other by the excess of their area (Ashikhmin, Premoze and Shirley, A microfacet-based BRDF
+    generator, 2000). The result is the mean over all turns of the cloth."""
     places = (np.arange(_THREAD_PLACES) + 0.5) / _THREAD_PLACES
     grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
     normals, shade = weave(grid, 1.0)

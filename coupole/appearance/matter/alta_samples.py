@@ -60,7 +60,7 @@ class AltaSamples:
 
 def read_alta(path: Path) -> AltaSamples:
     """Read a file. Raises InputError with line and column for a missing file, for a head without DIM or PARAM_IN,
-    for a line whose number of values differs from that in the head, for words that are no numbers, and for a
+    for a line whose number of values differs from that in the head, for words that are not numbers, and for a
     lower bound above the upper one.
     """
     try:

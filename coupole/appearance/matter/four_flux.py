@@ -36,13 +36,13 @@ class Layer:
     absorption: ArrayLike
     """K, diffuse light."""
     scattering: ArrayLike
-    """S of diffuse light, from one direction to the other."""
+    """S: scattering of diffuse light from one direction to the other."""
     direct_absorption: ArrayLike
     """k, of directional light."""
     forward: ArrayLike
-    """s_i: from directional light to diffuse light in the same direction."""
+    """s_i: scattering of directional light into diffuse light of the same direction."""
     backward: ArrayLike
-    """s_j: from directional light to diffuse light in the opposite direction."""
+    """s_j: scattering of directional light into diffuse light of the opposite direction."""
     thickness_mm: ArrayLike
 
 

@@ -55,7 +55,7 @@ class Photons:
     power: NDArray[np.float32]
     """[n, 81], W/nm."""
     bounces: NDArray[np.int64]
-    """[n], number of reflections at gold."""
+    """[n] number of reflections of each photon at gold."""
     started_power: Array
     """[81] power of all photons together, W/nm."""
     escaped_power: Array

@@ -47,7 +47,7 @@ class Shape(Model):
         now = typical.FORMER_NAMES.get(self.name)
         if now is None:
             return ""
-        return f"{self.name} is no measured pigment but an assumed shape: write {{kind: shape, name: {now}}}"
+        return f"{self.name} is not a measured pigment but an assumed shape: write {{kind: shape, name: {now}}}"
 
 
 class Bole(Model):
@@ -64,8 +64,8 @@ class Measured(Model):
     path: Path
     column: int | None = None
     sample: Literal["gloss excluded", "gloss included", "bare"] = "gloss excluded"
-    """Part of the gloss of the sample's face in the measurement. `bare`: the sample had no face (matt powder), so
-    the measured reflectance is also valid inside a binder."""
+    """How much of the gloss of the sample's face the measurement includes. `bare`: the sample had no face (matt
+    powder), so the measured reflectance is also valid inside a binder."""
 
 
 class MeasuredPaint(Model):

@@ -66,7 +66,7 @@ class Cube:
     left_out: tuple[int, ...]
     """Bands, from 1, that the header's list `bbl` names as bad."""
     _bands: NDArray[np.intp]
-    """[bands used] places, among the bands of the file, of the wavelengths above."""
+    """[bands used] place of each of these wavelengths among the bands of the file."""
     _all_bands: int
     _dtype: np.dtype[Any]
     _interleave: str
@@ -110,7 +110,9 @@ class Cube:
                         pixels = values.reshape(count, self.columns, -1)[:, :, self._bands]
         except OSError as error:
             raise InputError(f"{self.data}: {reason(error)}") from error
-        with np.errstate(over="ignore", invalid="ignore"):  # such values are infinite, so they are no reflectances
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # such values are infinite, so they are not reflectances
             reflectance = pixels.astype(np.float32)
             reflectance /= np.float32(self.scale)
         if self._ignore_value is not None:

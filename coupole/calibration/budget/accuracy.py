@@ -49,7 +49,7 @@ class Accuracy:
     unit: str
     """Empty for relative intervals."""
     paper: str
-    """The paper's figure in its own words."""
+    """The paper's figure, as the paper writes it."""
     our_figures: tuple[tuple[float, ...] | None, ...]
     """Our figure for each case: one number, or the two ends of an interval; None without a record."""
 

@@ -166,7 +166,7 @@ class _Descent:
     state: LedState
     steps: int
     last_equations: Reduced
-    """Normal equations of the last step, which changed the cost by less than `_STILL` of it."""
+    """Normal equations of the last step, which changed the cost by less than the share `_STILL`."""
 
 
 def _descend(

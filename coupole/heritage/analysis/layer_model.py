@@ -33,9 +33,9 @@ class Deserved:
     model: Model
     because: str
     difference: float
-    """Largest difference, over bands and grounds, between the two models under directional light."""
+    """Largest difference between the two models under directional light, among all bands and grounds."""
     unscattered_share: float
-    """Largest share, over the bands, of directional light that reaches the ground unscattered."""
+    """Largest share of directional light that reaches the ground unscattered, among all bands."""
 
 
 @dataclass(frozen=True)

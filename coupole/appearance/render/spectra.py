@@ -64,8 +64,8 @@ class Measured(Model):
     path: Path
     column: int | None = None
     sample: Literal["gloss excluded", "gloss included", "bare"] = "gloss excluded"
-    """How much of the gloss of the sample's face the measurement includes. `bare`: the sample had no face (matt
-    powder), so the measured reflectance is also valid inside a binder."""
+    """Statement whether the measurement includes the gloss of the sample's face. `bare`: the sample had no face
+    (matt powder), so the measured reflectance is also valid inside a binder."""
 
 
 class MeasuredPaint(Model):

@@ -80,7 +80,7 @@ class SuggestionRequest:
 
 
 class Settings(NamedTuple):
-    """What a plan consists of besides its views."""
+    """Everything in a plan besides its views."""
 
     exposures_us: tuple[int, ...]
     leds: int

@@ -287,7 +287,7 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface, digest: A
         file,
         "full_scales",
         scales,
-        "share of the camera's range for f cos_i E/Phi = 1 in the longest exposure",
+        "share of the camera's range that f cos_i E/Phi = 1 m^-2 sr^-1 gives in the longest exposure",
         digest,
     )
 

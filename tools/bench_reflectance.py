@@ -1,7 +1,8 @@
 """Speed and memory of reflectance: full-size frames to samples, fits of triangles, relit pictures.
 
 The run is that of `bench_measured_run`. The peers are a read of the same bytes past the page cache, BLAS, SciPy,
-Mitsuba, and the published figures of La Coupole (seed 003, 6.2 and 6.3: half a million triangles, ten cores).
+Mitsuba, and the published figures of La Coupole (Lucat et al. 2025, 6.2 and 6.3: half a million triangles, ten
+cores).
 """
 
 from __future__ import annotations

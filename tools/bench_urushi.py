@@ -1,6 +1,7 @@
 """Sphere maps of gold under ten lights: time to compute a map again when lights move, and its error.
 
-The limit is 2 ms; the paper (seed 002, section 3.3) needed a few tens of milliseconds for ten lights in 2002.
+The limit is 2 ms; the paper (Durikovic et al. 2002, section 3.3) needed a few tens of milliseconds for ten lights
+in 2002.
 """
 
 from __future__ import annotations

@@ -10,10 +10,10 @@ visible triangles. The relief is then a fifth as high, so that it stays in focus
 with finer pixels, 8 for each triangle, and its records are drawn at random (`drawn_records`). 400,000 triangles
 take half an hour, and 5 GB of disk.
 
-1,000 clusters are those of the paper, for 416,859 triangles (seed 003, Fig. 6). The result for one cluster per 417
-triangles, the paper's ratio, is printed too. As in the paper, errors are means over blocks of 2 x 2 pixels under
-LEDs that were left out. Exits with 1 if the error with 1,000 clusters is more than 1.3 times that with the
-triangles' own materials. Run and result stay in the folder `--keep`; a later call continues with them.
+1,000 clusters are those of the paper, for 416,859 triangles (Lucat et al. 2025, Fig. 6). The result for one
+cluster per 417 triangles, the paper's ratio, is printed too. As in the paper, errors are means over blocks of 2 x
+2 pixels under LEDs that were left out. Exits with 1 if the error with 1,000 clusters is more than 1.3 times that
+with the triangles' own materials. Run and result stay in the folder `--keep`; a later call continues with them.
 """
 
 from __future__ import annotations

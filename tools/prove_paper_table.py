@@ -1,4 +1,4 @@
-"""The paper's table of uncertainty (seed 003, 6.1) beside ours, on a simulated cell with the paper's
+"""The paper's table of uncertainty (Lucat et al. 2025, 6.1) beside ours, on a simulated cell with the paper's
 uncertainties.
 
     python tools/prove_paper_table.py [--every 20] [--material layered] [--depth 0.8] [--json]

@@ -1,4 +1,5 @@
-"""The sphere map of a glossy finish under several lights, on meshes that follow its lobes (seed 002, section 3.3).
+"""The sphere map of a glossy finish under several lights, on meshes that follow its lobes (Durikovic et al. 2002,
+section 3.3).
 
 For a distant eye and distant lights, reflected radiance depends only on the normal. The map gives it for each
 normal, as a sphere shows it. Each light has its own mesh, and the maps are added. Its lines have constant angles

@@ -3,8 +3,8 @@
     uv run python tools/time_renderings.py [NAME[=NOISE] ...] [--size 1200] [--step 5] [--samples 512]
 
 Each scene of `configs/scenes` is rendered with its first camera as a square picture, until half of the pixels have
-at most the given noise (or until `--samples` are reached). Seed 000 took 8 hours for a picture of 1200 x 1200
-pixels (figure 12).
+at most the given noise (or until `--samples` are reached). Dumazet et al. 2008 took 8 hours for a picture of 1200
+x 1200 pixels (figure 12).
 """
 
 from __future__ import annotations

@@ -16,8 +16,8 @@ from coupole.calibration.adjustment import Block
 from coupole.calibration.rotations import Floats
 
 _OWN = 1e-6
-"""Least redundancy of a direction of a view's residuals. A direction with less redundancy is determined by the
-view alone."""
+"""Least redundancy at which a direction of a view's residuals is used. A direction with less redundancy is
+determined by the view alone."""
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ GLARE = "glare"
 """Kind of record whose veil is subtracted from the signal. A record of LEDs' powers says only whether it was
 used."""
 READ_WITH = "read_with."
-"""First part of the names of figures in a record of LEDs' powers. Such a figure says whether a kind of record was
-used for it: 1, or 0."""
+"""First part of the name of each figure in a record of the LEDs' powers. Such a figure says whether a kind of
+record was used for it: 1, or 0."""
 
 
 def read_earlier(path: Path, kind: Kind, about: About, size_px: tuple[int, int]) -> Record:

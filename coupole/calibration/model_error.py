@@ -84,7 +84,7 @@ class ModelError:
     coefficients: Floats
     """[modes] coefficients of all suspects together, in their order."""
     joint_covariance: Floats
-    """[p + modes] squared, of the parameters and all coefficients."""
+    """[p + modes, p + modes] covariance of the parameters and all coefficients."""
 
     def of(self, name: str) -> Suspected:
         return next(suspect for suspect in self.suspects if suspect.name == name)

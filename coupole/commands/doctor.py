@@ -37,10 +37,10 @@ def doctor(
 ) -> None:
     """List what this machine lacks for a rig, and measure whether it answers the arm's controller in time.
 
-    The list has libraries, rights, ports and folders, each with its remedy. No device is opened. If the arm's
-    driver answers its controller in every cycle, the answering process runs as in a session, against a controller
-    that this command simulates. During the measurement, let the machine do the work of a run. Exit code 3:
-    something is missing, or the machine cannot hold the rig's cycle.
+    The list has libraries, rights, ports and folders, with a remedy for each that is missing. No device is opened.
+    If the controller of the arm must be answered in every cycle, the command simulates this controller, and the
+    process that answers it runs as in a session. During the measurement, let the machine do the work of a run.
+    Exit code 3: something is missing, or the machine cannot hold the rig's cycle.
     """
     from coupole.commands.extras import lacking_extras
     from coupole.plan.cell import read_cell

@@ -186,8 +186,8 @@ def _show_discarded(console: Console, verification: Verification) -> None:
     total = sum(verification.discarded_counts.values())
     console.print(
         f"{total} more frames were discarded, as the plan says (discard: after_fit): {counts}. Nobody can look at "
-        "them again. The journal has their shots and checksums; the samples that were taken from them replace "
-        "them:",
+        "them again. The journal has the shots and checksums of these frames. The samples that were taken "
+        "from the frames replace them:",
         markup=False,
     )
     samples = (

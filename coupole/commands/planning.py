@@ -36,7 +36,7 @@ def check(
         Path | None, typer.Option("--resume", help="Check the rest of this run.", autocompletion=runs)
     ] = None,
     no_paths: Annotated[
-        bool, typer.Option("--no-paths", help="Leave out path planning and swept collisions.")
+        bool, typer.Option("--no-paths", help="Leave out path planning and the collision checks along paths.")
     ] = False,
     no_disk_speed: Annotated[
         bool,
@@ -79,7 +79,7 @@ def view(
     rig: RigOption = None,
     out: Annotated[Path, typer.Option("--out", help="Folder for both files.")] = Path(),
     no_paths: Annotated[
-        bool, typer.Option("--no-paths", help="Leave out path planning and swept collisions.")
+        bool, typer.Option("--no-paths", help="Leave out path planning and the collision checks along paths.")
     ] = False,
     show: Annotated[bool, typer.Option("--show", help="Open the page in a browser.")] = False,
     as_json: JsonOption = False,

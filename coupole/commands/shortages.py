@@ -1,4 +1,4 @@
-"""Errors that come from a limit of this machine or of this process: they are no defects."""
+"""Errors that come from a limit of this machine or of this process: they are not defects."""
 
 from __future__ import annotations
 

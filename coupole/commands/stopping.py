@@ -209,8 +209,8 @@ class _Stopping:
             if waited_s > _SAID_AFTER_S and pid not in self._told_pids:
                 self._told_pids.add(pid)
                 _alarm(
-                    f"{name} is just starting: waiting until it can be stopped, or until it is known that "
-                    "another session was meant"
+                    f"{name} is just starting: waiting until it can be stopped, or until it turns out to be "
+                    "a session that you did not mean"
                 )
         if starting:
             time.sleep(_STARTING_EVERY_S)

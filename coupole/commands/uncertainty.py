@@ -63,7 +63,7 @@ def budget(
         list[Path] | None,
         typer.Argument(
             help="Records, or folders of them: camera, hand-eye, leds, mesh, flat-field, response, "
-            "led-power, drift, glare. Without a record, figures of seed 003 or assumed figures are used.",
+            "led-power, drift, glare. Without a record, figures of Lucat et al. 2025 or assumed figures are used.",
             metavar="RECORD_OR_FOLDER",
         ),
     ] = None,
@@ -296,7 +296,12 @@ def _show_accuracies(console: Console, result: _Result) -> None:
 
     cases = result.cases
     table = Table(
-        "accuracy", "seed 003", *(case.name for case in cases), box=None, padding=(0, 1, 0, 0), pad_edge=False
+        "accuracy",
+        "Lucat et al. 2025",
+        *(case.name for case in cases),
+        box=None,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
     )
     table.add_row("robot's noise, found", "", *(case.robot for case in cases))
     for line in result.table:

@@ -43,7 +43,7 @@ class CameraColour:
     it is not known."""
     neutral: Neutral
     origin: str
-    """Origin of this knowledge, in words."""
+    """Source of these colours, in words."""
 
 
 def unknown_colour() -> CameraColour:

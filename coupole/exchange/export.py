@@ -83,7 +83,7 @@ def export_run(
 
 def _words_of_kept(kept_shots: Sequence[ShotId]) -> str:
     label = str(kept_shots[0].label) if kept_shots else "dark*"
-    return f"Name frames that are kept with --shots, such as `{label}`; "
+    return f"With --shots, name frames that were not discarded, such as `{label}`; "
 
 
 def _encoder(to: str, run: Run, colour: ColourWanted | None) -> Callable[[Picture], bytes]:

@@ -53,9 +53,9 @@ class CrateFacts:
     """Facts that only the authors of a crate can state."""
 
     licence: str | None = None
-    """A URL, or words; None for the licence in the run's plan."""
+    """URL or text of the licence; None for the licence in the run's plan."""
     authors: tuple[str, ...] = ()
-    """Each as `NAME <https://orcid.org/...> at INSTITUTION`, or a name alone."""
+    """The authors, each as `NAME <https://orcid.org/...> at INSTITUTION`, or a name alone."""
     publisher: str | None = None
     name: str | None = None
     """Title; None for the folder's name."""

@@ -1,4 +1,5 @@
-"""JSON, and YAML that is no plan or rig, as plain data: the one place where others' files and messages are parsed.
+"""JSON, and YAML that is not a plan or rig, as plain data: the one place where others' files and messages are
+parsed.
 
 Every text gives data or an InputError with file, line and column. The same is true of text that is not UTF-8,
 deeply nested lists, numbers of thousands of digits, NaN, and aliases that multiply each other. Otherwise these

@@ -35,7 +35,7 @@ class LedTable:
         """Return the illuminance [points, leds] on a surface that faces each LED. This is the maximum at a point.
 
         E = Phi / (pi d^2) cos(emission angle) for a small Lambertian emitter; `paper` takes the cosine twice
-        (seed 003, Eq. 2). Points are [points, 3] in mm in the base frame.
+        (Lucat et al. 2025, Eq. 2). Points are [points, 3] in mm in the base frame.
         """
         from_led = np.asarray(points_base_mm, dtype=np.float64)[:, None, :] - self.positions_mm[None, :, :]
         distance_mm = np.linalg.norm(from_led, axis=2)

@@ -82,7 +82,7 @@ class _Explainer:
         self.kind: str = self.node["type"]
 
     def _peel(self, node: Schema) -> Schema:
-        """Return the node below validators, defaults and references."""
+        """Return the schema's node inside all validators, defaults and references around it."""
         while True:
             if node["type"] == "definition-ref":
                 node = self.definitions[node["schema_ref"]]

@@ -309,7 +309,7 @@ class _Builder:
 
     def _check_text(self, node: ScalarNode, key_path: KeyPath) -> None:
         if any("\ud800" <= character <= "\udfff" for character in node.value):
-            self.complain(node, key_path, "text with half a surrogate pair is no Unicode text")
+            self.complain(node, key_path, "text with half a surrogate pair is not Unicode text")
         if "\0" in node.value:
             self.complain(node, key_path, "text with a NUL character")
 

@@ -65,7 +65,7 @@ class AdaptiveLightsChooser(Chooser):
     def choose_ahead(
         self, view: OpenView, choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
     ) -> Choice | None:
-        """See `coupole.plan.choices.Chooser`. None for the second burst, and for the end of a view."""
+        """See `coupole.plan.choices.Chooser`. None for the second burst of a view, and if the view ends."""
         lights = self._lights[view.name]
         if not isinstance(lights, AdaptiveLights) or len(choices) < 2:
             return None

@@ -62,7 +62,7 @@ class StepResult(Model):
     settings: dict[str, JsonValue]
     """All settings of the rig that the result depends on, by their place in the rig."""
     covers: Literal["everything"] | None = Field(default=None, exclude_if=lambda value: value is None)
-    """None in records of versions that kept only some of the settings."""
+    """None in a record of a version that kept only some of the settings."""
     limits: tuple[Limit, ...]
     answers: tuple[Answer, ...]
     remarks: tuple[str, ...]

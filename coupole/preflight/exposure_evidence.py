@@ -21,7 +21,7 @@ Booleans = NDArray[np.bool_]
 FULL = 0.95
 """Share of the range above black that counts as full. It is below 1, so that noise does not reach saturation."""
 QUANTILES = 48
-"""Number of rates that represent the rates of all pixels in an LED's light."""
+"""Number of signal rates that represent the rates of all pixels in an LED's light."""
 _JUDGED_MARGIN, _HELP_MARGIN = 1.03, 1.05
 """Factors by which the required ratio is multiplied when frames are judged, because a pixel's ratio is computed
 from noisy pixels.
@@ -56,7 +56,7 @@ class Judgement:
     reached_share: float
     """Share of the object's pixels in its light that reach the ratio; 1 if it lights none."""
     full_rate: float
-    """Rate that all but the allowed share of pixels stay below, DN per us."""
+    """Signal rate that only the allowed share of the pixels exceeds, DN per us."""
     lit_rates: Floats
     """[quantiles] rates of the object's pixels in its light, DN per us, rising; empty if it lights none."""
 

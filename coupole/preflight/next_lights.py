@@ -1,12 +1,12 @@
 """The lights that add the most information to the lights taken so far, judged by the pictures under these.
 
 Pictures between lights are interpolated from the pictures taken, by radial basis functions with a linear tail
-(seed 003, 5.2). Each light taken is left out in turn and predicted from the others; Rippa (1999) gives all these
-errors from one inverse. A large error shows that a highlight or an edge of shadow passes over the object. So the
-errors of pictures are modelled over the directions of light as a random field of exponential covariance. Its
-strength in each direction follows the errors found near this direction. The next light is the one with the largest
-expected error of its picture (MacKay 1992). It counts as taken while the next one is chosen. So do lights whose
-pictures are still to come.
+(Lucat et al. 2025, 5.2). Each light taken is left out in turn and predicted from the others; Rippa (1999) gives
+all these errors from one inverse. A large error shows that a highlight or an edge of shadow passes over the
+object. So the errors of pictures are modelled over the directions of light as a random field of exponential
+covariance. Its strength in each direction follows the errors found near this direction. The next light is the one
+with the largest expected error of its picture (MacKay 1992). It counts as taken while the next one is chosen. So
+do lights whose pictures are still to come.
 
 Nothing is drawn at random, so a resumed run chooses the same lights.
 """

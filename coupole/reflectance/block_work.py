@@ -29,7 +29,7 @@ _BLOCKS_EACH, _FEWEST_ROWS, _MOST_ROWS = 8, 256, 1 << 12
 """Least number of blocks for each thread; least and largest number of triangles in a block."""
 _ROWS_OF_A_CORE = 1024
 """Number of triangles of a block in this process, for each core: four parts for each thread, and arrays so small
-that the C library uses their memory again. For larger arrays the kernel clears new pages each time."""
+that the C library uses their memory again. For larger arrays the operating system clears new pages each time."""
 _MISSING = "--scheduler: dask.distributed is not installed here; `pip install 'coupole[cluster]'` adds it"
 
 

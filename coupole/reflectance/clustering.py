@@ -1,5 +1,5 @@
-"""Clusters of triangles that look alike, and one material for each cluster from all its samples (seed 003, section
-7: 1,000 materials for 400,000 triangles).
+"""Clusters of triangles that look alike, and one material for each cluster from all its samples (Lucat et al.
+2025, section 7: 1,000 materials for 400,000 triangles).
 
 Each sample is turned into the frame of its own triangle, in which z is the fitted normal. Without this, normals
 that are wrong by degrees would blur the pooled samples.
@@ -98,8 +98,8 @@ def pool_samples(
     members: NDArray[np.int64],
     random: np.random.Generator,
 ) -> None:
-    """Add samples of triangles with fitted `normals` [b, 3] to the pools of their clusters [b] (-1 for none). All
-    triangles of a cluster, `members` [k] in number, contribute equally."""
+    """Add samples of triangles with fitted `normals` [b, 3] to the pools of their clusters [b] (-1 for none). The
+    triangles of a cluster, whose number is `members` [k], contribute equally."""
     most_each = np.maximum(_LEAST_EACH, MOST_POOLED // np.maximum(members, 1))
     order = random.permutation(np.flatnonzero(sample_mask))
     _pool(

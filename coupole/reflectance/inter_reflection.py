@@ -50,8 +50,8 @@ is the number of triangles that a thread works on at a time."""
 def radiosity(
     form_factors: csr_array, direct: NDArray[np.float32], apparent_reflectance: Floats, passes: int = _PASSES
 ) -> NDArray[np.float32]:
-    """[channels, patches, leds] exitance of patches for a power of 1. `apparent_reflectance` [patches, channels]
-    is the reflectance if all light counts as direct; patches that no LED reaches keep it."""
+    """[channels, patches, leds] exitance of patches under LEDs with a power of 1. `apparent_reflectance` [patches,
+    channels] is the reflectance if all light counts as direct; patches that no LED reaches keep it."""
 
     def of_channel(channel_reflectance: Floats) -> NDArray[np.float32]:
         reflectance = channel_reflectance.copy()

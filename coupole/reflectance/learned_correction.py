@@ -67,7 +67,7 @@ class Sight:
     """Input of the network for one light at the pixels of a strip, and the bounds of its output."""
 
     kernel_sum: Floats
-    """[pixels, 3] sum by the first kernel, as shares of the level."""
+    """[pixels, 3] weighted sum of pictures by the first kernel, as shares of the pixel's level."""
     features: Floats
     """[pixels * 3, features]"""
     low: Floats
@@ -165,7 +165,7 @@ def initial_network(features: int, generator: np.random.Generator) -> Network:
 
 
 class _Adam:
-    """Optimiser with the steps of Kingma and Ba (2015)."""
+    """Optimiser that makes the steps of Kingma and Ba (2015)."""
 
     def __init__(self, network: Network) -> None:
         self._parts = [part for layer in network.layers for part in layer]
@@ -218,7 +218,7 @@ def lessons(
 
 
 def join_lessons(parts: Sequence[Lesson]) -> Lesson:
-    """Join the lessons of one light in several strips into one lesson."""
+    """Join the training samples of one light from several strips."""
     return Lesson(
         np.concatenate([part.features for part in parts]),
         np.concatenate([part.targets for part in parts]),

@@ -182,7 +182,7 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
-        refuse(path, "is no text in UTF-8; save it as UTF-8")
+        refuse(path, "is not text in UTF-8; save it as UTF-8")
     except OSError as error:
         refuse(path, f"cannot be read: {error.strerror or error}")
 
@@ -193,7 +193,7 @@ def _number(path: Path, line: int, word: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        refuse(path, f"{word!r} is no number", line)
+        refuse(path, f"{word!r} is not a number", line)
     return value
 
 

@@ -1,8 +1,8 @@
 """Values of a point under a light between the measured lights: a weighted sum of the measured values.
 
-Radial basis functions of the lights' directions with a linear tail (seed 003, 5.2): the weights of the measured
-lights depend on directions alone, so one solution serves all pixels. The best kernel depends on the object and is
-found by leaving lights out.
+Radial basis functions of the lights' directions with a linear tail (Lucat et al. 2025, 5.2): the weights of the
+measured lights depend on directions alone, so one solution serves all pixels. The best kernel depends on the
+object and is found by leaving lights out.
 """
 
 from __future__ import annotations

@@ -43,8 +43,8 @@ FEWEST_GROUPS = 6
 """Least number of groups. Fewer groups say too little about errors that their samples
 share; then single samples are used too."""
 _LEAST_KS = 1e-3
-"""Least ks, as a share of kd, in the derivatives. With a smaller value, the covariance of the logarithm would say
-nothing about a possible highlight."""
+"""Least ks that the derivatives assume, as a share of kd. With a smaller value, the covariance of the logarithm
+would say nothing about a possible highlight."""
 LEAST_KNOWN = 1e-2
 """1 over the variance of the logarithm of kd if the samples do not determine it."""
 _PART = 256

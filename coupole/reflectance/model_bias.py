@@ -27,8 +27,8 @@ _TOGETHER, _MOST_GROUPS = 1000, 8
 _NEAREST = 50
 """Number of triangles whose mean normal is taken as the direction in which the surface faces."""
 _USUAL_TILT = np.radians(3.0)
-"""Usual tilt of fitted normals, rad. It limits the weight of large triangles, whose normals the scanner measures
-well."""
+"""Usual tilt of fitted normals, rad. This tilt limits the weight of large triangles, whose normals the scanner
+measures well."""
 _CHUNK = 1 << 16
 
 

@@ -31,7 +31,8 @@ _TAUGHT_PIXELS = 60_000
 _TAUGHT_ROWS = 32
 _KERNEL_PIXELS = 20_000
 LEAST_LEVEL = 1e-3
-"""Least level, as a share of the values' 99.9 % quantile. Darker pixels are treated as if they had this level."""
+"""Least level of a pixel, as a share of the 99.9 % quantile of all values. Darker pixels are treated as if they
+had this level."""
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ class RelitIntervals:
     coefficients: Floats
     """[columns of `Foreseen.regressors`] coefficients for the logarithm of the error's scale."""
     factors: dict[str, StratumFactors]
-    """Quantiles, by the names in `LEVELS`."""
+    """Quantiles of the errors, by the names in `LEVELS`."""
     spacing: float
     """Largest distance, between unit vectors, from a measured light to its nearest one."""
 

@@ -1,7 +1,7 @@
 """Dependence of each fit on the number of LEDs, on grazing samples and on the number of coefficients.
 
 Some triangles of a result, spread over it, are fitted again with fewer samples or coefficients. The fits are
-compared under LEDs that were left out of all fits (seed 003, 6.3 and 6.4).
+compared under LEDs that were left out of all fits (Lucat et al. 2025, 6.3 and 6.4).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ LED_STEPS = (1, 2, 4, 8)
 MOST_INCIDENCES_DEG = (89, 80, 70, 60)
 COEFFICIENTS = (100, 64, 36, 16)
 _BLOCKS, _TRIANGLES = 16, 48
-"""Number of places in the result, and of neighbouring triangles at each place."""
+"""Number of places that are taken from the result, and number of neighbouring triangles at each place."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Variant:
 
 
 Variants = dict[str, list[tuple[float, Variant]]]
-"""Values of settings and their variants, by the settings' names."""
+"""Values of each setting with the variant of the data for each value, by the setting's name."""
 FEWER_SAMPLES: Variants = {
     "share of the LEDs": [(1.0 / step, Variant(led_step=step)) for step in LED_STEPS],
     "most incidence, degrees": [(deg, Variant(most_incidence_deg=deg)) for deg in MOST_INCIDENCES_DEG],

@@ -1,8 +1,8 @@
 """Errors of the fits of runs under LEDs that were not fitted, and the content of `result.json`.
 
-The fits are compared with pictures, in blocks of 2 x 2 pixels (seed 003, 6.3), and with the samples, which are
-means over triangles and have less noise. Inter-reflection that was subtracted from the samples is subtracted from
-the pictures too.
+The fits are compared with pictures, in blocks of 2 x 2 pixels (Lucat et al. 2025, 6.3), and with the samples,
+which are means over triangles and have less noise. Inter-reflection that was subtracted from the samples is
+subtracted from the pictures too.
 """
 
 from __future__ import annotations

@@ -83,8 +83,8 @@ def predict_samples(
     result: RunResult, name: str, view: ViewSamples, rows: slice, samples: TriangleSamples
 ) -> NDArray[np.float32]:
     """[b, samples, channels] f cos_i, 1/sr, of a fit for `samples` of rows of a view's file, under any lights. It
-    is NaN where the fit has no value. If the residual of the material was not fitted, it is the material's
-    value."""
+    is NaN where the fit has no value. If the residual of the material was not fitted, the result is the value of
+    the material."""
     places = np.searchsorted(result.triangles, view.triangles[rows])
     if name == CLUSTERED:
         own_materials = result.materials(GGX_NORMAL.name, places)

@@ -79,7 +79,7 @@ class HeldOut:
     share: NDArray[np.float64]
     """[n, leds, channels] share of the camera's range for f cos_i = 1."""
     columns: list[int]
-    """Places of the pictures' LEDs among the samples' LEDs."""
+    """Index of each LED of the pictures among the LEDs of the samples."""
     blocks: tuple[tuple[NDArray[np.int64], NDArray[np.float32]], ...]
     """Triangle [blocks] that each block sees, and measured values [blocks, pictures], by channel."""
 

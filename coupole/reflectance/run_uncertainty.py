@@ -17,7 +17,7 @@ Said = Callable[[str, int, int], None]
 
 COVERAGE, QUANTILE = 0.95, 1.959964
 TABLE_COVERAGE, TABLE_QUANTILE = 0.68, 0.994458
-"""Coverage and quantile of the table, as in seed 003, 6.1."""
+"""Coverage and quantile of the table, as in Lucat et al. 2025, 6.1."""
 _TYPICAL = 200_000
 """Number of samples of all views from which the typical bounds are found."""
 _TRIANGLES = 2000

@@ -1,5 +1,5 @@
 """Uncertainty of samples of reflectance: in closed form for each, and by Monte Carlo through the whole measurement
-equation, source by source (seed 003, 6.1; JCGM 101).
+equation, source by source (Lucat et al. 2025, 6.1; JCGM 101).
 
 A sample is f = S / (P L cos): the signal S over the LED's power P, the geometry L of its emission and distance,
 and the cosine of incidence. Relative errors are normal: a for the signal in the numerator, b for all factors of
@@ -30,7 +30,7 @@ SOURCES = {
     "led_mm": "places of the LEDs",
     "u_glare": "veiling glare taken off",
 }
-"""Fields of `Sources`, and their meaning."""
+"""Names of the fields of `Sources`, with what each of them means."""
 
 
 @dataclass(frozen=True)

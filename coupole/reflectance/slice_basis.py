@@ -17,20 +17,20 @@ from coupole.kernels import kernel
 Floats = NDArray[np.float64]
 
 COUNT = 100
-"""Number of coefficients of each basis, as in seed 003, 6.3."""
+"""Number of coefficients of each basis, as in Lucat et al. 2025, 6.3."""
 _DEGREES = 10
 TIKHONOV = 0.1
-"""Penalty of the highest degree of the harmonics (seed 003, 5.2)."""
+"""Penalty of the highest degree of the harmonics (Lucat et al. 2025, 5.2)."""
 _TAIL = 4
 _RADIAL, _RESIDUAL = 1e-3, 0.1
 """Ridge of the radial functions: for reflectance, and for the residual of a material, which is mostly noise. Both
 were chosen on simulated glossy reliefs by leaving lights out; a tenth and ten times the ridge change the error by
 5 %."""
 USUAL_LEFT = 2e-4
-"""Residual of a material with the fit's form, as a share of the samples' sum of squares. If the residual is
-larger, its ridge is smaller in proportion, down to the ridge of reflectance."""
+"""Residual that a material of exactly the fit's form leaves, as a share of the samples' sum of squares. If the
+residual is larger, its ridge is smaller in proportion, down to the ridge of reflectance."""
 LEAST_RESIDUAL = _RADIAL / _RESIDUAL
-"""Least factor on the ridge of a material's residual, for a large residual."""
+"""Factor on the ridge of a material's residual if the residual is large."""
 _TAIL_SHARE = 0.01
 _HELD = 1e9
 """Ridge of a coefficient that is held at 0."""

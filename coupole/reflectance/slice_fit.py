@@ -1,7 +1,7 @@
 """Slices of reflectance of triangles: coefficients in a basis, from the samples of one view.
 
 A sample's error is weighted as it appears in a picture, multiplied by the cosine of incidence. A slice's values
-are never below 0. A slice is valid for the view to which it was fitted (seed 003, 6.3).
+are never below 0. A slice is valid for the view to which it was fitted (Lucat et al. 2025, 6.3).
 
 A fit to the residual of a model is stacked with a fit to the samples themselves (Breiman, Stacked regressions,
 Machine Learning 24, 1996): the chosen share of the model has the smallest error for left-out samples.

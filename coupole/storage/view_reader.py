@@ -79,7 +79,7 @@ class View:
         except (TypeError, ValueError):
             number = math.nan
         if not math.isfinite(number):
-            raise StorageError(f"{self.path}: `{name}` is no number: {value!r:.40}")
+            raise StorageError(f"{self.path}: `{name}` is not a number: {value!r:.40}")
         return number
 
 

@@ -108,7 +108,7 @@ def _check_template(name: str, template: str) -> None:
             raise ValueError(f"it has {{{min(unknown)}}}; allowed: {allowed_fields}")
         line = template.format(led=0, on_ms=1)
     except (ValueError, IndexError, KeyError) as error:
-        raise ValueError(f"`{name}`: `{template}` is no template of a command: {error}") from error
+        raise ValueError(f"`{name}`: `{template}` is not a template of a command: {error}") from error
     if not line.isascii() or not line.isprintable() or not line:
         raise ValueError(f"`{name}`: expected one line of printable ASCII, found {line!r}")
 

@@ -59,7 +59,7 @@ class Settings(camera_body.Settings):
     lost_packets: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Fraction of stream packets that are lost on the wire."""
     link_mb_per_s: Annotated[float, Field(gt=0)] = 1_000.0
-    """Rate of the wire in machine time. The world pauses while the wire is busy."""
+    """Data rate of the wire, by the machine's clock. The world pauses while the wire is busy."""
     temperature_c: float = 41.5
 
 

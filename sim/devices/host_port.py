@@ -15,9 +15,9 @@ class HostPort:
     """An address to which the arm of one world only sends, until it is closed or its process ends.
 
     The host binds the port itself, so no world can bind it. If two arms sent to one port, both would reach the
-    same host. The host would move the arm that it hears first, but its camera would look from its own arm. So the
-    port is claimed by the name of a socket (unix(7), abstract), which the kernel gives to only one process at a
-    time.
+    same host. The host would move the arm whose packet comes first, but the camera would be on the arm of the
+    host's own world. So the port is claimed by the name of a socket (unix(7), abstract), which the kernel gives to
+    only one process at a time.
     """
 
     def __init__(self, address: str) -> None:

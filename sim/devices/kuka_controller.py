@@ -133,7 +133,7 @@ class KukaController:
         self._delay = self._late_cycles = 0
 
     def late(self, cycles: int) -> None:
-        """Treat the next answers, one per cycle, as late."""
+        """Treat the next answers as late, one answer in each cycle."""
         self._late_cycles += cycles
 
     def lose_link(self, seconds: float) -> None:
@@ -239,7 +239,7 @@ class KukaController:
         return max(0.0, self._sent_s + allowed_s - time.monotonic())
 
     def _look_for_client(self) -> None:
-        """Begin a session at any answer to a packet of the present run of the RSI program."""
+        """Begin a session with the first answer to a packet of the present run of the RSI program."""
         if self._axes.brakes_closed:
             self._release_axes()  # the program was restarted
         answer = None

@@ -62,7 +62,7 @@ def answer_reader(settings: Settings) -> Callable[[bytes], Answer | Unread]:
             remark = f"corrections without {' '.join(missing)} in {tag.decode()} are taken as 0" if missing else ""
             return Answer(int(ipoc[1]), _finite(pairs.get(name, b"0") for name in names), stops, remark)
         except ValueError:
-            return Unread("an answer with a correction that is no number is ignored", text)
+            return Unread("an answer with a correction that is not a number is ignored", text)
 
     return read_answer
 

@@ -66,7 +66,7 @@ class Settings(BaseModel):
     thermal_time_constant_s: float = Field(default=240.0, gt=0)
     ambient_c: float = 22.0
     warm_k: float = Field(default=0.0, ge=0)
-    """Excess of the boards' temperature over ambient at power-on, as after a long run. The boards then cool."""
+    """Temperature of the boards above ambient at power-on, as after a long run. The boards then cool."""
     board_limit_c: float = 75.0
     block_timeout_s: float = Field(default=2.0, gt=0)
     """An incomplete block is discarded after this time without further bytes."""

@@ -1,8 +1,8 @@
 """Refusals of a stand-in. Refusals are shown to a person, because an outside client would otherwise see only
 silence.
 
-A mistake of a client occurs in every cycle. So the same reason is printed again only after a while, with its
-count.
+A client that makes a mistake usually makes it in every cycle. So the same reason is printed again only after a
+while, with its count.
 """
 
 from __future__ import annotations

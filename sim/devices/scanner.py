@@ -49,7 +49,9 @@ def export_scan(
     except ValidationError as error:
         raise InputError(f"scanner: expected a thing of the simulated world: {error}") from error
     if not isinstance(sample, Sample) or sample.stickers is None:
-        raise InputError(f"scanner: expected a thing with `stickers`, found {thing}; it has nothing to hold on to")
+        raise InputError(
+            f"scanner: expected a thing with `stickers`, found {thing}; without stickers a scan has no targets"
+        )
     random = np.random.default_rng([seed, 2])
     frame = scanner_from_thing(seed)
     bare = sample.bare()

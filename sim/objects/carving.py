@@ -1,4 +1,4 @@
-"""A carver's vocabulary for reliefs: profiles, noise, and distances in the plane, over arrays of places in mm."""
+"""Building blocks of reliefs: profiles, noise, and distances in the plane, for arrays of places in mm."""
 
 from __future__ import annotations
 

@@ -34,8 +34,8 @@ _RED_LACQUER = Face(np.asarray((1.0 - 0.04) * (1.0 - 0.6)), np.asarray(0.6), np.
 
 
 def tabulated_finish() -> Brdf:
-    """Return a metallic paint as seed 002 measures one: a table about the mirror direction, with Beckmann facets
-    on a body of rough diffuse grains."""
+    """Return a metallic paint as Durikovic et al. 2002 measure one: a table about the mirror direction, with
+    Beckmann facets on a body of rough diffuse grains."""
     grains = typical.reflectance("dull_yellow_shape").values
 
     def paint_brdf(wi: Array, wo: Array) -> Array:
@@ -52,15 +52,16 @@ def layered_paint() -> Brdf:
 
 
 def makie_ground() -> Brdf:
-    """Gold powder on red lacquer: a share of metal by its alpha, the rest diffuse (seed 002, section 4)."""
+    """Gold powder on red lacquer: a share of metal by its alpha, the rest diffuse (Durikovic et al. 2002, section
+    4)."""
     powder = partial(brdf.cook_torrance, slope=0.32, fresnel=_gold)
     residual = _RED_LACQUER.reflectance_in_air(typical.reflectance("orange_shape")).values
     return partial(makie.makie_brdf, alpha=0.3, residual=0.7 * residual, metallic=powder)
 
 
 def four_flux_varnish() -> Brdf:
-    """A turbid varnish on blue under a glossy face (seed 000, section 3.4). Directional light crosses the layer at
-    its refracted angle. Outgoing light has the same angles as incoming light, so that the material is
+    """A turbid varnish on blue under a glossy face (Dumazet et al. 2008, section 3.4). Directional light crosses
+    the layer at its refracted angle. Outgoing light has the same angles as incoming light, so that the material is
     reciprocal."""
     index, rough = indices.BINDER, 0.3
     blue = typical.reflectance("blue_one_peak_shape").values
@@ -87,9 +88,9 @@ def four_flux_varnish() -> Brdf:
 
 def woven_cloth() -> Brdf:
     """Return linen whose threads are finer than a pixel. It is the mean over the threads' normals
-    (`fabric.weave`), each rough and with some gloss. Threads that face away from light or eye are dark. The others
-    hide each other by the excess of their area (Ashikhmin, Premoze and Shirley, A microfacet-based BRDF generator,
-    2000). The result is the mean over all turns of the cloth."""
+    (`fabric.weave`), each rough and with some gloss. Threads that face away from light or eye are dark. The other
+    facets hide each other by the excess of their area (Ashikhmin, Premoze and Shirley, A microfacet-based BRDF
+    generator, 2000). The result is the mean over all turns of the cloth."""
     places = (np.arange(_THREAD_PLACES) + 0.5) / _THREAD_PLACES
     grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
     normals, shade = weave(grid, 1.0)

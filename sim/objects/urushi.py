@@ -1,4 +1,4 @@
-"""Urushi: a makie tile and a nashiji slab (seed 002), as virtual objects."""
+"""Urushi: a makie tile and a nashiji slab (Durikovic et al. 2002), as virtual objects."""
 
 from __future__ import annotations
 

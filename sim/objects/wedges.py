@@ -17,7 +17,7 @@ def gilt_step_wedge(
     depth_mm: float = 30.0,
     roughness: float = 0.12,
 ) -> Surface:
-    """A panel standing on z = 0: along x, gold leaf of these thicknesses on bole (seed 001, section 5)."""
+    """A panel that stands on z = 0: gold leaf of these thicknesses on bole along x (Callet et al. 2010, 5)."""
     fields = [[appearance.gilt(thickness, roughness=roughness) for thickness in thicknesses_nm]]
     return _panel(fields, step_mm, depth_mm)
 

@@ -20,7 +20,7 @@ _STEP = 1.25
 _SHARP_PX = 0.2
 """Blur below this has no visible effect on a pixel."""
 _ROWS, _COLUMNS = 64, 256
-"""Size of a tile, even for the sake of the Bayer pattern."""
+"""Size of a tile; even numbers, because of the Bayer pattern."""
 
 
 def through(

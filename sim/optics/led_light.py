@@ -40,7 +40,7 @@ class LedModel:
     hours_to_70_percent: float = 50_000.0
     """Operating time after which 70 % of the flux remains (L70), with exponential decay."""
     hours_shone: float = 0.0
-    """Operating time of the LEDs so far."""
+    """Operating time of the LEDs before this run."""
     flicker: float = 5e-4
     """Relative standard deviation of flux from flash to flash."""
     dead: tuple[int, ...] = ()

@@ -79,8 +79,8 @@ def mosaic_electrons(
     k = site.shape[0] // height
     if k < 1 or site.shape != (height * k, width * k):
         raise InputError(
-            f"sensor: expected sites for the {falloff.shape} pixels of the fall-off, times k in both "
-            f"directions; found {site.shape}; render for the camera's size"
+            f"sensor: expected sites for k x k samples of each of the {falloff.shape} pixels of the fall-off; "
+            f"found {site.shape}; render for the camera's size"
         )
     mean_e = np.empty(falloff.shape, np.float32)
     _collect(mean_e, site, radiance, falloff, model.channels(), electrons_per_radiance)

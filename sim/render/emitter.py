@@ -1,8 +1,8 @@
 """Irradiance from a square Lambertian emitter at a point.
 
 E is Phi / (2 pi A) times a sum over the edges of the part above the receiver's horizon. The term of edge i is
-angle_i (edge_i's normal . n). The formula is Lambert's (1760) and seed 003's, Eq. 2; there `paper` multiplies by
-the emitter's cosine once more. Lengths are in mm, except that E / Phi is per m^2.
+angle_i (edge_i's normal . n). The formula is from Lambert (1760) and Lucat et al. 2025, Eq. 2; there `paper`
+multiplies by the emitter's cosine once more. Lengths are in mm, except that E / Phi is per m^2.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def led_radiance(
     """[sites, 3] lm/(m^2 sr), red green blue. `reached_bits` are the bits of `Shadows.reached_bits`, `places` the
     indices. Without them nothing is in the light's way.
 
-    `paper` applies the emitter's cosine, towards the site, twice (seed 003, Eq. 2).
+    `paper` applies the emitter's cosine, towards the site, twice (Lucat et al. 2025, Eq. 2).
     """
     radiance = np.empty((len(view.points_mm), 3), np.float32)
     _shade(

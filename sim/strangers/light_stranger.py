@@ -38,8 +38,8 @@ class LightStranger(BaseModel):
     warming_frames: Annotated[float, Field(gt=0)] = 500.0
     """Number of frames after which 63 % of that share are lost."""
     primary_lens_mm: float = 0.0
-    """Shift of the die's image by the lens on it, across the die's normal and towards the viewer, over the sine of
-    the angle to the normal."""
+    """Shift of the die's image by the lens on the die, at right angles to the die's normal and towards the viewer,
+    divided by the sine of the angle to the normal."""
 
     @field_validator("lobe")
     @classmethod

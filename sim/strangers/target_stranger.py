@@ -26,7 +26,7 @@ class TargetStranger(BaseModel):
     tile_stain: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Share of the light that a stain on the white tile takes at its middle."""
     tile_stain_mm: Annotated[float, Field(gt=0)] = 8.0
-    """Radius at which the stain lowers the reflectance by 0.6 of that share. The stain's middle is at this
+    """Radius at which the stain lowers the reflectance by 0.6 times its depth. The stain's middle is at this
     distance along x from the tile's middle.
     """
 

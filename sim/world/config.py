@@ -93,8 +93,8 @@ class MeshConfig(_Model):
     unit: Literal["mm", "m", "um"]
     support_from_object: list[list[float]]
     material: MaterialConfig | SpecimenConfig | MeasuredConfig | None = None
-    """Material that is multiplied by the mesh's own colours. None: only these colours, or warm stone for a mesh
-    without colours."""
+    """Material that is multiplied by the mesh's own colours. None: only the mesh's own colours, or warm stone for
+    a mesh without colours."""
 
 
 class SceneConfig(_Model):
@@ -188,8 +188,8 @@ class Settings(_Model):
     cables: tuple[ToolBody, ...] = ()
     """Capsules in the support frame that hang in the cell and block light. No plan and no rig knows of them."""
     material: MaterialConfig | SpecimenConfig | MeasuredConfig | None = None
-    """Material of the plan's object, multiplied by its mesh's own colours. None: only these colours, or warm
-    stone."""
+    """Material of the plan's object, multiplied by its mesh's own colours. None: only the mesh's own colours, or
+    warm stone."""
     detail: tuple[Layer, ...] = ()
     """Detail of the plan's object: texture, bumps and turned normals that its mesh does not have."""
     true_surface: Literal["plaque"] | None = None

@@ -93,7 +93,7 @@ class RobotAlone(ABC):
         self.in_world(lambda: self.controller.lose_link(seconds))
 
     def push_aside(self, turns_deg: tuple[float, ...]) -> None:
-        """Turn the axes by these angles, without a command."""
+        """Turn the axes by these angles, without a command of the driver."""
         self.in_world(lambda: self.controller.nudge(turns_deg))
 
     def joints_deg(self) -> NDArray[np.float64]:

@@ -108,7 +108,7 @@ def test_directions_keep_their_shape_and_below_the_horizon_there_is_nothing(tmp_
         ({"theta_i": np.array([0.0, 0.5, 0.5, 1.0, 1.5], np.float32)}, "field `theta_i`: expected rising values"),
         ({"sigma": np.ones((4, 4))}, "field `sigma`: expected float32, n x n; found float64, 4 x 4"),
         ({"vndf": np.ones((1, 4, 8, 8), np.float32)}, "expected float32, 1 x 5 x n x n; found float32, 1 x 4"),
-        ({"ndf": np.full((4, 4), np.nan, np.float32)}, "field `ndf`: holds values that are no numbers"),
+        ({"ndf": np.full((4, 4), np.nan, np.float32)}, "field `ndf`: contains values that are not numbers"),
         ({"vndf": np.zeros((1, 5, 4, 4), np.float32)}, "`vndf` or `sigma` is 0"),
         ({"vndf": np.full((1, 5, 4, 4), -1, np.float32)}, "`vndf`: expected planes of 2 x 2 or more"),
     ],

@@ -39,7 +39,7 @@ def test_the_samples_quantities_give_the_surfaces_own_reflectance() -> None:
 
 
 def test_half_of_a_domes_samples_are_as_uncertain_as_the_paper_says() -> None:
-    """Seed 003, section 6.1: half of all within [-10.66, +14.00] %, at 68 %."""
+    """Lucat et al. 2025, section 6.1: half of all within [-10.66, +14.00] %, at 68 %."""
     cosines = np.linspace(0.98, 0.5, 9)
     found = spread_over(Known(), [Geometry(float(np.degrees(np.arccos(c)))) for c in cosines])
     low, high = found.half
@@ -51,7 +51,7 @@ def test_half_of_a_domes_samples_are_as_uncertain_as_the_paper_says() -> None:
 
 
 def test_a_better_scanner_helps_as_much_as_the_paper_says() -> None:
-    """Seed 003, section 7: with 20 um in place of 30 the median falls to [-8.11, +9.51] % from the above."""
+    """Lucat et al. 2025, section 7: with 20 um the median falls to [-8.11, +9.51] %."""
     better = budget_of(Known(vertex_mm=0.02), Geometry(42.0), most_trials=20_000).relative(0.68)
     today = budget_at(42.0).relative(0.68)
     assert 0.5 < (better[1] - better[0]) / (today[1] - today[0]) < 0.85

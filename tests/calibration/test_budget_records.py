@@ -98,7 +98,7 @@ def test_each_record_takes_the_place_of_what_is_stated(folder: Path) -> None:
     assert known.lens_px == 0.0, "rays use the hand-eye record's lens, and their uncertainty has it"
     assert known.source("flat field") == "flat-field-1"
     assert known.source("LED normal") == "leds-test"
-    assert known.source("vertices") == "seed 003"
+    assert known.source("vertices") == "Lucat et al. 2025"
     assert known.source("response") == "assumed"
 
 
@@ -117,7 +117,7 @@ def test_a_camera_alone_says_how_well_its_lens_is_known(tmp_path: Path) -> None:
     known = known_from(read_records([path]), Known())
     assert known.lens_px == 0.12
     assert known.pixel_mm == pytest.approx(335.0 / 7000.0)
-    assert known.source("camera") == "seed 003"
+    assert known.source("camera") == "Lucat et al. 2025"
 
 
 def test_led_power_is_split_into_each_leds_own_and_what_all_share(tmp_path: Path) -> None:
@@ -200,7 +200,8 @@ def test_the_command_prints_sources_intervals_and_both_cells_beside_the_paper(
     ended = cells.here("budget", folder, "--beside", folder / "mesh.yaml", "--out", out)
     assert ended.code == 0, ended.err
     words = " ".join(ended.err.split())
-    for text in ("mesh-1", "drift-1", "seed 003", "68%: [", "95%: [", "to digit 1 of u", "0.21 deg, at worst"):
+    given = ("mesh-1", "drift-1", "Lucat et al. 2025")
+    for text in (*given, "68%: [", "95%: [", "to digit 1 of u", "0.21 deg, at worst"):
         assert text in words
     assert "expired on 2026-05-03" in words
     document = json.loads(out.with_suffix(".json").read_text())

@@ -136,7 +136,7 @@ def test_views_of_a_panel_become_a_flat_field(tmp_path: Path, dark_record: Path)
 def test_the_budget_takes_what_records_say(tmp_path: Path, response_record: Path) -> None:
     result = run(budget, response_record, "--out", tmp_path / "budget.png", "--json")
     document = json.loads(result.stdout)
-    assert {s["said_by"] for s in document["sources"]} >= {"response x", "seed 003"}
+    assert {s["said_by"] for s in document["sources"]} >= {"response x", "Lucat et al. 2025"}
     assert (tmp_path / "budget.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "budget.json").read_text()) == document
 

@@ -80,7 +80,7 @@ def test_what_another_part_hides_counts_neither_in_nor_out_of_the_field() -> Non
 
 
 def test_the_field_is_that_of_the_paper() -> None:
-    """Seed 003: 14.5 x 19.3 cm at 47 um per pixel; the simulated sensor has an eighth of the pixels."""
+    """Lucat et al. 2025: 14.5 x 19.3 cm at 47 um per pixel; the simulated sensor has an eighth of the pixels."""
     seen = seen_of(slab(400, 400), distance_mm=335.0, target=(0, 0, 0))
     assert seen.fills == 1.0
     assert seen.px_per_mm[0] == pytest.approx(1.0 / (8 * 0.047), rel=0.01)

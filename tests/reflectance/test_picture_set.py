@@ -67,8 +67,8 @@ def test_the_mask_says_what_is_fitted_and_intensities_may_be_one_number(folder: 
     ("name", "content", "message"),
     [
         ("lights.txt", DIRECTIONS + "0 0\n", "lights.txt:7:1: 2 values; expected 3"),
-        ("lights.txt", DIRECTIONS.replace("0.5 1", "x 1", 1), "lights.txt:1:1: '-x' is no number"),
-        ("lights.txt", DIRECTIONS.replace("0.5 1", "nan 1", 1), "lights.txt:1:1: '-nan' is no number"),
+        ("lights.txt", DIRECTIONS.replace("0.5 1", "x 1", 1), "lights.txt:1:1: '-x' is not a number"),
+        ("lights.txt", DIRECTIONS.replace("0.5 1", "nan 1", 1), "lights.txt:1:1: '-nan' is not a number"),
         ("lights.txt", DIRECTIONS + "0 0 1\n", "has 7 lights"),
         (
             "lights.txt",
@@ -91,7 +91,7 @@ def test_the_mask_says_what_is_fitted_and_intensities_may_be_one_number(folder: 
             "lights.lp:4:1: two pictures are called 0.png; .*: put all into one folder",
         ),
         ("lights.lp", "9" * 5000 + "\n0.png 0 0 1\n", "lights.lp:1:1: expected the number of lights"),
-        ("pictures/filenames.txt", b"0.png \xe9.png", "filenames.txt: is no text in UTF-8; save it"),
+        ("pictures/filenames.txt", b"0.png \xe9.png", "filenames.txt: is not text in UTF-8; save it"),
         ("lights.lp", "7\n" + DIRECTIONS, "lights.lp:2:1: expected `name x y z`"),
         ("lights.lp", "six\n", "lights.lp:1:1: expected the number of lights"),
         ("lights.lp", "1\n9.png 0 0 1\n", "at least 6 are needed"),

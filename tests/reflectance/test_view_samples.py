@@ -65,7 +65,7 @@ def view_of(exposures_us: list[tuple[float, ...]], random: Any, emission: str, n
 def by_formula(
     work: Any, radiometry: Any, seen: Any, triangle: int, led: int, channel: int
 ) -> tuple[float, float]:
-    """f and its relative uncertainty (seed 003, Eqs. 1 to 3); exposures by their weights."""
+    """f and its relative uncertainty (Lucat et al. 2025, Eqs. 1 to 3); exposures by their weights."""
     means, weights = [], []
     noise = radiometry.noise[channel]
     for frame in work.view.by_led[led]:

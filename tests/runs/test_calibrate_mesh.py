@@ -166,5 +166,5 @@ def test_the_scanner_leaves_nothing_of_the_world_but_its_files(tmp_path: Path) -
 
 
 def test_a_thing_without_stickers_is_not_scanned(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="nothing to hold on to"):
+    with pytest.raises(InputError, match="a scan has no targets"):
         export_scan({"kind": "grey_card"}, tmp_path)

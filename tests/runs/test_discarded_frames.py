@@ -132,7 +132,7 @@ def test_frames_are_discarded_when_their_samples_are_safe_and_all_commands_under
     refused = cells.here("export", run, "--to", "tiff", "--out", tmp_path / "tiffs")
     assert refused.code == 2
     assert "were discarded when their samples were safe" in refused.err
-    assert "Name frames that are kept with --shots, such as `dark" in refused.err
+    assert "With --shots, name frames that were not discarded, such as `dark" in refused.err
     assert not (tmp_path / "tiffs").exists()
     for to in ("colmap", "iiif", "lp", "relight"):
         late = cells.here("export", run, "--to", to, "--out", tmp_path / "views" / to)

@@ -60,7 +60,7 @@ class AltaSamples:
 
 def read_alta(path: Path) -> AltaSamples:
     """Read a file. Raises InputError with line and column for a missing file, for a head without DIM or PARAM_IN,
-    for a line whose number of values differs from that in the head, for words that are no numbers, and for a
+    for a line whose number of values differs from that in the head, for words that are not numbers, and for a
     lower bound above the upper one.
     """
     try:
@@ -68,7 +68,7 @@ def read_alta(path: Path) -> AltaSamples:
     except OSError as error:
         raise InputError(f"{path}: cannot read the samples: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected ALTA's text; found bytes that are no text") from error
+        raise InputError(f"{path}: expected ALTA's text; found bytes that are not text") from error
     head, first = _head(path, lines)
     inputs, outputs = _dim(path, head)
     (given_in, line), given_out = head.get("PARAM_IN", ("", 0)), head.get("PARAM_OUT")

@@ -1,4 +1,4 @@
-"""Two directional and two diffuse fluxes in a scattering layer (seed 000, section 3.4).
+"""Two directional and two diffuse fluxes in a scattering layer (Dumazet et al. 2008, section 3.4).
 
 With z downward, l the directional and L the diffuse fluxes, mu = k + s_i + s_j::
 
@@ -36,13 +36,13 @@ class Layer:
     absorption: ArrayLike
     """K, diffuse light."""
     scattering: ArrayLike
-    """S of diffuse light, from one direction to the other."""
+    """S: scattering of diffuse light from one direction to the other."""
     direct_absorption: ArrayLike
     """k, of directional light."""
     forward: ArrayLike
-    """s_i: from directional light to diffuse light in the same direction."""
+    """s_i: scattering of directional light into diffuse light of the same direction."""
     backward: ArrayLike
-    """s_j: from directional light to diffuse light in the opposite direction."""
+    """s_j: scattering of directional light into diffuse light of the opposite direction."""
     thickness_mm: ArrayLike
 
 

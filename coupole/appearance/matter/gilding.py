@@ -1,4 +1,4 @@
-"""Gold leaf on bole (seed 001, section 5): Eq. 7 with all terms defined.
+"""Gold leaf on bole (Callet et al. 2010, section 5): Eq. 7 with all terms defined.
 
     R = f R_bole + (1 - f) (R(d) + T_in T_out R_b/(1 - R_int R_b))
 

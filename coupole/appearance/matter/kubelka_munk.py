@@ -1,4 +1,4 @@
-"""Two diffuse fluxes in a scattering layer (Kubelka and Munk 1931; seed 000, Eqs 5-7).
+"""Two diffuse fluxes in a scattering layer (Kubelka and Munk 1931; Dumazet et al. 2008, Eqs 5-7).
 
 All reflectances are inside the binder; `glossy_face` converts measured reflectances to these, and back.
 
@@ -51,6 +51,6 @@ def opaque(k_over_s: ArrayLike) -> Array:
 
 
 def k_over_s(r_inf: ArrayLike) -> Array:
-    """K/S of an opaque layer from its (internal) reflectance in 0 < R <= 1 (seed 001, Eq. 6)."""
+    """K/S of an opaque layer from its (internal) reflectance in 0 < R <= 1 (Callet et al. 2010, Eq. 6)."""
     r = within("R_inf", r_inf, np.finfo(float).tiny, 1.0)
     return np.asarray((1.0 - r) ** 2 / (2.0 * r))

@@ -2,8 +2,9 @@
 
 A ground is described by its reflectances for light inside the binder: diffuse to diffuse, directed to diffuse, and
 directed to its mirror image. A layer over a ground is again a ground, so layers are added from the bottom up.
-Layers have two fluxes (Kubelka and Munk) or four fluxes (seed 000, section 3.4, with a path of directed light that
-is 1/cos longer), are clear (Beer and Lambert), or are metal leaves (thin films). A face closes the stack.
+Layers have two fluxes (Kubelka and Munk) or four fluxes (Dumazet et al. 2008, section 3.4, with a path of directed
+light that is 1/cos longer), are clear (Beer and Lambert), or are metal leaves (thin films). A face closes the
+stack.
 
 For light along one direction, this computation is the exact solution of the four-flux equations with the
 reflections at the faces. Over directions, the emerging light is distributed as the entering light is accepted: f =

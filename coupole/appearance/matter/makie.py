@@ -1,4 +1,4 @@
-"""Makie: decomposition of a photograph of metal powder on lacquer (seed 002, section 4).
+"""Makie: decomposition of a photograph of metal powder on lacquer (Durikovic et al. 2002, section 4).
 
 A pixel of the picture is T = p m + sum of q_l c_l: m is the colour of the metallic finish alone, and c_l are the
 colours of up to three lacquers. All are photographed under the same light, linear and not negative. p becomes the

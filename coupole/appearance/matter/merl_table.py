@@ -35,7 +35,7 @@ def read_merl(path: Path) -> Brdf:
         )
     planes = np.frombuffer(data, "<f8", offset=12).reshape(3, *_STEPS) * np.reshape(_SCALES, (3, 1, 1, 1))
     if not np.isfinite(planes).all():
-        raise InputError(f"{path}: holds values that are not numbers; fetch or export it anew")
+        raise InputError(f"{path}: contains values that are not numbers; fetch or export it anew")
     for step in range(1, _STEPS[1]):
         planes[:, :, step] = np.where(planes[:, :, step] < 0.0, planes[:, :, step - 1], planes[:, :, step])
     around = np.concatenate([planes[..., -1:], np.maximum(planes, 0.0), planes[..., :1]], axis=3)

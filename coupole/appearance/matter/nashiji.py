@@ -1,4 +1,4 @@
-"""Nashiji: metal flakes at random depths in clear lacquer (seed 002, section 5).
+"""Nashiji: metal flakes at random depths in clear lacquer (Durikovic et al. 2002, section 5).
 
 A flake is a superquadric (Barr 1981), |x/a|^(2/e2) + |y/b|^(2/e2) to the power e2/e1, plus |z/c|^(2/e1), equal to
 1: a, b, c are its half axes. Flakes lie in a slab of lacquer with its surface at z = 0 and its substrate at z =

@@ -178,7 +178,9 @@ def read_bsdf(path: Path) -> RglTable:
                 f"{' x '.join(map(str, array.shape))}; fetch or export it anew"
             )
         if not np.isfinite(array).all():
-            raise InputError(f"{path}: field `{name}`: holds values that are no numbers; fetch or export it anew")
+            raise InputError(
+                f"{path}: field `{name}`: contains values that are not numbers; fetch or export it anew"
+            )
         return array.astype(np.float64)
 
     phi_i, theta_i = field("phi_i", None), field("theta_i", None)

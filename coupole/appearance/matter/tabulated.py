@@ -1,4 +1,4 @@
-"""A tabulated BRDF in coordinates about the specular direction (seed 002, section 3.1).
+"""A tabulated BRDF in coordinates about the specular direction (Durikovic et al. 2002, section 3.1).
 
 For light from wi, the polar axis is its mirror direction s'; theta is the angle between wo and s', and phi is the
 angle about s' from the upper side of the plane of incidence. The peak of a metallic finish is then always at theta

@@ -73,7 +73,7 @@ def reflectance(name: str) -> InternalReflectance:
 
 
 def bole() -> InternalReflectance:
-    """Return the papers' bole, equal parts of red lead and red ochre (seed 001, section 5), inside its binder. It
-    is mixed from the assumed shapes of these colours, by K/S with equal scattering."""
+    """Return the papers' bole, equal parts of red lead and red ochre (Callet et al. 2010, section 5), inside its
+    binder. It is mixed from the assumed shapes of these colours, by K/S with equal scattering."""
     halves = [kubelka_munk.k_over_s(reflectance(name).values) for name in ("orange_shape", "dull_red_shape")]
     return InternalReflectance(kubelka_munk.opaque(0.5 * (halves[0] + halves[1])))

@@ -1,4 +1,4 @@
-"""Effective index of a host with small spheroids in it (Maxwell Garnett 1904; seed 001, Eqs 2-5).
+"""Effective index of a host with small spheroids in it (Maxwell Garnett 1904; Callet et al. 2010, Eqs 2-5).
 
 For gilts the host is gold, a continuous leaf, and the inclusions are nanoscopic holes filled with egg white; the
 reverse describes separate grains of gold. The model is valid for lengths much smaller than the wavelength, and for

@@ -15,7 +15,7 @@ import numpy as np
 from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Complex, within
 
 EGG_WHITE = 1.36
-"""Index of egg white (size) under and in the leaf (seed 001, section 5.1)."""
+"""Index of egg white (size) under and in the leaf (Callet et al. 2010, section 5.1)."""
 BINDER = 1.5
 """Index of a dried oil or egg binder; drying oils have 1.48 to 1.52 (assumed without dispersion)."""
 URUSHI = 1.53

@@ -1,4 +1,4 @@
-"""A niche under a round arch, gilded inside (seed 001, figure 9), in which a low sun makes a caustic.
+"""A niche under a round arch, gilded inside (Callet et al. 2010, figure 9), in which a low sun makes a caustic.
 
 Its opening is in the plane y = 0 and faces -y; x is horizontal, z up from the sill, the back wall is at
 y = depth. Gold covers jambs and arch; back wall, sill and the wall around the opening are stone.

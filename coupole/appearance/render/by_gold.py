@@ -27,7 +27,7 @@ from coupole.errors import InputError
 
 Progress = Callable[[int, int], None]
 _RAYS = 2
-"""Number of rays along each side of a pixel."""
+"""Number of rays that each pixel has along each of its sides."""
 _BLACK = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.0))
 
 

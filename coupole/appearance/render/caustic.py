@@ -1,4 +1,4 @@
-"""The caustic of sunlight in a gilded niche on stone, by photon tracing (seed 001, figure 9).
+"""The caustic of sunlight in a gilded niche on stone, by photon tracing (Callet et al. 2010, figure 9).
 
 Photons start evenly over the opening, are reflected each time they hit gold, and stop where they hit
 stone: the first pass of photon mapping (Jensen 1999). A photon carries all 81 bands, because reflection has no
@@ -55,7 +55,7 @@ class Photons:
     power: NDArray[np.float32]
     """[n, 81], W/nm."""
     bounces: NDArray[np.int64]
-    """[n], number of reflections at gold."""
+    """[n] number of reflections of each photon at gold."""
     started_power: Array
     """[81] power of all photons together, W/nm."""
     escaped_power: Array

@@ -73,7 +73,7 @@ class SculptedRelief(Pose):
 
 
 class GiltStepWedge(Pose):
-    """Gold leaf of increasing thickness on bole, along x (seed 001, section 5)."""
+    """Gold leaf of increasing thickness on bole, along x (Callet et al. 2010, section 5)."""
 
     kind: Literal["gilt_step_wedge"]
     thicknesses_nm: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)] = samples.GILT_NM
@@ -92,7 +92,7 @@ class PaintWedge(Pose):
 
 
 class MakieTile(Pose):
-    """Polished black urushi with a flower of sprinkled gold (seed 002, section 4)."""
+    """Polished black urushi with a flower of sprinkled gold (Durikovic et al. 2002, section 4)."""
 
     kind: Literal["makie_tile"]
     side_mm: Positive = 60.0
@@ -103,7 +103,8 @@ class MakieTile(Pose):
 
 
 class NashijiSlab(Pose):
-    """Gold flakes in clear lacquer over black (seed 002, section 5); x and y go from 0 to the slab's size.
+    """Gold flakes in clear lacquer over black (Durikovic et al. 2002, section 5); x and y go from 0 to the slab's
+    size.
 
     Rays are refracted at the lacquer's face, which also reflects the lights. The rays are absorbed along their
     paths through the lacquer, and hit the flakes at their positions.

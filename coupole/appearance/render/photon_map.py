@@ -49,7 +49,7 @@ class Hits:
     """Ends of rays. Rays that meet nothing have surface -1."""
 
     surface: NDArray[np.int64]
-    """[n], the number of the surface."""
+    """[n] number of the surface that each ray meets."""
     places_mm: Array
     """[n, 3]."""
     normals: Array

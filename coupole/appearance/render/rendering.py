@@ -60,7 +60,7 @@ class Renderer:
     _mi: Any
     _parts: Description
     _radiance_unit: NDArray[np.float64]
-    """[81] W/(m^2 sr nm), factor for Mitsuba's result."""
+    """[81] factors that turn Mitsuba's result into W/(m^2 sr nm)."""
     _files: Path
     """A folder for the files that Mitsuba reads."""
 

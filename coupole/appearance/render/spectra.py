@@ -47,11 +47,12 @@ class Shape(Model):
         now = typical.FORMER_NAMES.get(self.name)
         if now is None:
             return ""
-        return f"{self.name} is no measured pigment but an assumed shape: write {{kind: shape, name: {now}}}"
+        return f"{self.name} is not a measured pigment but an assumed shape: write {{kind: shape, name: {now}}}"
 
 
 class Bole(Model):
-    """The papers' bole, half red lead, half red ochre (seed 001, section 5), of assumed shapes, in its binder."""
+    """The papers' bole, half red lead, half red ochre (Callet et al. 2010, section 5), of assumed shapes, in its
+    binder."""
 
     kind: Literal["bole"]
 
@@ -63,8 +64,8 @@ class Measured(Model):
     path: Path
     column: int | None = None
     sample: Literal["gloss excluded", "gloss included", "bare"] = "gloss excluded"
-    """Part of the gloss of the sample's face in the measurement. `bare`: the sample had no face (matt powder), so
-    the measured reflectance is also valid inside a binder."""
+    """Statement whether the measurement includes the gloss of the sample's face. `bare`: the sample had no face
+    (matt powder), so the measured reflectance is also valid inside a binder."""
 
 
 class MeasuredPaint(Model):

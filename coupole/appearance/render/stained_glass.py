@@ -14,7 +14,7 @@ from coupole.appearance.shapes.triangles import grid_faces
 from coupole.appearance.spectra.grid import Array
 
 OPEN = "."
-"""Sign for an opening without glass in a layout."""
+"""Sign in a layout that stands for an opening without glass."""
 
 
 class Glazing(Model):

@@ -88,7 +88,7 @@ def _still(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[st
 
 @dataclass(frozen=True)
 class _Moves:
-    """Changes from picture to picture of a film."""
+    """Things that change from one picture of a film to the next."""
 
     steps: Sequence[Callable[[Scene], Scene]]
     frames_per_s: int

@@ -1,4 +1,4 @@
-"""Urushi on bodies of any shape: makie on the surface, nashiji under it (seed 002, sections 4 and 5)."""
+"""Urushi on bodies of any shape: makie on it, nashiji under it (Durikovic et al. 2002, sections 4 and 5)."""
 
 from __future__ import annotations
 

@@ -23,9 +23,9 @@ from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
 _FINE = 2.0
-"""Number of triangles' edges in the width of a crack."""
+"""Number of triangles across the width of a crack."""
 _FINE_EDGE = 5.0
-"""Number of triangles' edges in the `reach_mm` of a worn edge."""
+"""Number of triangles across the `reach_mm` of a worn edge."""
 _MOST_OFF = 0.01
 
 

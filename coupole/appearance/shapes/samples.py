@@ -51,7 +51,7 @@ class MakieTile:
 
 def makie_tile(side_mm: float, triangles: int, petals: int, seed: int) -> MakieTile:
     """Return a tile. The share of powder falls over the edge of the drawing from 95 % inside to none outside. Each
-    triangle of the face is powder with this probability, else ground (seed 002, section 4)."""
+    triangle of the face is powder with this probability, else ground (Durikovic et al. 2002, section 4)."""
     columns, rows = cells_for(triangles, side_mm, side_mm)
     face = rectangle(side_mm, side_mm, columns, rows, z_mm=_TILE_MM)
     share = _drawing(face.mean(axis=1)[:, :2] / (0.5 * side_mm), petals)

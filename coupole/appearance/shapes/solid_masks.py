@@ -118,7 +118,7 @@ def divide_triangles(
         count += int((~again).sum())
         if count + 2 * again.sum() > MOST_TRIANGLES:
             raise InputError(
-                f"worn: a pattern of {finest_mm:.2g} mm expected {MOST_TRIANGLES} triangles or fewer, found more; "
+                f"worn: a pattern of {finest_mm:.2g} mm needs more than {MOST_TRIANGLES} triangles; "
                 "take larger cells, wider cracks or a smaller object"
             )
         edge = sides[again].argmax(axis=1)

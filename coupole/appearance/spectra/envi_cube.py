@@ -66,7 +66,7 @@ class Cube:
     left_out: tuple[int, ...]
     """Bands, from 1, that the header's list `bbl` names as bad."""
     _bands: NDArray[np.intp]
-    """[bands used] places, among the bands of the file, of the wavelengths above."""
+    """[bands used] place of each of these wavelengths among the bands of the file."""
     _all_bands: int
     _dtype: np.dtype[Any]
     _interleave: str
@@ -110,7 +110,9 @@ class Cube:
                         pixels = values.reshape(count, self.columns, -1)[:, :, self._bands]
         except OSError as error:
             raise InputError(f"{self.data}: {reason(error)}") from error
-        with np.errstate(over="ignore", invalid="ignore"):  # such values are infinite, so they are no reflectances
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # such values are infinite, so they are not reflectances
             reflectance = pixels.astype(np.float32)
             reflectance /= np.float32(self.scale)
         if self._ignore_value is not None:
@@ -276,8 +278,8 @@ class _Fields:
         """Type of the values, with their byte order."""
         word = self.word("data type")
         if word not in _TYPES:
-            raise self.wrong("data type", f"expected one of {', '.join(_TYPES)}, found {word!r}; complex values "
-                                          "are no reflectances")  # fmt: skip
+            raise self.wrong("data type", f"expected one of {', '.join(_TYPES)}, found {word!r}; complex "
+                                          "values are not reflectances")  # fmt: skip
         dtype = np.dtype(_TYPES[word])
         order = self.word("byte order") if dtype.itemsize > 1 else "0"
         if order not in ("0", "1"):

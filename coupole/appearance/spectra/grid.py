@@ -1,5 +1,5 @@
-"""The wavelengths of every spectrum in this package: 380 to 780 nm by 5 nm, as in the papers (seed 000, section
-3.4)."""
+"""The wavelengths of every spectrum in this package: 380 to 780 nm by 5 nm, as in the papers (Dumazet et al. 2008,
+section 3.4)."""
 
 from __future__ import annotations
 

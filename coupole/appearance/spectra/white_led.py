@@ -19,7 +19,7 @@ class LedSpectrum:
     phosphor_nm: float = 560.0
     phosphor_fwhm_nm: float = 115.0
     pump_share: float = 0.22
-    """Share of the pump in the radiant power between 380 and 780 nm."""
+    """Share of the radiant power between 380 and 780 nm that comes from the blue chip."""
 
 
 WHITE_LED = LedSpectrum()

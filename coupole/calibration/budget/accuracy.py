@@ -1,4 +1,4 @@
-"""The accuracies of seed 003 beside the accuracies from calibration records, for one cell or several.
+"""The accuracies of Lucat et al. 2025 beside the accuracies from calibration records, for one cell or several.
 
 Our figures are computed from records: standard uncertainties, all directions together. The paper does not state
 the coverage of its figures.
@@ -18,7 +18,7 @@ from coupole.calibration.record import step_names
 from coupole.calibration.rotations import Floats
 
 PAPER_SPREAD = {"best": (-0.0106, 0.0123), "half": (-0.1066, 0.1400), "most": (-0.1523, 0.2242)}
-"""Seed 003, section 6.1: relative intervals at 68 %."""
+"""Lucat et al. 2025, section 6.1: relative intervals at 68 %."""
 SPREAD_WORDS = {"best": "best", "half": "half of all", "most": "95 % of all"}
 
 
@@ -49,7 +49,7 @@ class Accuracy:
     unit: str
     """Empty for relative intervals."""
     paper: str
-    """The paper's figure in its own words."""
+    """The paper's figure, as the paper writes it."""
     our_figures: tuple[tuple[float, ...] | None, ...]
     """Our figure for each case: one number, or the two ends of an interval; None without a record."""
 

@@ -42,12 +42,12 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 STATED = {
-    "vertices": "seed 003",
+    "vertices": "Lucat et al. 2025",
     "pixel value": "assumed",
-    "LED position": "seed 003",
-    "LED normal": "seed 003",
-    "mesh to robot": "seed 003",
-    "camera": "seed 003",
+    "LED position": "Lucat et al. 2025",
+    "LED normal": "Lucat et al. 2025",
+    "mesh to robot": "Lucat et al. 2025",
+    "camera": "Lucat et al. 2025",
     "lens": "assumed",
     "flat field": "assumed",
     "response": "assumed",
@@ -61,8 +61,8 @@ STATED = {
 
 @dataclass(frozen=True)
 class Known:
-    """Standard uncertainties of all inputs, and the source of each. The defaults are seed 003's figures, or ours
-    if it has none."""
+    """Standard uncertainties of all inputs, and the source of each. The defaults are the figures of Lucat et al.
+    2025, or ours if it has none."""
 
     vertex_mm: float = 0.030
     """Bound of the error of each coordinate of each vertex. A manufacturer's accuracy is a bound, so its
@@ -315,7 +315,7 @@ def spread_over(
     trials: int = 10_000,
     seed: int = 1,
 ) -> Spread:
-    """Return relative intervals of many samples (seed 003, section 6.1)."""
+    """Return relative intervals of many samples (Lucat et al. 2025, section 6.1)."""
     relative = []
     for number, geometry in enumerate(geometries):
         inputs, led_normal = sample_inputs(uncertainties, geometry)

@@ -1,4 +1,4 @@
-"""The measurement equation: from a pixel's value to a reflectance (seed 003, Eq. 3).
+"""The measurement equation: from a pixel's value to a reflectance (Lucat et al. 2025, Eq. 3).
 
 Camera and LEDs are calibrated in the same digital numbers (`calibration.light.led_power`). So the constants of Eq.
 1, with pi, are both in the numerator and in the denominator, and

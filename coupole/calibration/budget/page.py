@@ -114,7 +114,7 @@ def _spread_table(sample_spread: Spread) -> Table:
     for key, words in SPREAD_WORDS.items():
         (low, high), (paper_low, paper_high) = getattr(sample_spread, key), PAPER_SPREAD[key]
         rows.append((words, f"[{low:+.2%}, {high:+.2%}]", f"[{paper_low:+.2%}, {paper_high:+.2%}]"))
-    return Table("Samples over a dome", ("samples", "here", "seed 003, section 6.1"), rows)
+    return Table("Samples over a dome", ("samples", "here", "Lucat et al. 2025, section 6.1"), rows)
 
 
 def _sources(budget: Budget) -> Table:

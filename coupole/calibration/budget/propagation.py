@@ -74,7 +74,9 @@ class Inputs:
             i, j = names.index(first), names.index(second)
             matrix[i, j] = matrix[j, i] = coefficient
         if np.linalg.eigvalsh(matrix)[0] < -1e-9:
-            raise InputError("budget: no quantities can have these correlations: their matrix has a negative root")
+            raise InputError(
+                "budget: no quantities can have these correlations: their matrix has a negative eigenvalue"
+            )
         return matrix
 
     def values(self) -> dict[str, float]:

@@ -19,8 +19,8 @@ from coupole.calibration.traceability import overdue_of, trace_of
 from coupole.errors import InputError
 
 WORKING_MM = 334.0
-"""Distance from camera to object for a record that has no focus distance. It follows from seed 003's field and
-pixels."""
+"""Distance from camera to object for a record that has no focus distance. It follows from the field of Lucat et
+al. 2025 and pixels."""
 _FIELD = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)])
 _SEEN_FROM_HAND_EYE = "flange_from_camera"
 

@@ -157,7 +157,7 @@ def _draw_spread(figure: Figure, place: Any, sample_spread: Spread) -> None:
     for x, key in ((1, "best"), (50, "half"), (95, "most")):
         ax.errorbar(
             x, 0, [[-100 * PAPER_SPREAD[key][0]], [100 * PAPER_SPREAD[key][1]]], color=RED, capsize=6, lw=1.5,
-            label="seed 003, section 6.1" if key == "best" else None,
+            label="Lucat et al. 2025, section 6.1" if key == "best" else None,
         )  # fmt: skip
     ax.axhline(0, color=DARK, lw=0.8)
     ax.legend(frameon=False, loc="upper left")

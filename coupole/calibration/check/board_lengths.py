@@ -57,7 +57,7 @@ class Position:
     base_from_flange: Floats
     """[views, 4, 4] poses, corrected by the axis zeros if the record has some."""
     camera: CameraPrior
-    """Lens and hand-eye, and the dependence of these poses on the axis zeros."""
+    """Lens and hand-eye, and how these poses depend on the axis zeros."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class _Seen:
     ids: NDArray[np.intp]
     """[m] numbers of the corners."""
     corner: NDArray[np.intp]
-    """[n] place of each observation's corner in `ids`."""
+    """[n] index in `ids` of the corner of each observation."""
     view: NDArray[np.intp]
     """[n]."""
     pixels: Floats

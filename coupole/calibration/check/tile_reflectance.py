@@ -31,7 +31,7 @@ _FLASH = 5e-4
 """Relative scatter of an LED's flashes (as in `calibrate_led_power`)."""
 _LEAST_ROWS = 6
 _DARK = 0.1
-"""Least share of the expected signal. A smaller signal means a shadow, or a dead LED."""
+"""Least signal that is used, as a share of the expected signal. A smaller signal means a shadow, or a dead LED."""
 
 
 @dataclass(frozen=True)

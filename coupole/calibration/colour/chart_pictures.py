@@ -26,8 +26,8 @@ _LARGEST_MISS = 15.0
 """Largest mean CIEDE2000 of the patches, after conversion by the best matrix alone, with which the chart counts as
 found."""
 _BETTER = 1.25
-"""Least error of the second best order of corners, divided by the error of the best order. Above this ratio the
-best order is certain."""
+"""Least ratio of the error of the second best order of corners to the error of the best order. Above this ratio
+the best order is certain."""
 _LEAST_PIXELS = 36
 _SIDE_TILES = 6
 """Greatest number of tiles along a patch's side. The tiles show the noise and evenness of the patch."""
@@ -38,8 +38,8 @@ patch is uneven."""
 _FULL_SHARE = 1e-3
 """Share of a patch's pixels that may be saturated, because some pixels are hot."""
 _STUCK_SHARE = 0.3
-"""Share of a patch's pixels with the picture's largest value. Above it, a converter has cut off the values
-there."""
+"""Share of a patch's pixels that have the largest value of the picture. Above it, a converter has cut off the
+values there."""
 _LEVELS_FOR_STUCK = 4096
 _MOST_UNEVEN = 1.0 / 3.0
 """Share of uneven patches above which the chart's place must be wrong."""

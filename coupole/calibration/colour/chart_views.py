@@ -23,8 +23,8 @@ _LEAST_COSINE = 0.3
 """Least cosine of incidence on the chart. Light at less than 17 degrees to the chart's plane shows the surface of
 the patches, not their colour."""
 _GLOSS_DEG = 25.0
-"""Angle about the mirrored direction to the camera. Light from within this angle is not used (45/0 geometry also
-avoids it)."""
+"""Light that comes from within this angle of the direction that the chart mirrors into the camera is not used
+(45/0 geometry also avoids it)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -51,7 +51,7 @@ from coupole.errors import InputError
 from coupole.pages.page_parts import Section, Table
 
 MATRIX = "xyz_d50_from_balanced."
-"""First part of the names of the matrix's coefficients. X, Y or Z follows, then r, g or b."""
+"""First part of the name of each coefficient of the matrix. X, Y or Z follows, then r, g or b."""
 _TERMS = ("r", "g", "b", "sqrt_rg", "sqrt_rb", "sqrt_gb")
 _MOST_EDGE_PICTURES = 8
 _SHARE = 0.95

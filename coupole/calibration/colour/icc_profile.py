@@ -18,9 +18,9 @@ from coupole.calibration.colour.colour_profile import Profile
 from coupole.calibration.rotations import Floats
 
 _GRID, _POWER = 49, 2.5
-"""Points of the table's grid, and exponent. They are a compromise between errors in bright and in dark colours:
-the errors are below 0.06 in L*, a*, b* for the simulated chart's patches, and below 0.13 at a twentieth of their
-light."""
+"""Number of points of the table's grid along each axis, and exponent of their spacing. They are a compromise
+between errors in bright and in dark colours: the errors are below 0.06 in L*, a*, b* for the simulated chart's
+patches, and below 0.13 at a twentieth of their light."""
 _HEAD_BYTES, _TAG_BYTES = 128, 12
 _LARGEST_XYZ = 1.0 + 32767.0 / 32768.0
 """The value of the largest code of X, Y, Z (ICC.1:2022, 6.3.4.2)."""

@@ -37,8 +37,8 @@ class Figure:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Limits of ISO's levels A, B, C and FADGI's 4, 3, 2, 1 stars: largest values, or least ones if `at_least`.
-    ISO's limits may be reached; FADGI's must not be reached."""
+    """Limits of ISO's levels A, B, C and of FADGI's 4, 3, 2, 1 stars: the largest allowed values, or the least
+    allowed ones if `at_least`. ISO's limits may be reached; FADGI's must not be reached."""
 
     iso: tuple[float, ...]
     fadgi: tuple[float, ...]

@@ -3,10 +3,10 @@
     pixel = project((base_from_flange_i . E_i . flange_from_camera)^-1 . base_from_board_b . (q_j + d_j))
 
 with q_j a place on the board by the table, d_j the LED's offset from it, E_i the arm's error at view i. Camera,
-hand-eye and the zeros of the arm's axes are observed by their record, with its covariance. (Seed 003, section 4
-triangulates each LED by itself.) The arm's error at one view shifts all LEDs that this view sees in the same way,
-so it can be estimated from the LEDs. Suspects (`suspects`) shift spots; their coefficients are shared unknowns
-with a prior.
+hand-eye and the zeros of the arm's axes are observed by their record, with its covariance. (Lucat et al. 2025,
+section 4 triangulates each LED by itself.) The arm's error at one view shifts all LEDs that this view sees in the
+same way, so it can be estimated from the LEDs. Suspects (`suspects`) shift spots; their coefficients are shared
+unknowns with a prior.
 
 A board's equations have only its own six parameters, its LEDs' offsets and the parameters that views share. So
 boards are eliminated one by one (Schur complement; Triggs et al., Bundle adjustment - a modern synthesis, 2000,
@@ -166,7 +166,7 @@ class _Descent:
     state: LedState
     steps: int
     last_equations: Reduced
-    """Normal equations of the last step, which changed the cost by less than `_STILL` of it."""
+    """Normal equations of the last step, which changed the cost by less than the share `_STILL`."""
 
 
 def _descend(

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _ARROW_MM = 120.0
-"""Length of the arrow of a typical shift."""
+"""Length that the arrow of a typical shift has in the picture."""
 
 
 def draw_leds(result: LedsFound, figure: Figure) -> None:

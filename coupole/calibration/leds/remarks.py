@@ -45,7 +45,7 @@ def _of_records(geometry: LedGeometry, prior: CameraPrior, limits: Sequence[Limi
 def _of_views(names: Sequence[str], geometry: LedGeometry, limits: Sequence[Limit]) -> list[str]:
     limit = next(limit for limit in limits if limit.name == "left_out")
     line = (
-        f"views left out in turn move the LEDs by {limit.found:.2f} of the stated uncertainty; "
+        f"views left out in turn move the LEDs by {limit.found:.2f} times the stated uncertainty; "
         f"{names[_worst(geometry)]} is predicted worst by the other views"
     )
     if limit.is_met:

@@ -32,8 +32,8 @@ two spots that touch have less. An LED seen at 75 degrees is four times as wide 
 MOST_SPOTS = 12
 """Largest number of bright regions: a frame with more has another source of light."""
 _COARSE = 0.4
-"""Error of the fill of a small spot times its width. The error arises because the spot consists of whole
-pixels."""
+"""Error of the fill of a small spot, multiplied by the width of the spot. The error arises because the spot
+consists of whole pixels."""
 _MARGIN_PX = 8
 _CROSSING = 0.25
 """Variance of the covered share of a rim pixel: half a pixel either way, as errors along a straight side are

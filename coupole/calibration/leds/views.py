@@ -19,7 +19,7 @@ from coupole.calibration.optics import Intrinsics
 from coupole.calibration.rotations import Floats, inverses
 
 ENOUGH = 6
-"""Sightings of each LED (seed 003)."""
+"""Sightings of each LED (Lucat et al. 2025)."""
 MOST_ANGLE_DEG = 65.0
 """Largest angle between an LED's normal and the direction to the camera; at larger angles the edges of boards hide
 the LED."""

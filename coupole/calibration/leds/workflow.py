@@ -125,7 +125,7 @@ def leds_from(
 
 @dataclass(frozen=True)
 class _InTableOrder:
-    """The dome's LEDs [n], by row of the table."""
+    """The dome's LEDs [n], in the order of the table's rows."""
 
     found_mask: NDArray[np.bool_]
     place: NDArray[np.intp]

@@ -13,8 +13,8 @@ IMAGES = (
 """`bare_field` is the share of the field's 8 x 6 cells without corners. `rejected` is the share of the corners
 left out as gross errors."""
 DOUBTS = (
-    Allowed("pattern", "lens: error of the model's form, over its uncertainty", 1.0),
-    Allowed("predicted", "views left out: prediction error over uncertainty", 1.5),
+    Allowed("pattern", "lens: ratio of the error of the model's form to its uncertainty", 1.0),
+    Allowed("predicted", "ratio of the error of predicted views to their stated uncertainty", 1.5),
 )
 """`pattern` is the root mean square over the field of the change that a richer lens would make, divided by the
 standard uncertainty of a direction's image. `predicted` is for all views, each of which is left out in turn."""
@@ -25,9 +25,9 @@ HAND_EYE = (
     *DOUBTS,
     Allowed("centre_mm", "camera centre on the flange", 0.3, "mm"),
     Allowed("turn_deg", "camera's turn", 0.05, "deg"),
-    Allowed("robot_ratio", "robot's noise, estimated over stated value", 3.0),
+    Allowed("robot_ratio", "ratio of the robot's estimated noise to its stated noise", 3.0),
 )
-"""`centre_mm` is a standard uncertainty, all directions together (seed 003: 300 um)."""
+"""`centre_mm` is a standard uncertainty, all directions together (Lucat et al. 2025: 300 um)."""
 CHROMATIC = (
     *IMAGES,
     Allowed("shift_px", "uncertainty of the shift between colours", 0.1, "px"),

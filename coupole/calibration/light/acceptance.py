@@ -10,9 +10,9 @@ RESPONSE = (
     Allowed("flicker", "flicker of the light", 0.005),
 )
 LED_POWER = (
-    Allowed("power", "median uncertainty against the mean", 0.02),
+    Allowed("power", "median uncertainty of an LED's power relative to the mean power", 0.02),
     Allowed("unusable", "share of LEDs without a usable picture", 0.02),
-    Allowed("left_out", "moves of the powers by views left out, over their uncertainty", 3.0),
+    Allowed("left_out", "ratio of the change of powers when views are left out to their uncertainty", 3.0),
     Allowed("scatter", "scatter of an LED between its views", 0.003),
     Allowed("lobe", "share of light that a lobe of the tile reflects", 0.03),
     Allowed("stain", "change of the tile's mean reflectance by a stain, with its uncertainty", 0.01),

@@ -39,7 +39,7 @@ _FLASH = 5e-4
 
 @dataclass(frozen=True)
 class Powers:
-    """The powers of a record, of one channel."""
+    """The powers that a record has for one channel."""
 
     row: dict[int, int]
     """Row of each LED in the arrays, by its id."""
@@ -53,7 +53,7 @@ class Powers:
     covariance: Floats
     """[c, c]."""
     departures: dict[str, float]
-    """Departure of the shared figures from their description, by the calibration."""
+    """Departure of the shared figures from their description, as the calibration found it."""
 
 
 def read_powers(path: Path, channel: str = CHANNEL) -> Powers:

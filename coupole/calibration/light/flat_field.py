@@ -1,9 +1,9 @@
 """Flat field: the light at each pixel divided by the light at the field's brightest point, per channel.
 
-The source is seed 003, section 4.2 (g in its Eq. 1). A luminous panel is photographed, shifted and turned. Its
-signal is a_v * g(p) * s(q). Here a_v is the view's brightness. g is the lens's fall-off, which depends on the
-pixel p. s is the panel's unevenness, which depends on the place q on the panel. Views that differ in shift and
-rotation separate the two. In logarithms
+The source is Lucat et al. 2025, section 4.2 (g in its Eq. 1). A luminous panel is photographed, shifted and
+turned. Its signal is a_v * g(p) * s(q). Here a_v is the view's brightness. g is the lens's fall-off, which depends
+on the pixel p. s is the panel's unevenness, which depends on the place q on the panel. Views that differ in shift
+and rotation separate the two. In logarithms
 
     ln g = -2 ln(1 + r^2/f^2) + k1 (r/R)^2 + k2 (r/R)^4 + k3 (r/R)^6,   r = |p - centre|,   R half the diagonal,
     ln s = e1 x + e2 y + e3 x^2 + e4 x y + e5 y^2,                      (x, y) = q / `panel_scale_mm`.

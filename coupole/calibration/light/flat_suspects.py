@@ -79,7 +79,7 @@ def flat_causes(
     size_px: tuple[int, int],
 ) -> FlatCauses:  # fmt: skip
     """Judge the suspects by the residuals [b] of blocks at pixels [b, 2] that show places [b, 2] of the panel.
-    `design` [b, p] are the derivatives of the fit, `used_mask` [b] the blocks that are no outliers."""
+    `design` [b, p] are the derivatives of the fit, `used_mask` [b] the blocks that are not outliers."""
     middle, reach = places.mean(axis=0), np.abs(places - places.mean(axis=0)).max(axis=0)
     panel = _polynomials((places - middle) / reach, *_PANEL_DEGREES)
     scale = np.linalg.norm(design, axis=0)

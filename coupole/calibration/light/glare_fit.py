@@ -43,8 +43,8 @@ _LEAST_SPREAD = 0.35
 """Least extent of the traps' positions, as a share of the picture's width. Traps in one place do not show the
 glare in other places."""
 _LEAST_VEIL = 1e-6
-"""Least veil, as a share of white, for a relative error. A fit without a view may predict no veil; then there is
-no relative error."""
+"""Least veil, as a share of white, whose error is also stated as a relative error. A fit without a view may
+predict no veil; then there is no relative error."""
 _ROUNDS = 4
 
 

@@ -1,9 +1,9 @@
 """Irradiance by an LED, which is a finite square that radiates by Lambert's law.
 
 The processing does not share this formula with the simulator. It is Lambert's formula for a polygon (Photometria,
-1760; seed 003, Eq. 2 and supplement). With unit vectors v_i from the point to the corners, it is G = sum_i
-angle(v_i, v_i+1) * unit(v_i x v_i+1), and E = Phi / (2 A) * G.n / pi for a flux Phi that leaves the square of area
-A. The factor 1 / pi is that of a Lambertian emitter's radiance, Phi / (pi A).
+1760; Lucat et al. 2025, Eq. 2 and supplement). With unit vectors v_i from the point to the corners, it is G =
+sum_i angle(v_i, v_i+1) * unit(v_i x v_i+1), and E = Phi / (2 A) * G.n / pi for a flux Phi that leaves the square
+of area A. The factor 1 / pi is that of a Lambertian emitter's radiance, Phi / (pi A).
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ def irradiance_per_flux(
     """Return E / Phi in m^-2 at points [..., 3] with unit normals [..., 3]. All arguments are broadcast.
 
     It is 0 for a point behind the LED, or an LED whose centre is below the point's horizon. At a metre the LED's
-    size matters only within less than half a degree of the horizon. `paper` has the emitter's cosine twice (seed
-    003, Eq. 2).
+    size matters only within less than half a degree of the horizon. `paper` has the emitter's cosine twice (Lucat
+    et al. 2025, Eq. 2).
     """
     points, facing = np.asarray(points_mm, float), np.asarray(normals, float)
     centres, axes = np.asarray(led_centres_mm, float), np.asarray(led_normals, float)

@@ -1,4 +1,4 @@
-"""Power of each LED from pictures of a Spectralon tile: Phi_k of seed 003, Eq. 2 and section 4.2.
+"""Power of each LED from pictures of a Spectralon tile: Phi_k of Lucat et al. 2025, Eq. 2 and section 4.2.
 
 A patch of the tile at x gives the signal S = f(i, o) * E/Phi(x) * Phi_k, where S is DN per second over the flat
 field. So Phi_k is in these units times m^2 sr, and the camera's constants cancel in a reflectance. In logarithms

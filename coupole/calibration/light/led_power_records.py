@@ -109,7 +109,7 @@ def _of_views(power: LedPower, limits: Sequence[Limit]) -> list[str]:
     if not power.left_out.worst:
         return ["each LED is in one view only, so a drift, or a lobe of the tile, cannot be detected"]
     line = (
-        f"views left out in turn move the powers by {figures['left_out'].found:.2f} of the stated uncertainty; "
+        f"views left out in turn move the powers by {figures['left_out'].found:.2f} times the stated uncertainty; "
         f"{power.left_out.worst} moves them most"
     )
     if figures["left_out"].is_met and figures["scatter"].is_met:

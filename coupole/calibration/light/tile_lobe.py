@@ -15,9 +15,9 @@ from coupole.calibration.rotations import Floats
 WIDTHS = (0.15, 0.25, 0.4, 0.6, 0.9, 1.4)
 """Root mean square slopes of the lobes."""
 ALBEDO = 0.01
-"""Unit of the lobes: reflectance of a mode for light along the normal."""
+"""Strength of a lobe with a coefficient of 1: its reflectance for light along the normal."""
 _GRID = 64
-"""Steps of the angle for the reflectance of a lobe."""
+"""Number of steps of the angle in the integral of a lobe's reflectance."""
 
 
 def lobes_of(angles: Angles, tile: Tile) -> Floats:

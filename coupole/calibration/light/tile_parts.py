@@ -2,7 +2,7 @@
 
 A stain is a pattern over the parts of the tile that all LEDs and views share. Its mean is not seen, but scales all
 powers. So its modes are those of a random field over the tile (covariance exp(-d / `_STAIN_MM`)), whose mean is
-about as large as its pattern. The flat field's error is a gradient over the tile in each view; it is no stain.
+about as large as its pattern. The flat field's error is a gradient over the tile in each view; it is not a stain.
 
 If the die of an LED is tilted, its light does not fall off across the tile by the cosine law. This effect scatters
 from LED to LED. It changes no power at the tile's middle, but it changes the light beside the middle.

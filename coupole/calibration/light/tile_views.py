@@ -14,9 +14,10 @@ from coupole.calibration.rotations import Floats
 
 _DEAD_SIGMA = 5.0
 _DEAD_SHARE = 0.01
-"""Share of the median LED's power. A smaller signal counts as dark."""
+"""Least power of an LED that counts as lit, as a share of the median LED's power. A smaller signal counts as dark.
+"""
 _SHADED = 0.03
-"""Relative departure of a part of the tile, beyond noise. A larger one counts as shadow."""
+"""Greatest relative departure of a part of the tile that noise does not explain. A larger one counts as shadow."""
 _SHADED_SIGMA = 6.0
 _FEW_LEDS = 8
 """Least number of LEDs of a view from which a pattern of the tile is distinguished from shadows."""

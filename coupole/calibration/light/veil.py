@@ -24,7 +24,8 @@ PARTS = tuple(WIDTHS)
 _ACROSS = 96
 """Approximate number of blocks along the picture's width."""
 _ROUNDS = 4
-"""Number of terms of the series in the shares. The next term is below 1e-7 of white for a veil of 4 %."""
+"""Number of terms of the series in powers of the shares. The next term is below 1e-7 of white for a veil of 4 %.
+"""
 _REACH = 4.0
 """Number of standard deviations at which a part is cut off."""
 

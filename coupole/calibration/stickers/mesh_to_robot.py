@@ -7,8 +7,8 @@ with the table by the triangles that they form. Then everything is adjusted toge
     pixel = project((base_from_flange_i . E_i . flange_from_camera)^-1 . base_from_mesh . (q_j + d_j))
 
 Here q_j is the table's target, d_j its error, and E_i the arm's error in view i. A record observes lens, hand-eye
-and, if known, the zeros of the arm's axes; all views share its error. (The source is seed 003, section 4, "mesh to
-robot", where target and arm have no uncertainty.)
+and, if known, the zeros of the arm's axes; all views share its error. (The source is Lucat et al. 2025, section 4,
+"mesh to robot", where target and arm have no uncertainty.)
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Stated:
 
     sticker_px: float = 0.1
     scanner_mm: float = 0.03
-    """Accuracy of the scanner (seed 003: 30 um)."""
+    """Accuracy of the scanner (Lucat et al. 2025: 30 um)."""
     robot_mm: float = 0.3
     robot_deg: float = 0.02
     """Noise of the arm from pose to pose."""

@@ -25,7 +25,8 @@ from coupole.exchange.atlas.charts import (
 from coupole.kernels import kernel
 
 PADDING_PX = 4
-"""Number of texels around a chart that continue it, so that mipmaps of three levels mix in no other chart."""
+"""Number of texels by which a chart is continued on all sides, so that three levels of mipmaps contain nothing of
+other charts."""
 _SAME_PLACE, _MOST_SHARED = 1e-6, 0.01
 """Step in which given places are compared, and greatest share of the surface whose places may coincide with
 others."""

@@ -23,9 +23,8 @@ _ROUNDS = 12
 _MOST_TURN = math.cos(math.radians(40.0))
 _LEAST_FACING = math.cos(math.radians(70.0))
 _LEAST_FACING_MERGED = math.cos(math.radians(86.0))
-"""Cosines of three greatest angles. First: between mean directions within a chart. Second: between a single
-triangle and the plane of its chart, while the chart grows. Third: as the second, while small charts are merged
-into their neighbours.
+"""Cosines of three greatest angles: between mean directions within a chart; between a single triangle and the
+plane of its chart while the chart grows; and the same angle while small charts are merged into their neighbours.
 """
 _LEAST_TRIANGLES = 64
 """Fewest triangles of a chart; smaller ones are merged into their neighbours."""

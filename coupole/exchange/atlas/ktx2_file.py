@@ -30,7 +30,7 @@ squared error.
 
 @dataclass(frozen=True)
 class _Layout:
-    """A format's words in header and descriptor."""
+    """The values that describe a format in the file's header and descriptor."""
 
     vulkan: int
     """VkFormat"""

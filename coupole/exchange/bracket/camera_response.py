@@ -148,7 +148,7 @@ def _samples(values: NDArray[np.float32]) -> Array:
 
 @dataclass(frozen=True)
 class _Fit:
-    """The state that one round passes to the next."""
+    """The values that one round of the fit passes to the next round."""
 
     g: Array
     robust: Array

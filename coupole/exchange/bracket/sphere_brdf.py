@@ -1,4 +1,4 @@
-"""The BRDF of a finish from linear photographs of a coated sphere (seed 002, section 3.1).
+"""The BRDF of a finish from linear photographs of a coated sphere (Durikovic et al. 2002, section 3.1).
 
 Each pixel of the sphere has a different normal. So one photograph under one distant light has thousands of samples
 of an isotropic BRDF, and several lights cover it. Two lobes of facets are fitted first (`finish_lobes`), then a

@@ -25,7 +25,7 @@ _LARGEST_HALF = 65504.0
 _SAME_SIZE = 0
 """Pillow's setting that stores colours at the resolution of brightness."""
 SCRIPT_BEGINS = "coupoleBlock("
-"""Beginning of the script of each block."""
+"""Text with which the script of each block begins."""
 
 
 def in_script(value: object) -> str:

@@ -19,7 +19,7 @@ MOST_PX = 4096
 """Greatest width of a page's maps, px, which every graphics card and browser supports."""
 TILE_PX = 1024
 NOWHERE = 0xFFFFFFFF
-"""Place in the maps for a corner without one."""
+"""Value of the place in the maps for a corner that has no place there."""
 _QUALITY = 92
 _STEPS = 4095
 """Number of codes of a coordinate of a normal: 12 bits."""

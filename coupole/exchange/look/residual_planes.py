@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 FIT = SLICES["ggx_rbf"]
 PLANES = 9
-"""Default number of planes. With three shares of GGX, they fill whole groups of four bytes."""
+"""Default number of planes. Together with the three shares of GGX, the planes fill whole groups of four bytes."""
 SIDE = 48
 """Number of entries on a side of a plane's table."""
 _STEPS = 127
@@ -59,7 +59,7 @@ class ResidualPlanes:
     missed_energy: float
     """Sum of the squared errors of pages relative to the fit, over some triangles, directions and channels."""
     energy: float
-    """The same sum for GGX alone: the energy of the residual."""
+    """The sum of squares for GGX alone: the energy of the residual."""
 
 
 def residual_fit(result: RunResult) -> str | None:

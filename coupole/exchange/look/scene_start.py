@@ -23,7 +23,7 @@ from coupole.errors import InputError
 
 MOST_LIGHTS = 10
 _WIDEST_DEG = 30.0
-"""Radius of the widest disk of a page, degrees."""
+"""Greatest radius of a light's disk on a page, degrees."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,9 @@ def lacquered_corners(thing: Nashiji, folder: Path) -> Array:
 def nashiji_layers(thing: Nashiji, folder: Path) -> tuple[Layer, Layer]:
     """The lacquer's face over the ground, and the flakes' lobe. Raises InputError."""
     if not isinstance(thing.ground, Diffuse):
-        raise InputError(f"nashiji on a ground of kind {thing.ground.kind}: a page shows grounds of kind diffuse")
+        raise InputError(
+            f"nashiji on a ground of kind {thing.ground.kind}: a page shows only grounds of kind diffuse"
+        )
     cover, absorption_per_mm = _covered_share(thing), absorption.per_mm(thing.absorption, indices.URUSHI, folder)
     face = fresnel.reflectance(COSINES, indices.URUSHI)
     passing = 1.0 - face

@@ -1,4 +1,5 @@
-"""Four fluxes of a film from its spectra under diffuse and under directional light (seed 000, section 3.4).
+"""Four fluxes of a film from its spectra under diffuse and under directional light (Dumazet et al. 2008, section
+3.4).
 
 K and S come from the diffuse spectra (`layer_fit`). Entering directional light is scattered into diffuse light,
 upwards R_b and downwards T_cd, or reaches the ground unscattered, Tr = exp(-mu h). Over a diffusing ground g the

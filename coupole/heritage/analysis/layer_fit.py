@@ -1,4 +1,5 @@
-"""K and S of a paint from its films over grounds, with uncertainties (Kubelka and Munk 1931; seed 000, Eqs 5-7).
+"""K and S of a paint from its films over grounds, with uncertainties (Kubelka and Munk 1931; Dumazet et al. 2008,
+Eqs 5-7).
 
 Each spectrum of a film is one equation for each band, in the measured reflectance. Two grounds, an opaque and a
 thin sample, or a series of thicknesses are the same problem, solved by weighted least squares. With alpha = (K+S)

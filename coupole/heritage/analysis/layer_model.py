@@ -1,4 +1,5 @@
-"""Choice of the model that a paint layer needs, and the size of its grains (seed 000, sections 3.4 and 3.5).
+"""Choice of the model that a paint layer needs, and the size of its grains (Dumazet et al. 2008, sections 3.4 and
+3.5).
 
 Two fluxes are valid for light that is diffuse inside the layer: under diffuse illumination, or where the layer
 scatters so much that nothing reaches its ground unscattered. A thin or clear layer under directional light (a
@@ -32,9 +33,9 @@ class Deserved:
     model: Model
     because: str
     difference: float
-    """Largest difference, over bands and grounds, between the two models under directional light."""
+    """Largest difference between the two models under directional light, among all bands and grounds."""
     unscattered_share: float
-    """Largest share, over the bands, of directional light that reaches the ground unscattered."""
+    """Largest share of directional light that reaches the ground unscattered, among all bands."""
 
 
 @dataclass(frozen=True)

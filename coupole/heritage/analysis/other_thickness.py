@@ -133,7 +133,7 @@ def _matching_depths(
 
 
 def _newton_step(off: Callable[[Array], Array], logs: Array) -> Array:
-    """[2, n] Newton's step, at most a factor of e in each unknown."""
+    """[2, n] Newton's step, which changes each unknown by at most a factor of e."""
     here = off(logs)
     slopes = np.stack([(off(logs + _STEP * unit) - here) / _STEP for unit in np.eye(2)[:, :, None]], axis=1)
     matrices = np.moveaxis(slopes, -1, 0)

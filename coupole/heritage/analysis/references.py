@@ -25,9 +25,9 @@ _SAME = 1e-4
 _WIDEST_GAP_NM = 20.0
 _VIOLET_NM = 460.0
 _RISE_BEYOND, _RISE_BY = 0.1, 0.005
-"""Limits of the change over 20 nm. The first limit is for a log(K/S) that falls more than the references'
-log(K/S). Unlike the rise of the reflectance, this fall does not depend on the concentration. The second is for
-reflectance.
+"""Limits of the change of a spectrum over 20 nm. The first limit is for a log(K/S) that falls more than the
+references' log(K/S). Unlike the rise of the reflectance, this fall does not depend on the concentration. The
+second is for reflectance.
 """
 
 

@@ -39,7 +39,7 @@ _NAMED_SHARE = 0.25
 _SEEN_NM = (620.0, 550.0, 460.0)
 _SEEN_GAMMA = 2.2
 _REFLECTANCE = (-0.1, 0.01, 2.0)
-"""Least of nearly all values; least and most of the highest values."""
+"""Lower limit of nearly all values, and lower and upper limit of the highest values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class ImageFinding:
 
     codes: NDArray[np.uint8]
     region_numbers: NDArray[np.uint8]
-    """0: like no region, or not looked at."""
+    """0 for a pixel that is like no region, or that was not examined."""
     confidence: NDArray[np.float32]
     """Probability, by the pixel's own spectrum, of the map's answer; NaN where there is no answer."""
     picture: NDArray[np.uint8]
@@ -96,7 +96,7 @@ def identify_image(
     """Identify the pixels of a cube where `mask` [rows, columns] is True. The state is kept in a folder until the
     job is done, so an interrupted job continues.
 
-    Raises InputError if the values are no reflectances, if no pixel has values in all bands, or if cube and
+    Raises InputError if the values are not reflectances, if no pixel has values in all bands, or if cube and
     library share too few bands; StorageError.
     """
     looks = np.ones((cube.rows, cube.columns), bool) if mask is None else mask

@@ -128,7 +128,7 @@ def is_record(folder: Path) -> bool:
 def check_record(folder: Path) -> RecordCheck:
     """Compare a record and the files beside it with their checksums.
 
-    Raises InputError if the file is no record of an identification.
+    Raises InputError if the file is not a record of an identification.
     """
     path = folder / RECORD
     try:

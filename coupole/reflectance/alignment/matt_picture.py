@@ -1,4 +1,4 @@
-"""One picture for each view, in which a place of the surface looks the same from all views.
+"""Makes one picture for each view; a place of the surface looks the same in the pictures of all views.
 
 Object and LEDs stand still while the camera goes round. So a matt surface has the same radiance in all views under
 the same LED, whatever its shape, its shadows and the LEDs' power are. Only gloss and the arm's shadow differ:

@@ -35,7 +35,7 @@ from coupole.storage.hdf5_file import hdf5_file
 Floats = NDArray[np.float64]
 
 _PATCHES_BESIDE = 9
-"""Number of patches: a patch and the patches around it."""
+"""Number of neighbouring patches that are examined, the patch itself included."""
 MOST_BLUR_PX = 2.0
 """Largest diameter of the circle of confusion of a pixel that is used, px."""
 Say = Callable[[str, int, int], None]
@@ -287,7 +287,7 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface, digest: A
         file,
         "full_scales",
         scales,
-        "share of the camera's range for f cos_i E/Phi = 1 in the longest exposure",
+        "share of the camera's range that f cos_i E/Phi = 1 m^-2 sr^-1 gives in the longest exposure",
         digest,
     )
 

@@ -42,7 +42,7 @@ class FrameVeils:
     channel: NDArray[np.int8]
     """[h, w] number of a pixel's channel."""
     curve: Floats
-    """[channels, 3] c2, c3 and range of the response."""
+    """[channels, 3] coefficients c2 and c3, and range, of the response."""
     top_dn: float
     """Upper end of the camera's range that is used."""
     darks: Mapping[float, NDArray[np.float32]]

@@ -1,7 +1,7 @@
 """Frames of LEDs that are kept for the check, as pictures: one value for each block of 2 x 2 pixels and channel.
 
-In a block, one pixel of each channel is used, so that green does not count twice (seed 003, 6.3). Pixels are
-linear, as shares of the camera's range, with dark and flat field removed, as in the samples.
+In a block, one pixel of each channel is used, so that green does not count twice (Lucat et al. 2025, 6.3). Pixels
+are linear, as shares of the camera's range, with dark and flat field removed, as in the samples.
 """
 
 from __future__ import annotations

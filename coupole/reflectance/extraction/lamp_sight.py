@@ -143,7 +143,7 @@ def lit_by(centre, led_centre, led_normal, paper, towards):  # type: ignore[no-u
     `towards` [3].
 
     The LED is a small Lambertian emitter, cos / (pi d^2). At 0.5 m, the irradiance from a square of 7 mm differs
-    from this by 7e-5. With `paper` the emitter's cosine counts twice (seed 003, Eq. 2).
+    from this by 7e-5. With `paper` the emitter's cosine counts twice (Lucat et al. 2025, Eq. 2).
     """
     for k in range(3):
         towards[k] = led_centre[k] - centre[k]

@@ -16,7 +16,7 @@ from coupole.calibration.rotations import moved_transforms, rotation, skew
 Floats = NDArray[np.float64]
 
 _SMALL = 1e-3
-"""Steps of the differences that approximate derivatives, as a share of a standard uncertainty."""
+"""Step of a finite difference that approximates a derivative, as a share of the unknown's standard uncertainty."""
 _POINTS = 100
 """Number of places on the object that represent all places of a view."""
 

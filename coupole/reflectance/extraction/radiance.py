@@ -20,7 +20,7 @@ from coupole.reflectance.extraction.measured_run import MeasuredRun
 from coupole.reflectance.extraction.seen_surface import SeenSurface
 
 RANGE_LEFT_OUT = 0.02
-"""Share of the camera's range that is left out at both ends (seed 003, 5.1)."""
+"""Share of the camera's range that is left out at both ends (Lucat et al. 2025, 5.1)."""
 
 
 class Radiometry:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 REACHED, AWAY, SHADED, PENUMBRA = range(4)
-"""Codes from the object's own shape. AWAY: the incidence is beyond `lamp_sight.MOST_INCIDENCE_DEG`, or the
-triangle is behind the LED."""
+"""Codes that follow from the object's own shape. AWAY: the incidence is beyond `lamp_sight.MOST_INCIDENCE_DEG`, or
+the triangle is behind the LED."""
 BY_CELL = PENUMBRA + 1
 """Arm, camera or tool may hide the LED from the triangle."""
 BY_UNKNOWN = BY_CELL + 1

@@ -63,7 +63,7 @@ class Lamps(NamedTuple):
     powers: Singles
     """[channels, 8] DN s^-1 m^2 sr; NaN where there is none."""
     paper: bool
-    """True if the emitter's cosine counts twice (seed 003, Eq. 2)."""
+    """True if the emitter's cosine counts twice (Lucat et al. 2025, Eq. 2)."""
 
 
 @kernel(error_model="numpy")

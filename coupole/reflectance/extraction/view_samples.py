@@ -1,9 +1,9 @@
 """One view's samples, in batches of LEDs in the order of the frames' file, and in blocks of triangles.
 
-f = S / (P E/Phi cos_i) (seed 003, Eqs. 1 to 3). S is the mean signal of a triangle's pixels, in DN/s over the
-flat field, with dark and response removed. It is divided by the irradiance on the triangle from the LED's power
-P, in DN/s m^2 sr. The mean over a triangle replaces the paper's prefilter of 0.1 degree, because neighbouring
-LEDs are degrees apart.
+f = S / (P E/Phi cos_i) (Lucat et al. 2025, Eqs. 1 to 3). S is the mean signal of a triangle's pixels, in DN/s over
+the flat field, with dark and response removed. It is divided by the irradiance on the triangle from the LED's
+power P, in DN/s m^2 sr. The mean over a triangle replaces the paper's prefilter of 0.1 degree, because
+neighbouring LEDs are degrees apart.
 """
 
 from __future__ import annotations

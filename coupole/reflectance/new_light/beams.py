@@ -87,8 +87,8 @@ def lighting_of(
     paper: bool,
 ) -> Lighting:
     """Return the beams of lights with places in the support frame; each area and environment has `samples` beams.
-    LEDs are taken from the first view that was lit by them; `paper` tells that their emission is by seed 003, Eq.
-    2.
+    LEDs are taken from the first view that was lit by them; `paper` tells that their emission is by Lucat et al.
+    2025, Eq. 2.
 
     Raises InputError if no view was lit by an LED, or if a file has no environment.
     """

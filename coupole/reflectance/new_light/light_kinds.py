@@ -136,7 +136,8 @@ def read_lights(path: Path) -> list[AnyLight]:
 
 
 def numbers_of(text: str, counts: Sequence[int], option: str, form: str) -> list[float]:
-    """Return numbers separated by commas. Raises InputError if their count is wrong, or if a text is no number."""
+    """Return numbers separated by commas. Raises InputError for a wrong count, and for a text that is not a
+    number."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:

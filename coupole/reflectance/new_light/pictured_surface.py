@@ -32,10 +32,10 @@ _DEGREE = 5
 """Degree of the polynomial: enough for Brown's k2, and for a homography up to 1e-6."""
 _LEAST_TRIANGLES = 4 * (_DEGREE + 1) * (_DEGREE + 2) // 2
 _OUTLIER = 4.0
-"""Largest deviation of a triangle, relative to the median deviation. Triangles with a larger deviation are only
-partly visible."""
+"""Largest deviation of a triangle that is used, relative to the median deviation. Triangles with a larger
+deviation are only partly visible."""
 _MARGIN = 1.05
-"""Factor for a margin around the object, in a picture without a given field of view."""
+"""Factor that leaves a margin around the object in a picture without a given field of view."""
 
 
 @dataclass(frozen=True)

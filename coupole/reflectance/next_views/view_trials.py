@@ -42,7 +42,7 @@ class Trial:
     is_shown: NDArray[np.bool_]
     """[parts] True where the view shows the part sharply and not too obliquely, and at least one LED lights it."""
     information: tuple[ViewInformation, ...]
-    """Its information about the parts, for each supposed material."""
+    """Information of the view about the parts, for each supposed material."""
     samples: Floats
     """[parts] number of samples that it gives of each part."""
 

@@ -41,7 +41,8 @@ def _page(name: str, document: dict[str, Any]) -> Page:
                 words=[
                     "Mean absolute error under the LEDs kept for the check, in % of the camera's range. All "
                     "fits are compared with the same samples.",
-                    "Published (seed 003, 6.3 and 6.4): with half of the photos radial functions have the "
+                    "Published (Lucat et al. 2025, 6.3 and 6.4): with half of the photos radial functions "
+                    "have the "
                     "smallest error of the three fits that the paper compares (it has no GGX with radial "
                     "functions), and spherical "
                     "harmonics are "

@@ -84,7 +84,9 @@ def _notes(document: dict[str, Any]) -> list[str]:
             f"triangles' own materials used these samples)."
         )
     if document["mae_ratio"] is not None:
-        notes.append(f"Ratio {document['mae_ratio']:.2f}; published: 1.7 (seed 003, figure 6, harmonics).")
+        notes.append(
+            f"Ratio {document['mae_ratio']:.2f}; published: 1.7 (Lucat et al. 2025, figure 6, harmonics)."
+        )
     return notes
 
 

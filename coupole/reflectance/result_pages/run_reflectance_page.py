@@ -222,7 +222,8 @@ def _uncertain(about: dict[str, Any]) -> Section:
     note = (
         f"By Monte Carlo through the measurement equation ({trial['samples']} samples, {trial['draws']} draws "
         "of each), "
-        "and with one source removed at a time; last, the figures published for La Coupole (seed 003, 6.1 and 7)."
+        "and with one source removed at a time; last, the figures published for La Coupole (Lucat et al. "
+        "2025, 6.1 and 7)."
     )
     head = ("sources", "median sample", "95th percentile", "narrower by")
     return Section(section, heading, tables=[Table(caption, head, lines)], notes=[note])
@@ -288,7 +289,9 @@ def _table_of_fits(about: dict[str, Any]) -> Section:
         "fits",
         "Under the LEDs kept for the check",
         tables=[Table("Errors of the fits", head, rows)],
-        notes=["Pictures are compared by blocks of 2 x 2 pixels, one pixel of each channel (seed 003, 6.3)."],
+        notes=[
+            "Pictures are compared by blocks of 2 x 2 pixels, one pixel of each channel (Lucat et al. 2025, 6.3)."
+        ],
     )
 
 

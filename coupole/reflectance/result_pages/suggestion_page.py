@@ -86,7 +86,8 @@ _LIMITS = (
     "noise, each LED's own power "
     "and place, the noise of the arm's poses, and a highlight with Fresnel's term.",
     "The figures do not include: light from surface to surface, edges of shadows, translucency, errors of the "
-    "mesh, the light of two triangles in one pixel, and materials that are no sum of a matt part and a highlight. "
+    "mesh, the light of two triangles in one pixel, and materials that are not a sum of a matt part and a "
+    "highlight. "
     "Where these matter, the uncertainties will be larger.",
 )
 

@@ -34,7 +34,7 @@ def _page(name: str, document: dict[str, Any]) -> Page:
         summary=f"{sum(document['texels'].values()):,} texels in patches of all views, and the triangles that "
         "they see, were fitted again with less data.",
         quality=quality(document["mae"], _FITS),
-        next_step="Take as many LEDs as the error that you can accept needs; the tables have the figures.",
+        next_step="Choose the number of LEDs by the error that you can accept; the tables have the figures.",
         sections=[
             *settings_told(document["mae"], _FITS),
             _known_share(document["share_with_material"]),

@@ -80,11 +80,11 @@ class SuggestionRequest:
 
 
 class Settings(NamedTuple):
-    """The parts of a plan besides its views."""
+    """Everything in a plan besides its views."""
 
     exposures_us: tuple[int, ...]
     leds: int
-    """Index into the numbers of LEDs."""
+    """Index of the chosen number of LEDs."""
 
 
 @dataclass(frozen=True)
@@ -216,8 +216,8 @@ class _Trial:
         raise PreflightRefused([f"{refusal}, even with {self._numbers[0]} LEDs"])
 
     def _exposures_to_try(self) -> list[tuple[int, ...]]:
-        """Return the exposures to try: short, long, and both. For several materials, the short one suits the
-        brightest, the long one the darkest."""
+        """Return the exposures to try: short, long, and both. If several materials are supposed, the short
+        exposure suits the brightest of them, and the long one the darkest."""
         noise, limits = self._surface.noise, self._job.cell.rig.led_limits.on_us
         parts_of_views = [candidate.seen_parts for candidate in self._candidates]
         brightest = [

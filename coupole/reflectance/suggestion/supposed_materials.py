@@ -21,7 +21,8 @@ SUPPOSED = {
     "glossy": SupposedMaterial(0.2 / math.pi, 0.04, 0.15),
     "metal": SupposedMaterial(0.05 / math.pi, 0.7, 0.25),
 }
-"""Limestone or unglazed clay; varnished or lacquered; gilt or polished metal, a little worn."""
+"""Limestone or unglazed clay; a varnished or lacquered surface; gilt or polished metal, a little
+worn."""
 UNKNOWN = "unknown"
 """Name for any of these materials."""
 

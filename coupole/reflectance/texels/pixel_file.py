@@ -75,7 +75,7 @@ class ViewTexels:
 
 @dataclass(frozen=True)
 class TexelFileHead:
-    """Head of a file of texels: its contents besides the texels."""
+    """Facts in a file of texels, besides the texels themselves."""
 
     view: str
     size_px: tuple[int, int]
@@ -86,7 +86,7 @@ class TexelFileHead:
     u_pixel: NDArray[np.float64]
     """[channels] relative standard uncertainty of kd and ks, from the responses of a texel's pixels."""
     u_shared: float
-    """The same uncertainty from the power of all LEDs."""
+    """Relative standard uncertainty of kd and ks from the power of all LEDs."""
     is_simulated: bool
 
 

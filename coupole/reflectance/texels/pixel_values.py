@@ -125,7 +125,7 @@ class LitPixels:
     places_mm: NDArray[np.float32]
     """[pixels, 3] places that the pixels see."""
     light: tuple[NDArray[np.uint8], NDArray[np.float32]]
-    """Codes, and shares of direct light, of the rows under the LEDs (`light_of`)."""
+    """Codes and shares of direct light for the triangles of these rows under the LEDs (`light_of`)."""
     values: NDArray[np.uint16]
     """[pixels, leds] values, which are to be filled."""
 

@@ -44,8 +44,8 @@ _TRACED = 200_000
 _FITTED, _SIDE_PX = 2048, 192
 """Number of texels for the trial of fits, and width in pixels of the trial of the steps with neighbours."""
 _ALL_OVER_SETTLE, _CHECK_OVER_FIT = 3.0, 17.0
-"""Ratios of measured times. First: all steps with neighbours over the step in the trial. Second: a pixel under an
-LED of the check, with uncertainties for every second LED, over a sample of a fit."""
+"""Ratios of measured times: all steps with neighbours to the step in the trial; and a pixel under an LED of the
+check, with uncertainties for every second LED, to a sample of a fit."""
 _PLACE_BYTES, _PIXEL_BYTES, _SHOWN_BYTES, _BEFORE_BYTES = 650, 60, 900, 400_000_000
 """Measured memory, in bytes, of a texel's place in a view; of a pixel of the picture; of a pixel that sees the
 object while pictures are compared; and of the program before the work."""

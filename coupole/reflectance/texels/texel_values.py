@@ -165,7 +165,7 @@ class _Band:
     """Some rows of a view's grid."""
 
     triangle_of_pixel: NDArray[np.int32]
-    """[h, w] also -1 outside of the band."""
+    """[h, w] place of a pixel's texel; -1 for none, and outside of the band."""
     texels: NDArray[np.int64]
     """[n] places in the grid, in rising order."""
 

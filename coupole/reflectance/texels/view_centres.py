@@ -35,7 +35,7 @@ from coupole.reflectance.triangle_fit import LEAST_KD, TriangleMaterials, turned
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 KD, KS, ALPHA = 2, 3, 4
-"""Places of the logarithms among the unknowns."""
+"""Indices of the logarithms among the unknowns."""
 MOST_KD = 1.0
 """Largest kd, 1/sr: three times the kd of white, to allow for strong light from other surfaces. A fit with more
 has failed."""

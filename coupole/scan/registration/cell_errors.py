@@ -35,7 +35,7 @@ class Overlap:
 
     @property
     def columns(self) -> NDArray[np.intp]:
-        """[12] columns of both scans' steps in the steps of all scans."""
+        """[12] indices of both scans' steps among the steps of all scans."""
         return np.concatenate([6 * scan + np.arange(6) for scan in (self.first, self.second)])
 
 

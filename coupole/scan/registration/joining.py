@@ -80,7 +80,8 @@ def _agree(scans: Sequence[PreparedScan], motion: PairMotion, predicted_motion: 
 def _merge(
     scans: Sequence[PreparedScan], groups: Groups, group: int, other_group: int, motions: Sequence[PairMotion]
 ) -> None:
-    """Place a group in another by the majority of the motions between them, or reject these motions."""
+    """Place one group in the frame of another by the majority of the motions between them, or reject these
+    motions."""
     places = [_place(groups, group, motion) for motion in motions]
     supporters = [
         [m for m in motions if _agree(scans, m, _between(groups, group, m, one_from_other))]

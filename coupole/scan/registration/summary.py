@@ -12,7 +12,7 @@ from coupole.scan.registration.registering import Registration
 from coupole.scan.registration.small_motions import displacement_mm, inverse_of
 
 _CONSPICUOUS = 3.0
-"""Ratio of a target's error to its uncertainty above which a sentence reports it."""
+"""A target is reported if its error divided by its uncertainty is above this ratio."""
 
 
 def about(registration: Registration, merged_mesh: Merged | None) -> dict[str, Any]:

@@ -62,7 +62,9 @@ def _main_tags(path: Path) -> Mapping[str, Any]:
             return {tag.name: tag.value for tag in file.pages.first.tags}
     except (ValueError, ArithmeticError, LookupError, TypeError, struct.error) as error:
         # tifffile raises all of these for directories that are damaged
-        raise ValueError(f"it is no TIFF that can be read, as CR2, NEF, ARW and DNG files are: {error}") from error
+        raise ValueError(
+            f"it is not a TIFF that can be read, as CR2, NEF, ARW and DNG files are: {error}"
+        ) from error
 
 
 def _taken_ns(capture_time: str, subseconds: str) -> int:
@@ -71,7 +73,7 @@ def _taken_ns(capture_time: str, subseconds: str) -> int:
     except ValueError as error:
         raise ValueError(f"it has no capture time (tag DateTimeOriginal holds {capture_time!r})") from error
     if subseconds and not (subseconds.isascii() and subseconds.isdigit()):
-        raise ValueError(f"its fraction of a second is no number (tag SubSecTimeOriginal holds {subseconds!r})")
+        raise ValueError(f"its fraction of a second is not a number (tag SubSecTimeOriginal holds {subseconds!r})")
     return int(seconds.timestamp()) * 1_000_000_000 + int(subseconds[:6].ljust(6, "0")) * 1000
 
 
@@ -89,7 +91,7 @@ def _iso(exif: Mapping[str, Any]) -> int:
         case int(iso) | (int(iso), *_):
             return iso
         case other:
-            raise ValueError(f"its ISO is no whole number (tag PhotographicSensitivity holds {other!r})")
+            raise ValueError(f"its ISO is not a whole number (tag PhotographicSensitivity holds {other!r})")
 
 
 def _text(tags: Mapping[str, Any], name: str) -> str:

@@ -130,7 +130,7 @@ def test_gold_in_grooves_is_cook_and_torrances_equation() -> None:
     wi, wo = ways()
     h = (wi + wo) / np.linalg.norm(wi + wo, axis=1, keepdims=True)
     cosine = np.sum(wi * h, axis=1)
-    # Cook and Torrance 1982, as seed 001 has it, with 1/pi in D and 4 below.
+    # Cook and Torrance 1982, as Callet et al. 2010 have it, with 1/pi in D and 4 below.
     tangent2 = 1.0 / h[:, 2] ** 2 - 1.0
     d = np.exp(-tangent2 / m**2) / (np.pi * m**2 * h[:, 2] ** 4)
     g = np.minimum(1.0, 2.0 * h[:, 2] * np.minimum(wi[:, 2], wo[:, 2]) / cosine)

@@ -129,7 +129,7 @@ def test_a_correction_past_a_software_limit_stops_rsi(tmp_path: Path) -> None:
             "<AKorr @0@/><IPOC>7</IPOC>",
             "an answer whose IPOC differs from the IPOC of the last packet is ignored: 7",
         ),
-        ('<AKorr A1="a"/><IPOC>@</IPOC>', "an answer with a correction that is no number is ignored"),
+        ('<AKorr A1="a"/><IPOC>@</IPOC>', "an answer with a correction that is not a number is ignored"),
         ('<RKorr X="1"/><IPOC>@</IPOC>', "corrections without A1 A2 A3 A4 A5 A6 in AKorr are taken as 0"),
         ("<AKorr @9@/><IPOC>@</IPOC>", "RSI stops: command velocity of A1 exceeded: 9.000 deg"),
         ("<AKorr @999@/><IPOC>@</IPOC>", "a correction is clamped: to [341.0, 0.0"),

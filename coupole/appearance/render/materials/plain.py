@@ -42,7 +42,7 @@ from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Comple
 THINNEST_NM = 1e-3
 Facets = Literal["ggx", "beckmann", "cook_torrance"]
 """Kind of facets. `beckmann`: Beckmann's slopes with Smith's shadowing; `cook_torrance`: the same slopes in
-V-shaped grooves (seed 001)."""
+V-shaped grooves (Callet et al. 2010)."""
 _LEAST_SHARE = 0.1
 """Least share of the paths for each part of a blended material."""
 _LEAST_THROUGH = 1e-5
@@ -105,7 +105,7 @@ class Metal(Model):
 
 
 class Gilt(Model):
-    """Gold leaf on bole (seed 001, Eq. 7, as defined in `coupole.appearance.matter.gilding`)."""
+    """Gold leaf on bole (Callet et al. 2010, Eq. 7, as defined in `coupole.appearance.matter.gilding`)."""
 
     kind: Literal["gilt"]
     thickness_nm: Annotated[float, Field(ge=0)] = 100.0

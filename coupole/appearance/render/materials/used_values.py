@@ -74,5 +74,5 @@ def _unused_of_gilt(gilt: Gilt, folder: Path) -> set[str]:
 
 
 def _unused_of_alloy(metal: Metal | Gilt | Leaf) -> set[str]:
-    """Return the unused keys of a metal with an index from a file, which is no alloy of gold and silver."""
+    """Return the unused keys of a metal with an index from a file, which is not an alloy of gold and silver."""
     return set() if metal.index is None else {"gold"}

@@ -167,9 +167,12 @@ def test_the_page_says_that_materials_are_shared(result: RunResult) -> None:
 
 def test_a_state_beside_it_shows_its_shared_materials(result: RunResult) -> None:
     choice = PageChoice(TEXEL_CLUSTERS, beside=OtherState(result.folder, np.eye(4), "the same"))
-    beside = look_of_result(result.folder, choice=choice).about["beside"]
-    assert beside["fit"] == TEXEL_CLUSTERS
-    assert beside["texels"] is not None
+    look = look_of_result(result.folder, choice=choice)
+    assert look.about["beside"]["fit"] == TEXEL_CLUSTERS
+    texts = {block.name: block.text for block in look.later}
+    tiles = [name for name in texts if name.startswith("texels-")]
+    assert tiles
+    assert all(texts[f"beside-{name}"] == texts[name] for name in tiles)
 
 
 def test_the_shell_completes_them() -> None:

@@ -83,7 +83,7 @@ class MeasuredSurface:
     `u_normal` in rad."""
     options: ExportChoice = ExportChoice()
     sharing: str = ""
-    """What is said of materials that texels share; empty for other fits."""
+    """Sentence about the materials that texels share; empty for other fits."""
 
     @cached_property
     def has_material(self) -> NDArray[np.bool_]:

@@ -1,7 +1,8 @@
-"""An exported OBJ with its maps in an independent renderer, which makes tangents of its own."""
+"""An exported OBJ or glTF with its maps in an independent renderer, which makes tangents of its own."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ from coupole.reflectance.new_light.pictured_surface import FreeCamera
 
 @dataclass(frozen=True)
 class ExportedMaps:
-    """The folder of `coupole export --to obj`, with its maps as numbers."""
+    """A folder of `coupole export`, with its maps as numbers."""
 
-    folder: Path
+    mesh: Path
+    """An OBJ: metres, y up."""
     kd: np.ndarray
     """[h, w, 3] pi kd."""
     ks: np.ndarray
@@ -26,11 +28,48 @@ class ExportedMaps:
 
     @classmethod
     def read(cls, folder: Path) -> ExportedMaps:
+        """Read what `--to obj` has written."""
         library = (folder / "surface.mtl").read_text().splitlines()
         most_ks = float(next(line for line in library if line.startswith("Ks ")).split()[1])
         ks = most_ks * linear(codes(folder / "specular.png"))
         kd = linear(codes(folder / "base_color.png")) * (1 - ks.max(axis=2, keepdims=True))
-        return cls(folder, kd, ks, codes(folder / "roughness.png") ** 2, codes(folder / "normal.png"))
+        mesh = folder / "surface.obj"
+        return cls(mesh, kd, ks, codes(folder / "roughness.png") ** 2, codes(folder / "normal.png"))
+
+    @classmethod
+    def read_gltf(cls, folder: Path) -> ExportedMaps:
+        """Read what `--to gltf` has written, from its layout. Its mesh is also written beside it, as an OBJ."""
+        data = (folder / "surface.glb").read_bytes()
+        length = int.from_bytes(data[12:16], "little")
+        document, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
+        (primitive,), (material,) = document["meshes"][0]["primitives"], document["materials"]
+
+        def block(number: int) -> bytes:
+            view = document["bufferViews"][number]
+            return binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+
+        def floats(name: str) -> np.ndarray:
+            accessor = document["accessors"][primitive["attributes"][name]]
+            values = np.frombuffer(block(accessor["bufferView"]), "<f4")
+            return values.reshape(accessor["count"], -1).astype(float)
+
+        def picture(texture: dict[str, int]) -> np.ndarray:
+            image = document["images"][document["textures"][texture["index"]]["source"]]
+            return shares_of(cv2.imdecode(np.frombuffer(block(image["bufferView"]), np.uint8), cv2.IMREAD_COLOR))
+
+        rows = np.frombuffer(block(document["accessors"][primitive["indices"]]["bufferView"]), "<u4") + 1
+        lines = [f"v {x} {y} {z}" for x, y, z in floats("POSITION")]
+        lines += [f"vn {x} {y} {z}" for x, y, z in floats("NORMAL")]
+        lines += [f"vt {u} {1.0 - v}" for u, v in floats("TEXCOORD_0")]
+        lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in rows.reshape(-1, 3)]
+        mesh = folder / "surface.obj"
+        mesh.write_text("\n".join(lines) + "\n")
+        specular = material["extensions"]["KHR_materials_specular"]
+        ks = np.array(specular["specularColorFactor"]) * linear(picture(specular["specularColorTexture"])) * 0.04
+        layers = material["pbrMetallicRoughness"]
+        kd = linear(picture(layers["baseColorTexture"])) * (1 - ks.max(axis=2, keepdims=True))
+        alpha = picture(layers["metallicRoughnessTexture"])[..., 1] ** 2
+        return cls(mesh, kd, ks, alpha, picture(material["normalTexture"]))
 
     def render(self, camera: FreeCamera, towards: np.ndarray, samples: int) -> np.ndarray:
         """[h, w, 3] under light from afar in which a white diffuser that faces it is 1. Both parts of the
@@ -62,7 +101,7 @@ class ExportedMaps:
                 "type": "scene",
                 "integrator": {"type": "direct", "hide_emitters": True},
                 "sensor": {**sensor, "to_world": look, "film": film},
-                "surface": {"type": "obj", "filename": str(self.folder / "surface.obj"), "bsdf": bsdf},
+                "surface": {"type": "obj", "filename": str(self.mesh), "bsdf": bsdf},
                 "light": light,
             }
             total += np.array(mi.render(mi.load_dict(scene), spp=samples))[..., :3]
@@ -77,7 +116,12 @@ def texture(values: np.ndarray) -> dict[str, Any]:
 
 
 def codes(path: Path) -> np.ndarray:
-    picture: np.ndarray = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+    return shares_of(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+
+
+def shares_of(found: Any) -> np.ndarray:
+    """Codes of a picture, of 0 to 1, red first."""
+    picture: np.ndarray = np.asarray(found)
     shares: np.ndarray = picture / float(np.iinfo(picture.dtype).max)
     return shares[..., ::-1] if shares.ndim == 3 else shares
 

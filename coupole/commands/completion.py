@@ -27,10 +27,10 @@ def fits(incomplete: str) -> list[tuple[str, str]]:
 
 
 def materials(incomplete: str) -> list[tuple[str, str]]:
-    """Fits that `coupole export --fit` accepts."""
-    from coupole.reflectance.fits import MATERIALS, TEXELS
+    """Fits that `coupole export --fit` and `coupole show --fit` accept."""
+    from coupole.reflectance.fits import MATERIALS, OF_TEXELS
 
-    return [(name, title) for name, title in fits(incomplete) if name in (*MATERIALS, TEXELS)]
+    return [(name, title) for name, title in fits(incomplete) if name in (*MATERIALS, *OF_TEXELS)]
 
 
 def templates(incomplete: str) -> list[str]:

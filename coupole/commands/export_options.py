@@ -11,7 +11,7 @@ import typer
 from coupole.commands.common import RecordsOption
 from coupole.commands.completion import formats, materials
 from coupole.exchange.formats import FORMATS, MAPS, Source, formats_of
-from coupole.reflectance.fits import MATERIALS, TEXELS
+from coupole.reflectance.fits import MATERIALS, OF_TEXELS
 
 _COLOUR, _PARTS, _ABOUT = "Colour of frames (dng, tiff)", "What is exported", "Metadata of the crate (rocrate)"
 _OF_MATERIALS = [name for name, export_format in FORMATS.items() if "triangle" in export_format.options]
@@ -47,8 +47,8 @@ FitOption = Annotated[
     typer.Option(
         "--fit",
         autocompletion=materials,
-        help=f"For results: {', '.join(MATERIALS)}, or {TEXELS} for formats with maps; by default the fit with "
-        "the smallest error in the check.",
+        help=f"For results: {', '.join(MATERIALS)}; for formats with maps also {' or '.join(OF_TEXELS)}. By "
+        "default the fit with the smallest error in the check; never shared materials.",
         rich_help_panel=_PARTS,
     ),
 ]

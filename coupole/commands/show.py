@@ -16,7 +16,7 @@ from coupole.commands.common import JsonOption, fail
 from coupole.commands.completion import materials
 from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError
-from coupole.reflectance.fits import MATERIALS, TEXELS
+from coupole.reflectance.fits import MATERIALS, OF_TEXELS, TEXELS
 
 if TYPE_CHECKING:
     from coupole.exchange.look.look_blocks import Look
@@ -55,8 +55,8 @@ FitOption = Annotated[
     typer.Option(
         "--fit",
         autocompletion=materials,
-        help=f"For a result of runs: {TEXELS}, {' or '.join(MATERIALS)}; by default {TEXELS} if it has any, else "
-        "the best fit with its residual.",
+        help=f"For a result of runs: {', '.join((*OF_TEXELS, *MATERIALS))}; by default {TEXELS} if it has any, "
+        "else the best fit with its residual.",
         show_default=False,
     ),
 ]

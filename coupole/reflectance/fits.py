@@ -137,9 +137,11 @@ TEXELS = "texels"
 """Name of the fit that `--texels` adds: materials of single pixels of each view."""
 TEXEL_CLUSTERS = "texel_clusters"
 """Name of the fit that `coupole reflectance cluster --texels` adds: materials that texels share."""
-ANYWHERE = (*MATERIALS, CLUSTERED, PAIR_HARMONICS, TEXELS, TEXEL_CLUSTERS)
+OF_TEXELS = (TEXELS, TEXEL_CLUSTERS)
+"""Fits with a material for each texel, which maps can show."""
+ANYWHERE = (*MATERIALS, CLUSTERED, PAIR_HARMONICS, *OF_TEXELS)
 """Fits that are valid from all directions."""
-RELIT = (*FITS, CLUSTERED, PAIR_HARMONICS, TEXELS, TEXEL_CLUSTERS)
+RELIT = (*FITS, CLUSTERED, PAIR_HARMONICS, *OF_TEXELS)
 """All values that `--fit` of `coupole reflectance relight` accepts."""
 
 

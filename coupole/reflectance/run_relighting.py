@@ -22,7 +22,6 @@ from coupole.reflectance.fits import (
     MATERIALS,
     PAIR_HARMONICS,
     RELIT,
-    TEXEL_CLUSTERS,
     TEXELS,
     ViewFit,
 )
@@ -51,8 +50,8 @@ from coupole.reflectance.pair_harmonics import pair_values
 from coupole.reflectance.parts_in_threads import first_alone
 from coupole.reflectance.run_result import RunResult, ViewSamples, read_about
 from coupole.reflectance.texels.gathered import TexelView, gather, open_views
-from coupole.reflectance.texels.pixel_file import ViewTexels, read_texel_errors, read_view_texels
-from coupole.reflectance.texels.texel_cluster_file import read_shared_texels
+from coupole.reflectance.texels.pixel_file import ViewTexels, read_texel_errors
+from coupole.reflectance.texels.texel_cluster_file import READ_TEXELS
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
 
 Say = Callable[[int, int], None]
@@ -61,8 +60,6 @@ SAMPLES = 256
 _FAR_MM = 1e5
 """Distance at which distant light is placed for a slice."""
 _TRIANGLES = 1 << 13
-_READ_TEXELS = {TEXELS: read_view_texels, TEXEL_CLUSTERS: read_shared_texels}
-"""Functions that read a view's texels, by the fits that have materials of texels."""
 
 
 def best_fit(result: RunResult, among: Collection[str] = FITS) -> str:
@@ -236,8 +233,8 @@ def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = 
     surface = surface_of_view(result, pictured_view)
     order = (pictured_view, *(run_view for run_view in result.views if run_view is not pictured_view))
     mesh = PacketMesh(result.corners_mm, compact=False)
-    if name in _READ_TEXELS:
-        texels = _texels_of(_READ_TEXELS[name](result, pictured_view), surface)
+    if name in READ_TEXELS:
+        texels = _texels_of(READ_TEXELS[name](result, pictured_view), surface)
         return RelitScene(result, name, surface, texels, order, mesh)
     known_fit = FITS.get(name)
     if not isinstance(known_fit, ViewFit):
@@ -261,8 +258,8 @@ def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) ->
     name = fit or best_with_texels(result, MATERIALS)
     mesh = PacketMesh(result.corners_mm, compact=False)
     surface = surface_from(result, mesh, camera)
-    if name in _READ_TEXELS:
-        texels = _gathered_texels(open_views(result, _READ_TEXELS[name]), surface)
+    if name in READ_TEXELS:
+        texels = _gathered_texels(open_views(result, READ_TEXELS[name]), surface)
         return RelitScene(result, name, surface, texels, result.views, mesh)
     return RelitScene(result, name, surface, _from_anywhere(result, name, surface), result.views, mesh)
 

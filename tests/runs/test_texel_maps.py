@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from skimage.color import deltaE_ciede2000, rgb2lab
 from coupole.exchange.atlas.flat_surface import flatten
 from coupole.exchange.of_results.measured_surface import ExportChoice, read_surface
 from coupole.exchange.srgb import srgb
-from coupole.reflectance.fits import TEXELS
+from coupole.reflectance.fits import TEXEL_CLUSTERS, TEXELS
 from coupole.reflectance.new_light.light_kinds import DistantLight
 from coupole.reflectance.new_light.pictured_surface import FreeCamera
 from coupole.reflectance.run_relighting import scene_from
@@ -41,6 +42,38 @@ def exported(made: Made, to: str, folder: Path, *options: str) -> Path:
     ended = cells.here("export", made[1], "--to", to, "--out", folder, *options, "--json")
     assert ended.code == 0, ended.err
     return folder
+
+
+@pytest.fixture(scope="module")
+def clustered(detailed: Made, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """A copy of the result whose texels share a few materials."""
+    out = Path(shutil.copytree(detailed[1], tmp_path_factory.mktemp("clustered") / "result"))
+    ended = cells.here("reflectance", "cluster", out, "--texels", "--clusters", "24", "--json")
+    assert ended.code == 0, ended.err
+    return detailed[0], out, ended.document
+
+
+LIGHTS = ((-1.0, 0.0, 0.5), (1.0, 0.3, 0.7), (0.0, 1.0, 0.6), (0.2, -1.0, 1.0), (0.0, 0.1, 1.0))
+
+
+def differences(
+    maps: ExportedMaps, result: Path, fit: str, lights: tuple[tuple[float, float, float], ...] = LIGHTS
+) -> list[float]:
+    """Mean CIEDE2000, under each light, of another renderer's picture from the command's, rendered twice as large:
+    where both show something lit, which they do nearly everywhere."""
+    camera = FreeCamera(np.array([60.0, -120.0, 280.0]), np.array([30.0, 0.0, 5.0]), (240, 180), 20.0)
+    scene = scene_from(RunResult(result), replace(camera, size_px=(480, 360)), fit)
+    found = []
+    for towards in lights:
+        theirs = maps.render(camera, np.array(towards) / np.linalg.norm(towards), 16)
+        ours = scene.picture([DistantLight(towards=towards)]).reshape(180, 2, 240, 2, 3).mean(axis=(1, 3))
+        known, shared = (ours > 0.0).any(axis=2), (theirs > 0.0).any(axis=2)
+        assert (known & ~shared).sum() < 0.05 * known.sum()
+        known &= shared
+        white = np.percentile(ours[known], 99)
+        colours = [rgb2lab(srgb(np.clip(picture / white, 0.0, 1.0))) for picture in (ours, theirs)]
+        found.append(float(np.mean(deltaE_ciede2000(*colours)[known])))
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -63,29 +96,34 @@ def model(detailed: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_maps_look_in_another_renderer_as_the_picture_that_relight_makes(
     detailed: Made, model: Path, tmp_path: Path, has_own_charts: bool
 ) -> None:
-    """Under five lights, in CIEDE2000, where both show something lit, which they do nearly everywhere; with the
-    map's green turned round, they do not. On new charts, and on those of a model."""
+    """With the map's green turned round, they do not. On new charts, and on those of a model."""
     options = ("--uv", str(model)) if has_own_charts else ()
     maps = ExportedMaps.read(exported(detailed, "obj", tmp_path / "obj", *options))
-    camera = FreeCamera(np.array([60.0, -120.0, 280.0]), np.array([30.0, 0.0, 5.0]), (240, 180), 20.0)
-    scene = scene_from(RunResult(detailed[1]), replace(camera, size_px=(480, 360)), TEXELS)
-
-    def difference(theirs: np.ndarray, ours: np.ndarray) -> float:
-        known, shared = (ours > 0.0).any(axis=2), (theirs > 0.0).any(axis=2)
-        assert (known & ~shared).sum() < 0.05 * known.sum()
-        known &= shared
-        white = np.percentile(ours[known], 99)
-        colours = [rgb2lab(srgb(np.clip(picture / white, 0.0, 1.0))) for picture in (ours, theirs)]
-        return float(np.mean(deltaE_ciede2000(*colours)[known]))
-
-    found = []
-    for towards in ((-1.0, 0.0, 0.5), (1.0, 0.3, 0.7), (0.0, 1.0, 0.6), (0.2, -1.0, 1.0), (0.0, 0.1, 1.0)):
-        way = np.array(towards) / np.linalg.norm(towards)
-        ours = scene.picture([DistantLight(towards=towards)]).reshape(180, 2, 240, 2, 3).mean(axis=(1, 3))
-        found.append(difference(maps.render(camera, way, 16), ours))
+    found = differences(maps, detailed[1], TEXELS)
     assert np.mean(found) < 1.5, found
     turned = replace(maps, normal=maps.normal * [1.0, -1.0, 1.0] + [0.0, 1.0, 0.0])
-    assert difference(turned.render(camera, way, 16), ours) > 1.5 * found[-1]
+    assert differences(turned, detailed[1], TEXELS, LIGHTS[-1:])[0] > 1.5 * found[-1]
+
+
+@pytest.mark.parametrize("to", ["obj", "gltf"])
+def test_shared_materials_look_in_another_renderer_as_relight_shows_them(
+    clustered: Made, tmp_path: Path, to: str
+) -> None:
+    """Nearer than to the texels' own materials."""
+    folder = exported(clustered, to, tmp_path / to, "--fit", TEXEL_CLUSTERS)
+    maps = ExportedMaps.read(folder) if to == "obj" else ExportedMaps.read_gltf(folder)
+    found = differences(maps, clustered[1], TEXEL_CLUSTERS)
+    assert np.mean(found) < 1.5, found
+    assert differences(maps, clustered[1], TEXELS, LIGHTS[-1:])[0] > 1.3 * found[-1]
+
+
+@needs_checkers
+def test_gltf_and_usd_with_shared_materials_are_valid(clustered: Made, tmp_path: Path) -> None:
+    folders = [exported(clustered, to, tmp_path / to, "--fit", TEXEL_CLUSTERS) for to in ("gltf", "usd")]
+    assert gltf_messages(folders[0] / "surface.glb") == []
+    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+    stage = Usd.Stage.Open(str(folders[1] / "surface.usdz"))
+    assert [found.GetMessage() for found in context.Validate(stage)] == []
 
 
 @needs_checkers

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import pwd
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -297,3 +298,36 @@ def test_a_ledger_that_was_moved_away_while_light_was_given_is_missed(tmp_path: 
     lost.enter(40.0, "of a ledger that was lost")
     lost.plan("three", 1.0, None)
     assert lost.read_history().total_lux_h == 43.5
+
+
+@pytest.mark.parametrize("loss", ["removed", "moved", "an older copy"])
+def test_a_ledger_that_is_lost_while_the_first_light_is_given_is_missed_at_once(tmp_path: Path, loss: str) -> None:
+    """The light is entered all the same, and no more is given; also if nothing had been entered before."""
+    ledger = Ledger(tmp_path / "ledgers", "shroud", only_grows=True)
+    if loss == "an older copy":
+        Ledger(tmp_path / "ledgers", "shroud").enter(5.0, "in a studio")
+    earlier = ledger.path.read_bytes() if ledger.path.exists() else b""
+    plan_id = ledger.plan("one", 3.0, None)
+    if loss == "removed":
+        shutil.rmtree(ledger.folder)
+    elif loss == "moved":
+        ledger.folder.rename(tmp_path / "elsewhere")
+    else:
+        ledger.path.write_bytes(earlier)
+    with pytest.raises(StorageError, match="while light was given"):
+        ledger.correct(plan_id, 2.5, None)
+    assert ledger.read_history().total_lux_h == 2.5 + 5.0 * (loss == "an older copy")
+    with pytest.raises(StorageError, match="while light was given"):
+        ledger.plan("one", 3.0, None)
+    with pytest.raises(StorageError, match="earlier lines are missing"):
+        Ledger(tmp_path / "ledgers", "shroud").plan("two", 3.0, None)
+
+
+def test_a_ledger_that_is_lost_after_the_last_light_is_missed_when_asked(tmp_path: Path) -> None:
+    ledger = Ledger(tmp_path, "shroud", only_grows=True)
+    ledger.correct(ledger.plan("one", 3.0, None), 2.5, None)
+    Ledger(tmp_path, "shroud").enter(5.0, "in a studio")
+    ledger.refuse_loss()
+    ledger.path.unlink()
+    with pytest.raises(StorageError, match="was removed while light was given"):
+        ledger.refuse_loss()

@@ -23,9 +23,10 @@ from coupole.exchange.atlas.textured_mesh import TexturedMesh, read_textured_mes
 from coupole.exchange.material_values import UNCERTAIN, red_green_blue
 from coupole.exchange.of_results.measured_surface import MeasuredSurface
 from coupole.geometry import apply
-from coupole.reflectance.fits import TEXELS
+from coupole.reflectance.fits import OF_TEXELS, TEXEL_CLUSTERS
 from coupole.reflectance.run_result import VARIANCES
 from coupole.reflectance.texels.gathered import Gathered, TexelView, gather, open_views
+from coupole.reflectance.texels.texel_cluster_file import READ_TEXELS
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -35,6 +36,8 @@ _MOST_U, _MOST_U_OF_TRIANGLE, _MOST_U_OF_WHITE = 0.4, 0.15, 0.03
 """Limits of the standard uncertainty of kd. A material is known if it meets one of two limits. One limit is
 relative to the material's kd: the first number for texels, the second for triangles, whose error may be in one
 channel only. The other limit is relative to the kd of a white diffuser: the third number."""
+_OF_MATERIAL = [n for n, name in enumerate(UNCERTAIN) if name != "u_normal"]
+"""Columns of the uncertainties of a material. A shared material has none; normals are not shared."""
 _BLOCK = 1 << 20
 """Number of texels that are looked up together."""
 
@@ -82,7 +85,8 @@ class FlatSurface:
     normals_in_frames: Singles
     """[k, 3] unit normals in the frames of the mesh: along the map's columns, up in the map, outwards."""
     uncertain: Singles
-    """[k, 4] standard uncertainties from all sources: of kd and ks (relative), normal (rad), alpha (relative)."""
+    """[k, 4] standard uncertainties from all sources: of kd and ks (relative), normal (rad), alpha (relative). NaN
+    for materials that texels share."""
     numbers: NDArray[np.int64]
     """[k] triangles of the texels, in the result's mesh."""
     open_sky: Singles
@@ -106,7 +110,7 @@ def flatten(surface: MeasuredSurface) -> FlatSurface:
     material.
     """
     textured_mesh = read_textured_mesh(surface.options.uv_mesh) if surface.options.uv_mesh else None
-    views = open_views(surface.result) if surface.fit == TEXELS else []
+    views = open_views(surface.result, READ_TEXELS[surface.fit]) if surface.fit in OF_TEXELS else []
     rows = _rows_to_show(surface, views)
     surface.options.say("charts", 0, 1)
     rows, atlas = _lay_out(surface, rows, views, textured_mesh)
@@ -164,12 +168,13 @@ def _seen_there(
     surface: MeasuredSurface, views: list[TexelView], places_mm: Floats
 ) -> tuple[Gathered, NDArray[np.bool_]]:
     """Materials that views show at places [k, 3] of the support frame, where they are certain. The normals of
-    these materials are in the base frame.
+    these materials are in the base frame. Shared materials are shown everywhere, as by `relight`: many texels tell
+    them, so they are better known than a texel's own.
     """
     gathered_there = gather(views, apply(surface.result.base_from_support, places_mm))
     u_kd = np.sqrt(gathered_there.covariance[:, VARIANCES[2]])
-    is_certain = (gathered_there.materials.alpha > 0.0) & _is_certain(u_kd, gathered_there.materials.kd, _MOST_U)
-    return gathered_there, is_certain
+    is_certain = (surface.fit == TEXEL_CLUSTERS) | _is_certain(u_kd, gathered_there.materials.kd, _MOST_U)
+    return gathered_there, is_certain & (gathered_there.materials.alpha > 0.0)
 
 
 def _finest_mm(views: list[TexelView], corners_mm: Floats) -> float:
@@ -259,7 +264,10 @@ class _Known:
         first, second, kd, ks, alpha = gathered_there.covariance[is_certain][:, VARIANCES].T
         common = np.mean([view.u_common**2 for view in self._views])
         columns = (np.sqrt(kd + common), np.sqrt(ks + common), np.sqrt(first + second), np.sqrt(alpha))
-        values.uncertain[is_certain] = np.stack(columns, axis=1)
+        uncertain = np.stack(columns, axis=1)
+        if self._surface.fit == TEXEL_CLUSTERS:
+            uncertain[:, _OF_MATERIAL] = np.nan
+        values.uncertain[is_certain] = uncertain
 
 
 @dataclass(frozen=True)

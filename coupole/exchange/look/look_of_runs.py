@@ -22,7 +22,7 @@ from coupole.exchange.look.residual_planes import PLANES, residual_blocks, resid
 from coupole.exchange.material_values import red_green_blue, standard_uncertainties
 from coupole.exchange.of_results.measured_surface import ExportChoice, read_surface
 from coupole.geometry import apply, inverse
-from coupole.reflectance.fits import MATERIALS, TEXELS
+from coupole.reflectance.fits import MATERIALS, OF_TEXELS, TEXELS
 from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import RunResult, read_about
 from coupole.reflectance.texels.pixel_file import has_texels
@@ -75,7 +75,7 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
     texels = _texels_of(result, choice, say)
     planes = 0 if texels else PLANES if choice.planes is None else choice.planes
     left_of = residual_fit(result) if planes and choice.fit is None else None
-    fit = TEXELS if texels else choice.fit or left_of or best_fit(result, MATERIALS)
+    fit = choice.fit or (TEXELS if texels else left_of or best_fit(result, MATERIALS))
     other_state = _other_state(choice, fit, say) if choice.beside else None
     support_from_base = inverse(result.base_from_support)
     corners_mm = apply(support_from_base, result.corners_mm.reshape(-1, 3).astype(np.float64))
@@ -149,15 +149,17 @@ def _texels_of(
     result: RunResult, choice: PageChoice, say: Said, turn: Floats | None = None, prefix: str = ""
 ) -> LookTexels | None:
     """Return the texels, unless triangles are to be shown. A rotation [3, 3] is applied to their normals."""
-    if choice.fit not in (None, TEXELS) or (choice.fit is None and (choice.planes or not has_texels(result))):
+    if choice.fit not in (None, *OF_TEXELS) or (choice.fit is None and (choice.planes or not has_texels(result))):
         return None
     if choice.planes:
         raise InputError("--residual-planes: a residual belongs to triangles; texels have none")
     options = ExportChoice(map_px=choice.map_px, say=say)
-    flat = flatten(read_surface(result.folder, TEXELS, options, takes_texels=True))
+    surface = read_surface(result.folder, choice.fit or TEXELS, options, takes_texels=True)
+    flat = flatten(surface)
     if turn is not None:
         flat = replace(flat, normals=(flat.normals @ turn.T).astype(np.float32))
-    return look_texels(flat, len(result.corners_mm), prefix)
+    texels = look_texels(flat, len(result.corners_mm), prefix)
+    return replace(texels, remark="; ".join(filter(None, (texels.remark, surface.sharing))))
 
 
 _ERRORS_OF_TEXELS = {
@@ -190,7 +192,7 @@ def _materials(result: RunResult, fit: str, support_from_base: Floats) -> dict[s
     """Return numbers of all triangles by name; 0 for those without a material. Raises InputError for an unknown
     fit."""
     if fit not in MATERIALS:
-        raise InputError(f"--fit: expected {', '.join((*MATERIALS, TEXELS))}; got {fit}")
+        raise InputError(f"--fit: expected {', '.join((*MATERIALS, *OF_TEXELS))}; got {fit}")
     path = result.materials_path(fit)
     if not path.exists():
         raise InputError(f"{result.folder}: has no fit {fit}; `coupole reflectance fit {result.folder}` makes it")
@@ -262,10 +264,11 @@ def _other_state(choice: PageChoice, fit_of_first: str, say: Said) -> _Other:
     folder, first_from_other = choice.beside.folder, choice.beside.first_from_other
     read_about(folder)
     result = RunResult(folder)
-    other_choice = replace(choice, planes=None, fit=choice.fit if fit_of_first == TEXELS else fit_of_first)
+    other_choice = replace(choice, planes=None, fit=choice.fit if fit_of_first in OF_TEXELS else fit_of_first)
     texels = _texels_of(result, other_choice, say, first_from_other[:3, :3], _BESIDE)
     has_same = fit_of_first in MATERIALS and result.materials_path(fit_of_first).exists()
-    fit = TEXELS if texels else choice.fit or (fit_of_first if has_same else best_fit(result, MATERIALS))
+    best = fit_of_first if has_same else best_fit(result, MATERIALS)
+    fit = choice.fit or (TEXELS if texels else best)
     first_from_base = first_from_other @ inverse(result.base_from_support)
     corners_mm = apply(first_from_base, result.corners_mm.reshape(-1, 3).astype(np.float64))
     of_triangles = texels.of_triangles if texels else _materials(result, fit, first_from_base)

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.exchange.material_values import red_green_blue, standard_uncertainties
 from coupole.geometry import apply, inverse
-from coupole.reflectance.fits import MATERIALS, TEXELS
+from coupole.reflectance.fits import MATERIALS, OF_TEXELS, TEXEL_CLUSTERS, TEXELS
 from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import RunResult, read_about
 from coupole.reflectance.texels.pixel_file import read_texel_errors
+from coupole.reflectance.texels.texel_cluster_file import describe_sharing
 from coupole.storage import so_far
 
 Floats = NDArray[np.float64]
@@ -61,8 +62,8 @@ class MeasuredSurface:
 
     result: RunResult
     fit: str
-    """The fit of the materials, one of `fits.MATERIALS`. With `TEXELS`, triangles have the materials of the best
-    other fit."""
+    """The fit of the materials, one of `fits.MATERIALS` or `fits.OF_TEXELS`. With texels, triangles have the
+    materials of the best other fit."""
     about: dict[str, Any]
     """Content of result.json."""
     vertices_mm: Floats
@@ -81,6 +82,8 @@ class MeasuredSurface:
     """[n] standard uncertainties from all sources: `u_kd`, `u_ks`, `u_alpha` relative (the channels' mean),
     `u_normal` in rad."""
     options: ExportChoice = ExportChoice()
+    sharing: str = ""
+    """Sentence about the materials that texels share; empty for other fits."""
 
     @cached_property
     def has_material(self) -> NDArray[np.bool_]:
@@ -90,15 +93,15 @@ class MeasuredSurface:
     @property
     def has_maps(self) -> bool:
         """True if maps are written instead of one texel for each triangle, by formats that can do both."""
-        return self.fit == TEXELS or self.options.uv_mesh is not None
+        return self.fit in OF_TEXELS or self.options.uv_mesh is not None
 
     @property
     def remark(self) -> str:
         """Remark in files about themselves, if their format allows it."""
         kind = "simulated" if self.about.get("simulated") else "measured"
         version, runs = self.about["software"]["coupole"], ", ".join(sorted(self.about["runs"]))
-        growing = so_far.words(self.about)
-        return f"{kind} with Coupole {version}; fit {self.fit} of {runs}" + (f"; {growing}" if growing else "")
+        origin = f"{kind} with Coupole {version}; fit {self.fit} of {runs}"
+        return "; ".join(words for words in (origin, self.sharing, so_far.words(self.about)) if words)
 
 
 def under_a_layer(kd: NDArray[np.floating], ks: NDArray[np.floating]) -> Floats:
@@ -112,18 +115,19 @@ def read_surface(
     folder: Path, fit: str | None = None, options: ExportChoice | None = None, *, takes_texels: bool = False
 ) -> MeasuredSurface:
     """Read the surface of a complete result. The material is that of the named fit, or of the fit with the
-    smallest error; `takes_texels` tells whether this may be `TEXELS`. Raises InputError if there is no such
-    fit."""
+    smallest error; `takes_texels` tells whether this may be one of `OF_TEXELS`. Raises InputError if there is
+    no such fit."""
     about = read_about(folder)
     result = RunResult(folder)
     name = fit or _best(result, takes_texels=takes_texels)
-    if name not in (*MATERIALS, TEXELS):
+    if name not in (*MATERIALS, *OF_TEXELS):
         raise InputError(
             f"--fit: expected {' or '.join(MATERIALS)}, which are valid from every direction; got {name}"
         )
-    if name == TEXELS and not takes_texels:
-        raise InputError("--fit texels: is for formats with maps; this format has one material for each triangle")
-    of_triangles = best_fit(result, MATERIALS) if name == TEXELS else name
+    if name in OF_TEXELS and not takes_texels:
+        raise InputError(f"--fit {name}: is for formats with maps; this format has one material for each triangle")
+    sharing = describe_sharing(folder) if name == TEXEL_CLUSTERS else ""
+    of_triangles = best_fit(result, MATERIALS) if name in OF_TEXELS else name
     path = result.materials_path(of_triangles)
     if not path.exists():
         raise InputError(f"{folder}: has no fit {of_triangles}; `coupole reflectance fit {folder}` makes it")
@@ -155,6 +159,7 @@ def read_surface(
         everywhere(materials.alpha),
         {key: everywhere(values) for key, values in standard_uncertainties(path).items()},
         options or ExportChoice(),
+        sharing,
     )
 
 

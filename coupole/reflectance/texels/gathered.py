@@ -19,7 +19,6 @@ from coupole.reflectance.parts_in_threads import in_threads
 from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples
 from coupole.reflectance.texels.pixel_file import (
     ViewTexels,
-    read_view_texels,
     texel_uncertainty,
     views_with_texels,
 )
@@ -60,9 +59,7 @@ class TexelView:
     power."""
 
 
-def open_views(
-    result: RunResult, read_view: Callable[[RunResult, ViewSamples], ViewTexels] = read_view_texels
-) -> list[TexelView]:
+def open_views(result: RunResult, read_view: Callable[[RunResult, ViewSamples], ViewTexels]) -> list[TexelView]:
     """Open the views that have texels; `read_view` reads those of a view. Raises InputError if
     no view has texels."""
     return [_open_view(result, view, read_view(result, view)) for view in views_with_texels(result)]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from coupole.reflectance.fits import TEXEL_CLUSTERS
+from coupole.reflectance.fits import TEXEL_CLUSTERS, TEXELS
 from coupole.reflectance.run_result import RunResult, ViewSamples
 from coupole.reflectance.texels.pixel_file import ViewTexels, read_view_texels
 from coupole.storage.hdf5_file import hdf5_file
@@ -74,6 +74,18 @@ def read_shared_texels(result: RunResult, view: ViewSamples) -> ViewTexels:
         )
     kd, ks, alpha = (values[number].astype(np.float32) for values in (clusters.kd, clusters.ks, clusters.alpha))
     return replace(texels, kd=kd, ks=ks, alpha=alpha)
+
+
+READ_TEXELS = {TEXELS: read_view_texels, TEXEL_CLUSTERS: read_shared_texels}
+"""Functions that read a view's texels, by the fits that have materials of texels."""
+
+
+def describe_sharing(folder: Path) -> str:
+    """Say how many materials the texels of a result share, and which command found them. Raises InputError if they
+    share none."""
+    members = read_texel_clusters(folder).members
+    command = "`coupole reflectance cluster --texels`"
+    return f"{members.sum():,} texels share {len(members):,} materials, which {command} found"
 
 
 def _remedy(folder: Path) -> str:

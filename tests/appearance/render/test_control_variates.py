@@ -81,7 +81,9 @@ def test_a_band_that_is_dark_stays_dark(tmp_path: Path) -> None:
     assert follower.residual_noise == 0.0
 
 
-def test_a_rendered_picture_with_a_noise_limit_agrees_with_one_of_all_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rendered_picture_with_a_noise_limit_agrees_with_one_of_all_paths(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Gold under a lamp and a sky of other colours: what is noise in the red is steady in the blue."""
     lamp = {
         "kind": "area",

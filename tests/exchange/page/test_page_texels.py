@@ -15,10 +15,12 @@ from shown_page import Page, difference
 from coupole.errors import InputError
 from coupole.exchange.look.look_of_runs import PageChoice, look_of_result
 from coupole.exchange.look.look_page import write_page
-from coupole.reflectance.fits import TEXELS
+from coupole.reflectance.fits import TEXEL_CLUSTERS, TEXELS
 from coupole.reflectance.new_light.light_kinds import DistantLight
 from coupole.reflectance.run_relighting import scene_from
 from coupole.reflectance.run_result import RunResult
+from coupole.reflectance.texels.texel_cluster_file import PATH, write_texel_clusters
+from coupole.reflectance.texels.texel_clusters import group_texels
 
 pytestmark = needs_chromium
 LIGHT = (-0.4, -0.3, 0.8)
@@ -56,6 +58,29 @@ def test_texels_look_as_the_command_relight_shows_them(page: Page, detailed: Pat
     )
     assert np.sum(fine * wanted) / np.sum(wanted**2) == pytest.approx(1.0, abs=0.07)
     assert np.sum(of_triangles * wanted) / np.sum(wanted**2) < 0.5
+
+
+def test_shared_materials_look_as_the_command_relight_shows_them(page: Page, detailed: Path) -> None:
+    """Three of them for stripes whose kd is anything between two: nearer than to the texels' own."""
+    result = RunResult(detailed / "result")
+    write_texel_clusters(result.folder / PATH, group_texels(result, 3, 1 << 30))
+    choice = PageChoice(TEXEL_CLUSTERS)
+    write_page(look_of_result(detailed / "result", choice=choice), "stripes", detailed / "shared.html")
+    page.open(detailed / "shared.html")
+    page.wait_for_all()
+    page.small()
+    camera = page.look(-70.0, 50.0, 150.0)
+    page.run(f"coupole.setLight({', '.join(map(str, LIGHT))})")
+    mine = page.picture(1)[..., :3]
+    assert "(texel_clusters)" in page.browser.text("#banner")
+    theirs, own = (
+        scene_from(result, camera, fit).picture([DistantLight(towards=LIGHT)]) for fit in (TEXEL_CLUSTERS, TEXELS)
+    )
+    both = (mine > 0.0).all(axis=2) & (theirs > 0.0).all(axis=2)
+    assert both.mean() > 0.2
+    white = float(np.quantile(theirs[both], 0.99))
+    assert difference(mine, theirs, white)[both].mean() < 1.5
+    assert difference(mine, own, white)[both].mean() > 1.5 * difference(mine, theirs, white)[both].mean()
 
 
 def test_a_page_shows_triangles_until_its_texels_have_come(page: Page, detailed: Path, tmp_path: Path) -> None:

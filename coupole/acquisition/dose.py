@@ -64,7 +64,7 @@ class LightOnObject:
         self, job: Job, cell: OpenedCell, what_for: str, before_lux_h: tuple[float, ...] | LuxHours = ()
     ) -> None:
         """`before_lux_h` [points] was given by earlier sessions of the same run. Raises StorageError if the ledger
-        cannot be read and written."""
+        cannot be read and written, or lacks this light."""
         plan_object = job.plan.object
         self._ledger = ledger_of(job.cell, plan_object.id, only_grows=True) if plan_object else None
         self._enters = self._ledger is not None and not cell.is_simulated
@@ -80,7 +80,14 @@ class LightOnObject:
         self._unentered_lux_h = 0.0
         """Dose of this session, in a simulated cell."""
         if self._ledger is not None:
-            self._ledger.newest()
+            history = self._ledger.newest()
+            if self._enters:
+                history.refuse_without_light_of(self._id, what_for, self.lux_h)
+
+    def refuse_lost_ledger(self) -> None:
+        """Raise StorageError if the ledger lacks light of this session."""
+        if self._ledger is not None and self._enters:
+            _ask_ledger(self._ledger, self._ledger.refuse_loss)
 
     @property
     def lux_h(self) -> float:
@@ -275,6 +282,10 @@ class DoseMeter:
         """Return the dose of the run so far, with this number of steps of the present burst. The light of a panel
         counts when it has ended."""
         return max(self.lux_h, float(self._under_way_lux_h[min(steps, len(self._under_way_lux_h) - 1)]))
+
+    def refuse_lost_ledger(self) -> None:
+        """Raise StorageError if the ledger lacks light of this session."""
+        self._light.refuse_lost_ledger()
 
     def begin(self, burst: Burst) -> None:
         """Enter the planned light of a burst before it is given. It is on the disk when this returns.

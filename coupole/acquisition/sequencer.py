@@ -131,6 +131,10 @@ class Sequencer:
             raise UnprovenError(self._say_missing())
         return self.outcome
 
+    def refuse_lost_ledger(self) -> None:
+        """Raise StorageError if the object's ledger lacks light of this session."""
+        self._dose.refuse_lost_ledger()
+
     def conclude(self, proven_shots: set[ShotId]) -> None:
         """Set the outcome's figures, with these shots as the proven ones."""
         self.outcome.dose_lux_h = self._dose.lux_h_in_all

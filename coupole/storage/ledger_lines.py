@@ -17,6 +17,8 @@ from coupole.storage.line_file import utc_now
 BY_HAND = "by hand"
 """Name instead of a run's name, for light that was entered with `coupole dose --add`."""
 _ROUNDING = 1e-9
+_ROUNDING_LUX_H = 1e-6
+"""Of the sum of all entries of a run."""
 _TAIL_BYTES = 256
 Amount = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 
@@ -159,6 +161,17 @@ class History:
 
     def of_run(self, run: str) -> History:
         return History([entry for entry in self.entries if entry.run == run])
+
+    def refuse_without_light_of(self, object_id: str, run: str, lux_h: float) -> None:
+        """Raise StorageError if less is entered in all than `lux_h`, which the journal of a single run states. (The
+        entries of a run cannot be told by its name, because its folder may have been renamed.)"""
+        if self.total_lux_h < lux_h - _ROUNDING_LUX_H:
+            raise StorageError(
+                f"object {object_id}: by its journal, the run {run} has given it {lux_h:.6f} lux.h, but its dose "
+                f"ledger has only {self.total_lux_h:.6f} lux.h in all: lines are missing. Put the whole ledger "
+                f"back; if it is lost, give `coupole dose {object_id} --add LUX_H --note WHY` with the light that "
+                "is missing"
+            )
 
     @property
     def runs(self) -> list[str]:

@@ -6,7 +6,7 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,7 @@ from coupole.acquisition.session_failure import (
     note_what_hangs,
     statistics,
 )
-from coupole.acquisition.signals import obeyed_by
+from coupole.acquisition.signals import SignalReceived, obeyed_by
 from coupole.bounded import left_behind, on_disk, run_bounded
 from coupole.errors import (
     Interrupted,
@@ -109,16 +109,38 @@ class _Session:
 
 def acquire_plan(job: Job, console: Console, request: SessionRequest, figures: dict[str, Any]) -> None:
     """Run a plan into a run folder. `figures` is filled with the figures of `--json`, even if this raises."""
-    with contextlib.ExitStack() as stack:
+    with _failure_first() as ending:
         run = Run(request.resume) if request.resume else None
         if run is not None:
-            stack.callback(os.close, run.lock())
+            ending.stack.callback(os.close, run.lock())
             run.refuse_old_journal()
             run.refuse_changes(job.inputs)
             refuse_lost(run.folder, run.proven().values())
         job = without_hidden(job, run.hidden_leds if run else None)
         job = with_choices(job, run.choices() if run else {}, run.chosen_views() if run else ())
-        _acquire_into(run, job, console, request, figures, stack)
+        _acquire_into(run, job, console, request, figures, ending)
+
+
+@dataclass
+class _Ending:
+    """What a session leaves to be done at its end, and the failure that ended it."""
+
+    stack: contextlib.ExitStack
+    failure: BaseException | None = None
+
+
+@contextlib.contextmanager
+def _failure_first() -> Iterator[_Ending]:
+    """Do at the end what a session leaves to be done. A signal that comes then does not take the place of the
+    failure that ended the session: the failure is raised."""
+    ending = _Ending(contextlib.ExitStack())
+    try:
+        with ending.stack:
+            yield ending
+    except SignalReceived:
+        if ending.failure is not None:
+            raise ending.failure from None
+        raise
 
 
 def _acquire_into(
@@ -127,7 +149,7 @@ def _acquire_into(
     console: Console,
     request: SessionRequest,
     figures: dict[str, Any],
-    exit_stack: contextlib.ExitStack,
+    ending: _Ending,
 ) -> None:
     is_resumed, beside = run is not None, request.beside
     folder = (run.folder if run else request.parent or job.cell.storage_folder).resolve()
@@ -156,9 +178,9 @@ def _acquire_into(
             inputs = replace(job.inputs, copy_large=request.with_mesh)
             create = partial(Run.create, folder, job.plan.name, inputs, about_run(job, cell))
             run = on_disk(str(folder), create, copied_s(inputs))
-            exit_stack.callback(os.close, run.lock())
+            ending.stack.callback(os.close, run.lock())
         on_disk(str(run.folder), partial(open_for_session, run))
-        exit_stack.callback(conclude, run, console)  # when the devices are closed
+        ending.stack.callback(conclude, run, console)  # when the devices are closed
         console.print(f"run {run.folder}")
         is_packed = job.cell.rig.storage.pixels == "packed12"
         about = metadata_of_views(job, cell), described_cell(job)
@@ -178,6 +200,9 @@ def _acquire_into(
             _acquire(
                 job, _Session(cell, run, recorder, faults, begun_s, request.when_served), console, light, figures
             )
+        except BaseException as error:
+            ending.failure = error
+            raise
         finally:
             _end_recording(recorder, beside)
 

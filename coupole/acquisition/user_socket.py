@@ -30,6 +30,8 @@ _MOST_WAITING = 256
 """Number of connections that may wait for a process; a stopped process leaves one waiting for each `coupole
 status`."""
 _CONNECTS_AGAIN_S = 0.05
+_LOOK_EVERY_S = 1.0
+"""Pause between looks at the socket's path."""
 _LONGEST_ANSWER_BYTES = 16 * 1024**2
 
 
@@ -55,37 +57,61 @@ class UserSocket:
         is a file at the path, a killed process left it; the caller knows that this process is not alive.
         """
         self.path, self._answer = path, answer
+        self._replacing = threading.Lock()
+        self._is_over = False
 
     def __enter__(self) -> UserSocket:
-        hidden_path = self.path.with_suffix(".new")
-        hidden_path.unlink(missing_ok=True)
-        self._socket = socket.socket(socket.AF_UNIX)
-        try:
-            self._socket.bind(str(hidden_path))
-            hidden_path.chmod(0o600)
-            self._socket.listen(_MOST_WAITING)
-            hidden_path.replace(self.path)
-        except BaseException:
-            self._socket.close()
-            raise
+        self._socket = self._listening()
         self._thread = threading.Thread(target=self._serve, name="user socket", daemon=True)
         self._thread.start()
         return self
 
+    def _listening(self) -> socket.socket:
+        """Return a new socket that listens at the path."""
+        hidden_path = self.path.with_suffix(".new")
+        hidden_path.unlink(missing_ok=True)
+        listener = socket.socket(socket.AF_UNIX)
+        try:
+            listener.bind(str(hidden_path))
+            hidden_path.chmod(0o600)
+            listener.listen(_MOST_WAITING)
+            hidden_path.replace(self.path)
+        except BaseException:
+            listener.close()
+            raise
+        return listener
+
     def __exit__(self, *_: object) -> None:
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)  # ends `accept`
+        with self._replacing:
+            self._is_over = True
+            with contextlib.suppress(OSError):
+                self._socket.shutdown(socket.SHUT_RDWR)  # ends `accept`
         self._thread.join()
         self._socket.close()
-        self.path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # its folder may be gone, or replaced by a file
+            self.path.unlink(missing_ok=True)
 
     def _serve(self) -> None:
         while True:
             try:
+                if not select.select([self._socket], [], [], _LOOK_EVERY_S)[0]:
+                    self._replace_if_lost()
+                    continue
                 connection, _ = self._socket.accept()
             except OSError:
                 return
             threading.Thread(target=self._obey, args=(connection,), daemon=True).start()
+
+    def _replace_if_lost(self) -> None:
+        """Listen at the path again if somebody removed it, for example a program that cleans /tmp. Otherwise
+        `coupole stop` would not find this process."""
+        with self._replacing, contextlib.suppress(OSError):
+            if self._is_over or os.path.lexists(self.path):
+                return
+            self.path.parent.mkdir(mode=0o700, exist_ok=True)
+            if self.path.parent.stat(follow_symlinks=False).st_uid == os.getuid():
+                lost, self._socket = self._socket, self._listening()
+                lost.close()
 
     def _obey(self, connection: socket.socket) -> None:
         with connection, contextlib.suppress(OSError):

@@ -12,6 +12,7 @@ from cells import CellFolder
 
 from coupole.acquisition import conclusion
 from coupole.acquisition.sequencer import Sequencer
+from coupole.errors import DeviceLost
 from coupole.storage import journal
 from coupole.storage.journal_events import SessionStopped
 from coupole.storage.run import Run
@@ -57,3 +58,21 @@ def test_a_signal_while_files_are_hashed_ends_the_command(tmp_path: Path, monkey
     ended = cells.here("acquire", cell.plan, "--yes", "--json")
     assert ended.code == 143, ended
     assert Run(Path(ended.document["run"])).folder.is_dir()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_the_end_of_a_failed_run_is_written_does_not_hide_the_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    cell = CellFolder(tmp_path)
+    lost = DeviceLost("robot", expected="an answer", happened="none came", remedy="Look at the arm.")
+
+    def fail(self: Sequencer) -> None:
+        raise lost
+
+    monkeypatch.setattr(Sequencer, "acquire", fail)
+    monkeypatch.setattr(conclusion, "_report", lambda _: signal.raise_signal(number))
+    ended = cells.here("acquire", cell.plan, "--yes", "--json")
+    assert ended.code == 4, ended
+    assert "none came" in ended.document["error"]
+    assert "Look at the arm." in ended.err

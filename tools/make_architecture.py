@@ -31,6 +31,8 @@ CONTRACTS = (
     "wrist_lengths",
 )
 BESIDE = ("drivers", "sim")
+ENTRY = "__main__"
+"""It only begins the commands, and counts as a part of them."""
 _STEP_X, _STEP_Y, _BOX_W, _BOX_H, _MARGIN = 74, 46, 132, 34, 16
 
 
@@ -39,7 +41,7 @@ def rooms_in_order() -> list[str]:
     and appearance."""
     config = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     contracts = config["tool"]["importlinter"]["contracts"]
-    layers = [name for name in contracts[0]["layers"] if name not in CONTRACTS]
+    layers = [name for name in contracts[0]["layers"] if name not in (*CONTRACTS, ENTRY)]
     place = layers.index("appearance")
     return [*layers[:place], *BESIDE, *layers[place:], "contracts"]
 
@@ -51,7 +53,7 @@ def room_of(module: str) -> str:
         return parts[0]
     if parts[1] in CONTRACTS:
         return "contracts"
-    return parts[1]
+    return "commands" if parts[1] == ENTRY else parts[1]
 
 
 def arrows() -> Counter[tuple[str, str]]:

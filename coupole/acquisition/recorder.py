@@ -310,6 +310,7 @@ class RunRecorder:
         before = self._run.folder
         with under_way(DISK, str(before)):
             self._follow_folder()
+            self._run.refuse_removed()
         if self._run.is_lost:
             raise StorageError(
                 f"{before}: the run's folder or its journal was removed or replaced while frames were taken. "

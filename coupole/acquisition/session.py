@@ -123,10 +123,19 @@ def acquire_plan(job: Job, console: Console, request: SessionRequest, figures: d
 
 @dataclass
 class _Ending:
-    """What a session leaves to be done at its end, and the failure that ended it."""
+    """Work that a session leaves for its end, and the failure that ended it."""
 
     stack: contextlib.ExitStack
     failure: BaseException | None = None
+
+    @contextlib.contextmanager
+    def noting_failure(self) -> Iterator[None]:
+        """Note what ends the session itself."""
+        try:
+            yield
+        except BaseException as error:
+            self.failure = error
+            raise
 
 
 @contextlib.contextmanager
@@ -197,12 +206,9 @@ def _acquire_into(
             tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
-            _acquire(
-                job, _Session(cell, run, recorder, faults, begun_s, request.when_served), console, light, figures
-            )
-        except BaseException as error:
-            ending.failure = error
-            raise
+            session = _Session(cell, run, recorder, faults, begun_s, request.when_served)
+            with ending.noting_failure():
+                _acquire(job, session, console, light, figures)
         finally:
             _end_recording(recorder, beside)
 

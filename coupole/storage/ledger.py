@@ -122,7 +122,7 @@ class Ledger:
             budget_request.refuse_beyond(self.object_id, history, -history.planned_lux_h(plan_id))
 
     def correct(self, plan_id: str, dose_lux_h: float, damage_wh_m2: float | None) -> None:
-        """Enter the light that was given of that plan, in place of the planned light. If earlier lines are missing,
+        """Enter the light that was given of that plan, in place of the planned light. If earlier lines are lost,
         the light is entered all the same, and then StorageError is raised: no more light may be given."""
         line = LightGiven(id=plan_id, dose_lux_h=dose_lux_h, damage_wh_m2=damage_wh_m2)
         with self._open_locked() as file:

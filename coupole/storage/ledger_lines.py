@@ -18,7 +18,7 @@ BY_HAND = "by hand"
 """Name instead of a run's name, for light that was entered with `coupole dose --add`."""
 _ROUNDING = 1e-9
 _ROUNDING_LUX_H = 1e-6
-"""Of the sum of all entries of a run."""
+"""Largest rounding error of the sum of all entries of a run."""
 _TAIL_BYTES = 256
 Amount = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 
@@ -163,8 +163,8 @@ class History:
         return History([entry for entry in self.entries if entry.run == run])
 
     def refuse_without_light_of(self, object_id: str, run: str, lux_h: float) -> None:
-        """Raise StorageError if less is entered in all than `lux_h`, which the journal of a single run states. (The
-        entries of a run cannot be told by its name, because its folder may have been renamed.)"""
+        """Raise StorageError if less is entered in all than `lux_h`, which the journal of a single run states. The
+        run's own entries are not compared: they have its folder's name, and the folder may have been renamed."""
         if self.total_lux_h < lux_h - _ROUNDING_LUX_H:
             raise StorageError(
                 f"object {object_id}: by its journal, the run {run} has given it {lux_h:.6f} lux.h, but its dose "

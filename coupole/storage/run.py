@@ -45,6 +45,7 @@ from coupole.storage.journal_events import (
     ViewChosen,
 )
 from coupole.storage.line_file import utc_now
+from coupole.storage.run_inputs import FOLDER as INPUTS_FOLDER
 from coupole.storage.run_inputs import Inputs, changes_since, keep
 from coupole.storage.run_json import RUN_JSON, SCHEMA_VERSION, read_description
 from coupole.storage.run_readme import readme
@@ -78,6 +79,7 @@ class Run:
         """True if the run's folder or journal was removed or replaced. Then nothing more is written at the run's
         path.
         """
+        self._described_by = [name for name in (RUN_JSON, INPUTS_FOLDER) if (self.folder / name).exists()]
         self.about = read_description(folder)
 
     @staticmethod
@@ -315,6 +317,15 @@ class Run:
                 f"{version}) cannot be continued: it cannot be resumed. It can be verified, exported, archived "
                 "and used for calibrations; acquire its missing frames in a new run."
             )
+
+    def refuse_removed(self) -> None:
+        """Raise StorageError if the description or the inputs were removed since the run was opened."""
+        for name in () if self.is_lost else self._described_by:
+            if not os.path.lexists(self.folder / name):
+                raise StorageError(
+                    f"{self.folder / name}: was removed while frames were taken. Without it the frames cannot be "
+                    "understood. Put it back, then resume the run; if it is lost, begin a new run."
+                )
 
     def refuse_changes(self, inputs: Inputs) -> None:
         """Raise InputError if plan, rig or the files that they name differ in meaning from those at the run's

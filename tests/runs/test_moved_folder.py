@@ -92,6 +92,26 @@ def test_a_run_whose_folder_is_removed_ends_and_does_not_make_another(standing: 
     assert not run.exists()
 
 
+@pytest.mark.parametrize("name", ["run.json", "inputs"])
+def test_a_run_whose_description_is_removed_ends_and_says_so(
+    standing: tuple[CellFolder, World], tmp_path: Path, name: str
+) -> None:
+    """It is not done, and it is resumed when the files are back."""
+    cell, world = standing
+    process = cells.start("acquire", cell.plan, "--yes")
+    run = cell.run_folder
+    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    (run / name).rename(tmp_path / "elsewhere")
+    ended = cells.finish(process)
+    assert ended.code == 6, ended
+    assert f"{run / name}: was removed while frames were taken" in ended.err
+    assert cells.safe(world)
+    assert cells.events(run)[-1]["outcome"] == "failed"
+    (tmp_path / "elsewhere").rename(run / name)
+    assert cell.acquire("--resume", run).code == 0
+    assert cells.here("verify", run).code == 0
+
+
 def cut(path: Path) -> None:
     """What another program's mistake leaves of a file."""
     os.truncate(path, 100)

@@ -40,12 +40,12 @@ Image = NDArray[np.floating[Any]]
 def batch_sizes(first: int, most: int) -> Iterator[int]:
     """Yield numbers of paths through a pixel, of one batch after the other: `first` at the beginning, doubled
     again and again, `most` in all. At least two batches."""
-    left, number = max(most, 2), 0
-    while left > 0:
+    remaining_paths, number = max(most, 2), 0
+    while remaining_paths > 0:
         growth = 2 ** (max(0, number - _LEAST_BATCHES + _BATCHES_PER_DOUBLING) // _BATCHES_PER_DOUBLING)
-        size = min(left - (number == 0 and left > 1), first * growth)
+        size = min(remaining_paths - (number == 0), first * growth)
         yield size
-        left, number = left - size, number + 1
+        remaining_paths, number = remaining_paths - size, number + 1
 
 
 @dataclass
@@ -91,7 +91,7 @@ class Moments:
         """Median over the lit pixels of the relative standard error of the mean."""
         return self._relative(self._variances()[0], self.mean)
 
-    def corrected(self, guide_of_all: Image) -> tuple[Image, float]:
+    def correct_by(self, guide_of_all: Image) -> tuple[Image, float]:
         """Return the picture, corrected by the guide's mean of all paths [h, w, 1], and the noise that the guide
         does not explain (`Follower`)."""
         variance, guide_variance, covariance = self._variances()
@@ -164,7 +164,7 @@ class Guide:
         for number, (size, picture) in enumerate(batches):
             moments.add(size, picture, self.batch(number))
             if moments.count >= _LEAST_BATCHES or moments.count == len(self.sizes):
-                follower = Follower(*moments.corrected(self.moments.mean), moments.paths)
+                follower = Follower(*moments.correct_by(self.moments.mean), moments.paths)
                 if follower.residual_noise <= RESIDUAL_SHARE * noise_limit:
                     break
         return follower

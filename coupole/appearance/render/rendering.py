@@ -112,13 +112,14 @@ class Renderer:
         pictures, noises = [], []
         for number, whole in enumerate(wholes):
             guide = Guide(self._files / f"guide-{number}", camera.height_px, camera.width_px)
-            guide_picture, residuals = 0.0, [0.0]
+            guide_picture: NDArray[np.floating[Any]] = np.zeros(())
+            residuals = [0.0]
             for size, picture in self._batches(whole, middle, sizes, camera):
                 progress(
                     number * len(groups) * len(sizes) + len(guide.sizes), len(wholes) * len(groups) * len(sizes)
                 )
                 guide.add(size, picture)
-                guide_picture += size * picture
+                guide_picture = guide_picture + size * picture
                 if number == 0 and guide.is_enough(noise_limit):
                     break
             sizes = guide.sizes

@@ -1,6 +1,7 @@
 """Bands that take their noise from a guide: against pictures whose truth is known, and against plain rendering."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ def test_batches_have_all_paths_and_grow(first: int, most: int) -> None:
     assert len(sizes) >= 2
     assert min(sizes) >= 1
     assert len(sizes) <= 9 + 4 * max(1.0, np.log2(most) + 1.0)
-    assert all(b in (a, 2 * a) for a, b in zip(sizes[1:-2], sizes[2:-1], strict=True))
+    assert all(b in (a, 2 * a) for a, b in pairwise(sizes[1:-1]))
 
 
 def batches(

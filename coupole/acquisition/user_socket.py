@@ -94,7 +94,7 @@ class UserSocket:
     def _serve(self) -> None:
         while True:
             try:
-                if not select.select([self._socket], [], [], _LOOK_EVERY_S)[0]:
+                if not _is_readable(self._socket, _LOOK_EVERY_S):
                     self._replace_if_lost()
                     continue
                 connection, _ = self._socket.accept()
@@ -120,6 +120,13 @@ class UserSocket:
                 line = _line(connection, LONGEST_REQUEST_BYTES)
                 answer = self._answer(line, Caller(connection))
                 connection.sendall(json.dumps(answer).encode() + b"\n")
+
+
+def _is_readable(listener: socket.socket, within_s: float) -> bool:
+    """Wait for a connection, or for the end of the socket."""
+    poll = select.poll()  # takes any file's number
+    poll.register(listener, select.POLLIN)
+    return bool(poll.poll(1e3 * within_s))
 
 
 def peer_uid(connection: socket.socket) -> int:

@@ -80,6 +80,8 @@ class _Stopping:
     only one."""
     _unclear: dict[int, str] = field(default_factory=dict)
     """Names of sessions whose rig is not known yet, by process."""
+    _ended_session: State = field(default_factory=dict)
+    """State of a session that ended while it was asked, as if another `coupole stop` had reached it first."""
     _told_pids: set[int] = field(default_factory=set)
     """Processes for which the command has said that it waits for them."""
     _no_run: InputError | None = None
@@ -104,6 +106,8 @@ class _Stopping:
             self._tell(starting, waited_s)
         if not self.replies and silent_sessions:
             self._ask_session(*next(iter(self._only(silent_sessions).items())))
+        if not self.replies and self._ended_session:
+            self.replies[self._ended_session["pid"]] = self._ended_session | {"state": "ended", "trouble": []}
         if not self.replies:
             assert self._no_run is not None
             raise self._no_run
@@ -179,7 +183,8 @@ class _Stopping:
 
         try:
             reply = ask_session(path, state, "stop", _alarm)
-        except SessionEnded:
+        except SessionEnded:  # or its run has begun, and is found by the next look
+            self._ended_session = state
             return
         if reply["state"] == "running":
             try:
@@ -266,6 +271,7 @@ def _await_end_without_run(reply: State, *, as_json: bool) -> None:
             remedy="Look at the cell, then end the process (`kill -9`).",
         )
     when = "stopped while it was starting: " if reply["doing"] == ACQUIRE else f"stopped: {reply['doing']} "
+    when = "ended while it was asked to stop: " if reply["state"] == "ended" else when
     words = f"{when}{reply['plan'] or reply.get('rig')}; its process {reply['pid']} has ended"
     make_console(quiet=as_json).print(words, markup=False)
 

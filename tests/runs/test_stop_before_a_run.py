@@ -20,7 +20,7 @@ from cells import CellFolder
 
 from coupole.acquisition import runtime_folder, starting_processes
 from coupole.acquisition.sessions_without_run import SessionEnded, ask_session, sessions_without_run
-from coupole.commands import stopping
+from coupole.commands import run_controls, stopping
 
 PATIENT_S = 5.0
 """Time that a stop waits for the answer of a session that may be the one that is meant."""
@@ -230,6 +230,30 @@ def test_a_session_that_ends_before_its_answer_was_sent_is_stopped(apart: Path) 
         state = {"run": "", "plan": "plan.yaml", "rig": "", "doing": "acquire", "pid": 1}
         assert ask_session(path, state, "stop", print)["state"] == "stopping"
         closing.join()
+
+
+def test_a_second_stop_of_a_session_that_ends_meanwhile_waits_for_the_same_end(
+    apart: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first stop is obeyed between two steps of the second one: it has found the session, and asks it now."""
+    monkeypatch.setattr(starting_processes, "YOUNG_S", 0.0)
+    found = run_controls.sessions
+
+    with _starts(apart / "plan.yaml") as process:
+
+        def find_and_end(patience_s: float) -> object:
+            sessions = found(patience_s)
+            process.kill()
+            process.wait()
+            for socket_path in apart.rglob("*.start"):
+                socket_path.unlink()
+            return sessions
+
+        monkeypatch.setattr(stopping, "sessions", find_and_end)
+        stopped = cells.here("stop")
+        assert stopped.code == 0, stopped.err
+        assert "ended while it was asked to stop" in stopped.out + stopped.err
+        assert f"process {process.pid} has ended" in " ".join((stopped.out + stopped.err).split())
 
 
 def test_a_process_whose_run_has_its_last_frame_is_interrupted(apart: Path, tmp_path: Path) -> None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -52,7 +56,7 @@ def demo(
     try:
         plan_name = "demo-short" if short else "demo"
         _refuse_foreign(folder, plan_name)
-        with SessionWithoutRun(ACQUIRE, None) as starting:
+        with _alone_in(folder), SessionWithoutRun(ACQUIRE, None) as starting:
             made = _make(folder, plan_name, console, starting)
     except CoupoleError as error:
         fail(error, as_json=as_json)
@@ -74,6 +78,26 @@ def _refuse_foreign(folder: Path, plan_name: str) -> None:
     for run in (folder / RUNS).glob("*"):
         if not run.name.endswith(f"Z-{plan_name}"):
             raise InputError(f"{folder}: holds another run ({run.name}); name another folder for this demo")
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Make the folder, and hold it against other demos. Raises InputError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        held = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be used: {error.strerror}") from error
+    try:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(
+                f"{folder}: another demo is being made there; wait for its end, or name another folder"
+            ) from error
+        yield
+    finally:
+        os.close(held)
 
 
 def _make(folder: Path, plan_name: str, console: Console, starting: SessionWithoutRun) -> Demo:

@@ -15,6 +15,7 @@ from coupole.storage import journal, manifest, run_dose
 from coupole.storage.discarding import discarded_views
 from coupole.storage.journal_events import ProcessingAsked, SessionResumed, SessionStopped, TextUnread
 from coupole.storage.run import Run
+from coupole.storage.run_inputs import FOLDER as INPUTS_FOLDER
 from coupole.viewing import report
 from coupole.viewing.terminal import alarm, bytes_text
 from coupole.viewing.text_outlet import unread
@@ -101,8 +102,8 @@ def _report(run: Run) -> tuple[list[str], int]:
     """Write the report, and list the small complete files. Also return the complete views that are not listed, and
     their bytes."""
     report.write(run, in_use=False)
-    unlisted_files = {
-        name for name in manifest.unlisted_files(run.folder) if not name.startswith(f"{manifest.VIEWS}/")
+    unlisted_files = {  # in other folders are views, and what somebody has moved there
+        name for name in manifest.unlisted_files(run.folder) if name.partition("/")[0] in (name, INPUTS_FOLDER)
     }
     manifest.enter(run.folder, sorted(unlisted_files))
     digests = manifest.read_checksums(run.folder)

@@ -92,7 +92,7 @@ def test_a_run_whose_folder_is_removed_ends_and_does_not_make_another(standing: 
     assert not run.exists()
 
 
-@pytest.mark.parametrize("name", ["run.json", "inputs"])
+@pytest.mark.parametrize("name", ["run.json", "inputs", "views"])
 def test_a_run_whose_description_is_removed_ends_and_says_so(
     standing: tuple[CellFolder, World], tmp_path: Path, name: str
 ) -> None:
@@ -101,13 +101,15 @@ def test_a_run_whose_description_is_removed_ends_and_says_so(
     process = cells.start("acquire", cell.plan, "--yes")
     run = cell.run_folder
     cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
-    (run / name).rename(tmp_path / "elsewhere")
+    elsewhere = run / "elsewhere" if name == "views" else tmp_path / "elsewhere"
+    (run / name).rename(elsewhere)
     ended = cells.finish(process)
     assert ended.code == 6, ended
-    assert f"{run / name}: was removed while frames were taken" in ended.err
+    assert f"{run / name}" in ended.err
+    assert "Put it back" in ended.err
     assert cells.safe(world)
     assert cells.events(run)[-1]["outcome"] == "failed"
-    (tmp_path / "elsewhere").rename(run / name)
+    elsewhere.rename(run / name)
     assert cell.acquire("--resume", run).code == 0
     assert cells.here("verify", run).code == 0
 

@@ -181,7 +181,7 @@ def test_what_misses_its_limits_is_kept_and_refused(folder: Path, tmp_path: Path
     result = calibrate("hand-eye", folder, "--model", "brown4", "--out", tmp_path, "--repeatability-mm", 1e-4,
                        "--repeatability-deg", 1e-5, "--absolute-mm", 0, "--absolute-deg", 1e-5)  # fmt: skip
     assert error_of(result).exit_code == 3
-    assert "robot's noise" in str(result.exception)
+    assert "ratio of the robot's estimated noise to its stated noise" in str(result.exception)
     assert json.loads(result.stdout)["accepted"] is False
 
 

@@ -24,9 +24,9 @@ from coupole.reflectance.fits import (
     FITS,
     GGX,
     MATERIALS,
+    OF_TEXELS,
     RELIT,
     SLICES,
-    TEXELS,
     MaterialFit,
     ViewFit,
     fitted_together,
@@ -147,10 +147,10 @@ def test_help_and_shell_know_all_fits(tmp_path: Path) -> None:
     assert [name for name in RELIT if name not in told] == []
     assert [name for name, _ in completion.fits("")] == list(RELIT)
     assert completion.fits("ggx_r") == [("ggx_rbf", FITS["ggx_rbf"].title)]
-    assert [name for name, _ in completion.materials("")] == [*MATERIALS, TEXELS]
+    assert [name for name, _ in completion.materials("")] == [*MATERIALS, *OF_TEXELS]
     for command in ("export", "show"):
         told = cells.here(command, "--help").out
-        assert [name for name in (*MATERIALS, TEXELS) if name not in told] == []
+        assert [name for name in (*MATERIALS, *OF_TEXELS) if name not in told] == []
     assert GGX.name in MATERIALS
 
 

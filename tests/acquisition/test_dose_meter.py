@@ -176,16 +176,14 @@ def test_a_panel_counts_for_its_time_and_is_planned_until_the_boxs_watchdog(job:
 def test_a_resumed_run_goes_on_from_the_points_of_its_earlier_sessions(job: Job, burst: Burst) -> None:
     points = len(job.shape.dose_points_mm)
     before = tuple(float(k == 0) for k in range(points))  # one corner has received 1 lux.h
-    with pytest.raises(StorageError, match="its dose ledger has only 0.000000 lux.h in all: lines are missing"):
+    with pytest.raises(StorageError, match=r"its dose ledger has only .* in all: lines are missing"):
         meter(job, Recorder(before))
     ledger_of(job.cell, "relief").enter(1.0, "the earlier sessions")
     found = meter(job, Recorder(before))
     found.begin(burst)
     given = end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
     assert found.lux_h == pytest.approx(1.0 + given[0])
-    assert total(job) == pytest.approx(1.0 + given[0], abs=1e-8), (
-        "the entries sum to the dose of the highest point"
-    )
+    assert total(job) == pytest.approx(1.0 + given[0], abs=1e-8), "entries sum to the highest point's dose"
 
 
 def test_a_burst_that_would_exceed_the_budget_is_not_planned(job: Job, burst: Burst) -> None:

@@ -8,7 +8,7 @@ import cells
 import pytest
 
 from coupole.acquisition.sequencer import Sequencer
-from coupole.errors import DeviceLost
+from coupole.errors import StorageError
 
 
 def test_a_second_demo_in_the_same_folder_is_refused_while_the_first_is_made(
@@ -17,13 +17,13 @@ def test_a_second_demo_in_the_same_folder_is_refused_while_the_first_is_made(
     second: list[cells.Ended] = []
 
     def try_again(self: Sequencer) -> None:
-        monkeypatch.undo()
         second.append(cells.finish(cells.start("demo", tmp_path / "demo", "--short", "--json")))
-        raise DeviceLost("robot", expected="an answer", happened="none came", remedy="Look at the arm.")
+        raise StorageError("the end of this test's first demo")
 
     monkeypatch.setattr(Sequencer, "acquire", try_again)
     first = cells.here("demo", tmp_path / "demo", "--short", "--json")
-    assert first.code == 4, first.err
+    assert first.code == 6, first.err
+    assert second, first.err
     assert second[0].code == 2
     assert "another demo is being made there; wait for its end" in second[0].document["error"]
     assert len(list((tmp_path / "demo/runs").iterdir())) == 1

@@ -85,19 +85,19 @@ def _alone_in(folder: Path) -> Iterator[None]:
     """Make the folder, and hold it against other demos. Raises InputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        held = os.open(folder, os.O_RDONLY)
+        folder_fd = os.open(folder, os.O_RDONLY)
     except OSError as error:
         raise InputError(f"{folder}: cannot be used: {error.strerror}") from error
     try:
         try:
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(folder_fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise InputError(
                 f"{folder}: another demo is being made there; wait for its end, or name another folder"
             ) from error
         yield
     finally:
-        os.close(held)
+        os.close(folder_fd)
 
 
 def _make(folder: Path, plan_name: str, console: Console, starting: SessionWithoutRun) -> Demo:

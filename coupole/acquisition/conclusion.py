@@ -102,10 +102,9 @@ def _report(run: Run) -> tuple[list[str], int]:
     """Write the report, and list the small complete files. Also return the complete views that are not listed, and
     their bytes."""
     report.write(run, in_use=False)
-    unlisted_files = {  # in other folders are views, and what somebody has moved there
-        name for name in manifest.unlisted_files(run.folder) if name.partition("/")[0] in (name, INPUTS_FOLDER)
-    }
-    manifest.enter(run.folder, sorted(unlisted_files))
+    unlisted_files = manifest.unlisted_files(run.folder)
+    inputs = f"{INPUTS_FOLDER}/"  # views are listed when they are complete; other folders are not the run's
+    manifest.enter(run.folder, [name for name in unlisted_files if "/" not in name or name.startswith(inputs)])
     digests = manifest.read_checksums(run.folder)
     views = [name for name in complete_views(run) if name not in digests]
     return views, sum((run.folder / name).stat().st_size for name in views)

@@ -85,9 +85,9 @@ class LightOnObject:
                 history.refuse_without_light_of(self._id, what_for, self.lux_h)
 
     def refuse_lost_ledger(self) -> None:
-        """Raise StorageError if the ledger lacks light of this session."""
+        """Raise StorageError if the ledger lacks lines that this session has read or written."""
         if self._ledger is not None and self._enters:
-            _ask_ledger(self._ledger, self._ledger.refuse_loss)
+            _ask_ledger(self._ledger, self._ledger.newest)
 
     @property
     def lux_h(self) -> float:
@@ -164,7 +164,8 @@ class LightOnObject:
 
     def end(self, given_lux_h: LuxHours | None) -> LuxHours:
         """Note that the light of the last `begin` is over. If `given_lux_h` is None, the planned light counts.
-        Returns the light that counts."""
+        Returns the light that counts. Raises StorageError if it cannot be entered; and if earlier lines are
+        missing, but then it is entered."""
         plan = self._planned
         if plan is None:
             return np.zeros_like(self._given_lux_h)
@@ -175,6 +176,7 @@ class LightOnObject:
         if not self._enters:
             self._unentered_lux_h += self.more_lux_h(counts)
         self._given_lux_h, self._planned = self._given_lux_h + counts, None
+        self.refuse_lost_ledger()
         return counts
 
     @property
@@ -284,7 +286,7 @@ class DoseMeter:
         return max(self.lux_h, float(self._under_way_lux_h[min(steps, len(self._under_way_lux_h) - 1)]))
 
     def refuse_lost_ledger(self) -> None:
-        """Raise StorageError if the ledger lacks light of this session."""
+        """As that of `LightOnObject`."""
         self._light.refuse_lost_ledger()
 
     def begin(self, burst: Burst) -> None:

@@ -340,7 +340,8 @@ class RunRecorder:
 
     def refuse_lost(self) -> None:
         """Raise StorageError if the disk does not have all that was proven in this session and before: lines of
-        the journal and files of the views."""
+        the journal and files of the views; or if it lacks the run's description."""
+        self._run.refuse_removed()
         proven_shots = self._run.proven()
         if lost_shots := self.committed - set(proven_shots):
             raise StorageError(

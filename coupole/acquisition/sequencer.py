@@ -127,13 +127,10 @@ class Sequencer:
             self._bursts.end()
             self.outcome.duration_s = (self._cell.clock.now_ns() - start_ns) / 1e9
             self.conclude(self._recorder.proven())
+        self._dose.refuse_lost_ledger()
         if self.outcome.missing or self.outcome.missing_darks:
             raise UnprovenError(self._say_missing())
         return self.outcome
-
-    def refuse_lost_ledger(self) -> None:
-        """Raise StorageError if the object's ledger lacks light of this session."""
-        self._dose.refuse_lost_ledger()
 
     def conclude(self, proven_shots: set[ShotId]) -> None:
         """Set the outcome's figures, with these shots as the proven ones."""

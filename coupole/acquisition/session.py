@@ -309,7 +309,6 @@ def _acquire_under(
                     cell.make_safe()
                 _refuse_unsafe_end(cell)
                 on_disk(str(run.folder), recorder.refuse_lost)
-                sequencer.refuse_lost_ledger()
                 outcome = "done"
         except BaseException as error:
             failure = control.interruption() if control.stop.is_set() else error

@@ -15,7 +15,8 @@ YOUNG_S = 20.0
 """A process without a socket that is older than this, s, is not starting: it needs no socket. A busy machine loads
 the modules in 5 s."""
 _HOLD = {"acquire", "demo", "commission", "meter", "live", "bench", "arm", "devices"}
-_MODULE = "coupole"
+_MODULES = {"coupole", "coupole.commands.cli"}
+"""Modules that a Python process may run as the command line."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def _words_after_coupole(line: list[bytes]) -> tuple[str, ...]:
         words = words[1:]
         while words and words[0].startswith("-") and words[0] != "-m":
             words = words[1:]
-        if words[:2] == ["-m", _MODULE]:
+        if words[:1] == ["-m"] and words[1] in _MODULES:
             return tuple(words[2:])
     return tuple(words[1:]) if words and Path(words[0]).name == "coupole" else ()
 

@@ -309,3 +309,7 @@ def _not_taken(why: str) -> int:
 def _say(error: CoupoleError) -> None:
     with contextlib.suppress(OSError):  # the terminal may be gone
         print(f"{error.heading}\n{error}".strip(), file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

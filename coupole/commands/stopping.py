@@ -270,8 +270,11 @@ def _await_end_without_run(reply: State, *, as_json: bool) -> None:
             happened="it is still there",
             remedy="Look at the cell, then end the process (`kill -9`).",
         )
-    when = "stopped while it was starting: " if reply["doing"] == ACQUIRE else f"stopped: {reply['doing']} "
-    when = "ended while it was asked to stop: " if reply["state"] == "ended" else when
+    when = f"stopped: {reply['doing']} "
+    if reply["state"] == "ended":
+        when = "ended while it was asked to stop: "
+    elif reply["doing"] == ACQUIRE:
+        when = "stopped while it was starting: "
     words = f"{when}{reply['plan'] or reply.get('rig')}; its process {reply['pid']} has ended"
     make_console(quiet=as_json).print(words, markup=False)
 

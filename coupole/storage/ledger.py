@@ -59,8 +59,8 @@ class Ledger:
     def __init__(
         self, folder: Path, object_id: str, former_folder: Path | None = None, *, only_grows: bool = False
     ) -> None:
-        """`only_grows`: all methods of a caller that gives light raise StorageError if lines that were read or
-        written are gone, or if the file is not text. Raises InputError for an id that no plan can have."""
+        """`only_grows`: `newest`, `plan` and `ask_again` raise StorageError if lines that were read or planned are
+        gone, or if the file is not text. Raises InputError for an id that no plan can have."""
         try:
             self.object_id = _NAME.validate_python(object_id)
         except ValidationError as error:
@@ -122,19 +122,8 @@ class Ledger:
             budget_request.refuse_beyond(self.object_id, history, -history.planned_lux_h(plan_id))
 
     def correct(self, plan_id: str, dose_lux_h: float, damage_wh_m2: float | None) -> None:
-        """Enter the light that was given of that plan, in place of the planned light. If earlier lines are lost,
-        the light is entered all the same, and then StorageError is raised: no more light may be given."""
-        line = LightGiven(id=plan_id, dose_lux_h=dose_lux_h, damage_wh_m2=damage_wh_m2)
-        with self._open_locked() as file:
-            try:
-                self.newest()
-            finally:
-                file.append([line.model_dump_json() + "\n"])
-            self.newest()
-
-    def refuse_loss(self) -> None:
-        """Raise StorageError if lines that were read or written are missing."""
-        self.newest()
+        """Enter the light that was given of that plan, in place of the planned light."""
+        self._append(LightGiven(id=plan_id, dose_lux_h=dose_lux_h, damage_wh_m2=damage_wh_m2))
 
     def enter(self, dose_lux_h: float, note: str) -> None:
         """Enter light that was given elsewhere, for example in a photographer's studio. Raises InputError if the

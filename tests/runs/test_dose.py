@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import signal
 import sys
 import threading
@@ -379,26 +378,3 @@ def test_earlier_light_from_elsewhere_counts_against_the_budget(cell: CellFolder
     ended = cell.acquire()
     assert ended.code == 3
     assert "after 121.00 lux.h before; its budget is 121 lux.h" in ended.document["error"]
-
-
-def test_a_ledger_that_vanishes_in_the_first_burst_ends_the_run_and_a_run_that_knows_of_its_light_is_not_resumed(
-    tmp_path: Path,
-) -> None:
-    with real_cell(tmp_path) as (cell, world):
-        cell.write(views=[HOME], lights=cells.SOME_LIGHTS, exposure=BRACKET, object=RELIEF)
-        ledger = Path(cell.rig_data["ledger"])
-        process = cell.start_acquire()
-        cells.wait_until(lambda: world.ask("light")["leds_s"], "the first light")
-        shutil.rmtree(ledger)
-        ended = cells.finish(process)
-        assert ended.code == 6, ended
-        assert "while light was given" in ended.err
-        assert cells.safe(world)
-        run = cell.run_folder
-        shutil.rmtree(ledger)  # what was entered afterwards too
-        again = cell.acquire("--resume", run)
-        assert again.code == 6
-        assert "its dose ledger has only 0.000000 lux.h in all" in again.err
-        light = world.ask("light")
-        cells.here("dose", "relief", "--folder", ledger, "--add", "100", "--note", "of the lost ledger")
-        assert world.ask("light") == light

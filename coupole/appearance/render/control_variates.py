@@ -48,6 +48,17 @@ def batch_sizes(first: int, most: int) -> Iterator[int]:
         remaining_paths, number = remaining_paths - size, number + 1
 
 
+@dataclass(frozen=True)
+class Follower:
+    """A group of bands, corrected by the guide."""
+
+    picture: Image
+    """[h, w, 4]."""
+    residual_noise: float
+    """Noise that the guide does not explain: median over the lit pixels of the relative standard error, of the
+    noisiest band."""
+
+
 @dataclass
 class Moments:
     """Sums over batches of paths, of a band [h, w, channels] and of the guide [h, w, 1]."""
@@ -91,16 +102,15 @@ class Moments:
         """Median over the lit pixels of the relative standard error of the mean."""
         return self._relative(self._variances()[0], self.mean)
 
-    def correct_by(self, guide_of_all: Image) -> tuple[Image, float]:
-        """Return the picture, corrected by the guide's mean of all paths [h, w, 1], and the noise that the guide
-        does not explain (`Follower`)."""
+    def correct_by(self, guide_of_all: Image) -> Follower:
+        """Return the band, corrected by the guide's mean of all paths [h, w, 1]."""
         variance, guide_variance, covariance = self._variances()
         window = (_WINDOW_PX, _WINDOW_PX, 1)
         around, guide_around = uniform_filter(covariance, window), uniform_filter(guide_variance, window)
         slope = np.divide(around, guide_around, out=np.zeros_like(around), where=guide_around > 0.0)
         picture = np.maximum(self.mean + slope * (guide_of_all - self.guide_mean), 0.0)
         residual = variance - 2.0 * slope * covariance + slope**2 * guide_variance
-        return picture, self._relative(np.maximum(residual, 0.0), picture)
+        return Follower(picture, self._relative(np.maximum(residual, 0.0), picture))
 
     def _relative(self, variance: Image, mean: Image) -> float:
         """Median over the lit pixels, of the channel where it is highest."""
@@ -116,34 +126,31 @@ class Moments:
         )
 
 
-@dataclass(frozen=True)
-class Follower:
-    """A group of bands, corrected by the guide."""
-
-    picture: Image
-    """[h, w, 4]."""
-    residual_noise: float
-    """Noise that the guide does not explain: median over the lit pixels of the relative standard error, of the
-    noisiest band."""
-    paths: int
-
-
 @dataclass
 class Guide:
-    """The guide's batches, in a file, since pictures may be large and batches many."""
+    """The group of bands that guides the others. Its batches are in a file, since pictures may be large and
+    batches many."""
 
     path: Path
+    """File of the batches; one that is there is replaced."""
     height_px: int
     width_px: int
     sizes: list[int] = field(default_factory=list)
     """Paths of each batch."""
     moments: Moments = field(default_factory=Moments)
+    _sums: Any = 0.0
+
+    @property
+    def picture(self) -> Image:
+        """[h, w, 4] mean of all paths."""
+        return np.asarray(self._sums / self.moments.paths)
 
     def add(self, size: int, picture: Image) -> None:
         """Add a batch with its mean picture [h, w, 4]."""
         guide = picture.mean(axis=2, keepdims=True, dtype=float).astype(np.float32)
-        with self.path.open("ab") as file:
+        with self.path.open("ab" if self.sizes else "wb") as file:
             file.write(guide.tobytes())
+        self._sums = self._sums + size * picture
         self.sizes.append(size)
         self.moments.add(size, guide, guide)
 
@@ -164,7 +171,7 @@ class Guide:
         for number, (size, picture) in enumerate(batches):
             moments.add(size, picture, self.batch(number))
             if moments.count >= _LEAST_BATCHES or moments.count == len(self.sizes):
-                follower = Follower(*moments.correct_by(self.moments.mean), moments.paths)
+                follower = moments.correct_by(self.moments.mean)
                 if follower.residual_noise <= RESIDUAL_SHARE * noise_limit:
                     break
         return follower

@@ -21,7 +21,11 @@ from coupole.errors import CoupoleError
 
 Progress = Callable[[int, int], None]
 """Function that takes the number of finished passes, and of all passes."""
+Tell = Callable[[float], None]
+"""Function that takes the finished share of one of the pictures, from 0 to 1."""
 FILTERS: tuple[description.Filter, ...] = (0.0, 90.0, 45.0, "circular")
+_TOLD = 1000
+"""Parts of a picture with a guide, for the progress."""
 _PATHS_PER_PASS = 4_000_000
 """Number of paths in a pass. This limits a pass to seconds, because Mitsuba cannot be interrupted within a
 pass."""
@@ -105,38 +109,63 @@ class Renderer:
         self, camera: Camera, wholes: Sequence[Description], noise_limit: float, progress: Progress
     ) -> tuple[list[NDArray[np.float32]], int, float]:
         """Return the picture [h, w, bands] of each description, the number of paths of their guides, and the noise
-        of the first one (`control_variates`). All guides have as many paths as the first one needs."""
-        groups = bands.groups(self.scene.bands.step_nm)
-        middle = groups[len(groups) // 2]
+        of the first one (`control_variates`). All guides have as many paths as the first one needs. Pictures
+        behind polarisers are subtracted later, so there all groups have all paths: their noise is the same."""
         sizes = list(batch_sizes(FIRST_PATHS, self.scene.samples))
+        follower_limit = 0.0 if self.scene.polarisation else noise_limit
         pictures, noises = [], []
         for number, whole in enumerate(wholes):
-            guide = Guide(self._files / f"guide-{number}", camera.height_px, camera.width_px)
-            guide_picture: NDArray[np.floating[Any]] = np.zeros(())
-            residuals = [0.0]
-            for size, picture in self._batches(whole, middle, sizes, camera):
-                progress(
-                    number * len(groups) * len(sizes) + len(guide.sizes), len(wholes) * len(groups) * len(sizes)
-                )
-                guide.add(size, picture)
-                guide_picture = guide_picture + size * picture
-                if number == 0 and guide.is_enough(noise_limit):
-                    break
+
+            def tell(share: float, number: int = number) -> None:
+                progress(round(_TOLD * (number + share)), _TOLD * len(wholes))
+
+            guide = self._guide(camera, whole, sizes, 0.0 if number else noise_limit, tell)
             sizes = guide.sizes
-            of_groups = []
-            for place, group in enumerate(groups):
-                progress(number * len(groups) + place, len(wholes) * len(groups))
-                if group == middle:
-                    of_groups.append(self._radiance(guide_picture / guide.moments.paths, group))
-                    continue
-                follower = guide.correct(self._batches(whole, group, sizes, camera), noise_limit)
-                of_groups.append(self._radiance(follower.picture, group))
-                residuals.append(follower.residual_noise)
-            noises.append(float(np.hypot(guide.moments.noise(), max(residuals))))
-            pictures.append(self._whole(of_groups))
-            guide.path.unlink()
-        progress(1, 1)
+            picture, noise = self._guided(camera, whole, guide, follower_limit, tell)
+            pictures.append(picture)
+            noises.append(noise)
         return pictures, sum(sizes), noises[0]
+
+    def _guide(
+        self,
+        camera: Camera,
+        whole: Description,
+        sizes: list[int],
+        noise_limit: float,
+        tell: Callable[[float], None],
+    ) -> Guide:
+        """Return the guide, the middle group of bands, with batches of these sizes, until it has its share of the
+        noise limit. It is taken for half of the work."""
+        guide = Guide(self._files / "guide", camera.height_px, camera.width_px)
+        for size, picture in self._batches(whole, self._middle, sizes, camera):
+            guide.add(size, picture)
+            tell(0.5 * len(guide.sizes) / len(sizes))
+            if guide.is_enough(noise_limit):
+                break
+        return guide
+
+    def _guided(
+        self, camera: Camera, whole: Description, guide: Guide, noise_limit: float, tell: Tell
+    ) -> tuple[NDArray[np.float32], float]:
+        """Return the picture [h, w, bands] with its guide, and its noise."""
+        groups = bands.groups(self.scene.bands.step_nm)
+        of_groups, residuals = [], [0.0]
+        for number, group in enumerate(groups):
+            tell(0.5 + 0.5 * number / len(groups))
+            if group == self._middle:
+                of_groups.append(self._radiance(guide.picture, group))
+                continue
+            follower = guide.correct(self._batches(whole, group, guide.sizes, camera), noise_limit)
+            of_groups.append(self._radiance(follower.picture, group))
+            residuals.append(follower.residual_noise)
+        tell(1.0)
+        return self._whole(of_groups), float(np.hypot(guide.moments.noise(), max(residuals)))
+
+    @property
+    def _middle(self) -> list[int]:
+        """The group of bands that guides the others."""
+        groups = bands.groups(self.scene.bands.step_nm)
+        return groups[len(groups) // 2]
 
     def _batches(
         self, whole: Description, group: list[int], sizes: Sequence[int], camera: Camera

@@ -286,7 +286,7 @@ class DoseMeter:
         return max(self.lux_h, float(self._under_way_lux_h[min(steps, len(self._under_way_lux_h) - 1)]))
 
     def refuse_lost_ledger(self) -> None:
-        """As that of `LightOnObject`."""
+        """Raise StorageError if the ledger lacks lines that this session has read or written."""
         self._light.refuse_lost_ledger()
 
     def begin(self, burst: Burst) -> None:

@@ -339,8 +339,7 @@ class RunRecorder:
         self.committed.update(shots)
 
     def refuse_lost(self) -> None:
-        """Raise StorageError if the disk does not have all that was proven in this session and before: lines of
-        the journal and files of the views; or if it lacks the run's description."""
+        """Raise StorageError if the disk lacks lines of proven frames, files of their views, or the description."""
         self._run.refuse_removed()
         proven_shots = self._run.proven()
         if lost_shots := self.committed - set(proven_shots):

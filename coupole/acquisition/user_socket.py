@@ -110,8 +110,8 @@ class UserSocket:
                 return
             self.path.parent.mkdir(mode=0o700, exist_ok=True)
             if self.path.parent.stat(follow_symlinks=False).st_uid == os.getuid():
-                lost, self._socket = self._socket, self._listening()
-                lost.close()
+                old_socket, self._socket = self._socket, self._listening()
+                old_socket.close()
 
     def _obey(self, connection: socket.socket) -> None:
         with connection, contextlib.suppress(OSError):

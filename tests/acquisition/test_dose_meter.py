@@ -186,6 +186,19 @@ def test_a_resumed_run_goes_on_from_the_points_of_its_earlier_sessions(job: Job,
     assert total(job) == pytest.approx(1.0 + given[0], abs=1e-8), "entries sum to the highest point's dose"
 
 
+def test_a_ledger_that_is_lost_during_a_burst_is_missed_at_its_end_and_the_light_counts(
+    job: Job, burst: Burst
+) -> None:
+    found = meter(job)
+    found.begin(burst)
+    ledger_of(job.cell, "relief").path.unlink()
+    with pytest.raises(StorageError, match="while light was given"):
+        end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    assert found.lux_h_in_all == pytest.approx(total(job), abs=1e-8)
+    with pytest.raises(StorageError, match="while light was given"):
+        found.begin(burst)
+
+
 def test_a_burst_that_would_exceed_the_budget_is_not_planned(job: Job, burst: Burst) -> None:
     one = meter(job)
     one.begin(burst)

@@ -339,7 +339,7 @@ class RunRecorder:
         self.committed.update(shots)
 
     def refuse_lost(self) -> None:
-        """Raise StorageError if the disk lacks lines of proven frames, files of their views, or the description."""
+        """Raise StorageError if the disk lacks lines of proven frames, files of views, or the description."""
         self._run.refuse_removed()
         proven_shots = self._run.proven()
         if lost_shots := self.committed - set(proven_shots):
